@@ -50,6 +50,10 @@ const MAX_PACKET: u32 = 2 << 20;
 const RECEIVE_MAXIMUM: u16 = 64;
 /// Size of a packet with subscriptions, bytes, at most.
 const SUBSCRIBE_BYTES: usize = 8 << 10;
+/// Filters of a packet with subscriptions, at most: AWS IoT Core closes the connection at the ninth, without a reason.
+const MOST_FILTERS: usize = 8;
+/// Packets with subscriptions, at most: the client takes [`REQUESTS`] at a time. Behind that they have more filters.
+const MOST_PACKETS: usize = REQUESTS / 2;
 /// What the system buffers of sent messages: a result waits behind no more than that.
 const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
@@ -221,22 +225,9 @@ impl Connection {
             retain_forward_rule: RetainForwardRule::Never,
             ..first.clone()
         });
-        let most = limits.max_packet.min(SUBSCRIBE_BYTES);
-        let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
-        for filter in filters {
-            // Besides the path: its length, the options; the head of the packet.
-            let bytes = filter.path.len() + 3;
-            match packets.last_mut().filter(|(size, _)| size + bytes <= most) {
-                Some((size, packet)) => {
-                    *size += bytes;
-                    packet.push(filter);
-                }
-                None => packets.push((bytes + 8, vec![filter])),
-            }
-        }
-        packets
+        packets(filters, limits.max_packet.min(SUBSCRIBE_BYTES))
             .into_iter()
-            .all(|(_, packet)| self.client.try_subscribe_many(packet).is_ok())
+            .all(|packet| self.client.try_subscribe_many(packet).is_ok())
     }
 
     /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
@@ -529,4 +520,57 @@ fn reason(error: &ConnectionError) -> String {
         _ => "",
     };
     format!("the broker refuses the connection ({code:?}){advice}")
+}
+
+/// Packets with these filters, in their order, of at most so many bytes, and of [`MOST_FILTERS`] unless they are too many.
+fn packets(filters: Vec<Filter>, most: usize) -> Vec<Vec<Filter>> {
+    let most_filters = MOST_FILTERS.max(filters.len().div_ceil(MOST_PACKETS));
+    let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
+    for filter in filters {
+        // Besides the path: its length, the options; the head of the packet.
+        let bytes = filter.path.len() + 3;
+        let has_room = |(size, packet): &&mut (usize, Vec<Filter>)| size + bytes <= most && packet.len() < most_filters;
+        match packets.last_mut().filter(has_room) {
+            Some((size, packet)) => {
+                *size += bytes;
+                packet.push(filter);
+            }
+            None => packets.push((bytes + 8, vec![filter])),
+        }
+    }
+    packets.into_iter().map(|(_, packet)| packet).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_packet_with_subscriptions_has_eight_filters_and_so_many_bytes_at_most() {
+        let filters = |count: usize, length: usize| -> Vec<Filter> {
+            let path = |number: usize| format!("{number:0length$}");
+            (0..count)
+                .map(|number| Filter::new(path(number), QoS::AtLeastOnce))
+                .collect()
+        };
+        for (count, length, most, sizes) in [
+            (0, 10, 8192, vec![]),
+            (8, 10, 8192, vec![8]),
+            (9, 10, 8192, vec![8, 1]),
+            (20, 10, 8192, vec![8, 8, 4]),
+            (640, 4, 8192, vec![10; 64]),
+            // Three of 103 bytes and the head of 8 fit into 320.
+            (7, 100, 320, vec![3, 3, 1]),
+            (2, 400, 320, vec![1, 1]),
+        ] {
+            let wanted = filters(count, length);
+            let packets = packets(wanted.clone(), most);
+            assert_eq!(
+                packets.iter().map(Vec::len).collect::<Vec<_>>(),
+                sizes,
+                "{count} {length}"
+            );
+            assert_eq!(packets.concat(), wanted, "in their order");
+        }
+    }
 }
