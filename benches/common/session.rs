@@ -15,6 +15,7 @@ use drivegate::queue::CommandQueue;
 /// States and events as by default, without TLS, commands and Sparkplug.
 pub fn options(client_id: &str, host: &str, port: u16) -> Options {
     Options {
+        retain: true,
         brokers: vec![Broker {
             host: host.to_string(),
             port,

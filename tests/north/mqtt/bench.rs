@@ -522,6 +522,7 @@ pub(crate) fn at(port: u16) -> mqtt::Broker {
 /// Options for a broker on that port; commands are served.
 pub(crate) fn options(port: u16) -> Options {
     Options {
+        retain: true,
         brokers: vec![at(port)],
         tls: false,
         client_id: "drivegate-hall".to_string(),

@@ -60,6 +60,30 @@ fn all_topics_are_there_retained() {
     gateway.stop();
 }
 
+/// Some brokers close the connection at a retained message.
+#[test]
+fn nothing_is_retained_where_that_is_not_wanted() {
+    let broker = Broker::start();
+    let options = drivegate::north::mqtt::Options {
+        retain: false,
+        ..options(broker.port)
+    };
+    let watcher = Watcher::new(&broker, "drivegate/#");
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    watcher.wait_payload("drivegate/hall/status", "online");
+    watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
+    watcher.wait("the bus", |m| m.topic == "drivegate/hall/bus/line1");
+    gateway.stop();
+    watcher.wait_payload("drivegate/hall/status", "offline");
+    // A broker that has anything retained sends it before it answers to a new message.
+    let late = Watcher::new(&broker, "drivegate/#");
+    let gateway = Gateway::start(self::options(broker.port), plant(&["p2"]));
+    late.wait_payload("drivegate/hall/status", "online");
+    assert!(late.payloads("drivegate/hall/drive/p1/state").is_empty());
+    assert_eq!(late.payloads("drivegate/hall/status"), ["online"]);
+    gateway.stop();
+}
+
 #[test]
 fn changes_are_published_and_lost_values_taken_away() {
     let broker = Broker::start();

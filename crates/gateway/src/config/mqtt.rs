@@ -92,6 +92,14 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     }
     let buffer = read_buffer(reader, base);
     let home_assistant = read_home_assistant(reader);
+    let retain = MQTT.retain.get(reader);
+    if !retain && home_assistant.is_some() {
+        reader.warning(
+            MQTT.retain.name,
+            "Home Assistant learns of drives by retained messages, and has none of them after it restarts",
+            "leave retain out, or home_assistant",
+        );
+    }
     let sparkplug = read_sparkplug(reader, gateway, state_dir);
     reader.finish();
     let at = |Broker { host, port, .. }| mqtt::Broker { host, port };
@@ -107,6 +115,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
         telemetry,
         telemetry_qos,
         event_qos,
+        retain,
         expiry,
         message_expiry,
         min_interval,

@@ -82,6 +82,14 @@ pub(super) struct WillForm {
 }
 
 impl WillForm {
+    /// The form that is tried first.
+    pub(super) fn first(retain: bool) -> WillForm {
+        WillForm {
+            not_retained: !retain,
+            ..WillForm::default()
+        }
+    }
+
     /// The broker refused the connection for that; whether there is a lesser form to try.
     pub(super) fn lessen(&mut self, lack: Lack) -> bool {
         let given_up = match lack {

@@ -75,14 +75,14 @@ impl BrokerLink {
         BrokerLink {
             rotation: Rotation::new(brokers.len(), first.unwrap_or(0)),
             outages: brokers.iter().map(|_| OutageLog::default()).collect(),
-            options: Arc::new(options),
             client_id,
             prefix,
             state: State::Down {
                 retry_at: Instant::now(),
             },
             dial: Dial::default(),
-            will: WillForm::default(),
+            will: WillForm::first(options.retain),
+            options: Arc::new(options),
             takeovers: Takeovers::default(),
         }
     }
@@ -133,6 +133,8 @@ impl BrokerLink {
         match (step, &mut *phase) {
             (Step::Accepted(limits), _) => {
                 let since = Instant::now();
+                let retains = limits.retains && self.options.retain;
+                let limits = BrokerLimits { retains, ..limits };
                 *phase = Phase::Subscribing { limits, since };
                 Step::Accepted(limits)
             }
@@ -234,7 +236,9 @@ impl BrokerLink {
     pub(super) fn log_ready(&mut self, limits: BrokerLimits, named: &str) {
         let (prefix, broker) = (self.prefix, self.broker());
         tracing::info!(target: "drivegate::north::mqtt", "{prefix}connected to the broker at {broker}{named}");
-        for lost in limits.losses() {
+        // What the configuration does without is no news.
+        let retains = limits.retains || !self.options.retain;
+        for lost in (BrokerLimits { retains, ..limits }).losses() {
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}the broker at {broker} {lost}");
         }
         if let Some(outages) = self.outages.get_mut(self.rotation.current()) {
@@ -297,7 +301,7 @@ impl BrokerLink {
         };
         if held.is_some() || !self.rotation.is_single() {
             // The next broker, or this one with another configuration, may take more.
-            self.will = WillForm::default();
+            self.will = WillForm::first(self.options.retain);
         }
         let usual = self.rotation.next(held.unwrap_or_default());
         let retry_at = now + wait.unwrap_or(usual);

@@ -124,6 +124,8 @@ pub struct Options {
     pub telemetry_qos: Qos,
     /// Quality of service of events and history.
     pub event_qos: Qos,
+    /// Whether messages are retained; else none is, the last will included.
+    pub retain: bool,
     /// Time after which the broker drops telemetry; never if absent.
     pub expiry: Option<Duration>,
     /// Time after which a broker drops the status `online`, and telemetry at the latest, unless it is renewed; never if absent.

@@ -56,6 +56,9 @@ keys! {
         }, default ["state", "points"];
         /// Quality of service of published messages.
         qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
+        /// Whether messages are retained; `false` for brokers that [refuse
+        /// that](mqtt.md#security-and-brokers).
+        retain: bool = Flag, default true;
         /// The broker drops telemetry that is older (message expiry); `"0s"`: never.
         expiry: Duration = EXPIRY, default "5min";
         /// The broker drops `online`, and telemetry at the latest, after this time; renewed after half of it; `"0s"`:

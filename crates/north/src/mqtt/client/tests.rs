@@ -7,6 +7,7 @@ use crate::process_image::{BusImage, BusSpec};
 
 pub(in crate::mqtt) fn options(buffer: Option<Buffer>) -> Options {
     Options {
+        retain: true,
         brokers: vec![Broker {
             host: "127.0.0.1".to_string(),
             port: 1,
