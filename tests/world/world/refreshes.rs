@@ -52,7 +52,8 @@ impl World {
         );
         if let Some(supervision) = &self.buses[bus].line.supervision {
             let last = truth.heard.1.unwrap_or(now);
-            let acted = truth.supervised.is_some_and(|at| at >= last);
+            let speed = matches!(supervision.action, LeaseAction::SpeedReference(_));
+            let acted = speed && truth.supervised.is_some_and(|at| at >= last);
             assert!(
                 acted || now - last <= supervision.timeout + ACTION,
                 "drive {} is fed {:?} after its client fell silent",

@@ -45,7 +45,8 @@ impl Plant {
                 refresh: Some(EVERY),
                 supervision: Some(Settings {
                     timeout: Duration::from_secs(3600),
-                    action: LeaseAction::Stop,
+                    // A stop would end the refresh, too.
+                    action: LeaseAction::Hold,
                     adopt: false,
                 }),
                 ..spec
