@@ -64,7 +64,9 @@ struct Bus<'a> {
     load_ratio: f64,
     fast_cycle_ms: Option<f64>,
     slow_cycle_ms: Option<f64>,
-    refresh_ratio: f64,
+    /// Share of the line that refreshes take; absent where there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    refresh_ratio: Option<f64>,
     /// Duration of the stops at shutdown if all drives reply, and if none does.
     shutdown_ms: f64,
     shutdown_worst_ms: f64,
@@ -199,7 +201,7 @@ fn bus_report<'a>(bus: &'a BusSettings, memory: &BusMemory) -> Bus<'a> {
         load_ratio: prediction.load,
         fast_cycle_ms: prediction.fast_cycle.map(milliseconds),
         slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
-        refresh_ratio: prediction.refreshes,
+        refresh_ratio: (prediction.refreshes > 0.0).then_some(prediction.refreshes),
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
         recorder_bytes: memory.recorder.total(),

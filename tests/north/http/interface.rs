@@ -161,7 +161,7 @@ async fn a_good_drive() {
         json!({
             "name": "pump-1", "bus": "line1", "address": 1, "unit": 1, "profile": "vacon-nx", "access": "monitor",
             "state": "running", "quality": "good", "online": true, "since": "…", "age_ms": "…", "fault_text": "", "blocked_by": [], "why": [],
-            "turnaround_ms": 1.9, "transactions": {"ok": 1, "exception": 0, "timeout": 0, "corrupt": 0},
+            "refreshing": false, "turnaround_ms": 1.9, "transactions": {"ok": 1, "exception": 0, "timeout": 0, "corrupt": 0},
             "starts": 0, "running_seconds": 0.0, "energy_kwh": null,
         })
     );

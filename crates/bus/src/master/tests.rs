@@ -350,6 +350,21 @@ fn a_lease_ends_with_the_action_though_its_order_waited_longer_than_it() {
     assert!(rig.news.contains(&News::LeaseRanOut(DriveIndex::new(0))));
 }
 
+/// While the port is lost nobody looks at heartbeats; a reload takes them along.
+#[test]
+fn a_heartbeat_of_an_outage_is_handed_over_with_the_lease() {
+    let mut rig = Rig::new(1);
+    let _run = rig.switch(0, "client", true);
+    rig.run(Duration::from_millis(100));
+    rig.master.lost(rig.now);
+    rig.now += Duration::from_millis(300);
+    rig.bus.image.drives[0].renew_lease(rig.now);
+    let heard = rig.now;
+    rig.now += Duration::from_millis(300);
+    let handover = rig.master.ended(None, rig.now);
+    assert_eq!(handover.leases[0].lease, Lease::held(heard));
+}
+
 #[test]
 fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
     let mut rig = Rig::new(2);
