@@ -422,7 +422,7 @@ impl Schedule {
     }
 
     /// Reads that cover an address are due at once: a command changed it.
-    pub fn refresh(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+    pub fn read_soon(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };

@@ -462,7 +462,7 @@ impl Master {
             let ends = || (read.start..read.start.saturating_add(read.count)).any(is_end);
             items.iter().any(|(address, _)| read.covers(table, *address)) || (range && read.table == table && ends())
         };
-        self.schedule.refresh(index, covers, now);
+        self.schedule.read_soon(index, covers, now);
     }
 
     /// Schedules reading back written registers.

@@ -27,6 +27,8 @@ mod rights;
 mod shutdown;
 mod stop_all;
 
+/// Kept before each request.
+const SILENCE: Duration = Duration::from_micros(1750);
 /// What an exchange takes.
 const COST: Duration = Duration::from_millis(20);
 /// What one without an answer takes.
@@ -101,6 +103,16 @@ impl Registers {
     }
 }
 
+fn options() -> BusOptions {
+    BusOptions {
+        response_timeout: Duration::from_millis(100),
+        retries: 1,
+        silence: Silence::Spec,
+        line: LineOptions::default(),
+        mode: Default::default(),
+    }
+}
+
 struct Rig {
     bus: BusHandle,
     master: Master,
@@ -165,16 +177,15 @@ impl Rig {
             ..bus_spec("b")
         };
         let bus = bus(line, images.collect());
-        let options = BusOptions {
-            response_timeout: Duration::from_millis(100),
-            retries: 1,
-            silence: Silence::Spec,
-            line: LineOptions::default(),
-            mode: Default::default(),
-        };
         let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
-        let silence = Duration::from_micros(1750);
-        let mut master = Master::new(bus.clone(), &options, silence, stats.clone(), &Handover::default(), now);
+        let mut master = Master::new(
+            bus.clone(),
+            &options(),
+            SILENCE,
+            stats.clone(),
+            &Handover::default(),
+            now,
+        );
         master.opened(now);
         Rig {
             bus,
@@ -190,18 +201,10 @@ impl Rig {
 
     /// Another bus takes the place of this one.
     fn begin_anew(&mut self, before: &Handover) {
-        let options = BusOptions {
-            response_timeout: Duration::from_millis(100),
-            retries: 1,
-            silence: Silence::Spec,
-            line: LineOptions::default(),
-            mode: Default::default(),
-        };
-        let silence = Duration::from_micros(1750);
         self.master = Master::new(
             self.bus.clone(),
-            &options,
-            silence,
+            &options(),
+            SILENCE,
             self.stats.clone(),
             before,
             self.now,

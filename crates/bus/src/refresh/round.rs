@@ -142,23 +142,26 @@ impl Refresh {
         }
     }
 
-    /// The drive answered the present step. Whether the round is over, or why the refresh has ended.
-    pub(crate) fn answered(&mut self, profile: &Profile, reply: &Reply, now: Instant) -> Result<bool, End> {
+    /// The drive answered the present step.
+    ///
+    /// # Errors
+    /// Why the refresh has ended.
+    pub(crate) fn answered(&mut self, profile: &Profile, reply: &Reply, now: Instant) -> Result<(), End> {
         let (Some((every, _)), Some(control)) = (self.settings, profile.control.as_ref()) else {
-            return Ok(true);
+            return Ok(());
         };
         let Some(stage) = self.round.as_ref().map(|round| round.stage) else {
-            return Ok(true);
+            return Ok(());
         };
         if let Reply::Exception(code) = reply {
             if *code == Exception::FUNCTION && stage == Stage::Write && !self.apart {
                 self.apart = true;
                 self.round = None;
-                return Ok(true);
+                return Ok(());
             }
             if code.is_busy() || code.leaves_open() || code.is_no_answer() {
                 self.not_answered(now);
-                return Ok(true);
+                return Ok(());
             }
             return Err(End::Refused(format!("the drive refused it with {code}")));
         }
@@ -168,21 +171,21 @@ impl Refresh {
                 Fits::Yes => Stage::Look,
                 Fits::NotNow => {
                     self.put_off(now + every);
-                    return Ok(true);
+                    return Ok(());
                 }
                 Fits::No => return Err(End::Foreign),
             },
             Stage::Look => {
-                let Some(round) = &mut self.round else { return Ok(true) };
+                let Some(round) = &mut self.round else { return Ok(()) };
                 if !round.look.hears(reply) {
-                    return Ok(false);
+                    return Ok(());
                 }
                 let motor = round.look.motor();
                 match self.judge_motor(motor) {
                     Ok(true) => Stage::Write,
                     Ok(false) => {
                         self.not_answered(now);
-                        return Ok(true);
+                        return Ok(());
                     }
                     Err(end) => return Err(end),
                 }
@@ -192,13 +195,13 @@ impl Refresh {
                     (going.due, going.lost) = (now + every, None);
                 }
                 self.round = None;
-                return Ok(true);
+                return Ok(());
             }
         };
         if let Some(round) = &mut self.round {
             round.stage = next;
         }
-        Ok(false)
+        Ok(())
     }
 
     /// Whether the drive has the word, and the reference, that were written.

@@ -345,35 +345,24 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
     }
 }
 
+/// The thread of the bus stands still for so many ms.
+fn stands_still(rig: &mut Rig, ms: u64) {
+    let began = rig.now;
+    rig.now += Duration::from_millis(ms);
+    rig.master.stood(crate::stalls::Stall::new(began, rig.now), rig.now);
+}
+
 /// What a round has read holds no longer when the port was lost, or the thread stood still, before its write.
 #[test]
 fn a_round_that_was_interrupted_reads_again_before_it_writes() {
     type Event = fn(&mut Rig);
     let events: [(&str, Event); 3] = [
-        ("stall", |rig| {
-            let began = rig.now;
-            rig.now += Duration::from_millis(600);
-            let stall = crate::stalls::Stall {
-                began,
-                ended: rig.now,
-                slept: Duration::ZERO,
-            };
-            rig.master.stood(stall, rig.now);
-        }),
+        ("stall", |rig| stands_still(rig, 600)),
         ("port", |rig| {
             rig.master.lost(rig.now);
             rig.master.opened(rig.now);
         }),
-        ("pause", |rig| {
-            let began = rig.now;
-            rig.now += Duration::from_millis(1100);
-            let stall = crate::stalls::Stall {
-                began,
-                ended: rig.now,
-                slept: Duration::ZERO,
-            };
-            rig.master.stood(stall, rig.now);
-        }),
+        ("pause", |rig| stands_still(rig, 1100)),
     ];
     for (name, _) in FAMILIES {
         for (event, happens) in &events {

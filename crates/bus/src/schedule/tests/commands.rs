@@ -45,7 +45,7 @@ fn flooded(again: Option<Urgency>) -> ([Duration; 4], Duration) {
                 taken[3] += command;
                 rig.schedule.command_done(urgency, command);
                 drive = 1 - drive;
-                rig.schedule.refresh(
+                rig.schedule.read_soon(
                     DriveIndex::new(drive),
                     |read| read.covers(Table::Holding, 2002),
                     rig.now,
@@ -99,7 +99,7 @@ fn a_single_command_is_confirmed_before_the_round_goes_on() {
             Decision::Command(Urgency::Command),
             "to drive {drive}"
         );
-        rig.schedule.refresh(
+        rig.schedule.read_soon(
             DriveIndex::new(drive),
             |read| read.covers(Table::Holding, 2002),
             rig.now,
