@@ -222,15 +222,24 @@ impl Refresh {
             true => ordered.reference.is_some(),
             false => ordered.word.is_some_and(|word| word & !control.known_bits() == 0),
         };
-        self.repeated.going = ordered.does.filter(|_| fits).map(|does| Going {
+        let due = ordered.fed.unwrap_or(now) + every;
+        // Orders that only set a reference change nothing of what was seen, however often they come.
+        let goes_on = |going: &Going| !self.says_run && Some(going.does) == ordered.does && going.by == by;
+        let before = self.repeated.going.filter(goes_on);
+        let anew = |does| Going {
             does,
             since: now,
             stops: self.stops,
-            due: ordered.fed.unwrap_or(now) + every,
+            due,
             seen: false,
             lost: None,
             by,
+        };
+        let going = before.map(|going| Going {
+            due: going.due.max(due),
+            ..going
         });
+        self.repeated.going = going.or(ordered.does.map(anew)).filter(|_| fits);
     }
 
     /// Ends it, and forgets what it repeats. The reason where it had begun.

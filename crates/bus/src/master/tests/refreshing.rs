@@ -198,6 +198,27 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
     }
 }
 
+/// A client that sets references faster than the status is read keeps no drive from its word.
+#[test]
+fn references_without_end_do_not_hold_up_the_word() {
+    for (name, _) in FAMILIES.into_iter().filter(|(_, by_word)| *by_word) {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        plant.rig.run(Duration::from_secs(2));
+        let (from, until) = (plant.rig.wire.len(), plant.rig.now + Duration::from_secs(6));
+        let mut percent = 10.0;
+        while plant.rig.now < until {
+            percent = if percent > 40.0 { 10.0 } else { percent + 1.0 };
+            plant.order(&[(ModelPoint::SpeedReference, Value::Number(percent))]);
+            plant.rig.run(Duration::from_millis(150));
+        }
+        let wire = plant.rig.wire[from..].iter();
+        let words = wire.filter(|(_, turn)| turn.purpose == Purpose::Refresh && turn.pdu.is_write());
+        let words = words.filter(|(_, turn)| plant.has_word(&turn.pdu).is_some()).count();
+        assert!(words >= 4, "{name}: {words} in 6 s");
+    }
+}
+
 /// What ends a refresh, and nothing but an order begins it again.
 #[test]
 fn a_refresh_ends_for_good_with_everything_that_contradicts_it() {
