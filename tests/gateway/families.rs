@@ -3,6 +3,7 @@
 
 mod behind_its_back;
 mod cases;
+mod confirmed;
 mod other_stops;
 mod words;
 

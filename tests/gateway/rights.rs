@@ -62,9 +62,11 @@ fn tcp(port: u16) -> TcpStream {
 }
 
 const COMMANDS: &str = "/api/v1/drives/pump-1/commands";
+/// Still wanted after a login and a reload: an order dates from its first byte.
+const START: &str = "{\"run\": true, \"expires_ms\": 60000}";
 
 fn http(site: &Site) -> Begun {
-    start_over_http(tcp(site.http), COMMANDS, "{\"run\": true}")
+    start_over_http(tcp(site.http), COMMANDS, START)
 }
 
 /// Requests that change something, but for commands: each with its body.
@@ -79,7 +81,7 @@ const OTHERS: [(&str, &str); 5] = [
 fn socket(site: &Site) -> Begun {
     let stream = UnixStream::connect(site.file("socket")).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    start_over_http(stream, COMMANDS, "{\"run\": true}")
+    start_over_http(stream, COMMANDS, START)
 }
 
 /// Half a frame that writes 1 to 0x8100.

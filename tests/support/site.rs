@@ -114,11 +114,15 @@ impl Site {
         assert!(added.status.success(), "{added:?}");
     }
 
-    /// Status and reply of a request of a user to the HTTP API, by curl; `more` has the method or the body.
+    /// Status and reply of a request of a user to the HTTP API, by curl; `more` has the method or the body. It is
+    /// asked again where an order expired: after a pause of the machine of more than a second, starts are refused.
     pub(crate) fn curl(&self, user: &str, path: &str, more: &[&str]) -> (u16, serde_json::Value) {
         let url = format!("http://127.0.0.1:{}/api/v1/{path}", self.http);
         let login = format!("{user}:{PASSWORD}");
-        curl(&[&["-u", &login][..], more, &[&url]].concat())
+        until("a request that no pause of the machine held up", || {
+            let answer = curl(&[&["-u", &login][..], more, &[&url]].concat());
+            (answer.1["result"] != "expired").then_some(answer)
+        })
     }
 
     /// Simulated drives at the port of `line1`, at 38400; what is on their line is written down.

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, PointIndex, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, Point, PointIndex, Profile, Value};
 use crate::order::{Order, Receipt, written};
 use crate::process_image::Reading;
 
@@ -100,7 +100,7 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
 
 fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effect> {
     let is = |point| profile.model_index(point) == Some(index);
-    let reads = |point| profile.model_point(point).is_some_and(|p| p.class != PollClass::Never);
+    let reads = |point| profile.model_point(point).is_some_and(Point::is_read);
     if is(ModelPoint::Run) && reads(ModelPoint::Running) {
         return Some(if value.as_bool() { Effect::Runs } else { Effect::Stops });
     }
@@ -108,7 +108,7 @@ fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effec
         return (value.as_bool() && reads(ModelPoint::Fault)).then_some(Effect::NoFault);
     }
     let point = profile.points.get(index)?;
-    let readable = point.class != PollClass::Never && !point.pulse && point.raw().is_some();
+    let readable = point.is_read() && !point.pulse && point.raw().is_some();
     readable.then_some(Effect::ReadBack(index, value))
 }
 
@@ -143,12 +143,24 @@ fn is_standstill(output_frequency: Value) -> bool {
 
 /// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band
 /// does not; the percentage where the profile has nothing else.
-fn speed(reading: &Reading<'_>) -> Option<f64> {
+fn speed(reading: &Reading<'_>) -> Option<Speed> {
     let has = |point: &ModelPoint| reading.spec.profile.model_point(*point).is_some();
     let point = [ModelPoint::OutputFrequency, ModelPoint::ActualSpeed]
         .into_iter()
         .find(has)?;
-    reading.model(point).good().map(|value| value.as_f64().abs())
+    let value = reading.model(point).good()?.as_f64().abs();
+    Some(Speed {
+        value,
+        unit: point.unit(),
+    })
+}
+
+/// The magnitude of a speed.
+#[derive(Debug, Clone, Copy)]
+struct Speed {
+    value: f64,
+    /// `Hz`, or `%` where no frequency is read.
+    unit: &'static str,
 }
 
 /// An effect that is waited for.
@@ -166,7 +178,7 @@ struct Watch {
     since: Instant,
     within: Duration,
     /// Least speed since the acknowledgement, and when it last fell.
-    slowest: Option<f64>,
+    slowest: Option<Speed>,
     fell_at: Instant,
     /// The command, as text.
     what: String,
@@ -235,11 +247,14 @@ impl Watch {
         format!("acknowledged {what} but did not show it within {within:?}: {missing}")
     }
 
-    /// Ends the wait: those waiting are given the reason, if known.
-    fn let_go(&mut self) {
+    /// Ends the wait at `now`: those waiting are given the reason, if known.
+    fn let_go(&mut self, now: Instant) {
+        let falling = self.slowest.filter(|_| self.slows_down(now));
+        let slows = falling.map(|speed| format!("the motor is still slowing down, {:.0} {}", speed.value, speed.unit));
+        let why = self.unseen.clone().or(slows);
         for receipt in self.receipts.drain(..) {
-            match &self.unseen {
-                Some(unseen) => receipt.cannot_be_seen(unseen),
+            match &why {
+                Some(why) => receipt.cannot_be_seen(why),
                 None => drop(receipt),
             }
         }
@@ -250,7 +265,7 @@ impl Watch {
             return;
         };
         match self.slowest {
-            Some(slowest) if speed >= slowest - RIPPLE => {}
+            Some(slowest) if speed.value >= slowest.value - RIPPLE => {}
             Some(_) => (self.slowest, self.fell_at) = (Some(speed), now),
             None => self.slowest = Some(speed),
         }
@@ -324,7 +339,7 @@ impl Confirmations {
             }
             if watch.is_over(now) {
                 // Shown too late for those who waited.
-                watch.let_go();
+                watch.let_go(now);
             }
             if watch.effects.is_empty() {
                 let receipts = self.0.remove(index).receipts;
@@ -343,7 +358,7 @@ impl Confirmations {
             if !watch.is_over(now) {
                 return true;
             }
-            watch.let_go();
+            watch.let_go(now);
             if watch.slows_down(now) {
                 return true;
             }

@@ -414,7 +414,7 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
         return true;
     };
     match point.raw() {
-        Some(_) if point.class == PollClass::Never => true,
+        Some(_) if !point.is_read() => true,
         Some(raw) => matches!(
             reading.words(raw.table, raw.address, raw.form.items()),
             Err(Unavailable::Refused(_))

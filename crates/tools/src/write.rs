@@ -200,7 +200,7 @@ fn acknowledged(what: &str, write: &Written, way: Way) -> String {
     let confirmed = match write.confirmed_ms {
         Some(after) => format!("confirmed after {after:.0} ms"),
         None => match &write.note {
-            Some(known) => format!("not confirmed by a read: {}", printable::line(known)),
+            Some(known) => printable::line(known),
             None => "not confirmed by a read".to_string(),
         },
     };

@@ -5,6 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::codec::{Reply, RequestPdu, Table};
+use crate::drive::profile::Profiles;
 use crate::order::{Outcome, WriteStats};
 use crate::process_image::{DriveImage, DriveSpec};
 
@@ -140,6 +141,35 @@ fn below_the_minimum_frequency_the_motor_still_slows_down() {
     rig.read(2100, &[2, 0, 0, 0]);
     assert!(rig.confirmations.is_empty() && rig.expired().is_empty());
     assert_eq!(rig.results(), ["acknowledged"], "nobody waited for 10 s");
+    let mut confirmation = rig.confirmation.take().unwrap();
+    let told = confirmation.try_recv().unwrap().unwrap_err();
+    // 2 s after the order, and 10 ms a read.
+    assert_eq!(told, "the motor is still slowing down, 8 Hz");
+}
+
+/// Whatever a family shows of its motor and faults confirms its orders, be it a bit, a state of a word, or a coil.
+#[test]
+fn every_family_confirms_what_it_shows() {
+    let shows_nothing = ["lenze-i550"];
+    for profile in Profiles::built_in().iter() {
+        let name = profile.name.as_str();
+        let order = |point, value| {
+            let index = profile.model_index(point)?;
+            Some(effects(profile, &Order::Points(vec![(index, Value::Bool(value))])))
+        };
+        let expected = |effect| {
+            if shows_nothing.contains(&name) {
+                None
+            } else {
+                Some(vec![effect])
+            }
+        };
+        assert_eq!(order(ModelPoint::Run, true), expected(Effect::Runs), "{name}");
+        assert_eq!(order(ModelPoint::Run, false), expected(Effect::Stops), "{name}");
+        if let Some(effects) = order(ModelPoint::FaultReset, true) {
+            assert_eq!(effects, [Effect::NoFault], "{name}");
+        }
+    }
 }
 
 #[test]

@@ -34,7 +34,7 @@ use tokio::sync::Notify;
 
 use self::health::TURNAROUNDS;
 use crate::diagnosis::Diagnosis;
-use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, Profile, Value};
 
 #[derive(Debug)]
 pub struct DriveImage {
@@ -372,7 +372,7 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
 /// The model points and profile points of a drive with their names, in their public order; not those that are never
 /// read, of which there is nothing to show, nor hidden ones.
 pub fn public_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
-    let is_read = |point: &Point| !point.hidden && (point.raw().is_none() || point.class != PollClass::Never);
+    let is_read = |point: &Point| !point.hidden && point.is_read();
     let model = ModelPoint::ALL
         .iter()
         .filter_map(|m| profile.model_index(*m).map(|i| (i, m.name())));

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use super::{Reading, Unavailable};
-use crate::drive::{ModelPoint, PollClass};
+use crate::drive::{ModelPoint, Point};
 
 /// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
 const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
@@ -65,10 +65,7 @@ impl Reading<'_> {
 
     /// Whether the polls of the drive can show that the motor stands.
     fn tells_standstill(&self) -> bool {
-        let reads = |point| {
-            let point = self.spec.profile.model_point(point);
-            point.is_some_and(|point| point.class != PollClass::Never)
-        };
+        let reads = |point| self.spec.profile.model_point(point).is_some_and(Point::is_read);
         reads(ModelPoint::ZeroSpeed) || (reads(ModelPoint::Running) && reads(ModelPoint::OutputFrequency))
     }
 

@@ -330,6 +330,11 @@ impl Point {
         self.write && !self.hidden
     }
 
+    /// Whether polling shows it: from its own registers, or derived, which rests on points that are polled.
+    pub fn is_read(&self) -> bool {
+        self.raw().is_none() || self.class != PollClass::Never
+    }
+
     /// Kind of its values.
     pub fn kind(&self) -> Kind {
         use Derived::{All, Equal, LowestBit, State, Zero};

@@ -1,0 +1,66 @@
+//! Orders of every family end as confirmed once the drive shows them, and as not confirmed where it does not.
+
+use super::Rig;
+use super::cases::{Case, cases};
+use crate::support::process::{get, until};
+
+fn confirms(case: &Case) {
+    let rig = Rig::new(case, false);
+    let name = case.profile;
+    let confirmed = |values: &str| {
+        let (status, result) = rig.command(values);
+        assert_eq!(
+            (status, result["result"].as_str()),
+            (200, Some("confirmed")),
+            "{name} {values}: {result}"
+        );
+    };
+    rig.order(&case.reference);
+    confirmed("{\"run\": true}");
+    confirmed("{\"run\": false}");
+    confirmed("{\"run\": true}");
+    rig.drive.signal("USR1");
+    rig.site.until_state("drive", "fault");
+    if !case.reset.is_empty() {
+        confirmed("{\"fault_reset\": true}");
+    }
+}
+
+/// Every third family, so that three tests run side by side.
+fn every_third(first: usize) {
+    for case in cases().iter().skip(first).step_by(3) {
+        println!("{}", case.profile);
+        confirms(case);
+    }
+}
+
+#[test]
+fn what_is_shown_is_confirmed_1() {
+    every_third(0);
+}
+
+#[test]
+fn what_is_shown_is_confirmed_2() {
+    every_third(1);
+}
+
+#[test]
+fn what_is_shown_is_confirmed_3() {
+    every_third(2);
+}
+
+/// A drive that does not run at a word that it takes: the answer and an event say so.
+#[test]
+fn a_start_that_is_ignored_is_not_confirmed() {
+    for case in cases().iter().filter(|case| !case.has_sequence()) {
+        let rig = Rig::new(case, true);
+        rig.order(&case.reference);
+        let (_, result) = rig.command("{\"run\": true}");
+        assert_eq!(result["result"], "acknowledged", "{}: {result}", case.profile);
+        until("the event", || {
+            let (_, log) = get(rig.site.http, "/api/v1/events/log?kind=not_confirmed").unwrap();
+            log.contains("does not run").then_some(())
+        });
+        rig.command("{\"run\": false}");
+    }
+}
