@@ -106,6 +106,7 @@ impl Rig {
             retries: 1,
             silence: Silence::Spec,
             line: setup.options,
+            allow: Vec::new(),
             mode: Default::default(),
         };
         let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();

@@ -149,6 +149,7 @@ impl WorldBus {
             retries: line.retries,
             silence: parts.silence,
             line: LineOptions::default(),
+            allow: Vec::new(),
             mode: Default::default(),
         };
         let guards = Arc::new(Guards::default());

@@ -93,6 +93,7 @@ impl Scene {
             retries: 1,
             silence: Silence::Spec,
             line: LineOptions::default(),
+            allow: Vec::new(),
             mode: Mode::Listen,
         };
         let mut core = ListenCore::new(handle.clone(), &options, events.clone(), writes.clone(), began);

@@ -251,7 +251,7 @@ impl BusCore {
                 }
                 continue;
             };
-            let clear = self.line.clear_at(chosen.since);
+            let clear = self.line.clear_at(chosen.since, self.master.silence_of(&chosen.turn));
             let clear = self.server.closes_until().map_or(clear, |until| clear.max(until));
             if now < clear {
                 return wait(clear, !chosen.turn.is_stop(), true);
@@ -351,9 +351,10 @@ impl BusCore {
                                                                                              silent; sending anyway");
         }
         let quiet_since = self.line.quiet_since();
-        self.report
-            .diagnosis
-            .sending(now.saturating_duration_since(quiet_since));
+        // What a drive needs beyond the silence of the bus is no pause of the line.
+        let needed = self.line.silence_before(self.master.silence_of(&turn));
+        let paused = now.saturating_duration_since(quiet_since + needed.saturating_sub(self.line.silence()));
+        self.report.diagnosis.sending(paused);
         let drive = self.known(&turn);
         self.tap = self.report.tape_request(drive, &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);

@@ -7,6 +7,7 @@ use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::refresh::{End, OrderEnd, Refresh};
+use super::repeated_stops::RepeatedStops;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::{Reply, Table};
@@ -29,6 +30,7 @@ pub(super) struct DriveState {
     pub(super) commanded: Vec<(Table, u16)>,
     /// Replies that it may still send.
     pub(super) late: LateReplies,
+    pub(super) repeated_stops: RepeatedStops,
     /// Its lease.
     pub(super) supervision: Supervision,
     /// What is written again for its own timeout.
@@ -89,6 +91,7 @@ impl DriveState {
             words: KnownWords::default(),
             commanded: commanded(profile),
             late: LateReplies::default(),
+            repeated_stops: RepeatedStops::default(),
             supervision: Supervision::default(),
             refresh: Refresh::new(profile, spec.refresh),
             refresh_ended: None,

@@ -39,6 +39,7 @@ pub mod predict;
 pub mod prober;
 pub mod proof;
 pub mod refresh;
+pub mod repeated_stops;
 mod report;
 pub mod schedule;
 mod selection;
@@ -67,6 +68,8 @@ pub use line_loop::BusTask;
 
 use std::time::Duration;
 
+use ipnet::IpNet;
+
 use crate::codec::wire::Silence;
 use crate::line::LineOptions;
 
@@ -83,6 +86,8 @@ pub struct BusOptions {
     pub line: LineOptions,
     /// Whose line it is.
     pub mode: Mode,
+    /// From where the device of the bus may dial in.
+    pub allow: Vec<IpNet>,
 }
 
 /// Whose line it is.

@@ -44,9 +44,13 @@ impl LineDiagnosis {
             silence,
             response_timeout,
         };
+        let mut figures = Figures::new(line, image.drives.iter().map(|drive| drive.spec.address), now);
+        for (drive, image) in figures.drives.iter_mut().zip(&image.drives) {
+            drive.response_timeout = image.spec.timing.response_timeout.unwrap_or(response_timeout);
+        }
         LineDiagnosis {
             names: image.drives.iter().map(|drive| drive.spec.name.clone()).collect(),
-            figures: Figures::new(line, image.drives.iter().map(|drive| drive.spec.address), now),
+            figures,
             hold: Hold::default(),
             by_drive: vec![None; image.drives.len()].into(),
             gap: Duration::ZERO,

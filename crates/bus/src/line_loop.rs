@@ -230,7 +230,7 @@ impl Worker {
     fn keep_open<C: Core>(&self, mut core: C) -> C {
         line::sharpen_timers();
         let mut pauses = ReopenPauses::default();
-        let mut names = Names::default();
+        let mut names = Names::allowing(&self.options.allow);
         while !self.stopping() {
             let spec = &self.handle.image.spec;
             let go_on = || !self.stopping();

@@ -38,6 +38,8 @@ const WEIGHT_OF_BELIEVED: u32 = 8;
 /// How a request is to be sent.
 #[derive(Debug, Clone, Copy)]
 pub struct Sending {
+    /// Silence before the request, and after its reply before a request to another drive.
+    pub silence: Duration,
     /// Time for the first byte of the reply.
     pub response_timeout: Duration,
     /// The last reply on the line, if it came once more, could pass for this one's.
@@ -86,6 +88,8 @@ pub struct LineState {
     protocol: Protocol,
     format: LineFormat,
     silence: Duration,
+    /// Silence after the last exchange, as the drive of it needs.
+    owed: Duration,
     /// End of the last character on the line, either direction.
     quiet_since: Instant,
     /// Nothing is sent before then: a reply to the previous master may arrive.
@@ -113,6 +117,7 @@ impl LineState {
             protocol,
             format,
             silence,
+            owed: silence,
             quiet_since: now,
             left_alone: now,
             learned: Learned {
@@ -160,12 +165,23 @@ impl LineState {
         self.quiet_since
     }
 
-    /// When a request may go out that is wanted since `since`: when the line has been silent long enough, or has babbled
-    /// too long.
-    pub(crate) fn clear_at(&self, since: Instant) -> Instant {
+    /// When a request may go out that is wanted since `since`, to a drive that needs `own` silence before it: when the line
+    /// has been silent long enough, or has babbled too long.
+    pub(crate) fn clear_at(&self, since: Instant, own: Duration) -> Instant {
         let since = since.max(self.left_alone);
-        let silent = (self.quiet_since + self.silence).min(since + self.silence + BABBLE);
+        let silence = self.silence_before(own);
+        let silent = (self.quiet_since + silence).min(since + silence + BABBLE);
         silent.max(self.left_alone)
+    }
+
+    /// Silence before a request to a drive that needs `own`.
+    pub(crate) fn silence_before(&self, own: Duration) -> Duration {
+        own.max(self.owed)
+    }
+
+    /// Silence before a request to a drive without a silence of its own.
+    pub(crate) fn silence(&self) -> Duration {
+        self.silence
     }
 
     /// Nothing is sent before `until`.
@@ -210,6 +226,7 @@ impl LineState {
             }
         }
         self.quiet_since = sent;
+        self.owed = sending.silence;
         self.underway = Some(Underway {
             transaction,
             began: now,
@@ -301,7 +318,7 @@ impl LineState {
             at,
             reply_time,
             // A reply that came faster than the wire could carry it frees the line no sooner.
-            took: at.max(heard_at).saturating_duration_since(began) + self.silence,
+            took: at.max(heard_at).saturating_duration_since(began) + self.owed,
             beats,
         })
     }

@@ -37,6 +37,7 @@ use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
 use super::refresh::Repeated;
+use super::repeated_stops::RepeatedStops;
 use super::schedule::{Cadence, Poll, Schedule};
 use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
@@ -44,10 +45,10 @@ use super::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{Protocol, RequestPdu};
 use crate::drive::plan::WireTime;
-use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
+use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, PlannedRead, PollClass, Value};
 use crate::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::plant::{BusHandle, turn_away};
-use crate::process_image::DriveImage;
+use crate::process_image::{DriveImage, Timing};
 
 /// The bus looks around at least this often.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
@@ -152,15 +153,17 @@ pub struct Carried {
     pub lease: Lease,
     /// What is written again for its own timeout.
     pub repeated: Repeated,
+    /// The stops that are to be written again.
+    pub stops: RepeatedStops,
 }
 
 impl Carried {
-    /// The lease without what is refreshed.
+    /// The lease without what is refreshed and repeated.
     #[must_use]
     pub fn alone(self) -> Carried {
         Carried {
-            repeated: Repeated::default(),
-            ..self
+            lease: self.lease,
+            ..Carried::default()
         }
     }
 
@@ -235,7 +238,9 @@ impl Master {
         };
         let plans: PerDrive<&Plan> = images.iter().map(|d| &d.plan).collect();
         let cost = |index: DriveIndex, read: &PlannedRead| {
-            let turnaround = images.get(index).map_or(Duration::ZERO, |d| d.spec.turnaround);
+            let (turnaround, silence) = images.get(index).map_or((Duration::ZERO, silence), |drive| {
+                (drive.spec.turnaround, drive.spec.timing.silence_around(silence))
+            });
             WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
         };
         let fast = |(index, plan): (DriveIndex, &&Plan)| -> Duration {
@@ -243,11 +248,13 @@ impl Master {
             reads.map(|read| cost(index, read)).sum()
         };
         let round = spec.cycle.max(plans.enumerate().map(fast).sum());
-        let schedule = Schedule::new(cadence, &plans, cost, now);
+        let mut schedule = Schedule::new(cadence, &plans, cost, now);
+        schedule.try_again(images.iter().map(|image| image.spec.timing.retries));
         let mut drives: PerDrive<DriveState> = images.iter().map(|image| DriveState::new(&image.spec, round)).collect();
         for (drive, carried) in drives.iter_mut().zip(&before.leases) {
             drive.supervision.take_over(carried.lease);
             drive.refresh.take_over(carried.repeated, now);
+            drive.repeated_stops = carried.stops;
         }
         let sessions = match spec.protocol {
             Protocol::N2 => N2Sessions::new(images.iter().map(|d| d.spec.profile.n2)),
@@ -326,6 +333,7 @@ impl Master {
             Carried {
                 lease: drive.supervision.lease(),
                 repeated: drive.refresh.handed_over(),
+                stops: drive.repeated_stops,
             }
         };
         let leases = self.drives.iter_mut().map(close).collect();
@@ -394,6 +402,20 @@ impl Master {
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
             }
+            if drive.repeated_stops.take_due(now) {
+                let origin = Origin::new(SourceKind::Schedule, Origin::REPEATED_STOP);
+                let stop = (ModelPoint::Run, Value::Bool(false));
+                let ordered = bus.own_order(
+                    index,
+                    &image.reading(now, drive.fresh),
+                    stop,
+                    origin,
+                    DEFAULT_EXPIRY,
+                    writes,
+                );
+                // A drive that takes no order any more has none of the gateway's starts on its way.
+                tracing::debug!(target: "drivegate::bus::master", drive = %image.spec.name, ?ordered, "a stop again");
+            }
         }
         self.look_at_refreshes(now, news);
         self.look_at_starts(now);
@@ -452,6 +474,12 @@ impl Master {
                 starts.written(turn.drive, &image.spec.profile, &step.pdu, start.as_ref(), now);
             }
         }
+        if self.bus.image.spec.tells_replies_apart()
+            && let Some(drive) = self.drives.get_mut(turn.drive)
+            && let Some(image) = self.bus.image.drives.get(turn.drive)
+        {
+            drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
+        }
         let is_command = matches!(
             turn.purpose,
             Purpose::Command {
@@ -479,6 +507,7 @@ impl Master {
         let last = self.last_answered.as_ref();
         let n2 = !self.waits.sessions.is_empty();
         Sending {
+            silence: self.silence_of(turn),
             response_timeout: self.timeout_of(turn),
             late_may_come: self.late_before,
             // An N2 reply does not even show whose it is. What was last on a line that was spoken on before
@@ -495,17 +524,44 @@ impl Master {
             return timeout;
         }
         let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
-        let patient = probes <= self.retries || probes.is_multiple_of(PATIENT_PROBES);
+        let patient = probes <= self.retries_of(turn.drive) || probes.is_multiple_of(PATIENT_PROBES);
+        let timeout = self.response_timeout_of(turn.drive);
         if self.schedule.is_online(turn.drive) || patient {
-            return self.response_timeout;
+            return timeout;
         }
         let known = self.drives.get(turn.drive).map(|drive| 2 * drive.answers_within);
-        self.response_timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
+        timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
+    }
+
+    /// The times of its own that the drive has.
+    fn timing_of(&self, drive: DriveIndex) -> Timing {
+        let image = self.bus.image.drives.get(drive);
+        image.map_or_else(Timing::default, |image| image.spec.timing)
+    }
+
+    pub(super) fn response_timeout_of(&self, drive: DriveIndex) -> Duration {
+        self.timing_of(drive).response_timeout.unwrap_or(self.response_timeout)
+    }
+
+    pub(super) fn retries_of(&self, drive: DriveIndex) -> u32 {
+        self.timing_of(drive).retries.unwrap_or(self.retries)
+    }
+
+    /// Silence before the request of that turn, and after its reply before a request to another drive.
+    pub(crate) fn silence_of(&self, turn: &Turn) -> Duration {
+        self.timing_of(turn.drive).silence.unwrap_or(self.silence)
     }
 
     /// How long a reply may come late on an N2 line.
     pub(super) fn n2_window(&self) -> Duration {
-        (N2_LATE * self.response_timeout).min(LONGEST_N2_LATE)
+        let own = self
+            .bus
+            .image
+            .drives
+            .iter()
+            .filter_map(|image| image.spec.timing.response_timeout);
+        let longest = own.chain([self.response_timeout]).max().unwrap_or_default();
+        (N2_LATE * longest).min(LONGEST_N2_LATE)
     }
 
     /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.

@@ -185,8 +185,14 @@ impl<'a> Line<'a> {
     }
 
     fn wire(&self, format: &LineFormat, drive: &DriveSpec, read: &PlannedRead) -> Duration {
-        WireTime::of(self.spec.protocol, format, &read.pdu())
-            .total(drive.turnaround, self.spec.protocol.silence(self.silence, format))
+        let silence = self.silence_around(format, drive);
+        WireTime::of(self.spec.protocol, format, &read.pdu()).total(drive.turnaround, silence)
+    }
+
+    /// Silence that an exchange with the drive takes.
+    fn silence_around(&self, format: &LineFormat, drive: &DriveSpec) -> Duration {
+        let of_bus = self.spec.protocol.silence(self.silence, format);
+        drive.timing.silence_around(of_bus)
     }
 
     fn requests(&self) -> Vec<PredictedRequest> {
@@ -232,7 +238,7 @@ impl<'a> Line<'a> {
     /// Share of the line that the refresh of a drive takes.
     fn refresh_share(&self, format: &LineFormat, drive: &DriveSpec) -> f64 {
         let Some(every) = drive.refresh else { return 0.0 };
-        let silence = self.spec.protocol.silence(self.silence, format);
+        let silence = self.silence_around(format, drive);
         let wire = |pdu| WireTime::of(self.spec.protocol, format, &pdu).total(drive.turnaround, silence);
         let round: Duration = refresh::requests(&drive.profile).into_iter().map(wire).sum();
         round.as_secs_f64() / every.as_secs_f64().max(1e-3)

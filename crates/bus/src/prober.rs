@@ -120,12 +120,15 @@ impl Prober<'_> {
     /// When the port is gone.
     pub fn ask(&mut self, request: &Request) -> Result<Answer, Lost> {
         let since = Instant::now();
-        while let Some(clear) = Some(self.state.clear_at(since)).filter(|clear| Instant::now() < *clear) {
+        while let Some(clear) =
+            Some(self.state.clear_at(since, self.state.silence())).filter(|clear| Instant::now() < *clear)
+        {
             self.listen(clear)?;
         }
         let mut frame = Vec::with_capacity(32);
         self.protocol.encode(request, &mut frame);
         let sending = Sending {
+            silence: self.state.silence(),
             response_timeout: self.timeout,
             could_be_doubled: false,
             late_may_come: false,

@@ -97,7 +97,7 @@ pub struct Cadence {
     pub fast: Duration,
     /// Aimed at for the slow class.
     pub slow: Duration,
-    /// Tries after the first.
+    /// Tries after the first, for a drive without a number of its own.
     pub retries: u32,
 }
 
@@ -177,7 +177,7 @@ impl Schedule {
                 })
             });
             let items = items.collect();
-            DriveSchedule::new(items, plan, now)
+            DriveSchedule::new(items, plan, cadence.retries, now)
         });
         let drives: PerDrive<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);
@@ -207,6 +207,13 @@ impl Schedule {
             probed: false,
             share: CommandShare::default(),
             background: BackgroundShare::default(),
+        }
+    }
+
+    /// Tries after the first of each drive, where it has a number of its own.
+    pub fn try_again(&mut self, retries: impl Iterator<Item = Option<u32>>) {
+        for (drive, own) in self.drives.iter_mut().zip(retries) {
+            drive.retries = own.unwrap_or(drive.retries);
         }
     }
 

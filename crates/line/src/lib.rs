@@ -6,7 +6,10 @@
 
 mod arrival;
 mod clock;
+mod datagram;
+mod dial_in;
 mod first_bytes;
+mod mbap;
 mod names;
 mod options;
 mod other_server;
@@ -22,6 +25,10 @@ use drivegate_proto as codec;
 pub use arrival::Arrival;
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, since_boot, wait_until};
+use datagram::Datagrams;
+use dial_in::Dialled;
+pub use dial_in::{LONGEST_ID, split as split_dial_in};
+use mbap::Mbap;
 pub use names::Names;
 pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
 pub use pty::Pty;
@@ -29,10 +36,10 @@ pub use receiver::Receiver;
 use remote::{Raw, Remote};
 pub use rfc2217::{ServedPort, escape as telnet_escaped};
 
-use std::cell::Cell;
+use std::cell::{Cell, Ref};
 use std::fmt;
 use std::io;
-use std::net::TcpStream;
+use std::net::{TcpStream, UdpSocket};
 use std::num::NonZeroUsize;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
@@ -70,6 +77,22 @@ pub enum OpenError {
     /// The device server is there, but cannot set up its port.
     #[error("cannot use {port}: {reason}")]
     Remote {
+        /// Address.
+        port: String,
+        /// The reason and the remedy.
+        reason: String,
+    },
+    /// Devices cannot dial in there.
+    #[error("cannot listen for {port}: {reason}; check the address, and which program has it")]
+    Listen {
+        /// Address.
+        port: String,
+        /// The system's error.
+        reason: io::Error,
+    },
+    /// No device has dialled in.
+    #[error("{port}: {reason}")]
+    Nobody {
         /// Address.
         port: String,
         /// The reason and the remedy.
@@ -139,6 +162,25 @@ enum Port {
     Serial(Exclusive),
     Tcp(Raw),
     Rfc2217(Remote),
+    ModbusTcp(Mbap),
+    Udp(Datagrams),
+    Dialled(Dialled),
+}
+
+/// The descriptor of a port, to wait for.
+enum PortFd<'p> {
+    Of(BorrowedFd<'p>),
+    /// Another one for each request.
+    Socket(Ref<'p, UdpSocket>),
+}
+
+impl AsFd for PortFd<'_> {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        match self {
+            PortFd::Of(fd) => *fd,
+            PortFd::Socket(socket) => socket.as_fd(),
+        }
+    }
 }
 
 impl fmt::Debug for Port {
@@ -147,6 +189,9 @@ impl fmt::Debug for Port {
             Port::Serial(_) => "Serial",
             Port::Tcp(_) => "Tcp",
             Port::Rfc2217(_) => "Rfc2217",
+            Port::ModbusTcp(_) => "ModbusTcp",
+            Port::Udp(_) => "Udp",
+            Port::Dialled(_) => "Dialled",
         })
     }
 }
@@ -196,6 +241,15 @@ impl Line {
                 let (remote, warnings) = Remote::open(stream, port, settings, go_on)?;
                 (Port::Rfc2217(remote), warnings)
             }
+            Some(("modbus-tcp", address)) => {
+                let stream = connect(names, port, address, go_on)?;
+                (Port::ModbusTcp(Mbap::new(stream)), Vec::new())
+            }
+            Some(("udp", address)) => {
+                let datagrams = Datagrams::open(names, port, address, go_on)?;
+                (Port::Udp(datagrams), Vec::new())
+            }
+            Some(("tcp-listen", place)) => (Port::Dialled(Dialled::wait(names, port, place, go_on)?), Vec::new()),
             _ => {
                 let (fd, warnings) = open_serial(port, format, options)?;
                 (Port::Serial(fd), warnings)
@@ -213,12 +267,15 @@ impl Line {
         Ok((line, warnings))
     }
 
-    fn fd(&self) -> BorrowedFd<'_> {
-        match &self.port {
+    fn fd(&self) -> PortFd<'_> {
+        PortFd::Of(match &self.port {
             Port::Serial(fd) => fd.as_fd(),
             Port::Tcp(raw) => raw.as_fd(),
             Port::Rfc2217(remote) => remote.stream.as_fd(),
-        }
+            Port::ModbusTcp(mbap) => mbap.as_fd(),
+            Port::Udp(datagrams) => return PortFd::Socket(datagrams.socket()),
+            Port::Dialled(dialled) => dialled.as_fd(),
+        })
     }
 
     /// Gives a whole frame to the port. Does not wait until it is on the wire.
@@ -230,6 +287,9 @@ impl Line {
             Port::Serial(fd) => write_all(fd.as_fd(), frame).map_err(Lost::of_adapter),
             Port::Tcp(raw) => raw.send(frame),
             Port::Rfc2217(remote) => remote.send(frame),
+            Port::ModbusTcp(mbap) => mbap.send(frame),
+            Port::Udp(datagrams) => datagrams.send(frame),
+            Port::Dialled(dialled) => dialled.send(frame),
         }
     }
 
@@ -242,6 +302,9 @@ impl Line {
             Port::Serial(fd) => read(fd.as_fd(), buffer).map_err(Lost::of_adapter),
             Port::Tcp(raw) => raw.receive(buffer),
             Port::Rfc2217(remote) => remote.receive(buffer),
+            Port::ModbusTcp(mbap) => mbap.receive(buffer),
+            Port::Udp(datagrams) => datagrams.receive(buffer),
+            Port::Dialled(dialled) => dialled.receive(buffer),
         }
     }
 
@@ -259,7 +322,8 @@ impl Line {
         };
         let asleep = until.checked_sub(spin).unwrap_or(until);
         let mut sleeps = precise && Instant::now() < asleep;
-        let port = || PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
+        let fd = self.fd();
+        let port = || PollFd::from_borrowed_fd(fd.as_fd(), PollFlags::IN);
         while Instant::now() < until {
             let woken = match wake {
                 None => poll_port(&mut [port()], asleep)?.then_some(Woken::Readable),

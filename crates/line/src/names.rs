@@ -7,7 +7,10 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
+use ipnet::IpNet;
+
 use super::clock;
+use super::dial_in::Place;
 use super::other_server::OtherServer;
 
 /// Longest wait for an answer.
@@ -31,6 +34,10 @@ pub struct Names {
     doubtful: bool,
     /// What the server turned out to be.
     pub(super) other: OtherServer,
+    /// Who may dial in.
+    pub(super) allow: Vec<IpNet>,
+    /// Where devices dial in.
+    pub(super) dial_in: Option<Place>,
 }
 
 impl std::fmt::Debug for Names {
@@ -48,6 +55,14 @@ impl Default for Names {
 }
 
 impl Names {
+    /// For a line whose device may dial in from these networks.
+    pub fn allowing(allow: &[IpNet]) -> Names {
+        Names {
+            allow: allow.to_vec(),
+            ..Names::default()
+        }
+    }
+
     fn asking(ask: impl Fn(&str) -> Found + Send + Sync + 'static, patience: Duration) -> Names {
         Names {
             ask: Arc::new(ask),
@@ -57,6 +72,8 @@ impl Names {
             failure: None,
             doubtful: false,
             other: OtherServer::default(),
+            allow: Vec::new(),
+            dial_in: None,
         }
     }
 

@@ -34,6 +34,14 @@ pub struct LineFormat {
 pub struct BadFormat(pub String);
 
 impl LineFormat {
+    /// Stands for a network without a serial line: characters take no time that counts.
+    pub const NETWORK: LineFormat = LineFormat {
+        baud: 100_000_000,
+        data_bits: 8,
+        parity: Parity::None,
+        stop_bits: 1,
+    };
+
     /// The format `text` (such as `8N1`) at `baud`.
     ///
     /// # Errors
@@ -106,8 +114,11 @@ impl LineFormat {
 }
 
 impl fmt::Display for LineFormat {
-    /// `38400 8N1`.
+    /// `38400 8N1`; `Ethernet` for a network without a serial line.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if *self == LineFormat::NETWORK {
+            return f.write_str("Ethernet");
+        }
         write!(f, "{} {}", self.baud, self.characters())
     }
 }

@@ -47,6 +47,7 @@ impl DoublingLine {
         let mut frame = Vec::new();
         self.protocol.encode(&request, &mut frame);
         let sending = Sending {
+            silence: self.line.silence(),
             response_timeout: Duration::from_millis(100),
             could_be_doubled: true,
             late_may_come: false,
@@ -143,14 +144,48 @@ fn a_request_waits_for_silence_but_not_for_ever() {
     let mut rig = DoublingLine::new();
     let since = rig.now;
     let mut now = since;
-    assert_eq!(rig.line.clear_at(since), since + Duration::from_millis(4));
+    assert_eq!(
+        rig.line.clear_at(since, rig.line.silence()),
+        since + Duration::from_millis(4)
+    );
     while !rig.line.babbles(since) {
         now += Duration::from_millis(2);
         assert!(rig.line.heard(&[0x55], now).is_none());
-        assert!(rig.line.clear_at(since) > now || rig.line.babbles(since));
+        assert!(rig.line.clear_at(since, rig.line.silence()) > now || rig.line.babbles(since));
     }
-    assert!(rig.line.clear_at(since) <= now + Duration::from_millis(4));
+    assert!(rig.line.clear_at(since, rig.line.silence()) <= now + Duration::from_millis(4));
     assert!(now <= since + BABBLE + Duration::from_millis(4));
+}
+
+#[test]
+fn a_drive_has_its_own_silence_before_its_request_and_after_its_reply() {
+    let (usual, own) = (Duration::from_millis(4), Duration::from_millis(100));
+    for (silence, of_next, expected) in [
+        (usual, usual, usual),
+        (usual, own, own),
+        (own, usual, own),
+        (own, own, own),
+    ] {
+        let mut rig = DoublingLine::new();
+        let request = Request::new(1, RequestPdu::read(Table::Holding, 0, 1));
+        let mut frame = Vec::new();
+        rig.protocol.encode(&request, &mut frame);
+        let sending = Sending {
+            silence,
+            response_timeout: Duration::from_millis(100),
+            could_be_doubled: false,
+            late_may_come: false,
+        };
+        rig.line
+            .send(request, frame, sending, N2LateReplies::default(), rig.now);
+        let over = rig.line.heard(&reply(), rig.line.quiet_since() + REGULAR).unwrap();
+        assert_eq!(
+            rig.line.clear_at(over.at, of_next),
+            over.at + expected,
+            "{silence:?}, then {of_next:?}"
+        );
+        assert_eq!(over.took, over.at - over.began + silence);
+    }
 }
 
 /// Every tenth reply comes twice and the one behind it is lost: its copy is alone in its exchange.
@@ -198,6 +233,7 @@ fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
         let mut frame = Vec::new();
         bench.protocol.encode(&request, &mut frame);
         let sending = Sending {
+            silence: bench.line.silence(),
             response_timeout: Duration::from_millis(100),
             could_be_doubled: false,
             late_may_come: false,

@@ -222,9 +222,11 @@ impl Master {
     /// Duration of the transaction, as far as the profile gives it.
     pub(super) fn exchange_cost(&self, drive: DriveIndex, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
-        let turnaround = self.bus.image.drives.get(drive);
-        let turnaround = turnaround.map_or(Duration::ZERO, |drive| drive.spec.turnaround);
-        WireTime::of(spec.protocol, &spec.format, pdu).total(turnaround, self.silence)
+        let image = self.bus.image.drives.get(drive);
+        let (turnaround, silence) = image.map_or((Duration::ZERO, self.silence), |image| {
+            (image.spec.turnaround, image.spec.timing.silence_around(self.silence))
+        });
+        WireTime::of(spec.protocol, &spec.format, pdu).total(turnaround, silence)
     }
 
     /// Whether the background transaction that was chosen may still go.
@@ -426,7 +428,7 @@ impl Master {
         let spec = &self.bus.image.spec;
         let wire = WireTime::of(spec.protocol, &spec.format, &turn.pdu);
         // How long the reply is shows only when it is there.
-        let patient = self.response_timeout + spec.format.chars(LONGEST);
+        let patient = self.response_timeout_of(turn.drive) + spec.format.chars(LONGEST);
         Some(patient.min(LONGEST_UNCHECKED.saturating_sub(wire.request + wire.reply)))
     }
 

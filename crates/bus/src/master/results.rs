@@ -92,6 +92,11 @@ impl Master {
                 // A valid reply may still follow.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
+            Ended::Silent | Ended::Corrupt(_) if self.bus.image.spec.tells_replies_apart() => {
+                if let Some((drive, image)) = drive.zip(self.bus.image.drives.get(turn.drive)) {
+                    drive.repeated_stops.not_answered(&image.spec.profile, &turn.pdu, now);
+                }
+            }
             Ended::Silent | Ended::Corrupt(_) if self.waits.sessions.is_empty() => {
                 let late = match (drive, stranger) {
                     (Some(drive), _) => Some(&mut drive.late),
@@ -400,6 +405,7 @@ impl Master {
         now: Instant,
     ) {
         let online = self.schedule.is_online(index);
+        let (retries, response_timeout) = (self.retries_of(index), self.response_timeout_of(index));
         let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
             return;
         };
@@ -423,16 +429,16 @@ impl Master {
         }
         let retries = match *ended {
             // The request may never have reached the drive, which is no sign of it.
-            Ended::Corrupt(CONNECTION_CLOSED) => self.retries.max(1),
+            Ended::Corrupt(CONNECTION_CLOSED) => retries.max(1),
             // As is the reply that was lost while the thread stood still.
-            _ if online => self.retries.max(u32::from(stood)),
+            _ if online => retries.max(u32::from(stood)),
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
             if silent {
-                drive.vain_stops.in_vain(self.response_timeout, now);
+                drive.vain_stops.in_vain(response_timeout, now);
                 self.schedule.doubted(index);
             }
         }

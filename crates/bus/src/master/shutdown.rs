@@ -189,8 +189,7 @@ fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<
         .iter()
         .all(|image| matches!(image.spec.on_shutdown, OnShutdown::Stop));
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
-    let pdu =
-        stop_of_line(bus.image.spec.protocol, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;
+    let pdu = stop_of_line(&bus.image.spec, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;
     let question = Question::broadcast(pdu, Origin::new(SourceKind::Shutdown, "on_shutdown"), now, BROADCAST);
     Some(bus.ask(question, writes, now))
 }

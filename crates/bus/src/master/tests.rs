@@ -26,6 +26,7 @@ mod refreshing;
 mod rights;
 mod shutdown;
 mod stop_all;
+mod timing;
 
 /// Kept before each request.
 const SILENCE: Duration = Duration::from_micros(1750);
@@ -110,6 +111,7 @@ fn options() -> BusOptions {
         silence: Silence::Spec,
         line: LineOptions::default(),
         mode: Default::default(),
+        allow: Vec::new(),
     }
 }
 

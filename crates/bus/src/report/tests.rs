@@ -20,6 +20,7 @@ fn options() -> BusOptions {
         silence: Default::default(),
         line: Default::default(),
         mode: Default::default(),
+        allow: Vec::new(),
     }
 }
 

@@ -71,6 +71,8 @@ pub(super) enum Presence {
 
 #[derive(Debug)]
 pub(super) struct DriveSchedule {
+    /// Tries after the first.
+    pub(super) retries: u32,
     pub(super) presence: Presence,
     /// A drill sends it nothing until then.
     pub(super) quiet_until: Option<Instant>,
@@ -210,8 +212,9 @@ impl DriveSchedule {
     }
 
     /// A drive that was not asked yet.
-    pub(super) fn new(items: Vec<Item>, plan: &Plan, now: Instant) -> DriveSchedule {
+    pub(super) fn new(items: Vec<Item>, plan: &Plan, retries: u32, now: Instant) -> DriveSchedule {
         DriveSchedule {
+            retries,
             presence: Presence::Away(now, Duration::ZERO),
             quiet_until: None,
             early: EarlyProbes::default(),
@@ -341,7 +344,8 @@ impl DriveSchedule {
 
     /// The drive, which answers others, did not answer this read as often as it is tried. A block of process data is read in
     /// halves from now on, until what it does not answer is found; that is tried again after a pause that grows.
-    pub(super) fn in_vain(&mut self, read: PlannedRead, retries: u32, now: Instant) {
+    pub(super) fn in_vain(&mut self, read: PlannedRead, now: Instant) {
+        let retries = self.retries;
         let Some(index) = self.items.iter().position(|item| item.read == read) else {
             // The block was taken apart meanwhile: any of its parts may be what is not answered.
             let parts = self

@@ -12,7 +12,7 @@ const MOST_GARBLED: u32 = 8;
 
 impl Schedule {
     pub(super) fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
-        let (slow, retries) = (self.cadence.slow, self.cadence.retries);
+        let slow = self.cadence.slow;
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return Change::None;
         };
@@ -28,7 +28,7 @@ impl Schedule {
             drive.probes = 0;
             // The drive answers, but not what took it away.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
-                drive.in_vain(vain, retries, now);
+                drive.in_vain(vain, now);
             }
             if self.round_started.is_none() {
                 self.round_due = self.round_due.min(now);
@@ -67,10 +67,10 @@ impl Schedule {
     }
 
     pub(super) fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return Change::None;
         };
+        let retries = drive.retries;
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
             drive.probes += usize::from(drive.tried);
@@ -98,7 +98,7 @@ impl Schedule {
                 in_vain = item.failures > retries;
             }
             if in_vain {
-                drive.in_vain(poll.read, retries, now);
+                drive.in_vain(poll.read, now);
             }
             self.ask_whether_it_answers(poll.drive, now);
             return Change::None;
@@ -134,10 +134,10 @@ impl Schedule {
     }
 
     pub(super) fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return Change::None;
         };
+        let retries = drive.retries;
         let counts = drive.shows_presence(&poll.read);
         if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
             return self.failed(poll, took, now);

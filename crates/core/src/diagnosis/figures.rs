@@ -119,6 +119,8 @@ impl Figures {
             address,
             window: Window::new(),
             slowest: Window::new(),
+            response_timeout: line.response_timeout,
+            latest: Window::new(),
             run: 0,
             run_paused: [0; 2],
             silent_at: None,
@@ -314,11 +316,11 @@ impl Figures {
         if follows && exchange.gap >= self.line.silence + Duration::from_millis(4) {
             self.paced.add(self.millisecond(exchange.began), 1);
         }
-        let limit = self.line.response_timeout / 2;
         let (middle, length) = self.middle(exchange);
         let Some(drive) = self.drives.get_mut(exchange.drive) else {
             return;
         };
+        let limit = drive.response_timeout / 2;
         drive.add(Sign::Answered);
         if let Shape::Led(zero) = shape {
             drive.add(Sign::Led);
@@ -453,7 +455,7 @@ impl Figures {
         };
         let is_second = drive.is_some() && self.last == drive.map(|drive| (drive, End::Answered));
         match drive.and_then(|drive| self.drives.get_mut(drive)) {
-            Some(drive) if drive.was_silent(at) => drive.add(Sign::Late),
+            Some(drive) if drive.was_silent(at) => drive.replied_late(at),
             Some(drive) if is_second => drive.add(Sign::Second),
             _ => self.wrong.add(0, 1),
         }
@@ -472,6 +474,7 @@ impl Figures {
             for drive in &mut self.drives {
                 drive.window.roll();
                 drive.slowest.roll();
+                drive.latest.roll();
                 drive.mains.sums.iter_mut().flatten().for_each(|sum| *sum *= FADE);
             }
             self.arrivals.roll();

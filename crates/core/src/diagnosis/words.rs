@@ -42,7 +42,7 @@ impl Cause {
             }
             Cause::OneDrive => {
                 "check this drive's cable, terminals and power supply, and that no other drive has its address; if \
-                 its replies are late, raise response_timeout of the bus"
+                 its replies are late, raise its response_timeout"
             }
             Cause::FromAddress => {
                 "if addresses follow the cable, check cable and terminals just before the first of these drives; \

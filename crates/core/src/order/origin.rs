@@ -152,6 +152,8 @@ pub struct Origin {
 impl Origin {
     /// Who acts when a lease expires.
     pub const LEASE: &str = "supervision";
+    /// The client name for a stop that is written again because an earlier write may still be on its way.
+    pub const REPEATED_STOP: &str = "repeated stop";
     /// The client name for the stop of a drive that was switched to local control with its run command set.
     pub const LOCAL: &str = "local control place";
 

@@ -21,7 +21,8 @@ pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
 pub use crate::spec::{
-    Access, BusSpec, DriveSpec, LeaseAction, Machine, OnShutdown, ParamsAccess, PointTrigger, Supervision, TriggerLimit,
+    Access, BusSpec, DriveSpec, LeaseAction, Machine, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing,
+    TriggerLimit, is_modbus_tcp,
 };
 
 use std::collections::BTreeMap;

@@ -108,6 +108,28 @@ pub struct DriveSpec {
     pub params: ParamsAccess,
     /// How often what was ordered last is written again, for its own timeout; none where it is not.
     pub refresh: Option<Duration>,
+    /// Its own times on the line.
+    pub timing: Timing,
+}
+
+/// The times of one drive, where they are not those of its bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Timing {
+    /// Time for the first byte of its reply; wire time is added.
+    pub response_timeout: Option<Duration>,
+    /// Silence before each request to it, and after its reply before a request to any other drive.
+    pub silence: Option<Duration>,
+    /// Tries after the first.
+    pub retries: Option<u32>,
+}
+
+impl Timing {
+    /// Silence that an exchange with the drive takes at most, on a line with that silence: before the request, and what
+    /// the next request waits longer than after any other drive.
+    pub fn silence_around(&self, of_bus: Duration) -> Duration {
+        let own = self.silence.unwrap_or(of_bus);
+        own + own.saturating_sub(of_bus)
+    }
 }
 
 /// A value that makes a recording when it holds for a time.
@@ -134,7 +156,8 @@ pub enum TriggerLimit {
 pub struct BusSpec {
     /// Name, unique in the gateway.
     pub name: String,
-    /// Path of the serial port, or `tcp://host:port` or `rfc2217://host:port`.
+    /// Path of the serial port, or the address of a device server: `tcp://`, `rfc2217://`, `modbus-tcp://`, `udp://` or
+    /// `tcp-listen://`.
     pub port: String,
     pub protocol: Protocol,
     /// Baud rate and character format.
@@ -165,6 +188,18 @@ impl std::fmt::Display for Machine {
 }
 
 impl BusSpec {
+    /// Whether a device behind the network speaks Modbus TCP: there is no serial line that the gateway knows of, no baud
+    /// rate and no broadcast.
+    pub fn is_modbus_tcp(&self) -> bool {
+        is_modbus_tcp(&self.port)
+    }
+
+    /// Whether no late or doubled reply can be taken for the reply to another request: transaction ids or sockets tell
+    /// them apart. On the way there, the network may hold a request up and let a later one pass.
+    pub fn tells_replies_apart(&self) -> bool {
+        self.is_modbus_tcp() || self.port.starts_with("udp://")
+    }
+
     /// The machine that a drive of this bus is.
     pub fn machine(&self, drive: &DriveSpec) -> Machine {
         Machine {
@@ -173,6 +208,11 @@ impl BusSpec {
             profile: drive.profile.name.clone(),
         }
     }
+}
+
+/// Whether that is a port of Modbus TCP.
+pub fn is_modbus_tcp(port: &str) -> bool {
+    port.starts_with("modbus-tcp://")
 }
 
 impl DriveSpec {
@@ -198,6 +238,7 @@ impl DriveSpec {
             raw_writes: RawWrites::Points,
             params: ParamsAccess::Read,
             refresh: None,
+            timing: Timing::default(),
         }
     }
 

@@ -246,7 +246,7 @@ fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> O
     let drives = &bus.image.drives;
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let specs = drives.iter().map(|image| &image.spec);
-    let pdu = stop_of_line(bus.image.spec.protocol, specs).filter(|_| online && bus.image.is_up())?;
+    let pdu = stop_of_line(&bus.image.spec, specs).filter(|_| online && bus.image.is_up())?;
     let question = Question::broadcast(pdu, origin.clone(), now, BROADCAST);
     Some(bus.ask_first(question, &plant.writes, now))
 }

@@ -3,14 +3,18 @@
 use std::time::Duration;
 
 use crate::codec::{Protocol, RequestPdu};
-use crate::process_image::{Access, DriveSpec};
+use crate::process_image::{Access, BusSpec, DriveSpec};
 
 /// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
 pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 
 /// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be
 /// stopped, and it means that to each of them. It gets no reply, so a separate stop must follow for every drive.
-pub fn stop_of_line<'d>(protocol: Protocol, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
+pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
+    // Address 0 is a device like any other there.
+    if bus.protocol == Protocol::N2 || bus.is_modbus_tcp() {
+        return None;
+    }
     let mut stops = drives
         .into_iter()
         .map(|drive| (drive.access == Access::Control).then(|| drive.profile.broadcast_stop())?);
@@ -18,12 +22,13 @@ pub fn stop_of_line<'d>(protocol: Protocol, drives: impl IntoIterator<Item = &'d
     // One drive is stopped as soon by its own stop.
     let mut others = stops.peekable();
     others.peek()?;
-    (protocol != Protocol::N2 && others.all(|stop| stop.as_ref() == Some(&first))).then_some(first)
+    others.all(|stop| stop.as_ref() == Some(&first)).then_some(first)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::codec::LineFormat;
     use crate::drive::profile::Profiles;
 
     fn drives(profiles: &[&str], access: Access) -> Vec<DriveSpec> {
@@ -37,7 +42,16 @@ mod tests {
 
     #[test]
     fn only_where_it_means_the_same_to_every_drive() {
-        let rtu = |profiles: &[&str]| stop_of_line(Protocol::ModbusRtu, &drives(profiles, Access::Control));
+        let bus = |protocol, port: &str| BusSpec {
+            name: "b".to_string(),
+            port: port.to_string(),
+            protocol,
+            format: LineFormat::NETWORK,
+            cycle: Duration::ZERO,
+            slow_cycle: Duration::ZERO,
+        };
+        let line = bus(Protocol::ModbusRtu, "/dev/ttyUSB0");
+        let rtu = |profiles: &[&str]| stop_of_line(&line, &drives(profiles, Access::Control));
         let clear = |address| Some(RequestPdu::WriteRegister { address, value: 0 });
         assert_eq!(rtu(&["vacon-nx", "vacon-nx"]), clear(2000));
         assert_eq!(
@@ -48,18 +62,21 @@ mod tests {
         let coil = RequestPdu::WriteCoil { address: 0, on: false };
         assert_eq!(rtu(&["vacon-cx", "vacon-cx"]), Some(coil));
         let ascii = stop_of_line(
-            Protocol::ModbusAscii,
+            &bus(Protocol::ModbusAscii, "/dev/ttyUSB0"),
             &drives(&["teco-7300pa", "teco-7300pa"], Access::Control),
         );
         assert_eq!(ascii, clear(1));
         assert_eq!(rtu(&["vacon-nx", "vacon-cx"]), None, "another register");
         assert_eq!(rtu(&["vacon-nx"]), None, "its own stop is as fast");
         let monitored = drives(&["vacon-nx", "vacon-nx"], Access::Monitor);
-        assert_eq!(stop_of_line(Protocol::ModbusRtu, &monitored), None);
+        assert_eq!(stop_of_line(&line, &monitored), None);
         let mut one_monitored = drives(&["vacon-nx", "vacon-nx"], Access::Control);
         one_monitored[1].access = Access::Monitor;
-        assert_eq!(stop_of_line(Protocol::ModbusRtu, &one_monitored), None);
+        assert_eq!(stop_of_line(&line, &one_monitored), None);
         let n2 = drives(&["vacon-nx-n2", "vacon-nx-n2"], Access::Control);
-        assert_eq!(stop_of_line(Protocol::N2, &n2), None);
+        assert_eq!(stop_of_line(&bus(Protocol::N2, "/dev/ttyUSB0"), &n2), None);
+        let network = bus(Protocol::ModbusRtu, "modbus-tcp://10.0.0.7:502");
+        let all = drives(&["vacon-nx", "vacon-nx"], Access::Control);
+        assert_eq!(stop_of_line(&network, &all), None, "there is no broadcast");
     }
 }

@@ -1,19 +1,19 @@
 //! `[[bus]]`: the line and its drives.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use super::drive::{self, Surroundings};
-use super::keys::BUS;
+use super::keys::{BUS, RESERVED};
 use super::settings::BusSettings;
-use super::{line, slot, values};
+use super::{line, port, slot};
 use crate::bus::predict::faster_points;
 use crate::bus::{BusOptions, Mode};
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
 use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
-use crate::process_image::{Access, BusSpec, DriveSpec};
+use crate::process_image::{Access, BusSpec, DriveSpec, is_modbus_tcp};
 
 /// A longer `response_timeout` causes a warning.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);
@@ -32,15 +32,23 @@ pub(super) struct Found {
 pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profiles_broken: bool) -> Found {
     let name = BUS.name.placed(reader);
     let port = BUS.port.read(reader);
-    let port = port.and_then(|text| reader.accept(BUS.port.name, check_port(&text, base)));
+    let port = port.and_then(|text| reader.accept(BUS.port.name, port::check(&text, base)));
+    let is_modbus_tcp = port.as_deref().is_some_and(is_modbus_tcp);
     // A wrong protocol is an error already; the rest is checked as for the default.
     let protocol = BUS.protocol.read(reader).unwrap_or(Protocol::ModbusRtu);
-    let format = read_format(reader, protocol);
+    if let Some(port) = &port {
+        port::check_keys(reader, port, protocol);
+    }
+    let format = match is_modbus_tcp {
+        true => Some(LineFormat::NETWORK),
+        false => read_format(reader, protocol),
+    };
     let (cycle, slow_cycle) = read_cadence(reader);
     let options = read_options(reader, protocol, format.as_ref(), port.as_deref());
     let around = Surroundings {
         bus: name.as_ref().map_or("", |(name, _)| name),
         protocol,
+        is_modbus_tcp,
         profiles,
         profiles_broken,
     };
@@ -51,6 +59,10 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
     let drives: Vec<drive::Found> = tables.iter().map(|table| drive::read(table, &around)).collect();
     if options.mode == Mode::Listen {
         check_listening(reader, &drives);
+    }
+    check_only_one(reader, &drives, protocol, is_modbus_tcp);
+    if let Some(port) = &port {
+        port::check_dial_in(reader, port, &drives);
     }
     let slots = slot::read(
         reader,
@@ -122,9 +134,13 @@ fn read_options(
     let options = BusOptions {
         response_timeout: BUS.response_timeout.get_on(reader, protocol),
         retries: BUS.retries.get_on(reader, protocol),
-        silence: read_silence(reader, protocol, format),
+        silence: match format {
+            Some(&LineFormat::NETWORK) => Silence::Fixed(Duration::ZERO),
+            _ => read_silence(reader, protocol, format),
+        },
         line: line::read(reader, port),
         mode: BUS.mode.get(reader),
+        allow: BUS.allow.get(reader),
     };
     if options.response_timeout > LONG_TIMEOUT {
         let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
@@ -137,6 +153,29 @@ fn read_options(
         );
     }
     options
+}
+
+/// Address 248 is reserved, and devices that answer at any address take it for theirs.
+fn check_only_one(reader: &Reader<'_>, drives: &[drive::Found], protocol: Protocol, is_modbus_tcp: bool) {
+    if protocol == Protocol::N2 || is_modbus_tcp {
+        return;
+    }
+    let addresses = drives.iter().filter_map(|drive| drive.address.as_ref());
+    for (_, place) in addresses.filter(|(address, _)| *address == RESERVED) {
+        if drives.len() == 1 {
+            reader.document().warning(
+                place,
+                "address 248 is reserved by the Modbus specification; some devices answer at it whatever their address is",
+                "write the address of the device, 1 to 247, if it has one",
+            );
+        } else {
+            reader.document().problem(
+                place,
+                "address 248 is for the only device of a line: one that answers at it answers at any address",
+                "write an address from 1 to 247, or put the device on a bus of its own",
+            );
+        }
+    }
 }
 
 /// A key that needs a frame of the gateway on a line where it sends none is an error; a key that only sets how it would
@@ -179,51 +218,6 @@ fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
             "leave the key out",
         );
     }
-}
-
-/// Path of a device, relative to the directory of the file, or `tcp://host:port` or `rfc2217://host:port`.
-///
-/// # Errors
-/// The text is neither.
-pub fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
-    match text.split_once("://") {
-        Some((scheme @ ("tcp" | "rfc2217"), server)) => match values::host_port(server, None) {
-            Some(_) => Ok(text.to_string()),
-            None => Err(Finding::new(
-                format!("`{text}` is not the address of a device server"),
-                format!("write \"{scheme}://host:port\""),
-            )),
-        },
-        Some((scheme, _)) => Err(Finding::new(
-            format!("`{scheme}://` is not a kind of port"),
-            "write the path of a serial device, \"tcp://host:port\" or \"rfc2217://host:port\"",
-        )),
-        None if text.is_empty() || text.contains('\0') => Err(Finding::new(
-            "the port has no path",
-            "write for example \"/dev/serial/by-id/usb-…\"",
-        )),
-        None if is_windows_name(text) => Err(Finding::new(
-            format!("`{text}` is the name of a port on Windows"),
-            "write the path of the adapter on this machine, such as \"/dev/serial/by-id/usb-…\"; `ls /dev/serial/by-id` lists them",
-        )),
-        None if values::host_port(text, None).is_some() => Err(Finding::new(
-            format!("`{text}` is not a path of a serial device"),
-            format!(
-                "did you mean \"tcp://{text}\"? Or \"rfc2217://{text}\" for a server that sets up its port over the network"
-            ),
-        )),
-        None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
-    }
-}
-
-/// `COM3`.
-fn is_windows_name(text: &str) -> bool {
-    let number = text
-        .get(..3)
-        .filter(|start| start.eq_ignore_ascii_case("com"))
-        .and_then(|_| text.get(3..));
-    let number = number.map(|number| number.trim_end_matches(':')).unwrap_or_default();
-    !number.is_empty() && number.chars().all(|c| c.is_ascii_digit())
 }
 
 fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
@@ -302,10 +296,12 @@ fn check_format(reader: &Reader<'_>, format: &LineFormat, drives: &[DriveSpec]) 
 /// Warns about valid settings that suit the drives badly.
 fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
     let mut reported: Vec<&str> = Vec::new();
-    check_format(reader, format, drives);
+    if *format != LineFormat::NETWORK {
+        check_format(reader, format, drives);
+    }
     for drive in drives {
         let profile = &drive.profile;
-        let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud);
+        let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud) || *format == LineFormat::NETWORK;
         if !listed && !reported.contains(&profile.name.as_str()) {
             reported.push(&profile.name);
             let bauds: Vec<String> = profile.bauds.iter().map(u32::to_string).collect();
@@ -315,15 +311,16 @@ fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, dri
                 format!("check the drives; the profile lists {}", bauds.join(", ")),
             );
         }
-        if drive.turnaround >= options.response_timeout {
-            let [turnaround, timeout] = [drive.turnaround, options.response_timeout].map(format_duration);
+        let timeout = drive.timing.response_timeout.unwrap_or(options.response_timeout);
+        if drive.turnaround >= timeout {
+            let [turnaround, timeout] = [drive.turnaround, timeout].map(format_duration);
             reader.warning(
                 BUS.response_timeout.name,
                 format!(
                     "drive `{}` takes {turnaround} to start its reply, but response_timeout is {timeout}",
                     drive.name
                 ),
-                "raise response_timeout",
+                "raise response_timeout of the bus or of the drive",
             );
         }
     }

@@ -6,7 +6,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::key::{Key, Number};
-use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
+use super::keys::{
+    ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, RESERVED, SUPERVISION, TRIGGER, UNIT_IDS,
+    WITH_RESERVED,
+};
 use super::start_guard::Guards;
 use super::{raw_writes, start_guard};
 use crate::codec::Protocol;
@@ -15,7 +18,7 @@ use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PointIndex, PollClass, Profile, Value};
 use crate::process_image::{
-    Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, TriggerLimit,
+    Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
 };
 
 /// Points that a message names.
@@ -45,6 +48,7 @@ pub(super) struct Found {
 pub(super) struct Surroundings<'a> {
     pub(super) bus: &'a str,
     pub(super) protocol: Protocol,
+    pub(super) is_modbus_tcp: bool,
     pub(super) profiles: &'a Profiles,
     pub(super) profiles_broken: bool,
 }
@@ -52,7 +56,11 @@ pub(super) struct Surroundings<'a> {
 pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let name = DRIVE.name.placed(reader);
     let address = Key {
-        form: address_form(around.protocol),
+        form: match around.is_modbus_tcp {
+            true => &UNIT_IDS,
+            false if is_reserved(reader) && around.protocol != Protocol::N2 => &WITH_RESERVED,
+            false => address_form(around.protocol),
+        },
         ..DRIVE.address
     };
     let address = address.read(reader);
@@ -64,6 +72,11 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
     let supervision = read_supervision(reader, profile.as_deref(), &limits);
+    let timing = Timing {
+        response_timeout: DRIVE.response_timeout.read(reader),
+        silence: DRIVE.silence.read(reader),
+        retries: DRIVE.retries.read(reader),
+    };
     let refresh = read_refresh(reader, profile.as_deref(), access, supervision.as_ref());
     let on_shutdown = read_on_shutdown(reader, profile.as_deref());
     let turnaround = DRIVE.turnaround.read(reader);
@@ -96,6 +109,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             raw_writes,
             params,
             refresh,
+            timing,
         }),
         _ => None,
     };
@@ -194,6 +208,12 @@ fn read_params(reader: &Reader<'_>, access: Access) -> ParamsAccess {
     params
 }
 
+/// Whether the drive has the address that the Modbus specification reserves.
+fn is_reserved(reader: &Reader<'_>) -> bool {
+    let address = reader.raw(DRIVE.address.name).map(|node| &node.value);
+    matches!(address, Some(Node::Integer(address)) if *address == i64::from(RESERVED))
+}
+
 /// Addresses that a drive can have on a line of that protocol.
 pub fn addresses(protocol: Protocol) -> RangeInclusive<u8> {
     let Number(range, _) = address_form(protocol);
@@ -202,10 +222,12 @@ pub fn addresses(protocol: Protocol) -> RangeInclusive<u8> {
 
 /// The unit id; the address if there is none.
 fn read_unit(reader: &Reader<'_>, address: Option<u8>) -> Option<u8> {
-    if !reader.has(DRIVE.unit.name) && address == Some(255) {
+    if !reader.has(DRIVE.unit.name)
+        && let Some(address @ (0 | 255)) = address
+    {
         reader.problem(
             DRIVE.address.name,
-            "unit 255 is the gateway itself, so the drive needs another one",
+            format!("unit {address} is the gateway itself, so the drive needs another one"),
             "add `unit`, 1 to 254",
         );
     }
@@ -233,7 +255,9 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
             "use another profile or put the drive on another bus",
         );
     }
-    if let Some(address) = address.filter(|a| !profile.addresses.contains(a)) {
+    // A device on a network has any unit id, and one that answers at 248 has no address of its own.
+    let is_of_line = |address: &u8| !around.is_modbus_tcp && !(*address == RESERVED && *profile.addresses.end() == 247);
+    if let Some(address) = address.filter(|a| is_of_line(a) && !profile.addresses.contains(a)) {
         let (least, most) = profile.addresses.clone().into_inner();
         reader.problem(
             DRIVE.address.name,

@@ -23,6 +23,7 @@ mod modbus_tcp;
 mod mqtt;
 pub mod named_files;
 mod params;
+mod port;
 mod raw_writes;
 mod recordings;
 mod settings;
@@ -33,13 +34,13 @@ mod together;
 mod unique;
 mod values;
 
-pub use bus::check_port;
 pub use drive::{addresses, unknown_profile};
 pub use keys::{LogFormat, default_format, parse_level, schema};
 pub use load::{DEFAULT_FILE, Loaded, environment};
 pub use log::LogSettings;
 pub use named_files::{FileKind, NamedFile, named_files};
 pub use params::ParamsSettings;
+pub use port::check as check_port;
 pub use settings::{BusSettings, Settings};
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;
 use crate::drive::control::{ControlItem, OwnWord};
 use crate::drive::plan::WireTime;
-use crate::process_image::{Access, DriveSpec, OnShutdown};
+use crate::process_image::{Access, DriveSpec, OnShutdown, Timing};
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
 pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
@@ -57,18 +57,22 @@ impl BusSettings {
     /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
     pub fn shutdown_time(&self) -> ShutdownTime {
         let mut time = ShutdownTime::default();
-        if let Some(stop) =
-            stop_of_line(self.spec.protocol, &self.drives).filter(|_| self.drives.iter().all(is_stopped))
-        {
+        if let Some(stop) = stop_of_line(&self.spec, &self.drives).filter(|_| self.drives.iter().all(is_stopped)) {
             let broadcast = self.exchange(&stop, BROADCAST_PAUSE);
             time.answered += broadcast;
             time.unanswered += broadcast;
         }
         for drive in self.drives.iter().filter(|drive| is_stopped(drive)) {
             let Some((read, write)) = stop_of(drive) else { continue };
-            let tries = self.options.retries.saturating_add(1);
-            let timeout = self.options.response_timeout;
-            let exchange = |pdu: &RequestPdu, turnaround| self.exchange(pdu, turnaround);
+            let Timing {
+                response_timeout,
+                silence,
+                retries,
+            } = drive.timing;
+            let tries = retries.unwrap_or(self.options.retries).saturating_add(1);
+            let timeout = response_timeout.unwrap_or(self.options.response_timeout);
+            let quiet = silence.unwrap_or_default();
+            let exchange = |pdu: &RequestPdu, turnaround| self.exchange(pdu, turnaround) + 2 * quiet;
             let reading = |turnaround| read.as_ref().map_or(Duration::ZERO, |read| exchange(read, turnaround));
             time.drives += 1;
             time.answered += reading(drive.turnaround) + exchange(&write, drive.turnaround);

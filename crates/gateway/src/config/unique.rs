@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use super::bus::Found;
 use super::http::Listener;
 use crate::document::{Document, Place};
+use crate::line::split_dial_in;
 
 pub(super) fn check(document: &Document, buses: &[Found]) {
     let names = buses.iter().filter_map(|bus| bus.name.as_ref());
@@ -19,6 +20,7 @@ pub(super) fn check(document: &Document, buses: &[Found]) {
         drives().filter_map(|drive| drive.name.as_ref()),
     );
     check_ports(document, buses);
+    check_dial_in(document, buses);
     check_ptys(document, buses);
     check_addresses(document, buses);
 }
@@ -71,6 +73,30 @@ fn check_ports(document: &Document, buses: &[Found]) {
             format!("the port {port} already belongs to bus{owner}{how}"),
             "give each bus its own port",
         );
+    }
+}
+
+/// Devices that dial in at one address are told apart by their texts: none may be the beginning of another.
+fn check_dial_in(document: &Document, buses: &[Found]) {
+    let mut seen: Vec<(&str, &str)> = Vec::new();
+    for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
+        let Some(at) = port.strip_prefix("tcp-listen://") else {
+            continue;
+        };
+        let (address, id) = split_dial_in(at);
+        let alike = |other: &str| other != id && (other.starts_with(id) || id.starts_with(other));
+        if let Some((_, other)) = seen.iter().find(|(at, other)| *at == address && alike(other)) {
+            let [id, other] = [id, other].map(|id| match id {
+                "" => "no text".to_string(),
+                id => format!("the text `{id}`"),
+            });
+            document.problem(
+                place,
+                format!("{id} cannot be told from {other} of another bus at {address}"),
+                "give each bus at one address a text that is not the beginning of another one",
+            );
+        }
+        seen.push((address, id));
     }
 }
 

@@ -102,7 +102,9 @@ impl Leases {
     /// A bus was stopped; `leases` are those of its drives, in their order. A drive that could have none has left none.
     pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Carried>) {
         let all = bus.drives.iter().zip(leases);
-        for (drive, carried) in all.filter(|(drive, _)| is_commanded(drive) && drive.supervision.is_some()) {
+        for (drive, carried) in all
+            .filter(|(drive, carried)| is_commanded(drive) && (drive.supervision.is_some() || carried.stops.is_any()))
+        {
             let left = Left {
                 carried,
                 control: drive.profile.control.clone(),
@@ -125,10 +127,14 @@ impl Leases {
             }
             let left = self.left.remove(&machine);
             if drive.supervision.is_none() {
+                let stops = left.as_ref().map(|left| left.carried.stops);
                 // Its time stands until a configuration supervises the drive again.
                 self.parted
                     .extend(left.map(|left| (machine, (now, left.carried.alone()))));
-                return None;
+                return stops.map(|stops| Carried {
+                    stops,
+                    ..Carried::default()
+                });
             }
             // What is refreshed goes on only where the drive is commanded as before.
             let left = left.map(|left| match left.control == drive.profile.control {

@@ -307,7 +307,7 @@ fn probes(drive: &mut DriveSchedule, away: Instant, took: Duration, until: Durat
 fn the_first_probes_come_at_half_a_second_one_and_two_whatever_they_cost() {
     let (ms, now) = (Duration::from_millis, Instant::now());
     for took in [ms(10), ms(110), ms(240)] {
-        let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), now);
+        let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), 1, now);
         let times = probes(&mut drive, now, took, Duration::from_secs(120));
         assert_eq!(times[..3], [ms(500), ms(1_000), ms(2_000)], "{took:?}");
         let later: Vec<Duration> = times[2..].windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -324,7 +324,7 @@ fn the_first_probes_come_at_half_a_second_one_and_two_whatever_they_cost() {
 fn a_drive_that_comes_and_goes_has_no_more_early_probes_than_it_saved_up() {
     let (ms, took) = (Duration::from_millis, Duration::from_millis(110));
     let mut now = Instant::now();
-    let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), now);
+    let mut drive = DriveSchedule::new(Vec::new(), &Plan::default(), 1, now);
     let mut early = Vec::new();
     for _ in 0..20 {
         drive.presence = Presence::Online;
@@ -352,7 +352,7 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
         due: now + 60 * second,
         ..Item::new(read, read, COST, now)
     };
-    let mut drive = DriveSchedule::new(vec![put_off.clone()], &Plan::default(), now);
+    let mut drive = DriveSchedule::new(vec![put_off.clone()], &Plan::default(), 1, now);
     assert_eq!(drive.due(&put_off), now + 60 * second, "the drive is mute to it");
     drive.troubled = Some(now + 3 * second);
     assert_eq!(drive.due(&put_off), now + 13 * second);

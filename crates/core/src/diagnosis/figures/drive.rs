@@ -1,6 +1,6 @@
 //! The counters of one drive.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::LATE;
 use crate::diagnosis::counters::{InPhase, Window};
@@ -49,6 +49,10 @@ pub struct Drive {
     pub(super) window: Window<SIGNS>,
     /// Slowest beginning of a reply in each step, tenths of a millisecond.
     pub(super) slowest: Window<1>,
+    /// Time for the first byte of its reply.
+    pub response_timeout: Duration,
+    /// Longest time from a request to the late reply in each step, ms.
+    pub(super) latest: Window<1>,
     /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
     pub(super) run: u16,
     pub(super) run_paused: [u16; 2],
@@ -81,6 +85,19 @@ impl Drive {
     /// Slowest beginning of a reply in the last minute, ms.
     pub fn slowest_ms(&self) -> f64 {
         f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
+    }
+
+    /// A reply came after the time limit, at `at`.
+    pub(super) fn replied_late(&mut self, at: Instant) {
+        self.add(Sign::Late);
+        let over = self.silent_at.map(|silent| at.saturating_duration_since(silent));
+        let took = self.response_timeout + over.unwrap_or_default();
+        self.latest.most(0, u16::try_from(took.as_millis()).unwrap_or(u16::MAX));
+    }
+
+    /// Longest time from a request to its late reply in the last minute, at least.
+    pub fn latest(&self) -> Duration {
+        Duration::from_millis(u64::from(self.latest.each(0).max().unwrap_or_default()))
     }
 
     /// Requests to a drive that has never replied.

@@ -11,11 +11,13 @@ use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::slot::SlotAccess;
 
 /// Longest fixed silence.
-const MOST_SILENCE: Duration = Duration::from_secs(1);
+pub(super) const MOST_SILENCE: Duration = Duration::from_secs(1);
+pub(super) const SHORTEST_TIMEOUT: Duration = Duration::from_millis(1);
+pub(super) const LONGEST_TIMEOUT: Duration = Duration::from_secs(5);
 /// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves no other
 /// drive.
 const RESPONSE_TIMEOUTS: Capped = Capped {
-    range: Duration::from_millis(1)..=Duration::from_secs(5),
+    range: SHORTEST_TIMEOUT..=LONGEST_TIMEOUT,
     before: HOUR,
     why: "is longer than any drive takes to start its reply",
     until: "0.2",
@@ -36,9 +38,12 @@ keys! {
         /// Name of the bus, unique; metric label, MQTT topic.
         name: String = Name("-_"), required;
         /// Serial port, preferably by its name under `/dev/serial/by-id`; or a device server that passes bytes through
-        /// (`tcp://`: raw serial over TCP, not Modbus TCP), or one whose port drivegate sets up with `baud` and
-        /// `format` (`rfc2217://`). Each port belongs to one bus.
-        port: String = Text("", "a path, \"tcp://host:port\" or \"rfc2217://host:port\""), required;
+        /// (`tcp://`: raw serial over TCP), or one whose port drivegate sets up with `baud` and `format` (`rfc2217://`);
+        /// or [another way](installation.md#ports): `modbus-tcp://`, `udp://`, `tcp-listen://`. Each port belongs to one
+        /// bus.
+        port: String = Text("", "a path or an address such as \"tcp://host:port\""), required;
+        /// With `tcp-listen://`: who may dial in.
+        allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
         /// `"listen"`: another master owns the line; the gateway sends nothing and shows what that master reads, see
         /// [Listening](troubleshooting.md#listening-to-a-line-that-another-master-owns). Its drives cannot have `access
         /// = "control"`, `supervision` or `on_shutdown = "stop"`.

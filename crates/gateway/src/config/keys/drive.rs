@@ -1,5 +1,6 @@
 //! `[[bus.drive]]` and its tables.
 
+use super::bus::{LONGEST_TIMEOUT, MOST_SILENCE, SHORTEST_TIMEOUT};
 use super::forms::*;
 use crate::process_image::{Access, LeaseAction, OnShutdown, ParamsAccess};
 use crate::start_guard::MOST_STARTS;
@@ -9,6 +10,12 @@ pub(in crate::config) const MOST_HERTZ: f64 = 10_000.0;
 const BROADCAST: Option<(i64, &str)> = Some((0, "address 0 is the broadcast, not a drive"));
 /// Addresses on a Modbus line.
 pub(in crate::config) const MODBUS_ADDRESSES: Number = Number(1..=247, BROADCAST);
+/// The first address that the Modbus specification reserves.
+pub(in crate::config) const RESERVED: u8 = 248;
+/// Addresses on a Modbus line with that one.
+pub(in crate::config) const WITH_RESERVED: Number = Number(1..=RESERVED as i64, BROADCAST);
+/// Unit ids behind `modbus-tcp://`.
+pub(in crate::config) const UNIT_IDS: Number = Number(0..=255, None);
 /// Addresses on a line of N2; each family has its own range within.
 pub(in crate::config) const N2_ADDRESSES: Number = Number(1..=255, BROADCAST);
 /// The actions that are words.
@@ -20,8 +27,9 @@ keys! {
     DRIVE: Drive {
         /// Name of the drive, unique in the gateway; used in topics and labels.
         name: String = Name("-_"), required;
-        /// Address on the line, unique on the bus; 247 at most on Modbus. The profile may allow fewer.
-        address: u8 = N2_ADDRESSES, required;
+        /// Address on the line, unique on the bus: 1 to 247 on Modbus (248 for the only device of a line that answers at any
+        /// address), 1 to 255 on N2; behind `modbus-tcp://` the unit id, 0 to 255. The profile may allow fewer.
+        address: u8 = UNIT_IDS, required;
         /// Family of the drive: its points and limits; `drivegate profiles` lists them.
         profile: String = Text("^[a-z][a-z0-9-]*$", "the name of a profile"), required;
         /// Modbus TCP unit id, unique on each listener of `[modbus_tcp]`. 255 is the gateway itself.
@@ -48,6 +56,12 @@ keys! {
         /// Time the drive takes to start its reply, used only for the prediction of `check`; the measured value is a
         /// metric.
         turnaround: Duration = Time(Duration::ZERO..=Duration::from_secs(1)), or "the profile's";
+        /// Time this drive may take to start its reply; the time on the wire is added.
+        response_timeout: Duration = Time(SHORTEST_TIMEOUT..=LONGEST_TIMEOUT), or "that of the bus";
+        /// Silence before each request to this drive, and after its reply before a request to another one.
+        silence: Duration = Time(Duration::ZERO..=MOST_SILENCE), or "that of the bus";
+        /// Retries after the first attempt before this drive counts as offline.
+        retries: u32 = Number(0..=10, None), or "that of the bus";
         /// Minimum and maximum frequency, used to convert `frequency_reference` if the drive's own cannot be read, or
         /// were not read [recently](commands.md#limits-and-frequencies).
         frequency_range: Present = Own {

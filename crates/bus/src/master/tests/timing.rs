@@ -1,0 +1,75 @@
+//! Times of one drive that are not those of its bus.
+
+use super::*;
+use crate::process_image::Timing;
+
+const SLOW: Timing = Timing {
+    response_timeout: Some(Duration::from_millis(400)),
+    silence: Some(Duration::from_millis(90)),
+    retries: Some(4),
+};
+
+/// The second of two drives has times of its own.
+fn rig() -> Rig {
+    Rig::with(2, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
+        DriveSpec {
+            timing: if spec.address == 2 { SLOW } else { Timing::default() },
+            supervision: None,
+            ..spec
+        }
+    })
+}
+
+fn tries_until_offline(rig: &mut Rig, drive: usize) -> usize {
+    rig.drives[drive].silent = true;
+    let from = rig.wire.len();
+    let is_offline = |rig: &Rig| matches!(rig.bus.image.drives[drive].snapshot().link, Link::Offline(_));
+    while !is_offline(rig) {
+        rig.step();
+    }
+    let tries = rig.wire[from..]
+        .iter()
+        .filter(|(_, turn)| turn.drive.place() == drive)
+        .count();
+    rig.drives[drive].silent = false;
+    tries
+}
+
+#[test]
+fn a_drive_has_its_own_time_and_silence_and_the_others_have_those_of_the_bus() {
+    let mut rig = rig();
+    let mut asked = [false; 2];
+    for _ in 0..200 {
+        let Ok(turn) = rig.master.next(rig.now, &mut Vec::new()) else {
+            rig.now += Duration::from_millis(1);
+            continue;
+        };
+        let sending = rig.master.sending(&turn, rig.now);
+        let (timeout, silence) = match turn.drive.place() {
+            0 => (options().response_timeout, SILENCE),
+            _ => (Duration::from_millis(400), Duration::from_millis(90)),
+        };
+        assert_eq!((sending.response_timeout, sending.silence), (timeout, silence));
+        asked[turn.drive.place()] = true;
+        let end = TurnEnd {
+            ended: rig.drives[turn.drive.place()].answer(turn.pdu()),
+            began: rig.now,
+            at: rig.now + COST,
+            stood: false,
+            took: COST,
+            mangled: false,
+            doubted: false,
+            frame: Vec::new(),
+        };
+        rig.now += COST;
+        rig.master.done(&turn, end, rig.now, &mut Vec::new());
+    }
+    assert_eq!(asked, [true; 2]);
+}
+
+#[test]
+fn a_drive_is_tried_as_often_as_it_says_before_it_is_offline() {
+    let mut rig = rig();
+    assert_eq!(tries_until_offline(&mut rig, 0), 1 + 1);
+    assert_eq!(tries_until_offline(&mut rig, 1), 4 + 1);
+}
