@@ -28,8 +28,8 @@ impl Server {
             }
             Server::ModbusTcp => {
                 "a Modbus TCP server answers on this port, but tcp:// sends the frames of the serial line (RTU over \
-                 TCP); set the converter to raw TCP (also called transparent, TCP server or RTU over TCP), or connect \
-                 to its raw port"
+                 TCP); write modbus-tcp:// instead of tcp://, or set the converter to raw TCP (also called \
+                 transparent, TCP server or RTU over TCP)"
             }
         }
     }
@@ -56,6 +56,11 @@ impl FirstBytes {
     /// The address in what came first.
     pub(super) fn unit(&self) -> u8 {
         self.came.first().copied().unwrap_or_default()
+    }
+
+    /// The drive that was asked first.
+    pub(super) fn first_unit(&self) -> Option<u8> {
+        self.asked.first().map(|[unit, _]| *unit)
     }
 
     /// Whether nothing was received yet.

@@ -63,19 +63,31 @@ impl OtherServer {
         if !is_rtu || now.saturating_duration_since(opened) < SILENT {
             return;
         }
-        let Ok(server) = stream.peer_addr() else { return };
+        let (Ok(server), Ok(silent)) = (stream.peer_addr(), stream.try_clone()) else {
+            return;
+        };
+        self.ask(server, unit, Some(silent), now);
+    }
+
+    /// The server closed a connection at a request for the drive `unit`, and nothing ever came on it: some Modbus TCP servers do
+    /// that at a frame of a line.
+    pub(super) fn hung_up(&self, server: SocketAddr, unit: u8) {
+        self.ask(server, unit, None, Instant::now());
+    }
+
+    /// Asks in a thread; a connection that waits in vain is ended where the server responds.
+    fn ask(&self, server: SocketAddr, unit: u8, silent: Option<TcpStream>, now: Instant) {
         let mut asked = self.0.asked.lock().unwrap_or_else(PoisonError::into_inner);
         if asked.is_some_and(|asked| now.saturating_duration_since(asked) < AGAIN) {
             return;
         }
         *asked = Some(now);
-        let Ok(silent) = stream.try_clone() else { return };
         let known = self.clone();
         let asking = move || {
             if answers(server, unit) {
                 known.recognised(unit);
                 // Wakes all waiting callers, and reports to those that open it again.
-                let ended = silent.shutdown(Shutdown::Both);
+                let ended = silent.map(|silent| silent.shutdown(Shutdown::Both));
                 tracing::debug!(target: "drivegate::line", ?ended, "a Modbus TCP server answers instead of a line");
             }
         };

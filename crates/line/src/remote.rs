@@ -2,7 +2,7 @@
 //! recognised by its first bytes.
 
 use std::cell::RefCell;
-use std::net::TcpStream;
+use std::net::{SocketAddr, TcpStream};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::{Duration, Instant};
 
@@ -23,6 +23,7 @@ const STEP: Duration = Duration::from_millis(100);
 pub(super) struct Raw {
     stream: TcpStream,
     opened: Instant,
+    server: Option<SocketAddr>,
     /// What came first; `None` once it is known to be of a line.
     first: RefCell<Option<FirstBytes>>,
     other: OtherServer,
@@ -41,6 +42,7 @@ impl Raw {
             });
         }
         Ok(Raw {
+            server: stream.peer_addr().ok(),
             stream,
             opened: Instant::now(),
             first: RefCell::new(Some(FirstBytes::default())),
@@ -64,10 +66,7 @@ impl Raw {
     /// # Errors
     /// When the port is gone, or no raw one: frames would never arrive, stops among them.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
-        let count = read(self.stream.as_fd(), buffer).map_err(|lost| match self.other.is_found() {
-            true => Lost::new(Server::ModbusTcp.words()),
-            false => lost,
-        })?;
+        let count = read(self.stream.as_fd(), buffer).map_err(|lost| self.explained(lost))?;
         let mut first = self.first.borrow_mut();
         let Some(seen) = first.as_mut() else { return Ok(count) };
         match seen.came(buffer.get(..count).unwrap_or_default()) {
@@ -83,6 +82,24 @@ impl Raw {
                 Err(Lost::new(server.words()))
             }
         }
+    }
+}
+
+impl Raw {
+    /// Why the connection ended, where the server is known to be another one; it is asked where it hung up at a request.
+    fn explained(&self, lost: Lost) -> Lost {
+        if self.other.is_found() {
+            return Lost::new(Server::ModbusTcp.words());
+        }
+        let first = self.first.borrow();
+        let unit = first
+            .as_ref()
+            .filter(|first| first.is_empty())
+            .and_then(FirstBytes::first_unit);
+        if let Some((server, unit)) = self.server.zip(unit).filter(|_| lost.closed) {
+            self.other.hung_up(server, unit);
+        }
+        lost
     }
 }
 

@@ -133,7 +133,10 @@ fn switch(address: u16, on: bool) -> Option<Command> {
 pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     match (&request.pdu, command_of(&request.pdu)) {
         (RequestPdu::Other(text), _) => command::encode_text(request.address, text, out),
-        (_, Some(command)) => command.encode(request.address, request.n2.region_width, out),
+        (_, Some(command)) => {
+            let command = command.counted_from(request.n2.first_object);
+            command.encode(request.address, request.n2.region_width, out);
+        }
         (_, None) => {}
     }
 }

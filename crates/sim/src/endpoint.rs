@@ -12,6 +12,10 @@ use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+mod network;
+
+use network::Network;
+
 /// Where a master reaches the line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum EndpointOptions {
@@ -30,6 +34,23 @@ pub enum EndpointOptions {
         /// Where to listen; port 0 takes a free one.
         listen: SocketAddr,
     },
+    /// Modbus TCP, as a drive with Ethernet on board speaks it. One client at a time.
+    ModbusTcp {
+        /// Where to listen; port 0 takes a free one.
+        listen: SocketAddr,
+    },
+    /// One frame of the line in each datagram.
+    Udp {
+        /// Where to listen; port 0 takes a free one.
+        listen: SocketAddr,
+    },
+    /// The line dials in at a gateway, as a modem does.
+    Dial {
+        /// The gateway.
+        server: SocketAddr,
+        /// What is said first.
+        text: String,
+    },
 }
 
 /// An open endpoint. All reading and writing is non-blocking.
@@ -41,6 +62,7 @@ pub(super) enum Endpoint {
         listener: TcpListener,
         master: Option<TcpStream>,
     },
+    Network(Network),
 }
 
 impl Endpoint {
@@ -58,12 +80,17 @@ impl Endpoint {
                     .map_err(explain)
             }
             EndpointOptions::Tcp { listen } => {
-                let explain =
-                    |error: io::Error| io::Error::new(error.kind(), format!("cannot listen on {listen}: {error}"));
-                let listener = TcpListener::bind(listen).map_err(explain)?;
+                let listener = TcpListener::bind(listen).map_err(|error| cannot_listen(*listen, error))?;
                 listener.set_nonblocking(true)?;
                 Ok(Endpoint::Tcp { listener, master: None })
             }
+            EndpointOptions::ModbusTcp { listen } => Network::modbus_tcp(*listen)
+                .map(Endpoint::Network)
+                .map_err(|error| cannot_listen(*listen, error)),
+            EndpointOptions::Udp { listen } => Network::udp(*listen)
+                .map(Endpoint::Network)
+                .map_err(|error| cannot_listen(*listen, error)),
+            EndpointOptions::Dial { server, text } => Ok(Endpoint::Network(Network::dial(*server, text))),
         }
     }
 
@@ -75,6 +102,7 @@ impl Endpoint {
             Endpoint::Tcp { listener, .. } => listener
                 .local_addr()
                 .map_or_else(|_| "tcp://?".to_string(), |address| format!("tcp://{address}")),
+            Endpoint::Network(network) => network.address(),
         }
     }
 
@@ -88,6 +116,7 @@ impl Endpoint {
                 let master = master.as_ref().map(|stream| wanted(stream.as_fd()));
                 std::iter::once(wanted(listener.as_fd())).chain(master).collect()
             }
+            Endpoint::Network(network) => network.poll_fds(),
         }
     }
 
@@ -118,6 +147,7 @@ impl Endpoint {
                 }
                 Ok(count)
             }
+            Endpoint::Network(network) => Ok(network.receive(buffer)),
         }
     }
 
@@ -137,6 +167,14 @@ impl Endpoint {
                 }
                 Ok(sent.unwrap_or(0))
             }
+            Endpoint::Network(network) => Ok(network.send(bytes)),
+        }
+    }
+
+    /// Dials in where the line does that and has no connection.
+    pub(super) fn connect(&mut self) {
+        if let Endpoint::Network(network) = self {
+            network.connect();
         }
     }
 
@@ -146,6 +184,10 @@ impl Endpoint {
             pty.settle();
         }
     }
+}
+
+fn cannot_listen(listen: SocketAddr, error: io::Error) -> io::Error {
+    io::Error::new(error.kind(), format!("cannot listen on {listen}: {error}"))
 }
 
 /// Bytes of a connected master; an ended connection is forgotten.

@@ -392,6 +392,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
 
     /// Sends what is due, waits for what comes next, and takes what came.
     fn turn(&mut self, port: &mut Endpoint) -> io::Result<()> {
+        port.connect();
         self.deliver(port)?;
         let now = self.shared.now();
         let wake = self.shared.line().wake();

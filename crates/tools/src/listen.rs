@@ -77,6 +77,11 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 /// Protocols and formats to try, in order.
 fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
+    if let Some((scheme @ ("modbus-tcp" | "udp"), _)) = args.port.split_once("://") {
+        return Err(format!(
+            "behind {scheme}:// nobody else's frames are heard; --port; write a serial port or tcp://"
+        ));
+    }
     let protocols = scan::protocols(&args.protocol)?;
     let bauds = if args.baud.is_empty() {
         BAUDS.to_vec()

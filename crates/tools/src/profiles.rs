@@ -430,6 +430,11 @@ pub(super) fn place(profile: &Profile, point: &Point) -> (String, String, String
                 Some(power) => format!("10^{}", name_of(profile, power)),
                 None => format!("{}{offset}", raw.scale),
             };
+            let factors = raw
+                .factor_from
+                .iter()
+                .map(|factor| format!(" × {}", name_of(profile, *factor)));
+            let scale = factors.fold(scale, |scale, factor| scale + &factor);
             let form = raw.type_text();
             match raw.form {
                 Form::Bit { .. } if raw.table.is_bits() => (at, form, String::new()),
@@ -480,6 +485,13 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
             any.iter().map(one).collect::<Vec<_>>().join(" or ")
         }
         Derived::All { .. } => "true while all of them are".to_string(),
+        Derived::Sum { of, weights } => {
+            let parts = of.iter().zip(weights).map(|(of, weight)| match weight {
+                1.0 => name_of(profile, *of).to_string(),
+                weight => format!("{weight} {}", name_of(profile, *of)),
+            });
+            parts.collect::<Vec<String>>().join(" + ")
+        }
         Derived::LowestBit { .. } => "number of the lowest bit that is set, counted from 1".to_string(),
     }
 }

@@ -21,6 +21,7 @@ use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome, documented, negative};
 use super::report;
 use crate::bus::Mode;
+use crate::codec::LineFormat;
 use crate::drive::profile::Profiles;
 
 /// Finds the drives on a line and prints a configuration for them; only reads.
@@ -32,7 +33,7 @@ use crate::drive::profile::Profiles;
 Addresses 1 to 10 are tried first with all settings. Once a drive has answered, no other settings are tried, unless
 --exhaustive. The configuration goes to standard output, everything else to standard error.")]
 pub(super) struct Args {
-    /// Serial device, or rfc2217://host:port or tcp://host:port of a device server.
+    /// Serial device, or tcp://, rfc2217://, modbus-tcp:// or udp:// with host:port.
     #[arg(long, value_name = "PORT", value_parser = parse_port)]
     port: String,
     #[command(flatten)]
@@ -100,8 +101,8 @@ fn document(args: &Args, search: &Search<'_>, error: Option<&String>) -> Json {
         json!({
             "address": found.address,
             "protocol": found.setting.protocol.name(),
-            "baud": found.setting.format.baud,
-            "format": found.setting.format.characters(),
+            "baud": (found.setting.format != LineFormat::NETWORK).then_some(found.setting.format.baud),
+            "format": (found.setting.format != LineFormat::NETWORK).then(|| found.setting.format.characters()),
             "profiles": found.profiles,
             "turnaround_ms": found.turnaround.map(|time| time.as_secs_f64() * 1000.0),
         })

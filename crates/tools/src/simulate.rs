@@ -11,6 +11,7 @@ use crate::document::{self, Problem, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Point, PointIndex};
+use crate::line::split_dial_in;
 use crate::process_image::DriveSpec;
 use crate::sim::by_profile::Given;
 use crate::sim::cx::AddressOffset;
@@ -70,6 +71,20 @@ pub(super) struct Args {
     /// Serve the line raw over TCP, as a serial device server does
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen)]
     pub listen: Option<SocketAddr>,
+    /// Serve the drives by Modbus TCP, as drives with Ethernet on board do
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen, conflicts_with_all = ["link", "port", "listen"])]
+    pub modbus_tcp: Option<SocketAddr>,
+    /// Serve the line with one frame in each datagram
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen,
+          conflicts_with_all = ["link", "port", "listen", "modbus_tcp"])]
+    pub udp: Option<SocketAddr>,
+    /// Dial in at a gateway, as a modem does
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen,
+          conflicts_with_all = ["link", "port", "listen", "modbus_tcp", "udp"])]
+    pub dial: Option<SocketAddr>,
+    /// Text that is said first where the line dials in
+    #[arg(long, value_name = "TEXT", requires = "dial", default_value = "")]
+    pub id: String,
     /// modbus-rtu, modbus-ascii or n2 [default: the first of the profile]
     #[arg(long, value_name = "PROTOCOL", value_parser = parse_protocol)]
     pub protocol: Option<Protocol>,
@@ -201,21 +216,28 @@ pub(super) enum Speed {
 /// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
 ///
 /// # Errors
-/// A `tcp://` address that is not an address to listen on; `rfc2217://`, which is not simulated.
+/// An address that is none of this machine; `rfc2217://`, which is not simulated.
 fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
-    if port.starts_with("rfc2217://") {
-        return Err(format!(
-            "`{port}` cannot be simulated; write it as tcp://127.0.0.1:4001, or as a path"
-        ));
-    }
-    let Some(address) = port.strip_prefix("tcp://") else {
+    let Some((scheme, address)) = port.split_once("://") else {
         return Ok(EndpointOptions::Pty {
             link: Some(PathBuf::from(port)),
         });
     };
-    socket_address(address)
-        .map(|listen| EndpointOptions::Tcp { listen })
-        .ok_or_else(|| format!("`{port}` is not an address to listen on; write it as tcp://127.0.0.1:4001"))
+    let (place, text) = split_dial_in(address);
+    let socket = socket_address(place)
+        .ok_or_else(|| format!("`{port}` is not an address to listen on; write it as {scheme}://127.0.0.1:4001"))?;
+    match scheme {
+        "tcp" => Ok(EndpointOptions::Tcp { listen: socket }),
+        "modbus-tcp" => Ok(EndpointOptions::ModbusTcp { listen: socket }),
+        "udp" => Ok(EndpointOptions::Udp { listen: socket }),
+        "tcp-listen" => Ok(EndpointOptions::Dial {
+            server: socket,
+            text: text.to_string(),
+        }),
+        _ => Err(format!(
+            "`{port}` cannot be simulated; write it as tcp://127.0.0.1:4001, or as a path"
+        )),
+    }
 }
 
 fn socket_address(text: &str) -> Option<SocketAddr> {
@@ -322,18 +344,30 @@ impl Args {
         let baud = self.baud.or(usual).unwrap_or(USUAL_BAUD);
         let usual = profile.formats.first().map_or(default_format(protocol), String::as_str);
         let format = self.format.as_deref().unwrap_or(usual);
-        let format = LineFormat::new(baud, format).map_err(|error| format!("{error}; in --format"))?;
+        let format = match self.modbus_tcp {
+            Some(_) => LineFormat::NETWORK,
+            None => LineFormat::new(baud, format).map_err(|error| format!("{error}; in --format"))?,
+        };
         let drives = self.addresses.0.iter();
         let drives = drives.map(|&address| DriveOptions::new(address, model.clone()));
         let mut line = SimulatedBusOptions::new("line", LineRules::of(protocol, format), drives.collect());
-        line.endpoint = match (&self.port, self.listen) {
-            (Some(path), _) => EndpointOptions::Port { path: path.clone() },
-            (None, Some(listen)) => EndpointOptions::Tcp { listen },
-            (None, None) => EndpointOptions::Pty {
-                link: self.link.clone(),
-            },
-        };
+        line.endpoint = self.endpoint();
         Ok(line)
+    }
+
+    fn endpoint(&self) -> EndpointOptions {
+        let served = self.listen.map(|listen| EndpointOptions::Tcp { listen });
+        let modbus_tcp = self.modbus_tcp.map(|listen| EndpointOptions::ModbusTcp { listen });
+        let udp = self.udp.map(|listen| EndpointOptions::Udp { listen });
+        let dialled = self.dial.map(|server| EndpointOptions::Dial {
+            server,
+            text: self.id.clone(),
+        });
+        let port = self.port.clone().map(|path| EndpointOptions::Port { path });
+        let chosen = port.or(served).or(modbus_tcp).or(udp).or(dialled);
+        chosen.unwrap_or_else(|| EndpointOptions::Pty {
+            link: self.link.clone(),
+        })
     }
 
     /// The profile of that name, or that file.

@@ -30,7 +30,7 @@ const LISTEN: Duration = Duration::from_secs(1);
 Addresses 1 to 10 are tried first with all settings, then the rest. The status page is on the loopback only, and nothing is
 ever written to a drive. Ctrl-C ends it.")]
 pub(super) struct Args {
-    /// Serial device, or rfc2217://host:port or tcp://host:port of a device server [default: asks which adapter].
+    /// Serial device, or tcp://, rfc2217://, modbus-tcp:// or udp:// with host:port [default: asks which adapter].
     #[arg(long, value_name = "PORT", value_parser = parse_port)]
     port: Option<String>,
     #[command(flatten)]

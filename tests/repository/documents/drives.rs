@@ -162,6 +162,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
         Derived::Equal { of, to, .. } => format!("{} = {}", name(of), name(to)),
         Derived::State { any } => format!("{} states", any.len()),
         Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
+        Derived::Sum { of, .. } => of.iter().map(name).collect::<Vec<_>>().join(" + "),
         Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
     }
 }

@@ -120,7 +120,6 @@ impl Figures {
             window: Window::new(),
             slowest: Window::new(),
             response_timeout: line.response_timeout,
-            latest: Window::new(),
             run: 0,
             run_paused: [0; 2],
             silent_at: None,
@@ -332,8 +331,7 @@ impl Figures {
             if turnaround > limit {
                 drive.add(Sign::Slow);
             }
-            let tenths = u16::try_from(turnaround.as_micros() / 100).unwrap_or(u16::MAX);
-            drive.slowest.most(0, tenths);
+            drive.replied_after(turnaround);
         }
         drive.mains.look(middle, length, false);
     }
@@ -474,7 +472,6 @@ impl Figures {
             for drive in &mut self.drives {
                 drive.window.roll();
                 drive.slowest.roll();
-                drive.latest.roll();
                 drive.mains.sums.iter_mut().flatten().for_each(|sum| *sum *= FADE);
             }
             self.arrivals.roll();

@@ -227,18 +227,33 @@ impl Reading<'_> {
         let words = words.get(..items).unwrap_or_default();
         let value = match raw.scale_from.map(|scale| self.sample(scale)) {
             _ if at.is_none() => None,
-            None => raw.decode(words, kind),
+            None => raw.decode_scaled(words, kind, 0),
             Some(scale) => {
                 quality = quality.worse(scale.quality);
                 let power = scale.value.and_then(Value::exact_f64);
                 power.and_then(|power| raw.decode_scaled(words, kind, power as i64))
             }
         };
+        let value = match raw.factor_from.is_empty() {
+            true => value,
+            false => value.and_then(|value| self.multiplied(value, raw, &mut quality)),
+        };
         Sample {
             value,
             quality: if value.is_some() { quality } else { Quality::Bad },
             at,
         }
+    }
+
+    /// The value multiplied by those of other points; the quality becomes that of the worst of them.
+    fn multiplied(&self, value: Value, raw: &Raw, quality: &mut Quality) -> Option<Value> {
+        let factors = raw.factor_from.iter().map(|factor| {
+            let factor = self.sample(*factor);
+            *quality = quality.worse(factor.quality);
+            factor.value.map(Value::as_f64)
+        });
+        let factors: Option<Vec<f64>> = factors.collect();
+        Raw::multiplied(value, factors?.into_iter())
     }
 
     /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the

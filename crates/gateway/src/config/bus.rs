@@ -61,6 +61,9 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
         check_listening(reader, &drives);
     }
     check_only_one(reader, &drives, protocol, is_modbus_tcp);
+    if protocol == Protocol::N2 {
+        check_numbers(reader, &drives, options.mode);
+    }
     if let Some(port) = &port {
         port::check_dial_in(reader, port, &drives);
     }
@@ -153,6 +156,31 @@ fn read_options(
         );
     }
     options
+}
+
+/// What others send on a line of N2 is understood by the numbers of the maps, which such drives do not have.
+fn check_numbers(reader: &Reader<'_>, drives: &[drive::Found], mode: Mode) {
+    let from_zero = |drive: &&drive::Found| {
+        drive
+            .spec
+            .as_ref()
+            .is_some_and(|spec| spec.profile.n2.first_object == 0)
+    };
+    let Some(drive) = drives.iter().find(from_zero) else {
+        return;
+    };
+    let name = drive.name.as_ref().map_or("?", |(name, _)| name);
+    let keys = [
+        (BUS.slot.name, reader.has(BUS.slot.name)),
+        (BUS.mode.name, mode == Mode::Listen),
+    ];
+    for (key, _) in keys.iter().filter(|(_, is)| *is) {
+        reader.problem(
+            key,
+            format!("drive `{name}` counts its objects from 0 (first_object), which is known for the gateway's own requests only"),
+            format!("leave `{key}` out"),
+        );
+    }
 }
 
 /// Address 248 is reserved, and devices that answer at any address take it for theirs.

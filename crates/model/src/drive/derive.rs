@@ -66,6 +66,14 @@ pub enum Derived {
         /// Alternatives.
         any: Vec<Mask>,
     },
+    /// The sum of the points, each times its weight. All of them must be of one reading: a counter that rolls over into the
+    /// next register would seem to go back.
+    Sum {
+        /// Points.
+        of: Vec<PointIndex>,
+        /// As many.
+        weights: Vec<f64>,
+    },
     /// Number of the lowest set bit, counted from 1; 0 if none is set.
     LowestBit {
         /// Point with a mask.
@@ -84,6 +92,7 @@ impl Derived {
             Derived::Equal { .. } => "equal",
             Derived::All { .. } => "all",
             Derived::State { .. } => "state",
+            Derived::Sum { .. } => "sum",
             Derived::LowestBit { .. } => "lowest_bit",
         }
     }
@@ -107,7 +116,7 @@ impl Derived {
             | Derived::Zero { of, .. }
             | Derived::LowestBit { of } => (Some(*of), None),
             Derived::Equal { of, to, .. } => (Some(*of), Some(*to)),
-            Derived::All { of } => {
+            Derived::All { of } | Derived::Sum { of, .. } => {
                 more = of;
                 (None, None)
             }
@@ -164,6 +173,11 @@ impl Derived {
                         .fold(false, |is, (state, word)| is | state.holds(word)),
                 ))
             }
+            Derived::Sum { weights, .. } => {
+                let values = std::iter::once(first).chain(sources).map(Value::as_f64);
+                let sum: f64 = values.zip(weights).map(|(value, weight)| value * weight).sum();
+                sum.is_finite().then(|| Value::Number(tidy(sum)))
+            }
             Derived::LowestBit { .. } => {
                 let mask = first.as_f64() as u64;
                 let number = if mask == 0 {
@@ -190,8 +204,10 @@ impl Derived {
     /// The sample derived from those of the sources: the worst quality, the oldest time.
     pub fn sample(&self, sources: impl Iterator<Item = Sample>, band: Option<(f64, f64)>) -> Sample {
         let (mut quality, mut at, mut complete) = (Quality::Good, None::<Instant>, true);
+        let of_one_reading = matches!(self, Derived::Sum { .. });
         let values = sources.filter_map(|source| {
             quality = quality.worse(source.quality);
+            complete &= !of_one_reading || at.is_none() || at == source.at;
             at = source.at.map(|time| at.map_or(time, |at| at.min(time))).or(at);
             complete &= source.value.is_some();
             source.value

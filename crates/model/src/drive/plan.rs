@@ -150,7 +150,7 @@ impl Plan {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
-                raw.addresses().all(is_read) && raw.scale_from.is_none_or(|scale| self.shows(profile, scale))
+                raw.addresses().all(is_read) && raw.scaled_by().all(|scale| self.shows(profile, scale))
             }
             Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(|of| self.shows(profile, of)),
             None => false,

@@ -394,7 +394,7 @@ impl Profile {
                 let of = derived.rests_on();
                 of.into_iter().flat_map(|of| self.raw_points_of(of)).collect()
             }
-            Some(Source::Raw(raw)) => std::iter::once(point).chain(raw.scale_from).collect(),
+            Some(Source::Raw(raw)) => std::iter::once(point).chain(raw.scaled_by()).collect(),
             None => Vec::new(),
         }
     }

@@ -34,6 +34,8 @@ pub struct N2Options {
     pub unreliable_bit: Option<u8>,
     /// Digits of the region in override and release.
     pub region_width: RegionWidth,
+    /// Number on the wire of the object that the maps call 1: some families count from 0.
+    pub first_object: u8,
     /// Drives are identified before they are asked anything else, and after a transaction that failed.
     pub identify: bool,
     /// Device type that a drive is expected to report.
@@ -50,6 +52,7 @@ impl N2Options {
         state_bit: 6,
         unreliable_bit: None,
         region_width: RegionWidth::Two,
+        first_object: 1,
         identify: true,
         device_type: 0x10,
         release: true,

@@ -84,6 +84,18 @@ pub(super) fn encode_text(address: u8, text: &[u8], out: &mut Vec<u8>) {
 pub type Heard = (u8, Result<Command, u8>);
 
 impl Command {
+    /// The command with the object numbers of a drive whose first object has that number.
+    pub(super) fn counted_from(mut self, first: u8) -> Command {
+        if let Command::Read { object, .. }
+        | Command::Write { object, .. }
+        | Command::Override { object, .. }
+        | Command::Release { object } = &mut self
+        {
+            object.number = object.number.saturating_sub(1).saturating_add(first);
+        }
+        self
+    }
+
     /// Appends the frame to `out`; [`Command::Other`] has none.
     pub fn encode(&self, address: u8, width: RegionWidth, out: &mut Vec<u8>) {
         let mut body = Vec::with_capacity(24);

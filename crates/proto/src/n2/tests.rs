@@ -406,3 +406,29 @@ proptest! {
         }
     }
 }
+
+/// Danfoss and GE count from 0 (their maps' object 1 is 0 on the wire).
+#[test]
+fn objects_of_a_family_that_counts_from_zero() {
+    let of = |first_object, pdu: &RequestPdu| {
+        let mut frame = Vec::new();
+        let n2 = N2Options {
+            first_object,
+            ..N2Options::DEFAULT
+        };
+        let request = Request {
+            address: 5,
+            pdu: pdu.clone(),
+            n2,
+        };
+        encode_request(&request, &mut frame);
+        String::from_utf8(frame).unwrap()
+    };
+    let read = RequestPdu::read(Table::Input, 2, 2);
+    assert!(of(1, &read).starts_with(">051102"), "{}", of(1, &read));
+    assert!(of(0, &read).starts_with(">051101"), "{}", of(0, &read));
+    let first = RequestPdu::WriteCoil { address: 0, on: true };
+    assert!(of(1, &first).contains("01") && of(0, &first) != of(1, &first));
+    let identify = RequestPdu::N2(Session::Identify);
+    assert_eq!(of(0, &identify), of(1, &identify));
+}

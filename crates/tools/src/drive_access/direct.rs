@@ -186,7 +186,7 @@ fn is_polled(profile: &Profile, index: PointIndex) -> bool {
     let read = |i: PointIndex| profile.points.get(i).is_some_and(|p| p.class != PollClass::Never);
     match profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(read),
-        Some(Source::Raw(raw)) => read(index) && raw.scale_from.is_none_or(read),
+        Some(Source::Raw(raw)) => read(index) && raw.scaled_by().all(read),
         None => false,
     }
 }
@@ -195,7 +195,7 @@ fn is_polled(profile: &Profile, index: PointIndex) -> bool {
 fn is_settled(reading: &Reading<'_>, index: PointIndex) -> bool {
     let sources = match reading.spec.profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on(),
-        Some(Source::Raw(raw)) => std::iter::once(index).chain(raw.scale_from).collect(),
+        Some(Source::Raw(raw)) => std::iter::once(index).chain(raw.scaled_by()).collect(),
         None => Vec::new(),
     };
     sources.into_iter().all(|source| {

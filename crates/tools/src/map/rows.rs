@@ -254,6 +254,8 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes:
     if let Some(power) = raw.scale_from.and_then(|power| profile.points.get(power)) {
         notes.push(format!("times 10^{}", power.name));
     }
+    let factors = raw.factor_from.iter().filter_map(|factor| profile.points.get(*factor));
+    notes.extend(factors.map(|factor| format!("times {}", factor.name)));
     if !raw.invalid.is_empty() {
         let values: Vec<String> = raw.invalid.iter().map(|value| format!("{value:#06x}")).collect();
         notes.push(format!("{} means not available", values.join(", ")));

@@ -10,8 +10,23 @@ use crate::drive::Profile;
 use crate::parameters::cells;
 
 /// Columns of a list.
-const COLUMNS: [&str; 14] = [
-    "name", "address", "table", "bit", "type", "order", "scale", "offset", "unit", "class", "mask", "note", "write",
+const COLUMNS: [&str; 17] = [
+    "name",
+    "address",
+    "table",
+    "bit",
+    "type",
+    "byte",
+    "order",
+    "scale",
+    "scale_from",
+    "factor_from",
+    "offset",
+    "unit",
+    "class",
+    "mask",
+    "note",
+    "write",
     "min",
 ];
 const MAX: &str = "max";
@@ -130,9 +145,14 @@ fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<R
         "[[point]]\nname = \"{name}\"\nat = \"{} {address}{bit}\"\n",
         table.name()
     );
-    for key in ["type", "order", "unit", "class", "note"] {
+    for key in ["type", "byte", "order", "unit", "class", "note"] {
         if let Some(text) = cell(key) {
             let _ = writeln!(toml, "{key} = {}", quoted(text));
+        }
+    }
+    for key in ["scale_from", "factor_from"] {
+        if let Some(text) = cell(key) {
+            let _ = writeln!(toml, "{key} = {}", names_in(text));
         }
     }
     for key in ["scale", "offset", "mask"] {
@@ -167,6 +187,15 @@ fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<R
         write,
         toml,
     })
+}
+
+/// The points that a cell names, as this list calls them: one, or several with `*` or `+` between them.
+fn names_in(text: &str) -> String {
+    let names: Vec<String> = text.split(['*', '+']).map(|name| quoted(&words(name, '_'))).collect();
+    match names.as_slice() {
+        [one] => one.clone(),
+        several => format!("[{}]", several.join(", ")),
+    }
 }
 
 /// Registers of a type; of an unknown one, which the profile reports, 1.

@@ -95,8 +95,14 @@ pub(super) fn parts(options: &Options, settings: &[Setting], exhaustive: bool) -
 
 /// The settings to try, in order.
 pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, String> {
-    let protocols = protocols(&args.protocol)?;
-    let by_server = port.starts_with("tcp://");
+    if port.starts_with("modbus-tcp://") {
+        return network_settings(args);
+    }
+    let protocols = match port.starts_with("udp://") {
+        true => vec![Protocol::ModbusRtu],
+        false => protocols(&args.protocol)?,
+    };
+    let by_server = ["tcp://", "udp://"].iter().any(|scheme| port.starts_with(scheme));
     let mut settings: Vec<Setting> = Vec::new();
     for protocol in protocols {
         for baud in bauds(protocol, &args.baud, by_server)? {
@@ -120,8 +126,29 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
     Ok(settings)
 }
 
+/// Behind Modbus TCP there is no line whose settings could be wrong.
+fn network_settings(args: &Options) -> Result<Vec<Setting>, String> {
+    if !args.baud.is_empty() || !args.format.is_empty() {
+        return Err(
+            "behind modbus-tcp:// there is no baud rate and no format; leave --baud and --format out".to_string(),
+        );
+    }
+    let setting = Setting {
+        protocol: Protocol::ModbusRtu,
+        format: LineFormat::NETWORK,
+    };
+    check_addresses(args, &[setting])?;
+    Ok(vec![setting])
+}
+
 /// The port as in a configuration, relative to the working directory.
 pub(crate) fn parse_port(text: &str) -> Result<String, Finding> {
+    if text.starts_with("tcp-listen://") {
+        return Err(Finding::new(
+            "a device that dials in comes when it wants to, so it cannot be searched for",
+            "write the bus into a configuration and start the gateway with it",
+        ));
+    }
     config::check_port(text, Path::new(""))
 }
 
@@ -323,9 +350,14 @@ mod tests {
                 "no drive can have address 248; --addresses; modbus-ascii has 1 to 247, modbus-rtu has 1 to 247",
             ),
             ("--port tcp://foo", "write \"tcp://host:port\""),
+            ("--port tcp-listen://0.0.0.0:5020", "start the gateway with it"),
             (
-                "--port udp://foo:1",
-                "write the path of a serial device, \"tcp://host:port\" or \"rfc2217://host:port\"",
+                "--port modbus-tcp://foo:502 --baud 9600",
+                "leave --baud and --format out",
+            ),
+            (
+                "--port http://foo:1",
+                "write the path of a serial device, or \"tcp://host:port\"",
             ),
             (
                 "--timeout 5",

@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::found::Found;
 use super::settings::Setting;
 use crate::bus::{Mode, predict};
+use crate::codec::LineFormat;
 use crate::config::{BusSettings, Settings};
 use crate::document::format_duration;
 use crate::drive::profile::Profiles;
@@ -83,18 +84,15 @@ impl Snippet<'_> {
             Mode::Master => "",
             Mode::Listen => "mode = \"listen\"\n",
         };
-        let mut text = format!(
-            "\n[[bus]]\nname = \"line{number}\"\nport = {port:?}\n{mode}protocol = \"{}\"\n",
-            protocol.name()
-        );
-        if port.starts_with("tcp://") {
-            text += "# The device server sets up the line itself: enter its settings here.\n";
+        let mut text = format!("\n[[bus]]\nname = \"line{number}\"\nport = {port:?}\n{mode}");
+        if format != LineFormat::NETWORK {
+            text += &format!("protocol = \"{}\"\n", protocol.name());
+            if ["tcp://", "udp://"].iter().any(|scheme| port.starts_with(scheme)) {
+                text += "# The device server sets up the line itself: enter its settings here.\n";
+            }
+            text += &format!("baud = {}\nformat = \"{}\"\n", format.baud, format.characters());
         }
-        text += &format!(
-            "baud = {}\nformat = \"{}\"\n{cadence}",
-            format.baud,
-            format.characters()
-        );
+        text += cadence;
         if let Some(timeout) = self.timeout {
             text += &format!("response_timeout = \"{}\"\n", format_duration(timeout));
         }

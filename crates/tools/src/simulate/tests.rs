@@ -240,6 +240,19 @@ fn the_endpoint_of_a_configured_bus() {
         endpoint_for("tcp://127.0.0.1:4001"),
         Ok(EndpointOptions::Tcp { listen })
     );
+    assert_eq!(
+        endpoint_for("modbus-tcp://127.0.0.1:4001"),
+        Ok(EndpointOptions::ModbusTcp { listen })
+    );
+    assert_eq!(
+        endpoint_for("udp://127.0.0.1:4001"),
+        Ok(EndpointOptions::Udp { listen })
+    );
+    let dial = EndpointOptions::Dial {
+        server: listen,
+        text: "USR-0001".to_string(),
+    };
+    assert_eq!(endpoint_for("tcp-listen://127.0.0.1:4001?id=USR-0001"), Ok(dial));
     assert!(endpoint_for("tcp://127.0.0.1").is_err());
     assert!(endpoint_for("rfc2217://127.0.0.1:4001").is_err());
 }

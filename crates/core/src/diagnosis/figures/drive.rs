@@ -51,8 +51,6 @@ pub struct Drive {
     pub(super) slowest: Window<1>,
     /// Time for the first byte of its reply.
     pub response_timeout: Duration,
-    /// Longest time from a request to the late reply in each step, ms.
-    pub(super) latest: Window<1>,
     /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
     pub(super) run: u16,
     pub(super) run_paused: [u16; 2],
@@ -91,13 +89,13 @@ impl Drive {
     pub(super) fn replied_late(&mut self, at: Instant) {
         self.add(Sign::Late);
         let over = self.silent_at.map(|silent| at.saturating_duration_since(silent));
-        let took = self.response_timeout + over.unwrap_or_default();
-        self.latest.most(0, u16::try_from(took.as_millis()).unwrap_or(u16::MAX));
+        self.replied_after(self.response_timeout + over.unwrap_or_default());
     }
 
-    /// Longest time from a request to its late reply in the last minute, at least.
-    pub fn latest(&self) -> Duration {
-        Duration::from_millis(u64::from(self.latest.each(0).max().unwrap_or_default()))
+    /// A reply began so long after its request.
+    pub(super) fn replied_after(&mut self, time: Duration) {
+        let tenths = u16::try_from(time.as_micros() / 100).unwrap_or(u16::MAX);
+        self.slowest.most(0, tenths);
     }
 
     /// Requests to a drive that has never replied.

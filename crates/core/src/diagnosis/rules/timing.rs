@@ -7,7 +7,7 @@ use crate::diagnosis::known::{FEW, LASTING, share, sums};
 use crate::diagnosis::{Cause, Certainty};
 
 /// Longest `response_timeout` that is accepted, ms.
-const MOST_PROPOSED: u128 = 5000;
+const MOST_PROPOSED: u32 = 5000;
 
 impl Rules<'_> {
     /// A drive whose replies come after the time limit was seen to do so, whatever the others do.
@@ -20,15 +20,14 @@ impl Rules<'_> {
             if own < FEW || !lasts || self.is_told(place) || own * 2 <= late {
                 continue;
             }
-            let latest = drive.latest();
+            let latest = drive.slowest_ms();
             // Room for a reply that is a quarter later than all so far, in steps of 50 ms.
-            let enough = latest.mul_f64(1.25).as_millis().next_multiple_of(50).min(MOST_PROPOSED);
+            let enough = ((latest * 1.25) as u32).next_multiple_of(50).min(MOST_PROPOSED);
             let evidence = format!(
-                "{own} replies of {} came after the timeout of {} ms in the last minute, the latest after {} ms, {} of \
+                "{own} replies of {} came after the timeout of {} ms in the last minute, the latest after {latest:.0} ms, {} of \
                  the others; response_timeout = \"{enough}ms\" of this drive would wait for them",
                 self.name(place),
                 drive.response_timeout.as_millis(),
-                latest.as_millis(),
                 late - own
             );
             self.disturbed += own;

@@ -1,7 +1,9 @@
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
 use crate::codec::Exception;
+use crate::drive::Profile;
 use crate::process_image::{Cadence, Link};
 use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
 
@@ -194,4 +196,39 @@ fn a_scale_in_another_register() {
     assert_eq!(seen("motor_current", 0), (None, Quality::Bad), "not available");
     store(6, &[0x7FFE], 0);
     assert_eq!(seen("motor_current", 0).1, Quality::Good);
+}
+
+/// A meter behind transformers, whose counter takes two registers.
+#[test]
+fn a_value_of_several_registers_is_as_good_as_all_of_them() {
+    let text = "name = \"meter\"\nprotocols = [\"modbus-rtu\"]\n\
+                [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 10\n\
+                [[point]]\nname = \"current\"\nat = \"holding 0\"\nscale = 0.001\nfactor_from = [\"ct\", \"turns\"]\n\
+                [[point]]\nname = \"kwh\"\nat = \"holding 1\"\n[[point]]\nname = \"mwh\"\nat = \"holding 2\"\n\
+                [[point]]\nname = \"total\"\nderive = \"sum\"\nof = [\"mwh\", \"kwh\"]\nweights = [1000, 1]\n\
+                [[point]]\nname = \"ct\"\nat = \"holding 4\"\nclass = \"once\"\n\
+                [[point]]\nname = \"turns\"\nat = \"holding 5\"\nclass = \"once\"\n";
+    let meter = Arc::new(Profile::parse("meter.toml", text, false).unwrap());
+    let image = image(monitored("meter", "line1", 1, &meter));
+    online(&image);
+    let now = Instant::now();
+    let store = |address, words: &[u16], at| image.update(|s| s.store(Table::Holding, address, words, at));
+    let seen = |name: &str| {
+        let sample = image.reading(now, STALE_AFTER).sample(meter.point_index(name).unwrap());
+        (sample.value, sample.quality)
+    };
+    store(0, &[1500, 999, 7], now);
+    assert_eq!(seen("current"), (None, Quality::Bad), "no ratio is known");
+    store(4, &[40], now);
+    assert_eq!(seen("current"), (None, Quality::Bad), "nor both");
+    store(5, &[2], now);
+    assert_eq!(seen("current"), (Some(Value::Number(120.0)), Quality::Good));
+    image.update(|s| s.refuse(Table::Holding, 4, 1, Exception::ADDRESS));
+    assert_eq!(seen("current").1, Quality::Bad);
+    assert_eq!(seen("total"), (Some(Value::Number(7999.0)), Quality::Good));
+    // The counter rolls over between two readings of its parts.
+    store(1, &[0], now + Duration::from_millis(10));
+    assert_eq!(seen("total"), (None, Quality::Bad), "it would go back by 999");
+    store(1, &[0, 8], now + Duration::from_millis(20));
+    assert_eq!(seen("total"), (Some(Value::Number(8000.0)), Quality::Good));
 }

@@ -41,6 +41,8 @@ pub struct Raw {
     pub offset: f64,
     /// Index of the point whose value is the power of ten by which a count is multiplied.
     pub scale_from: Option<PointIndex>,
+    /// Indices of the points by whose values it is multiplied, such as the ratio of a transformer.
+    pub factor_from: Vec<PointIndex>,
 }
 
 /// The count that makes a point true, or false.
@@ -102,6 +104,7 @@ impl Raw {
             scale: 1.0,
             offset: 0.0,
             scale_from: None,
+            factor_from: Vec::new(),
         }
     }
 
@@ -114,6 +117,8 @@ impl Raw {
     pub fn type_text(&self) -> String {
         let mut text = match self.form {
             Form::Text { registers } => format!("string:{registers}"),
+            Form::I8 { high: true } => "i8 high byte".to_string(),
+            Form::I8 { high: false } => "i8 low byte".to_string(),
             form => form.name().to_string(),
         };
         match (self.form.items(), self.order) {
@@ -137,6 +142,7 @@ impl Raw {
         match (self.mask, self.form) {
             (Some(mask), _) => most(mask),
             (None, Form::Bits { count, .. }) => (0, i128::from(low_mask(count))),
+            (None, Form::I8 { .. }) => (i128::from(i8::MIN), i128::from(i8::MAX)),
             (None, Form::Bcd16) => (0, 9999),
             (None, Form::Bcd32) => (0, 99_999_999),
             (None, form) if form.is_signed() => (-(1 << (form.width() - 1)), (1 << (form.width() - 1)) - 1),
@@ -146,8 +152,14 @@ impl Raw {
 
     /// Whether there is a way back from a value to its registers.
     pub(in crate::drive) fn is_only_read(&self) -> bool {
-        let derived = self.equals.is_some() || self.mask.is_some() || self.scale_from.is_some();
-        derived || matches!(self.form, Form::Text { .. })
+        let derived = self.equals.is_some() || self.mask.is_some() || self.scaled_by().next().is_some();
+        // Of a byte, the register has another one beside it.
+        derived || matches!(self.form, Form::Text { .. } | Form::I8 { .. })
+    }
+
+    /// The points whose values its own depends on.
+    pub fn scaled_by(&self) -> impl Iterator<Item = PointIndex> {
+        self.scale_from.into_iter().chain(self.factor_from.iter().copied())
     }
 
     /// Whether its values are codes or whole numbers of 64 bits, which are shown as they are.
@@ -158,13 +170,13 @@ impl Raw {
 
     /// Whether a count is the value: nothing is multiplied or added.
     pub fn is_unscaled(&self) -> bool {
-        self.scale == 1.0 && self.offset == 0.0 && self.scale_from.is_none()
+        self.scale == 1.0 && self.offset == 0.0 && self.scaled_by().next().is_none()
     }
 
     /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them or
-    /// they hold no value. A value with `scale_from` is decoded by [`Raw::decode_scaled`].
+    /// they hold no value. A value with `scale_from` or `factor_from` is decoded by [`Raw::decode_scaled`].
     pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
-        match self.scale_from {
+        match self.scaled_by().next() {
             Some(_) => None,
             None => self.decode_scaled(words, kind, 0),
         }
@@ -210,6 +222,7 @@ impl Raw {
             Form::Bit { bit, invert } => whole(i128::from(((bits >> bit) & 1 == 1) != invert)),
             Form::Bits { first, count } => whole(i128::from((bits >> first) & u64::from(low_mask(count)))),
             Form::U16 | Form::U32 | Form::U64 => whole(i128::from(bits)),
+            Form::I8 { high } => whole(i128::from((bits >> if high { 8 } else { 0 }) as u8 as i8)),
             Form::I16 => whole(i128::from(bits as u16 as i16)),
             Form::I32 => whole(i128::from(bits as u32 as i32)),
             Form::I64 => whole(i128::from(bits as i64)),
@@ -220,6 +233,12 @@ impl Raw {
                 .map(Count::Real),
             Form::Text { .. } => None,
         }
+    }
+
+    /// The value multiplied by the values of the points of `factor_from`.
+    pub fn multiplied(value: Value, factors: impl Iterator<Item = f64>) -> Option<Value> {
+        let product = tidy_product(factors.fold(value.as_f64(), |product, factor| product * factor));
+        product.is_finite().then_some(Value::Number(product))
     }
 
     fn scaled(&self, count: f64, power: i64) -> Option<Value> {

@@ -6,11 +6,12 @@
 use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 
 /// Keys of a derived point.
-const DERIVATION: [&str; 6] = ["derive", "of", "to", "within", "minimum", "maximum"];
+const DERIVATION: [&str; 7] = ["derive", "of", "to", "within", "minimum", "maximum", "weights"];
 /// Keys of a point that is read from registers.
-const PLACE: [&str; 12] = [
+const PLACE: [&str; 14] = [
     "at",
     "type",
+    "byte",
     "words",
     "order",
     "invert",
@@ -21,10 +22,12 @@ const PLACE: [&str; 12] = [
     "equals",
     "invalid",
     "scale_from",
+    "factor_from",
 ];
 /// Those of them that a bit does not have.
-const REGISTER: [&str; 8] = [
+const REGISTER: [&str; 10] = [
     "type",
+    "byte",
     "words",
     "order",
     "scale",
@@ -32,6 +35,7 @@ const REGISTER: [&str; 8] = [
     "mask",
     "equals",
     "scale_from",
+    "factor_from",
 ];
 
 /// Name and base of a file that is not read yet.

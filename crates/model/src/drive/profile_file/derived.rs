@@ -3,11 +3,12 @@
 use super::super::derive::{Bound, Derived};
 use super::super::model::Kind;
 use super::super::profile::{Point, PollClass, Source};
+use crate::codec::Table;
 use crate::document::{self, Finding, Reader};
-use crate::drive::{PerPoint, PointIndex};
+use crate::drive::{PerPoint, Plan, PlannedRead, PointIndex, Profile};
 
 pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
-    const KNOWN: [&str; 6] = ["band", "percent", "zero", "equal", "all", "lowest_bit"];
+    const KNOWN: [&str; 7] = ["band", "percent", "zero", "equal", "all", "sum", "lowest_bit"];
     let kind = reader.parsed("derive", |text| {
         let known = KNOWN.into_iter().find(|known| *known == text);
         known.ok_or_else(|| {
@@ -51,9 +52,54 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
             let of: Option<Vec<PointIndex>> = all.iter().map(|name| index("of", name)).collect();
             Derived::All { of: of? }
         }
+        "sum" => read_sum(reader, names)?,
         _ => Derived::LowestBit { of: other("of")? },
     };
     Some(Source::Derived(derived))
+}
+
+/// `of` and `weights` of a sum.
+fn read_sum(reader: &Reader<'_>, names: &[String]) -> Option<Derived> {
+    let all: Vec<String> = reader.required("of")?;
+    let of: Option<Vec<PointIndex>> = all.iter().map(|name| point_of(reader, "of", name, names)).collect();
+    let weights: Vec<f64> = reader.or("weights", vec![1.0; all.len()]);
+    if all.len() < 2 {
+        reader.problem("of", "a sum has two parts at least", "name the points in a list");
+    }
+    if weights.len() != all.len() {
+        reader.problem(
+            "weights",
+            format!("{} weights for {} points", weights.len(), all.len()),
+            "write one for each, or leave the key out",
+        );
+        return None;
+    }
+    Some(Derived::Sum { of: of?, weights })
+}
+
+/// Checks that one request of the plan brings all parts of each sum.
+pub(super) fn check_sums(tables: &[Reader<'_>], profile: &Profile) {
+    let plan = Plan::of(profile);
+    for ((_, point), table) in profile.points.enumerate().zip(tables) {
+        let Source::Derived(Derived::Sum { of, .. }) = &point.source else {
+            continue;
+        };
+        let places = of.iter().filter_map(|of| profile.points.get(*of)?.raw());
+        let places: Vec<(Table, u16)> = places
+            .flat_map(|raw| raw.addresses().map(|address| (raw.table, address)))
+            .collect();
+        let brings_all = |read: &PlannedRead| places.iter().all(|(table, address)| read.covers(*table, *address));
+        if !plan.reads.iter().any(brings_all) {
+            table.problem(
+                "of",
+                format!(
+                    "no single request reads all parts of `{}`, so they are not of one moment",
+                    point.name
+                ),
+                "give the parts one class, and their registers one [[range]] that is read at once",
+            );
+        }
+    }
 }
 
 pub(super) fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[String]) -> Option<PointIndex> {

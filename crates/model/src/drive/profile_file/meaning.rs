@@ -2,14 +2,15 @@
 
 use super::super::profile::{Equals, Form, Raw};
 use super::derived::point_of;
-use crate::document::Reader;
+use crate::document::{Raw as Node, Reader};
 
 /// The raw value with these keys applied.
 pub(super) fn apply(reader: &Reader<'_>, names: &[String], raw: Raw, invert: bool) -> Raw {
     let raw = read_mask(reader, raw);
     let raw = read_equals(reader, raw, invert);
     let raw = read_invalid(reader, raw);
-    read_scale_from(reader, names, raw)
+    let raw = read_scale_from(reader, names, raw);
+    read_factor_from(reader, names, raw)
 }
 
 /// A mask of neighbouring bits of one register is the same as `at` with these bits.
@@ -69,7 +70,7 @@ fn read_equals(reader: &Reader<'_>, mut raw: Raw, invert: bool) -> Raw {
             "write a value of that range",
         );
     }
-    for key in ["scale", "offset", "scale_from"]
+    for key in ["scale", "offset", "scale_from", "factor_from"]
         .into_iter()
         .filter(|key| reader.has(key))
     {
@@ -125,5 +126,29 @@ fn read_scale_from(reader: &Reader<'_>, names: &[String], mut raw: Raw) -> Raw {
         return raw;
     }
     raw.scale_from = point_of(reader, "scale_from", &name, names);
+    raw
+}
+
+/// `factor_from`: one point or several by whose values the value is multiplied.
+fn read_factor_from(reader: &Reader<'_>, names: &[String], mut raw: Raw) -> Raw {
+    let Some(node) = reader.raw("factor_from") else {
+        return raw;
+    };
+    let factors: Vec<String> = match &node.value {
+        Node::Text(_) => reader.optional::<String>("factor_from").into_iter().collect(),
+        _ => reader.optional("factor_from").unwrap_or_default(),
+    };
+    if matches!(raw.form, Form::Bit { .. } | Form::Bits { .. } | Form::Text { .. }) {
+        reader.problem(
+            "factor_from",
+            format!("{} is not multiplied", raw.form.name()),
+            "leave the key out, or name a register with a number",
+        );
+        return raw;
+    }
+    let points = factors
+        .iter()
+        .filter_map(|name| point_of(reader, "factor_from", name, names));
+    raw.factor_from = points.collect();
     raw
 }

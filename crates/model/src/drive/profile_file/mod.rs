@@ -29,8 +29,8 @@ use super::parameters::ParameterList;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
-use derived::{check_derived, keep_ends_fresh};
-use points::{check_monitor, check_object, check_scale, check_target, read_point};
+use derived::{check_derived, check_sums, keep_ends_fresh};
+use points::{check_factors, check_monitor, check_object, check_scale, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
 macro_rules! files {
@@ -274,6 +274,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         check_target(table, index, &points);
         check_monitor(table, index, &points);
         check_scale(table, index, &points);
+        check_factors(table, index, &points);
         if protocols.contains(&Protocol::N2) {
             check_object(table, index, &points);
         }
@@ -348,6 +349,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     if profile.control.is_none() {
         profile.control = profile.control_of_bits();
     }
+    check_sums(&tables, &profile);
     if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
         reader.problem(
             "broadcast_stop",

@@ -35,6 +35,14 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
             default.region_width
         }
     };
+    let first_object = table.or("first_object", default.first_object);
+    if first_object > 1 {
+        table.problem(
+            "first_object",
+            format!("{first_object} is not the number of a first object"),
+            "write 0 or 1",
+        );
+    }
     let poll = table.or("poll", default.poll);
     if !POLLS.contains(&poll) {
         table.problem(
@@ -47,6 +55,7 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
         state_bit: read_bit(&table, "state_bit").unwrap_or(default.state_bit),
         unreliable_bit: read_bit(&table, "unreliable_bit"),
         region_width,
+        first_object: first_object.min(1),
         identify: table.or("identify", default.identify),
         device_type: table.or("device_type", default.device_type),
         release: table.or("release", default.release),

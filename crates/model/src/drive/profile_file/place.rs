@@ -8,8 +8,9 @@ use crate::codec::Table;
 use crate::document::{Finding, Reader};
 
 /// Keys of a point that has `at`.
-const KEYS: [&str; 10] = [
+const KEYS: [&str; 12] = [
     "type",
+    "byte",
     "words",
     "order",
     "invert",
@@ -19,6 +20,7 @@ const KEYS: [&str; 10] = [
     "equals",
     "invalid",
     "scale_from",
+    "factor_from",
 ];
 
 /// A PDU address, decimal or hexadecimal as in some manuals (0x0023).
@@ -89,6 +91,13 @@ pub(super) fn read_raw(
     );
     if reader.has("invert") && !raw.is_bool() {
         reader.problem("invert", "only a bit or `equals` can be inverted", "leave the key out");
+    }
+    if reader.has("byte") && !matches!(raw.form, Form::I8 { .. }) {
+        reader.problem(
+            "byte",
+            format!("{} is not one byte of a register", raw.form.name()),
+            "leave the key out, or write type = \"i8\"",
+        );
     }
     if raw.scale == 0.0 {
         reader.problem(
@@ -177,9 +186,27 @@ fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: 
     }
 }
 
+/// Which byte of its register an `i8` is.
+fn is_high_byte(reader: &Reader<'_>) -> bool {
+    let byte = reader.parsed("byte", |text| match text {
+        "high" => Ok(true),
+        "low" => Ok(false),
+        other => Err(Finding::new(
+            format!("a register has no byte `{other}`"),
+            "write \"high\" or \"low\"",
+        )),
+    });
+    byte.unwrap_or(false)
+}
+
 fn form_of(reader: &Reader<'_>, kind: &str) -> Option<Form> {
     if let Some(form) = Form::NAMED.into_iter().find(|form| form.name() == kind) {
-        return Some(form);
+        return Some(match form {
+            Form::I8 { .. } => Form::I8 {
+                high: is_high_byte(reader),
+            },
+            form => form,
+        });
     }
     let length = kind.strip_prefix("string:");
     if let Some(length) = length {

@@ -292,7 +292,7 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
         ),
         _ => {}
     }
-    let scales = ["scale", "offset", "scale_from"];
+    let scales = ["scale", "offset", "scale_from", "factor_from"];
     if let Some(key) = scales.into_iter().find(|key| reader.has(key))
         && !reader.has("equals")
         && point.raw().is_some()
@@ -373,7 +373,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
         return;
     };
     if raw.is_only_read() {
-        let keys = ["equals", "mask", "scale_from"];
+        let keys = ["equals", "mask", "scale_from", "factor_from"];
         let key = keys.into_iter().find(|key| reader.has(key)).unwrap_or("type");
         reader.problem(
             "write",
@@ -430,5 +430,26 @@ pub(super) fn check_scale(reader: &Reader<'_>, index: PointIndex, points: &PerPo
             format!("`{}` is never read", scale.name),
             "give it another class",
         );
+    }
+}
+
+/// Checks `factor_from`: numbers that are read from the drive, and depend on no other.
+pub(super) fn check_factors(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
+    let factors = points.get(index).and_then(Point::raw).map(|raw| &raw.factor_from);
+    for factor in factors.into_iter().flatten().filter_map(|factor| points.get(*factor)) {
+        let is_number = |raw: &Raw| raw.scaled_by().next().is_none() && !raw.is_bool();
+        if !factor.raw().is_some_and(is_number) || factor.kind() == Kind::Text {
+            reader.problem(
+                "factor_from",
+                format!("`{}` is not a number of a register of its own", factor.name),
+                "name a point with `at`, and without `scale_from` and `factor_from`",
+            );
+        } else if factor.class == PollClass::Never {
+            reader.problem(
+                "factor_from",
+                format!("`{}` is never read", factor.name),
+                "give it another class",
+            );
+        }
     }
 }

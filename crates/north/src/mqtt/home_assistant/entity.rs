@@ -376,7 +376,7 @@ fn quantity(point: &Point) -> Value {
 /// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that starts again.
 fn may_fall(point: &Point) -> bool {
     match point.raw().map(|raw| raw.form) {
-        Some(Form::I16 | Form::I32 | Form::I64) => true,
+        Some(form) if form.is_signed() => true,
         // The energy of a drive on N2 is such a number, and never falls.
         Some(Form::F32 | Form::F64) | None => {
             point.model.is_none() && point.range.as_ref().is_none_or(|range| *range.start() < 0.0)

@@ -17,6 +17,11 @@ pub enum Form {
         /// How many, 1..=16.
         count: u8,
     },
+    /// Signed 8 bit, two's complement: one byte of a register.
+    I8 {
+        /// The high byte; else the low one.
+        high: bool,
+    },
     /// Unsigned 16 bit.
     U16,
     /// Signed 16 bit, two's complement.
@@ -119,7 +124,8 @@ impl Order {
 
 impl Form {
     /// Types that a profile names, without the texts.
-    pub const NAMED: [Form; 10] = [
+    pub const NAMED: [Form; 11] = [
+        Form::I8 { high: false },
         Form::U16,
         Form::I16,
         Form::U32,
@@ -137,7 +143,7 @@ impl Form {
         match self {
             Form::U64 | Form::I64 | Form::F64 => 4,
             Form::U32 | Form::I32 | Form::F32 | Form::Bcd32 => 2,
-            Form::Bit { .. } | Form::Bits { .. } | Form::U16 | Form::I16 | Form::Bcd16 => 1,
+            Form::Bit { .. } | Form::Bits { .. } | Form::I8 { .. } | Form::U16 | Form::I16 | Form::Bcd16 => 1,
             Form::Text { registers } => u16::from(registers),
         }
     }
@@ -147,6 +153,7 @@ impl Form {
         match self {
             Form::Bit { .. } => "bit",
             Form::Bits { .. } => "bits",
+            Form::I8 { .. } => "i8",
             Form::U16 => "u16",
             Form::I16 => "i16",
             Form::U32 => "u32",
@@ -163,7 +170,7 @@ impl Form {
 
     /// Whether its counts have a sign.
     pub fn is_signed(self) -> bool {
-        matches!(self, Form::I16 | Form::I32 | Form::I64)
+        matches!(self, Form::I8 { .. } | Form::I16 | Form::I32 | Form::I64)
     }
 
     /// Whether it is a whole number of registers that `mask` may take bits of.
@@ -189,6 +196,7 @@ impl Form {
         match self {
             Form::Bit { .. } => (0.0, 1.0),
             Form::Bits { count, .. } => (0.0, f64::from((1u32 << count.min(16)) - 1)),
+            Form::I8 { .. } => (f64::from(i8::MIN), f64::from(i8::MAX)),
             Form::U16 => (0.0, f64::from(u16::MAX)),
             Form::I16 => (f64::from(i16::MIN), f64::from(i16::MAX)),
             Form::U32 => (0.0, f64::from(u32::MAX)),

@@ -110,3 +110,69 @@ fn what_the_keys_of_a_value_make() {
         Some(Value::Integer(1))
     );
 }
+
+/// Values that need other registers, or half of one: transformer ratios, a counter in two registers, two bytes in one.
+#[test]
+fn what_is_made_of_several_registers_or_of_half_of_one() {
+    let text = format!(
+        "{HEAD}[[point]]\nname = \"current\"\nat = \"holding 0\"\nscale = 0.001\nfactor_from = \"ct\"\n\
+         [[point]]\nname = \"power\"\nat = \"holding 1\"\nfactor_from = [\"ct\", \"pt\"]\n\
+         [[point]]\nname = \"ct\"\nat = \"holding 2\"\nclass = \"once\"\n\
+         [[point]]\nname = \"pt\"\nat = \"holding 3\"\nscale = 0.1\nclass = \"once\"\n\
+         [[point]]\nname = \"kwh\"\nat = \"holding 4\"\n[[point]]\nname = \"mwh\"\nat = \"holding 5\"\n\
+         [[point]]\nname = \"total\"\nderive = \"sum\"\nof = [\"mwh\", \"kwh\"]\nweights = [1000, 1]\nunit = \"kWh\"\n\
+         [[point]]\nname = \"high\"\nat = \"holding 6\"\ntype = \"i8\"\nbyte = \"high\"\n\
+         [[point]]\nname = \"low\"\nat = \"holding 6\"\ntype = \"i8\"\n"
+    );
+    let profile = Profile::parse("p.toml", &text, false).unwrap();
+    let point = |name: &str| profile.points.get(profile.point_index(name).unwrap()).unwrap();
+    let raw = |name: &str| point(name).raw().unwrap();
+    let index = |name: &str| profile.point_index(name).unwrap();
+    assert_eq!(raw("current").factor_from, [index("ct")]);
+    assert_eq!(raw("power").factor_from, [index("ct"), index("pt")]);
+    let of = vec![index("mwh"), index("kwh")];
+    let weights = vec![1000.0, 1.0];
+    assert_eq!(point("total").source, Source::Derived(Derived::Sum { of, weights }));
+    assert_eq!(point("total").kind(), Kind::Number);
+    let byte = |name: &str, word: u16| raw(name).decode(&[word], Kind::Number);
+    for (word, high, low) in [(0xFF7F, -1.0, 127.0), (0x80FF, -128.0, -1.0), (0x0180, 1.0, -128.0)] {
+        assert_eq!(byte("high", word), Some(Value::Number(high)));
+        assert_eq!(byte("low", word), Some(Value::Number(low)));
+    }
+    assert_eq!(raw("power").decode(&[7], Kind::Number), None, "not without its factors");
+}
+
+#[test]
+fn each_mistake_of_a_value_of_several_registers() {
+    let cases = [
+        ("type = \"i8\"\nbyte = \"upper\"", "a register has no byte `upper`"),
+        ("byte = \"high\"", "u16 is not one byte of a register"),
+        ("type = \"i8\"\nwrite = true", "cannot be converted back"),
+        ("factor_from = \"b\"", "there is no point `b`"),
+        ("factor_from = \"a\"", "`a` is not a number of a register of its own"),
+        ("equals = 1\nfactor_from = \"c\"", "what is compared is the count"),
+        ("factor_from = \"c\"\nwrite = true", "cannot be converted back"),
+        ("factor_from = \"n\"", "`n` is never read"),
+    ];
+    let rest = "[[point]]\nname = \"c\"\nat = \"holding 2\"\n\
+                [[point]]\nname = \"n\"\nat = \"holding 3\"\nclass = \"never\"\n";
+    for (lines, wanted) in cases {
+        let own = format!("[[point]]\nname = \"a\"\nat = \"holding 1\"\n{lines}\n");
+        let all = mistakes("m", &format!("{HEAD}{own}{rest}"));
+        assert!(all.contains(wanted), "{lines}\n{wanted} is missing in\n{all}");
+    }
+    let sums = [
+        ("of = [\"c\"]", "a sum has two parts at least"),
+        ("of = [\"c\", \"c\"]\nweights = [1]", "1 weights for 2 points"),
+        ("of = [\"c\", \"f\"]", "no single request reads all parts of `s`"),
+        ("of = [\"c\", \"far\"]", "no single request reads all parts of `s`"),
+        ("of = [\"c\", \"n\"]", "`n` is never read"),
+    ];
+    let more = "[[point]]\nname = \"f\"\nat = \"holding 4\"\nclass = \"fast\"\n\
+                [[point]]\nname = \"far\"\nat = \"holding 90\"\n";
+    for (lines, wanted) in sums {
+        let own = format!("[[point]]\nname = \"s\"\nderive = \"sum\"\n{lines}\n");
+        let all = mistakes("m", &format!("{HEAD}{own}{rest}{more}"));
+        assert!(all.contains(wanted), "{lines}\n{wanted} is missing in\n{all}");
+    }
+}
