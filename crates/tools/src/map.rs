@@ -115,7 +115,7 @@ fn listeners(settings: &Settings) -> Vec<Listener> {
     let plain = options.listeners.iter().map(|listener| Listener {
         addresses: listener.listen.clone(),
         tls: false,
-        buses: listener.buses.clone(),
+        buses: listener.view.buses.clone(),
         writers: joined(listener.write.iter().map(ToString::to_string).collect()),
     });
     let tls = options.tls.iter().map(|tls| {

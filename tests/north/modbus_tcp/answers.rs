@@ -113,7 +113,7 @@ const KINDS: &str = "\
 15 wrong byte count                        | 4 | bytes 15 0 0 0 100 1 0               | 03 01 01 03 0A 03 03 03 03 03 03 03
 05 on a drive without coils                | 1 | 5 0 0xFF00                           | 01 01 01 01 0A 01 01 01 01 01 01 01
 22 mask write (not supported)              | 1 | 22 2000 0 0                          | 01 01 01 01 0A 01 01 01 01 01 01 01
-23 read and write (not supported)          | 1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | 01 01 01 01 0A 01 01 01 01 01 01 01
+23 write and read                          | 1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | ok 01 01 ok 0A 0B 0B 0A 06 02 0B 04
 43/14 identification                       | 1 | bytes 43 14 1 0                      | ok ok ok ok 0A ok ok ok ok ok ok ok
 43/13, or any other function               | 1 | bytes 43 13 1 0                      | 01 01 01 01 0A 01 01 01 01 01 01 01";
 
@@ -288,7 +288,7 @@ coils on a drive without                |   1 | 1 0 1                           
 inputs on a drive without               |   1 | 2 0 0                                | 2 ! 1
 coil write without coils                |   1 | 5 0 0xFF00                           | 5 ! 1
 mask write                              |   1 | 22 2000 0 0                          | 22 ! 1
-read and write                          |   1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | 23 ! 1
+write and read                          |   1 | bytes 23 8 0x34 0 1 7 0xD0 0 1 2 0 1 | 23 = 0x0023
 quantity 0                              |   1 | 3 2100 0                             | 3 ! 3
 quantity 126                            |   1 | 3 2100 126                           | 3 ! 3
 quantity 65535                          |   1 | 4 0 65535                            | 4 ! 3

@@ -158,7 +158,7 @@ async fn each_listener_has_its_own_rights_and_buses() {
     options.listeners = [("line1", false), ("line2", true)]
         .map(|(bus, may_write)| {
             let mut listener = listener();
-            listener.buses = Some(vec![bus.to_string()]);
+            listener.view.buses = Some(vec![bus.to_string()]);
             if !may_write {
                 listener.write = Vec::new();
             }
@@ -273,7 +273,7 @@ async fn a_reload_changes_rights_and_closes_only_who_is_no_longer_allowed() {
             .await
     );
     let address = rig.address();
-    options.listeners[0].buses = Some(vec!["line2".to_string()]);
+    options.listeners[0].view.buses = Some(vec!["line2".to_string()]);
     rig.reload(options).await.unwrap();
     assert_eq!(rig.address(), address);
     assert_eq!(

@@ -14,3 +14,4 @@ mod revocation;
 pub(crate) mod rig;
 mod second_opinion;
 mod tls;
+mod views;

@@ -189,7 +189,7 @@ pub(crate) fn listener() -> Listener {
         listen: vec![SocketAddr::from(([127, 0, 0, 1], 0))],
         allow: vec!["127.0.0.0/8".parse().unwrap()],
         write: vec!["127.0.0.1/32".parse().unwrap()],
-        buses: None,
+        view: Default::default(),
     }
 }
 

@@ -516,6 +516,7 @@ pub(crate) fn at(port: u16) -> mqtt::Broker {
     mqtt::Broker {
         host: "127.0.0.1".to_string(),
         port,
+        path: None,
     }
 }
 
@@ -528,6 +529,8 @@ pub(crate) fn options(port: u16) -> Options {
         client_id: "drivegate-hall".to_string(),
         username: None,
         password: None,
+        proxy: None,
+        publish_limit: 0,
         ca: None,
         identity: None,
         base: "drivegate".to_string(),

@@ -2,6 +2,7 @@
 
 mod bench;
 mod certificates;
+mod clouds;
 mod commands;
 mod delivery;
 mod failover;

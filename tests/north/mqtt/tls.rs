@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use drivegate::event::EventKind;
-use drivegate::north::mqtt::Secret;
+use drivegate::north::mqtt::{Password, Secret};
 use tempfile::TempDir;
 
 use super::bench::*;
@@ -112,7 +112,7 @@ fn users_passwords_and_rights() {
     let watcher = Watcher::with(&broker, "drivegate/#", &login);
     let mut wrong = options(broker.port);
     wrong.username = Some("hall".to_string());
-    wrong.password = Some(Secret("guess".to_string()));
+    wrong.password = Some(Password::Fixed(Secret("guess".to_string())));
     let gateway = Gateway::start(wrong.clone(), plant(&["p1"]));
     gateway.publish_event("p1", EventKind::Fault, "kept");
     wait_log(broker.port, "(NotAuthorized); check mqtt.username");
@@ -120,7 +120,7 @@ fn users_passwords_and_rights() {
     assert!(!gateway.connected());
     gateway.stop();
     let mut right = wrong;
-    right.password = Some(Secret("s3cret".to_string()));
+    right.password = Some(Password::Fixed(Secret("s3cret".to_string())));
     let gateway = Gateway::start(right, plant(&["p1"]));
     watcher.wait_payload("drivegate/hall/status", "online");
     watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");

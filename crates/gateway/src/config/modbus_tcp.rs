@@ -13,10 +13,13 @@ use super::keys::{LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::{files, values};
 use crate::document::{Place, Reader};
 use crate::north::TlsFile;
-use crate::north::modbus_tcp::{self, Identity, Role, Tls};
+use crate::north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
 
 /// Where the short form listens if `listen` is not written.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
+
+/// Name and place of a `default_drive`, and the buses that its listener shows.
+pub(super) type DefaultDrive = (String, Place, Option<Vec<String>>);
 
 /// `[modbus_tcp]` as read.
 pub(super) struct ModbusTcp {
@@ -28,6 +31,8 @@ pub(super) struct ModbusTcp {
     pub(super) addresses: Vec<Address>,
     /// The buses that each listener shows, `None` for all.
     pub(super) selections: Vec<Option<Vec<String>>>,
+    /// The drives at units 0 and 255.
+    pub(super) default_drives: Vec<DefaultDrive>,
     /// Whether any client could write.
     pub(super) commands: bool,
 }
@@ -81,6 +86,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         listeners,
         addresses,
         selections,
+        default_drives,
     } = found;
     let tls = match tls {
         None => Some(None),
@@ -101,6 +107,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         stale_place: MODBUS_TCP.stale_after.place(reader),
         addresses,
         selections,
+        default_drives,
         commands,
     }
 }
@@ -117,6 +124,7 @@ struct Found {
     listeners: Vec<modbus_tcp::Listener>,
     addresses: Vec<Address>,
     selections: Vec<Option<Vec<String>>>,
+    default_drives: Vec<DefaultDrive>,
 }
 
 impl Found {
@@ -125,7 +133,12 @@ impl Found {
         let place = MODBUS_TCP.listen.place(reader);
         self.addresses
             .extend(listener.listen.iter().map(|a| (*a, place.clone())));
-        self.selections.push(listener.buses.clone());
+        self.selections.push(listener.view.buses.clone());
+        if let Some(drive) = &listener.view.default_drive {
+            let place = LISTENER.default_drive.place(reader);
+            self.default_drives
+                .push((drive.clone(), place, listener.view.buses.clone()));
+        }
         self.listeners.push(listener);
     }
 }
@@ -137,7 +150,7 @@ fn short_form(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::Lis
         listen: listen.unwrap_or_else(|| vec![DEFAULT_LISTEN]),
         allow: inherited.allow.to_vec(),
         write: inherited.write.to_vec(),
-        buses: None,
+        view: View::default(),
     }
 }
 
@@ -148,7 +161,34 @@ fn read_listener(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::
         listen: LISTENER.listen.get(reader),
         allow: own(&LISTENER.allow, inherited.allow),
         write: own(&LISTENER.write, inherited.write),
+        view: read_view(reader, inherited),
+    }
+}
+
+fn read_view(reader: &Reader<'_>, inherited: &Inherited<'_>) -> View {
+    let view = LISTENER.view.get(reader);
+    let model_at: Option<u16> = LISTENER.model_at.read(reader);
+    if let Some(other) = model_at.filter(|at| ![0, 0x8000].contains(at)) {
+        reader.problem(
+            LISTENER.model_at.name,
+            format!("the common model cannot begin at {other}"),
+            "write 0 or 0x8000",
+        );
+    }
+    if view == Registers::Raw && reader.has(LISTENER.model_at.name) {
+        reader.problem(
+            LISTENER.model_at.name,
+            "view = \"raw\" shows no common model",
+            "leave one of them out",
+        );
+    }
+    View {
         buses: read_buses(reader, &LISTENER.buses, inherited.buses),
+        default_drive: LISTENER.default_drive.read(reader),
+        registers: match (view, model_at) {
+            (Registers::Model, Some(0)) => Registers::ModelAtZero,
+            (view, _) => view,
+        },
     }
 }
 

@@ -1,19 +1,17 @@
 //! `[mqtt]`.
 
 use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, Broker, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, SPARKPLUG, TelemetryTopic};
+use super::keys::{
+    BUFFER, Broker, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, ProxyAddress, SPARKPLUG, TelemetryTopic,
+};
 use super::{files, values};
 use crate::document::{Finding, FromNode, Reader, format_duration};
-use crate::north::mqtt::{self, Buffer, Options, Qos, Secret, Telemetry, sparkplug};
+use crate::north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
-
-/// Most bytes of a secret: a longer file is not a password.
-const SECRET: u64 = 4096;
 
 /// Most brokers: all of them are tried within 10 s, three a second.
 const MOST_BROKERS: usize = 16;
@@ -24,11 +22,12 @@ fn read_brokers(reader: &Reader<'_>) -> Option<Vec<Broker>> {
     let brokers: Vec<Broker> = std::iter::once(first?).chain(more).collect();
     let mut before: Vec<(&str, u16)> = Vec::new();
     for broker in &brokers {
-        let (address, tls) = ((broker.host.as_str(), broker.port), broker.tls);
+        let address = (broker.host.as_str(), broker.port);
         let shown = format!("{}:{}", broker.host, broker.port);
-        if brokers.first().is_some_and(|first| first.tls != tls) {
+        let scheme = |broker: &Broker| (broker.tls, broker.path.is_some());
+        if brokers.first().is_some_and(|first| scheme(first) != scheme(broker)) {
             let what = format!("{shown} uses another scheme than mqtt.url");
-            reader.problem(MQTT.urls.name, what, "write mqtts:// for all brokers or for none");
+            reader.problem(MQTT.urls.name, what, "write the same scheme for all brokers");
         }
         if before.contains(&address) {
             let what = format!("the broker {shown} is listed twice");
@@ -51,6 +50,8 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     let client_id = MQTT.client_id.read(reader);
     let username = MQTT.username.read(reader);
     let password = read_password(reader, base);
+    let proxy = MQTT.proxy.read(reader).map(|ProxyAddress { host, port }| (host, port));
+    let publish_limit = MQTT.publish_limit.get(reader);
     let has = |key: &str| reader.has(key);
     if (has(MQTT.password.name) || has(MQTT.password_file.name)) && !has(MQTT.username.name) {
         reader.problem(
@@ -64,8 +65,8 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     if !tls && brokers.is_some() && (has(MQTT.ca.name) || has(MQTT.certificate.name)) {
         reader.warning(
             MQTT.url.name,
-            "certificates are not used on an mqtt:// connection",
-            "write mqtts:// for TLS",
+            "certificates are not used on a connection without TLS",
+            "write mqtts:// or wss:// for TLS",
         );
     }
     for (place, broker) in all().enumerate().filter(|(_, broker)| broker.tls) {
@@ -102,13 +103,15 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     }
     let sparkplug = read_sparkplug(reader, gateway, state_dir);
     reader.finish();
-    let at = |Broker { host, port, .. }| mqtt::Broker { host, port };
+    let at = |Broker { host, port, path, .. }| mqtt::Broker { host, port, path };
     Some(Options {
         brokers: brokers?.into_iter().map(at).collect(),
         tls,
         client_id: client_id.unwrap_or_else(|| format!("drivegate-{}", gateway.unwrap_or_default())),
         username,
         password,
+        proxy,
+        publish_limit,
         ca,
         identity,
         base: topics?,
@@ -143,7 +146,7 @@ fn read_home_assistant(reader: &Reader<'_>) -> Option<String> {
 }
 
 /// `password` or the text of `password_file`; a value from the environment overrides one from the file.
-fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
+fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Password> {
     let (plain, file) = (MQTT.password.read(reader), MQTT.password_file.read(reader));
     let [plain_from_env, file_from_env] =
         [MQTT.password.place(reader), MQTT.password_file.place(reader)].map(|p| p.env.is_some());
@@ -152,9 +155,9 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
             if !plain_from_env {
                 files::warn_of_readers(reader, MQTT.password.name, Path::new(reader.document().file()));
             }
-            return Some(Secret(plain));
+            return Some(Password::Fixed(Secret(plain)));
         }
-        (Some(plain), Some(_)) if plain_from_env && !file_from_env => return Some(Secret(plain)),
+        (Some(plain), Some(_)) if plain_from_env && !file_from_env => return Some(Password::Fixed(Secret(plain))),
         (Some(_), Some(_)) if plain_from_env == file_from_env => {
             let what = "both password and password_file are set";
             reader.problem(MQTT.password.name, what, "remove one of them");
@@ -164,26 +167,21 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
     };
     let path = values::resolved(base, file);
     files::warn_of_readers(reader, MQTT.password_file.name, &path);
-    let text = secret(&path);
-    reader.accept(MQTT.password_file.name, text).map(Secret)
+    reader.accept(MQTT.password_file.name, secret(&path))?;
+    Some(Password::File(path))
 }
 
 /// The only line of a secret file.
 pub(super) fn secret(path: &Path) -> Result<String, Finding> {
-    let mut text = String::new();
-    File::open(path)
-        .and_then(|file| file.take(SECRET).read_to_string(&mut text))
-        .map_err(|error| files::cannot_read(path, &error))?;
     let shown = path.display();
-    let line = text.lines().next().unwrap_or_default();
-    if line.is_empty() {
-        return Err(Finding::new(format!("{shown} is empty"), "write the password into it"));
-    }
-    if text.trim_end_matches(['\r', '\n']).contains('\n') || text.len() as u64 == SECRET {
-        let what = format!("{shown} is not a password: it has several lines");
-        return Err(Finding::new(what, "write one line"));
-    }
-    Ok(line.to_string())
+    Secret::read(path).map(|secret| secret.0).map_err(|fault| match fault {
+        SecretFault::Unreadable(error) => files::cannot_read(path, &error),
+        SecretFault::Empty => Finding::new(format!("{shown} is empty"), "write the password into it"),
+        SecretFault::Lines => Finding::new(
+            format!("{shown} is not a password: it has several lines"),
+            "write one line",
+        ),
+    })
 }
 
 /// What others on the way to the broker could read or send.

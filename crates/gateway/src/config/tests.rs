@@ -355,7 +355,8 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     assert_eq!(all.modbus_tcp.unwrap().listeners[0].listen.len(), 2);
     assert_eq!(all.log.level, "debug");
     let mqtt = all.mqtt.unwrap();
-    assert_eq!(mqtt.password.as_ref().unwrap().0, "12345");
+    let secret = crate::north::mqtt::Secret("12345".to_string());
+    assert_eq!(mqtt.password, Some(crate::north::mqtt::Password::Fixed(secret)));
     assert!(!format!("{mqtt:?}").contains("12345"));
 
     let loaded = load(&[

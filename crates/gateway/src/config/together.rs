@@ -29,6 +29,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
+        unique::check_default_drives(reader.document(), buses, &modbus_tcp.default_drives);
     }
     if let Some(bacnet) = bacnet {
         bacnet::check_instances(reader, buses, bacnet);

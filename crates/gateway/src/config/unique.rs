@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 use super::bus::Found;
 use super::http::Listener;
-use crate::document::{Document, Place};
+use super::modbus_tcp::DefaultDrive;
+use crate::document::{Document, Place, nearest};
 use crate::line::split_dial_in;
 
 pub(super) fn check(document: &Document, buses: &[Found]) {
@@ -231,4 +232,25 @@ fn collide(one: SocketAddr, other: SocketAddr) -> bool {
     one.port() == other.port()
         && one.port() != 0
         && (one.ip() == other.ip() || everywhere(one, other) || everywhere(other, one))
+}
+
+/// A `default_drive` is a drive of a bus that its listener shows.
+pub(super) fn check_default_drives(document: &Document, buses: &[Found], wanted: &[DefaultDrive]) {
+    for (name, place, shown) in wanted {
+        let is_shown = |bus: &&Found| match (shown, &bus.name) {
+            (Some(shown), Some((bus, _))) => shown.contains(bus),
+            _ => true,
+        };
+        let names = buses.iter().filter(is_shown).flat_map(|bus| &bus.drives);
+        let names = names.filter_map(|drive| drive.name.as_ref().map(|(name, _)| name.as_str()));
+        let known: Vec<&str> = names.collect();
+        if !known.contains(&name.as_str()) {
+            let near = nearest(name, known.iter().copied());
+            let remedy = near.map_or_else(
+                || "write the name of a drive on a bus that the listener shows".to_string(),
+                |near| format!("did you mean `{near}`?"),
+            );
+            document.problem(place, format!("the listener shows no drive `{name}`"), remedy);
+        }
+    }
 }

@@ -15,7 +15,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::client::Client;
 use super::frame::NotModbus;
-use super::routes::PlantView;
+use super::routes::{PlantView, View};
 use super::session::ClientSession;
 use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
 use super::{Listener, ServerState, connection};
@@ -50,14 +50,14 @@ pub(super) struct Policy {
 
 impl Policy {
     /// Admits no client.
-    pub(super) fn nobody() -> (Policy, Option<Vec<String>>) {
+    pub(super) fn nobody() -> (Policy, View) {
         let write = WriteAccess::ByAddress(Vec::new());
         (
             Policy {
                 allow: Vec::new(),
                 write,
             },
-            None,
+            View::default(),
         )
     }
 
@@ -148,8 +148,8 @@ impl Admission {
     }
 
     /// Applies a new policy to open connections too: they get its rights, or are closed.
-    pub(super) fn update(&self, policy: Policy, buses: Option<Vec<String>>) {
-        self.view.show(buses);
+    pub(super) fn update(&self, policy: Policy, view: View) {
+        self.view.show(view, Instant::now());
         self.policy.store(Arc::new(policy.clone()));
         self.state
             .connections
@@ -327,7 +327,7 @@ mod tests {
                 listen: Vec::new(),
                 allow: networks(allow),
                 write: networks(write),
-                buses: None,
+                view: View::default(),
             }
         };
         let address = "10.0.0.5".parse().unwrap();

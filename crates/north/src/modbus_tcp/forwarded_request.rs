@@ -9,11 +9,13 @@ use tokio::sync::oneshot;
 
 use super::client::Client;
 use super::frame::Header;
+use super::routes::At;
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
 use crate::order::{Arrival, Authority, Order, Outcome, Refusal};
 use crate::plant::{DriveHandle, OrderRequest, Placed};
 use crate::process_image::{Reading, Unavailable};
+use crate::register_map::{BusState, DriveView};
 
 /// A request that is forwarded to a drive.
 #[derive(Debug)]
@@ -23,7 +25,18 @@ pub(super) struct ForwardedRequest {
     pub(super) request: RequestPdu,
     /// Whether the command includes a fault reset by 0x8100.
     pub(super) resets: bool,
+    /// What is read once the write is done.
+    pub(super) then: Option<ReadBehind>,
     read: Option<PartialRead>,
+}
+
+/// The read of function 23, which follows its write.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct ReadBehind {
+    pub(super) at: At,
+    /// In the drive.
+    pub(super) start: u16,
+    pub(super) count: u16,
 }
 
 /// The work that a forwarded request gives the bus.
@@ -32,6 +45,8 @@ pub(super) enum BusWork {
     Order(Order),
     /// The stop of a request whose rest is refused; the refusal is audited.
     Stop(Order, Refusal),
+    /// Nothing: it is done, and only the read behind it is left.
+    Written,
     /// Nothing, because it is refused; the refusal is audited.
     Refused(Refusal),
     /// A read that is split by object.
@@ -53,6 +68,16 @@ struct PartialRead {
     left: std::vec::IntoIter<ReadPart>,
     /// Items of the object being read to skip, and to use.
     asked: (usize, usize),
+}
+
+impl PartialRead {
+    fn of(parts: Vec<ReadPart>) -> PartialRead {
+        PartialRead {
+            words: Vec::new(),
+            left: parts.into_iter(),
+            asked: (0, 0),
+        }
+    }
 }
 
 /// State of a forwarded request.
@@ -116,6 +141,7 @@ impl ForwardedRequest {
             drive: drive.clone(),
             request,
             resets: false,
+            then: None,
             read: None,
         }
     }
@@ -132,17 +158,17 @@ impl ForwardedRequest {
                 let placed = forwarded.drive.place(request, now);
                 Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
+            BusWork::Written => match forwarded.then.take() {
+                Some(then) => forwarded.read_behind(then, client, now),
+                None => Progress::Done(forwarded, Outcome::Acknowledged(Reply::Written)),
+            },
             BusWork::Refused(refusal) => {
                 let what = describe::request(&forwarded.request);
                 let answer = forwarded.drive.refuse(&what, refusal, client.origin(), now);
                 Progress::Done(forwarded, answer.outcome)
             }
             BusWork::Parts(read_parts) => {
-                forwarded.read = Some(PartialRead {
-                    words: Vec::new(),
-                    left: read_parts.into_iter(),
-                    asked: (0, 0),
-                });
+                forwarded.read = Some(PartialRead::of(read_parts));
                 forwarded.read_on(client, now)
             }
         }
@@ -159,6 +185,40 @@ impl ForwardedRequest {
         let request = OrderRequest::new(order, client.origin(), authority);
         let placed = self.drive.place(request.arrived(arrival), now);
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
+    }
+
+    /// Reads what function 23 reads, after its write: from the process image, and from the drive what is not polled.
+    pub(super) fn read_behind(mut self: Box<Self>, then: ReadBehind, client: &Client, now: Instant) -> Progress {
+        let ReadBehind { at, start, count } = then;
+        let known = match at {
+            At::Model(start) => common(&self.drive, client, start, count, now).map_err(Some),
+            At::Drive => match self.drive.reading(now).words(Table::Holding, start, count) {
+                Ok(words) => Ok(words),
+                Err(Unavailable::NotPolled) => Err(None),
+                Err(Unavailable::Refused(code)) => Err(Some(code)),
+                Err(Unavailable::Stale) => Err(Some(Exception::GATEWAY_TARGET)),
+            },
+            At::Nowhere => Err(Some(Exception::ADDRESS)),
+        };
+        match known {
+            Ok(words) => Progress::Done(self, Outcome::Acknowledged(Reply::Registers(words))),
+            Err(Some(code)) => Progress::Done(self, Outcome::Exception(code)),
+            Err(None) => {
+                let protocol = self.drive.bus.image.spec.protocol;
+                let parts = read_parts(protocol, &self.drive.reading(now), Table::Holding, start, count);
+                match parts {
+                    Ok(None) => {
+                        let order = Order::Read(RequestPdu::read(Table::Holding, start, count));
+                        self.place(order, client, Authority::ReadOnly, Arrival::now(now), now)
+                    }
+                    Ok(Some(parts)) => {
+                        self.read = Some(PartialRead::of(parts));
+                        self.read_on(client, now)
+                    }
+                    Err(code) => Progress::Done(self, Outcome::Exception(code)),
+                }
+            }
+        }
     }
 
     /// Requests the next object of a read, if any is left.
@@ -187,6 +247,24 @@ impl ForwardedRequest {
     }
 }
 
+/// The registers of the common model from there on.
+///
+/// # Errors
+/// Exception 02 where there are none.
+pub(super) fn common(
+    drive: &DriveHandle,
+    client: &Client,
+    start: u16,
+    count: u16,
+    now: Instant,
+) -> Result<Vec<u16>, Exception> {
+    let reading = drive.reading(now);
+    let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
+    let hold = drive.has_authority().then(|| client.origin());
+    let hold = hold.and_then(|origin| drive.hold_view(Some(&origin), now));
+    DriveView::new(&reading, bus).with_hold(hold).registers(start, count)
+}
+
 impl AnsweredRequest {
     /// Continues a read with its next object, until one fails; any other request is done.
     pub(super) fn go_on(self, client: &Client, now: Instant) -> Progress {
@@ -194,6 +272,12 @@ impl AnsweredRequest {
             AnsweredRequest::Forwarded(forwarded, outcome) => (forwarded, outcome),
             AnsweredRequest::StopAll(header, request, all) => return Progress::Stopped(header, request, all),
         };
+        if let Some(then) = forwarded
+            .then
+            .take_if(|_| outcome == Outcome::Acknowledged(Reply::Written))
+        {
+            return forwarded.read_behind(then, client, now);
+        }
         let Some(read) = &mut forwarded.read else {
             return Progress::Done(forwarded, outcome);
         };

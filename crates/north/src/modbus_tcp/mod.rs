@@ -45,6 +45,7 @@ use crate::tcp_server::{TcpServer, TcpService};
 use crate::{NorthState, ServerError, ServerKind, certificate};
 
 pub use self::offline::Offline;
+pub use self::routes::{Registers, View};
 pub use self::tls::{Identity, Role, Tls};
 
 /// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
@@ -129,8 +130,8 @@ pub struct Listener {
     pub allow: Vec<IpNet>,
     /// Networks that may write.
     pub write: Vec<IpNet>,
-    /// Names of the visible buses; `None` for all.
-    pub buses: Option<Vec<String>>,
+    /// What its clients see.
+    pub view: View,
 }
 
 /// How raw reads outside the poll plan are handled.
@@ -235,30 +236,33 @@ impl TcpService<Options> for ModbusTcp {
         let mut plain = options.listeners.iter().flat_map(|l| l.listen.iter().map(move |_| l));
         let opened = &mut self.opened;
         listeners.commit(sockets, |spec, open, cancel| {
-            let (policy, buses) = match (spec.tls, tls, &options.tls) {
+            let (policy, view) = match (spec.tls, tls, &options.tls) {
                 (true, Some(authenticator), Some(tls)) => (
                     Policy {
                         allow: tls.allow.clone(),
                         write: WriteAccess::ByCertificate(authenticator.clone()),
                     },
-                    tls.buses.clone(),
+                    View {
+                        buses: tls.buses.clone(),
+                        ..View::default()
+                    },
                 ),
                 // The plain listeners are first and in the same order.
                 _ => plain.next().map_or_else(Policy::nobody, |l| {
                     let write = WriteAccess::ByAddress(l.write.clone());
                     let allow = l.allow.clone();
-                    (Policy { allow, write }, l.buses.clone())
+                    (Policy { allow, write }, l.view.clone())
                 }),
             };
             let runtime = if spec.tls { Handle::current() } else { own.clone() };
             let admission = match open {
                 Some(admission) => {
-                    admission.update(policy, buses);
+                    admission.update(policy, view);
                     admission.clone()
                 }
                 None => {
                     *opened += 1;
-                    let view = PlantView::new(plant.clone(), state.stats.stop_all.clone(), buses);
+                    let view = PlantView::new(plant.clone(), state.stats.stop_all.clone(), view);
                     Arc::new(Admission::new(*opened, policy, view, state.clone(), cancel.clone()))
                 }
             };

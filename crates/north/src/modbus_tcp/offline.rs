@@ -8,7 +8,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::client::Client;
 use super::dialogue::Dialogue;
-use super::routes::PlantView;
+use super::routes::{PlantView, View};
 use super::session::ClientSession;
 use super::{Options, ServerState};
 use crate::NorthState;
@@ -39,7 +39,7 @@ impl Offline {
     ) -> Offline {
         let (state, view) = (
             ServerState::new(options, stats, CancellationToken::new()),
-            PlantView::new(plant, Arc::default(), None),
+            PlantView::new(plant, Arc::default(), View::default()),
         );
         let client = Client::new(peer, None, authority);
         let session = ClientSession::new(Arc::new(state), Arc::new(view), client);

@@ -1,50 +1,141 @@
 //! The drives that a listener serves, by unit id.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use arc_swap::ArcSwap;
 
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use crate::register_map::{FIRST, GATEWAY_UNIT, STOP_ALL};
 use crate::stop_all::{Scope, StopAll};
 
-/// Names of the visible buses; `None` for all.
-type VisibleBuses = Option<Vec<String>>;
+/// What the clients of one listener see.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct View {
+    /// Names of the visible buses; `None` for all.
+    pub buses: Option<Vec<String>>,
+    /// Name of the drive at units 0 and 255, in place of the gateway's own registers.
+    pub default_drive: Option<String>,
+    /// Where its registers are.
+    pub registers: Registers,
+}
+
+/// The registers of a drive that clients see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Registers {
+    /// The common model from 0x8000 on, and those of the drive below.
+    #[default]
+    Model,
+    /// The common model from 0 on, and those of the drive from 0x0300 on.
+    ModelAtZero,
+    /// Those of the drive alone, at any address.
+    Raw,
+}
+
+/// Where a register of a client is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum At {
+    /// In the common model, by its address from 0x8000 on.
+    Model(u16),
+    /// In the drive.
+    Drive,
+    /// Nowhere.
+    Nowhere,
+}
+
+/// First address of the commands, of the floats and of the drive's own registers where the common model is at 0.
+const COMMANDS_AT: u16 = 0x0110;
+const FLOATS_AT: u16 = 0x0200;
+const DRIVE_AT: u16 = 0x0300;
+
+impl Registers {
+    /// Where the registers from `start` on are; a span that reaches from one kind into another is nowhere.
+    pub(super) fn at(self, start: u16, count: u16) -> At {
+        let last = u32::from(start) + u32::from(count.saturating_sub(1));
+        let Ok(last) = u16::try_from(last) else {
+            return At::Nowhere;
+        };
+        let (first, last) = (self.of(start), self.of(last));
+        match (first, last) {
+            (At::Model(first), At::Model(last)) if last.wrapping_sub(first) == count.saturating_sub(1) => {
+                At::Model(first)
+            }
+            (At::Drive, At::Drive) => At::Drive,
+            _ => At::Nowhere,
+        }
+    }
+
+    /// A write from `start` on that reaches from one kind into another and covers the command word: its begin as if all of it
+    /// were of the common model. What stops is carried out, however far the write reaches.
+    pub(super) fn around_the_command_word(self, start: u16, count: u16) -> Option<u16> {
+        let word = match self {
+            Registers::Model => FIRST + STOP_ALL,
+            Registers::ModelAtZero => COMMANDS_AT,
+            Registers::Raw => return None,
+        };
+        let covers = start <= word && u32::from(word) < u32::from(start) + u32::from(count);
+        covers.then(|| FIRST + STOP_ALL - (word - start))
+    }
+
+    fn of(self, address: u16) -> At {
+        match self {
+            Registers::Raw => At::Drive,
+            Registers::Model if address >= FIRST => At::Model(address),
+            Registers::Model => At::Drive,
+            Registers::ModelAtZero => match address {
+                ..STOP_ALL => At::Model(FIRST + address),
+                STOP_ALL..COMMANDS_AT => At::Nowhere,
+                COMMANDS_AT..FLOATS_AT => At::Model(FIRST + STOP_ALL + (address - COMMANDS_AT)),
+                FLOATS_AT..DRIVE_AT => At::Model(FIRST + address),
+                DRIVE_AT..FIRST => At::Drive,
+                FIRST.. => At::Nowhere,
+            },
+        }
+    }
+}
+
+/// A view, and since when clients have it: none of the first one.
+#[derive(Debug)]
+struct Shown {
+    view: View,
+    since: Option<Instant>,
+}
 
 /// The part of the plant that the clients of one listener see.
 #[derive(Debug)]
 pub(super) struct PlantView {
     plant: SharedPlant,
     stop_all: Arc<StopAll>,
-    buses: ArcSwap<VisibleBuses>,
+    shown: ArcSwap<Shown>,
     routes: ArcSwap<Routes>,
 }
 
 impl PlantView {
-    pub(super) fn new(plant: SharedPlant, stop_all: Arc<StopAll>, buses: Option<Vec<String>>) -> PlantView {
-        let buses = Arc::new(buses);
-        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), stop_all.clone(), buses.clone()));
+    pub(super) fn new(plant: SharedPlant, stop_all: Arc<StopAll>, view: View) -> PlantView {
+        let shown = Arc::new(Shown { view, since: None });
+        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), stop_all.clone(), shown.clone()));
         PlantView {
             plant,
             stop_all,
-            buses: ArcSwap::new(buses),
+            shown: ArcSwap::new(shown),
             routes,
         }
     }
 
-    /// Shows other buses from the next request of each client on.
-    pub(super) fn show(&self, buses: Option<Vec<String>>) {
-        if **self.buses.load() != buses {
-            self.buses.store(Arc::new(buses));
+    /// Shows another view from the next request of each client on, at `now`.
+    pub(super) fn show(&self, view: View, now: Instant) {
+        let before = self.shown.load();
+        if before.view == view {
+            return;
         }
+        let moved = (&before.view.default_drive, before.view.registers) != (&view.default_drive, view.registers);
+        let since = if moved { Some(now) } else { before.since };
+        self.shown.store(Arc::new(Shown { view, since }));
     }
 
     /// Whether that bus is visible.
     pub(super) fn shows(&self, bus: &str) -> bool {
-        let buses = self.buses.load();
-        buses
-            .as_ref()
-            .as_ref()
-            .is_none_or(|buses| buses.iter().any(|name| name == bus))
+        self.shown.load().view.has(bus)
     }
 
     /// The routes of the current plant; after a reload, the first client that asks rebuilds them for all.
@@ -56,14 +147,22 @@ impl PlantView {
         let routes = Arc::new(Routes::new(
             self.plant.load_full(),
             self.stop_all.clone(),
-            self.buses.load_full(),
+            self.shown.load_full(),
         ));
         self.routes.store(routes.clone());
         routes
     }
 
     pub(super) fn is_current(&self, routes: &Routes) -> bool {
-        Arc::ptr_eq(&self.plant.load(), &routes.plant) && Arc::ptr_eq(&self.buses.load(), &routes.buses)
+        Arc::ptr_eq(&self.plant.load(), &routes.plant) && Arc::ptr_eq(&self.shown.load(), &routes.shown)
+    }
+}
+
+impl View {
+    fn has(&self, bus: &str) -> bool {
+        self.buses
+            .as_ref()
+            .is_none_or(|buses| buses.iter().any(|name| name == bus))
     }
 }
 
@@ -72,7 +171,7 @@ impl PlantView {
 pub(super) struct Routes {
     pub(super) plant: Arc<Plant>,
     pub(super) stop_all: Arc<StopAll>,
-    buses: Arc<VisibleBuses>,
+    shown: Arc<Shown>,
     drives: Vec<DriveHandle>,
     /// Index in `drives`.
     units: Vec<Option<u16>>,
@@ -81,20 +180,25 @@ pub(super) struct Routes {
 }
 
 impl Routes {
-    fn new(plant: Arc<Plant>, stop_all: Arc<StopAll>, buses: Arc<VisibleBuses>) -> Routes {
-        let is_visible = |name: &String| buses.as_ref().as_ref().is_none_or(|buses| buses.contains(name));
-        let drives: Vec<DriveHandle> = plant.drives().filter(|d| is_visible(&d.image.spec.bus)).collect();
+    fn new(plant: Arc<Plant>, stop_all: Arc<StopAll>, shown: Arc<Shown>) -> Routes {
+        let view = &shown.view;
+        let drives: Vec<DriveHandle> = plant.drives().filter(|d| view.has(&d.image.spec.bus)).collect();
         let mut units = vec![None; usize::from(u8::MAX) + 1];
         for (index, drive) in (0u16..).zip(&drives) {
-            if let Some(unit) = units.get_mut(usize::from(drive.image.spec.unit)) {
-                unit.get_or_insert(index);
+            let spec = &drive.image.spec;
+            let is_default = view.default_drive.as_ref() == Some(&spec.name);
+            let more = [0, GATEWAY_UNIT].into_iter().filter(|_| is_default);
+            for unit in more.chain([spec.unit]) {
+                if let Some(unit) = units.get_mut(usize::from(unit)) {
+                    unit.get_or_insert(index);
+                }
             }
         }
-        let visible = plant.buses.iter().map(|b| is_visible(&b.image.spec.name)).collect();
+        let visible = plant.buses.iter().map(|b| view.has(&b.image.spec.name)).collect();
         Routes {
             plant,
             stop_all,
-            buses,
+            shown,
             drives,
             units,
             visible,
@@ -106,13 +210,29 @@ impl Routes {
         self.drives.get(usize::from(index))
     }
 
+    /// Where the registers of drives are.
+    pub(super) fn registers(&self) -> Registers {
+        self.shown.view.registers
+    }
+
+    /// Whether units 0 and 255 are a drive.
+    pub(super) fn has_default_drive(&self) -> bool {
+        self.shown.view.default_drive.is_some()
+    }
+
+    /// Whether what was asked then may have meant another drive or register: a reload has given the unit or the address
+    /// another meaning since.
+    pub(super) fn is_older(&self, asked: Instant) -> bool {
+        self.shown.since.is_some_and(|since| asked < since)
+    }
+
     pub(super) fn drives(&self) -> &[DriveHandle] {
         &self.drives
     }
 
     /// All of these drives, to stop them.
     pub(super) fn scope(&self) -> Scope {
-        match &*self.buses {
+        match &self.shown.view.buses {
             Some(buses) => Scope::Buses(buses.clone()),
             None => Scope::Gateway,
         }
@@ -122,5 +242,38 @@ impl Routes {
     pub(super) fn bus(&self, index: usize) -> Option<&BusHandle> {
         let visible = self.visible.get(index).copied().unwrap_or_default();
         self.plant.buses.get(index).filter(|_| visible)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn where_registers_are() {
+        use At::{Drive, Model, Nowhere};
+        for (registers, start, count, expected) in [
+            (Registers::Model, 0x8000, 19, Model(0x8000)),
+            (Registers::Model, 0x7FFF, 1, Drive),
+            (Registers::Model, 0x7FFF, 2, Nowhere),
+            (Registers::Raw, 0xFA00, 1, Drive),
+            (Registers::Raw, 0xFFFF, 1, Drive),
+            (Registers::Raw, 0xFFFF, 2, Nowhere),
+            (Registers::ModelAtZero, 0, 19, Model(0x8000)),
+            (Registers::ModelAtZero, 0x00FF, 2, Nowhere),
+            (Registers::ModelAtZero, 0x0100, 1, Nowhere),
+            (Registers::ModelAtZero, 0x010F, 2, Nowhere),
+            (Registers::ModelAtZero, 0x0110, 4, Model(0x8100)),
+            (Registers::ModelAtZero, 0x0200, 2, Model(0x8200)),
+            (Registers::ModelAtZero, 0x02FF, 2, Nowhere),
+            (Registers::ModelAtZero, 0x0300, 10, Drive),
+            (Registers::ModelAtZero, 0x7FFF, 1, Drive),
+            (Registers::ModelAtZero, 0x8000, 1, Nowhere),
+        ] {
+            assert_eq!(registers.at(start, count), expected, "{registers:?} {start:#x} {count}");
+        }
+        let around = |start, count| Registers::ModelAtZero.around_the_command_word(start, count);
+        assert_eq!((around(0x0100, 17), around(0x0100, 16)), (Some(0x80F0), None));
+        assert_eq!((around(0x0110, 123), around(0x0111, 9)), (Some(0x8100), None));
     }
 }

@@ -7,30 +7,32 @@ use futures_util::FutureExt;
 use tokio::sync::oneshot;
 
 use super::client::Client;
-use super::forwarded_request::{AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, read_parts};
+use super::forwarded_request::{
+    AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, ReadBehind, common, read_parts,
+};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::routes::{PlantView, Routes};
+use super::routes::{At, PlantView, Registers, Routes};
 use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_json::{nothing_to_stop, refuse_stop_all};
-use crate::drive::{Profile, State};
+use crate::drive::{ModelPoint, PointIndex, Profile, State, Value};
 use crate::log_throttle::LogThrottle;
-use crate::order::{self, Arrival, Authority, Order, Outcome};
+use crate::order::{self, Arrival, Authority, Order, Outcome, Refusal};
 use crate::permit::Verb;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, Unavailable};
 use crate::register_map::{
-    self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT, HEARTBEAT, HOLD, NOT_STANDING, STOP_ALL,
+    self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, HEARTBEAT, HOLD, NOT_STANDING, STOP_ALL,
 };
 use crate::stop_all;
 
 /// Function codes that write.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
 /// Function codes that every drive supports, through the blocks from 0x8000 on and the device identification.
-const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
+const OWN_FUNCTIONS: [u8; 6] = [3, 4, 6, 16, 23, 43];
 
 /// How a request is handled.
 enum Decision {
@@ -110,7 +112,7 @@ impl ClientSession {
         now: Instant,
         out: &mut Vec<u8>,
     ) -> Option<PendingRequest> {
-        match self.decide(frame, now) {
+        match self.decide(frame, &arrival, now) {
             Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
                 let drive = self.routes.drive(frame.header.unit);
@@ -204,15 +206,21 @@ impl ClientSession {
         }
     }
 
-    fn decide(&self, frame: &Frame<'_>, now: Instant) -> Decision {
-        if frame.header.unit == GATEWAY_UNIT {
+    fn decide(&self, frame: &Frame<'_>, arrival: &Arrival, now: Instant) -> Decision {
+        let unit = frame.header.unit;
+        let is_default = self.routes.has_default_drive() && [0, GATEWAY_UNIT].contains(&unit);
+        if unit == GATEWAY_UNIT && !is_default {
             return self.gateway(frame, now).unwrap_or_else(Decision::from);
         }
-        let Some(drive) = self.routes.drive(frame.header.unit) else {
+        let Some(drive) = self.routes.drive(unit) else {
             return Exception::GATEWAY_PATH.into();
         };
         let profile = &drive.image.spec.profile;
         let decoded = RequestPdu::decode(frame.pdu);
+        // A reload since the first byte may have given the unit or the address to another drive or register.
+        if WRITES.contains(&frame.function) && self.routes.is_older(arrival.asked) {
+            return Exception::GATEWAY_PATH.into();
+        }
         // Authority is checked before anything else that could be wrong with the request.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
@@ -225,24 +233,42 @@ impl ClientSession {
                 Err(_) => Exception::FUNCTION.into(),
             };
         }
+        let registers = self.routes.registers();
         let has_function = has_function(profile, frame.function);
-        if !has_function && !OWN_FUNCTIONS.contains(&frame.function) {
+        let is_own = OWN_FUNCTIONS.contains(&frame.function) && (registers != Registers::Raw || frame.function == 43);
+        if !has_function && !is_own && !is_default {
             return Exception::FUNCTION.into();
         }
         let request = match decoded {
             Ok(request) => request,
             Err(code) => return code.into(),
         };
+        if is_default && stops_by(&request, STOP_ALL) {
+            return stop_of_default(frame.header, drive, request);
+        }
         match request {
-            RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
-                self.common(drive, request, start, count, now)
+            RequestPdu::Read { table, start, count } if !table.is_bits() => match registers.at(start, count) {
+                At::Model(start) => self.common(drive, request, start, count, now),
+                At::Drive if has_function => self.raw_read(frame.header, drive, request, now),
+                At::Drive => Exception::FUNCTION.into(),
+                At::Nowhere => Exception::ADDRESS.into(),
+            },
+            RequestPdu::WriteRegister { address, value } => {
+                self.write(frame.header, drive, request, (address, &[value]), now)
             }
-            RequestPdu::WriteRegister { address, value } if address >= FIRST => {
-                self.command(frame.header, drive, request, address, &[value], now)
-            }
-            RequestPdu::WriteRegisters { start, ref values } if start >= FIRST => {
+            RequestPdu::WriteRegisters { start, ref values } => {
                 let values = values.clone();
-                self.command(frame.header, drive, request, start, &values, now)
+                self.write(frame.header, drive, request, (start, &values), now)
+            }
+            RequestPdu::ReadWrite {
+                read_start,
+                read_count,
+                write_start,
+                ref values,
+            } => {
+                let values = values.clone();
+                let write = (write_start, values.as_slice());
+                self.write_and_read(frame.header, drive, request, write, (read_start, read_count), now)
             }
             RequestPdu::DeviceIdentification { code, object } => {
                 let identity = Identity {
@@ -262,6 +288,96 @@ impl ClientSession {
                 BusWork::Order(Order::Write(request)),
             ),
             _ => Exception::FUNCTION.into(),
+        }
+    }
+
+    /// A write of registers: to the command block, or to the drive.
+    fn write(
+        &self,
+        header: Header,
+        drive: &DriveHandle,
+        request: RequestPdu,
+        (start, values): (u16, &[u16]),
+        now: Instant,
+    ) -> Decision {
+        let count = u16::try_from(values.len()).unwrap_or(u16::MAX);
+        match self.routes.registers().at(start, count) {
+            At::Model(start) => self.command(header, drive, request, start, values, now),
+            At::Drive if has_function(&drive.image.spec.profile, 6) => {
+                let order = match request {
+                    RequestPdu::ReadWrite { .. } => RequestPdu::write_registers(start, values),
+                    _ => request.clone(),
+                };
+                forwarded(header, drive, request, BusWork::Order(Order::Write(order)))
+            }
+            At::Drive => Exception::FUNCTION.into(),
+            At::Nowhere => match self.routes.registers().around_the_command_word(start, count) {
+                Some(start) => self.command(header, drive, request, start, values, now),
+                None => Exception::ADDRESS.into(),
+            },
+        }
+    }
+
+    /// Function 23: the write, and behind its answer the read. Both are judged before anything is written; a stop in the
+    /// write is carried out whatever else is asked.
+    fn write_and_read(
+        &self,
+        header: Header,
+        drive: &DriveHandle,
+        request: RequestPdu,
+        write: (u16, &[u16]),
+        (start, count): (u16, u16),
+        now: Instant,
+    ) -> Decision {
+        let at = self.routes.registers().at(start, count);
+        let then = ReadBehind { at, start, count };
+        let refused = self.judge_read(header, drive, then, now).err();
+        match self.write(header, drive, request, write, now) {
+            Decision::Drive(both) => {
+                let (mut forwarded, work) = *both;
+                let work = match (refused, work) {
+                    (None, work) => {
+                        forwarded.then = Some(then);
+                        work
+                    }
+                    (Some(_), stop @ BusWork::Stop(..)) => stop,
+                    (Some(code), BusWork::Order(order)) => match stop_in(drive, &order) {
+                        Some(stop) => BusWork::Stop(stop, not_readable(code, start)),
+                        None => return code.into(),
+                    },
+                    (Some(code), _) => return code.into(),
+                };
+                Decision::Drive(Box::new((forwarded, work)))
+            }
+            // A heartbeat alone, or the hold.
+            Decision::Reply(request, _) => match refused {
+                Some(code) => code.into(),
+                None => {
+                    let mut forwarded = ForwardedRequest::new(header, drive, request);
+                    forwarded.then = Some(then);
+                    Decision::Drive(Box::new((forwarded, BusWork::Written)))
+                }
+            },
+            other => other,
+        }
+    }
+
+    /// Whether a read of holding registers can be answered.
+    fn judge_read(
+        &self,
+        header: Header,
+        drive: &DriveHandle,
+        ReadBehind { at, start, count }: ReadBehind,
+        now: Instant,
+    ) -> Result<(), Exception> {
+        match at {
+            At::Model(start) => common(drive, &self.client, start, count, now).map(|_| ()),
+            At::Drive if !has_function(&drive.image.spec.profile, 3) => Err(Exception::ADDRESS),
+            At::Drive => match self.raw_read(header, drive, RequestPdu::read(Table::Holding, start, count), now) {
+                Decision::Exception(code) => Err(code),
+                _ => Ok(()),
+            },
+            At::Nowhere => Err(Exception::ADDRESS),
         }
     }
 
@@ -332,10 +448,6 @@ impl ClientSession {
             return Exception::FUNCTION.into();
         };
         let profile = &drive.image.spec.profile;
-        let beyond = !table.is_bits() && u32::from(start) + u32::from(count) > u32::from(FIRST);
-        if beyond {
-            return Exception::ADDRESS.into();
-        }
         if !drive.bus_up() {
             return Exception::GATEWAY_PATH.into();
         }
@@ -363,16 +475,9 @@ impl ClientSession {
 
     /// A read of the blocks from 0x8000 on.
     fn common(&self, drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
-        let reading = drive.reading(now);
-        let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
-        let hold = drive.has_authority().then(|| self.client.origin());
-        let hold = hold.and_then(|origin| drive.hold_view(Some(&origin), now));
-        DriveView::new(&reading, bus)
-            .with_hold(hold)
-            .registers(start, count)
-            .map_or_else(Decision::from, |words| {
-                Decision::Reply(request, Reply::Registers(words))
-            })
+        common(drive, &self.client, start, count, now).map_or_else(Decision::from, |words| {
+            Decision::Reply(request, Reply::Registers(words))
+        })
     }
 
     /// A write of `value` to the register of the hold, also in one write with the heartbeat.
@@ -456,17 +561,71 @@ fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: Bus
     Decision::Drive(Box::new((ForwardedRequest::new(header, drive, request), work)))
 }
 
+/// Whether a write to holding registers sets the register to 1.
+fn stops_by(request: &RequestPdu, register: u16) -> bool {
+    let items = match request {
+        RequestPdu::ReadWrite {
+            write_start, values, ..
+        } => order::written(&RequestPdu::write_registers(*write_start, values)),
+        request => order::written(request),
+    };
+    items.is_some_and(|(table, items)| table == Table::Holding && items.contains(&(register, 1)))
+}
+
+/// The drive at units 0 and 255 is stopped by the write that elsewhere stops all drives.
+fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> Decision {
+    let Some(run) = drive.image.spec.profile.model_index(ModelPoint::Run) else {
+        return Exception::FUNCTION.into();
+    };
+    let stop = Order::Points(vec![(run, Value::Bool(false))]);
+    let alone = stops_all_only(&request);
+    let work = match alone {
+        true => BusWork::Order(stop),
+        false => BusWork::Stop(stop, not_readable(Exception::ADDRESS, STOP_ALL)),
+    };
+    forwarded(header, drive, request, work)
+}
+
+/// The refusal of what stands beside a stop that is carried out.
+fn not_readable(code: Exception, address: u16) -> Refusal {
+    match code {
+        Exception::ADDRESS => Refusal::NotWritable(format!("there is no such register beside 0x{address:04X}")),
+        code => Refusal::BadValue(format!("register 0x{address:04X} cannot be read now ({code})")),
+    }
+}
+
+/// The stop that an order contains.
+fn stop_in(drive: &DriveHandle, order: &Order) -> Option<Order> {
+    let profile = &drive.image.spec.profile;
+    let run = profile.model_index(ModelPoint::Run)?;
+    let stops = match order {
+        Order::Points(values) => values.contains(&(run, Value::Bool(false))),
+        Order::Write(pdu) => order::written(pdu).is_some_and(|(table, items)| {
+            let runs = |(address, word): &(u16, u16)| profile.runs_by(table, *address, *word);
+            items.iter().find_map(runs) == Some(false)
+        }),
+        Order::Parameter(_) | Order::Read(_) => false,
+    };
+    stops.then(|| match order {
+        Order::Points(values) => {
+            let keeps = |point: &PointIndex| *point == run || profile.model_index(ModelPoint::Reverse) == Some(*point);
+            Order::Points(values.iter().filter(|(point, _)| keeps(point)).copied().collect())
+        }
+        order => order.clone(),
+    })
+}
+
 /// Whether a write that stops all drives names no other register.
 fn stops_all_only(request: &RequestPdu) -> bool {
     order::written(request).is_some_and(|(_, items)| items.len() == 1)
 }
 
-/// Whether the family has the table that a function code accesses. No family supports 22 and 23.
+/// Whether the family has the table that a function code accesses. No family supports 22; 23 is carried out as 16 and 3.
 fn has_function(profile: &Profile, function: u8) -> bool {
     let table = match function {
         1 | 5 | 15 => Table::Coil,
         2 => Table::DiscreteInput,
-        3 | 6 | 16 => Table::Holding,
+        3 | 6 | 16 | 23 => Table::Holding,
         4 => profile.canonical(Table::Input),
         _ => return false,
     };
@@ -493,6 +652,8 @@ fn answers(request: &RequestPdu, reply: &Reply) -> bool {
         (RequestPdu::Read { table, count, .. }, Reply::Registers(words)) => {
             !table.is_bits() && words.len() == usize::from(*count)
         }
+        (RequestPdu::ReadWrite { read_count, .. }, Reply::Registers(words)) => words.len() == usize::from(*read_count),
+        (RequestPdu::ReadWrite { .. }, _) => false,
         (_, Reply::Written) => request.is_write(),
         _ => false,
     }

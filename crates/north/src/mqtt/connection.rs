@@ -5,8 +5,8 @@
 //! outbox until [`Step::Room`].
 
 use std::collections::{HashMap, HashSet};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
@@ -14,8 +14,8 @@ use rumqttc::mqttbytes::v5::Filter;
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
     AsyncClient, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties, DisconnectReasonCode,
-    Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties,
-    RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
+    Event, EventLoop, LastWill, MqttOptions, NetworkOptions, Outgoing, Packet, Proxy, ProxyAuth, ProxyType,
+    PubAckReason, PublishProperties, RetainForwardRule, StateError, SubscribeReasonCode, TlsConfiguration, Transport,
 };
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
@@ -25,6 +25,8 @@ use super::broker_limits::{BrokerLimits, Lack};
 use super::dial::{ACCEPT_TIMEOUT, Dial};
 use super::keep_alive::{KEEP_ALIVE_S, Silence, Verdict};
 use super::outbox::Message;
+use super::password::Secret;
+use super::rate::Rate;
 use super::request::Incoming;
 use super::{Broker, Options};
 use crate::order::Arrival;
@@ -98,6 +100,8 @@ pub(super) struct Connection {
     backlog: Arc<Backlog>,
     aliases: Box<Aliases>,
     silence: Silence,
+    /// No message may be published before then.
+    held_until: Option<Instant>,
     /// What a broker that may be silent is asked.
     question: Option<Filter>,
     /// Number of subscriptions whose answers are awaited, and the answers so far.
@@ -141,11 +145,27 @@ impl Aliases {
 }
 
 /// Messages that rumqttc has not written yet.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Backlog {
     messages: AtomicUsize,
+    /// Those that it has written.
+    rate: Mutex<Rate>,
     /// Whether the client waits for [`Step::Room`].
     room_wanted: AtomicBool,
+}
+
+impl Backlog {
+    fn new(publish_limit: usize) -> Backlog {
+        Backlog {
+            messages: AtomicUsize::new(0),
+            rate: Mutex::new(Rate::new(publish_limit)),
+            room_wanted: AtomicBool::new(false),
+        }
+    }
+
+    fn rate(&self) -> MutexGuard<'_, Rate> {
+        self.rate.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl Drop for Connection {
@@ -162,21 +182,33 @@ impl Connection {
     pub(super) fn open(
         options: &Options,
         (broker, client_id): (&Broker, &str),
-        will: LastWill,
+        (will, password): (LastWill, Option<Secret>),
         tls: Option<Arc<ClientConfig>>,
         (dial, first): (Dial, usize),
     ) -> Connection {
         let mut mqtt = mqtt_options(options, (broker, client_id), will, tls);
-        let broker = broker.clone();
+        if let Some(user) = &options.username {
+            let password = password.map(|password| password.0).unwrap_or_default();
+            mqtt.set_credentials(user, password);
+        }
+        // Behind a proxy nothing is looked up but its own name.
+        let dialled = match &options.proxy {
+            None => broker.clone(),
+            Some((host, port)) => Broker {
+                host: host.clone(),
+                port: *port,
+                path: None,
+            },
+        };
         let reader = Arc::new(Reader::here());
         let of_stream = reader.clone();
         mqtt.set_socket_connector(move |_, network| {
-            let (connecting, reader) = (dial.clone().connect(broker.clone(), first, network), of_stream.clone());
+            let (connecting, reader) = (dial.clone().connect(dialled.clone(), first, network), of_stream.clone());
             async move { Ok(Dated::new(connecting.await?, reader)) }
         });
         let (client, eventloop) = AsyncClient::builder(mqtt).capacity(REQUESTS).build();
         let (sender, event) = mpsc::channel(EVENTS);
-        let backlog = Arc::<Backlog>::default();
+        let backlog = Arc::new(Backlog::new(options.publish_limit));
         let task = tokio::spawn(poll(eventloop, reader, sender, backlog.clone()));
         Connection {
             client,
@@ -184,6 +216,7 @@ impl Connection {
             backlog,
             aliases: Box::default(),
             silence: Silence::new(Instant::now()),
+            held_until: None,
             question: None,
             wanted: 0,
             answers: Vec::new(),
@@ -195,7 +228,16 @@ impl Connection {
     pub(super) async fn next(&mut self) -> Step {
         // The sender is dropped without a last event only if the task panicked.
         let silent = || Step::Lost("the MQTT client failed".to_string());
-        let event = self.event.recv().await.unwrap_or_else(silent);
+        let event = match self.held_until {
+            None => self.event.recv().await.unwrap_or_else(silent),
+            Some(until) => tokio::select! {
+                event = self.event.recv() => event.unwrap_or_else(silent),
+                () = tokio::time::sleep_until(until.into()) => {
+                    self.held_until = None;
+                    Step::Room
+                }
+            },
+        };
         match event {
             Step::Sent(_) | Step::Room => return event,
             Step::Pinged => {
@@ -245,6 +287,11 @@ impl Connection {
 
     /// Publishes a message; false if there is no room until [`Step::Room`].
     pub(super) fn publish(&mut self, message: Message, limits: BrokerLimits) -> bool {
+        let waiting = self.backlog.messages.load(Ordering::SeqCst);
+        if let Err(until) = self.backlog.rate().take(waiting, Instant::now()) {
+            self.held_until = Some(until);
+            return false;
+        }
         let telemetry = message.retain && !message.payload.is_empty();
         let alias = telemetry
             .then(|| self.aliases.of(&message.topic, limits.aliases))
@@ -349,8 +396,15 @@ fn mqtt_options(
     will: LastWill,
     tls: Option<Arc<ClientConfig>>,
 ) -> MqttOptions {
-    // TLS would take an IPv6 address with brackets for a name.
-    let mut mqtt = MqttOptions::new(client_id, (broker.bare_host(), broker.port));
+    let mut mqtt = MqttOptions::new(client_id, target(broker));
+    if let Some((host, port)) = &options.proxy {
+        mqtt.set_proxy(Proxy {
+            ty: ProxyType::Http,
+            auth: ProxyAuth::None,
+            addr: host.clone(),
+            port: *port,
+        });
+    }
     let mut properties = ConnectProperties::new();
     properties.max_packet_size = Some(MAX_PACKET);
     properties.receive_maximum = Some(RECEIVE_MAXIMUM);
@@ -362,18 +416,27 @@ fn mqtt_options(
         .set_read_batch_size(BATCH)
         .set_outgoing_inflight_upper_limit(INFLIGHT)
         .set_last_will(will);
-    if let Some(user) = &options.username {
-        let password = options.password.as_ref().map_or("", |p| p.0.as_str());
-        mqtt.set_credentials(user, password.to_string());
-    }
     let mut network = NetworkOptions::new();
     network.set_tcp_nodelay(true);
     network.set_tcp_send_buffer_size(SEND_BUFFER);
     mqtt.set_network_options(network);
     if let Some(config) = tls {
-        mqtt.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(config)));
+        let config = TlsConfiguration::Rustls(config);
+        mqtt.set_transport(match broker.path {
+            None => Transport::tls_with_config(config),
+            Some(_) => Transport::Wss(config),
+        });
     }
     mqtt
+}
+
+/// The broker as the library names it.
+fn target(broker: &Broker) -> rumqttc::Broker {
+    // TLS would take an IPv6 address with brackets for a name.
+    let plain = || rumqttc::Broker::tcp(broker.bare_host(), broker.port);
+    let Some(path) = &broker.path else { return plain() };
+    // What cannot be a URL was refused with the configuration.
+    rumqttc::Broker::websocket(format!("ws://{broker}{path}")).unwrap_or_else(|_| plain())
 }
 
 /// Polls until the first error and reports the events.
@@ -385,6 +448,7 @@ async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender
         let arrival = reader.first();
         let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
+                backlog.rate().sent(Instant::now());
                 let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
                 if left <= REQUESTS / 2
                     && backlog.room_wanted.swap(false, Ordering::SeqCst)

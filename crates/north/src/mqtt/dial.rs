@@ -142,6 +142,7 @@ mod tests {
             let broker = Broker {
                 host: host.to_string(),
                 port: address.port(),
+                path: None,
             };
             let dialled = Dial::default().connect(broker, 0, NetworkOptions::new()).await;
             assert_eq!(dialled.is_ok(), reaches, "{host}");

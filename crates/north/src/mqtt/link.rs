@@ -14,7 +14,10 @@ use super::outage_log::OutageLog;
 use super::outbox::Message;
 use super::session::Will;
 use super::takeover::Takeovers;
-use super::{Broker, Options, tls};
+use super::{Broker, Options, Password, Secret, tls};
+
+/// The reasons of a broker that does not accept a password (any more): 0x86 and 0x87.
+const CREDENTIALS: [&str; 2] = ["BadUserNamePassword", "NotAuthorized"];
 
 /// The next action of the link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,6 +68,10 @@ pub(super) struct BrokerLink {
     /// Of each broker.
     outages: Vec<OutageLog>,
     takeovers: Takeovers,
+    /// The password of the last attempt.
+    password: Option<Secret>,
+    /// A password of a file that the broker refused, and when it may be tried again.
+    refused: Option<(Secret, Instant)>,
 }
 
 impl BrokerLink {
@@ -84,6 +91,8 @@ impl BrokerLink {
             will: WillForm::first(options.retain),
             options: Arc::new(options),
             takeovers: Takeovers::default(),
+            password: None,
+            refused: None,
         }
     }
 
@@ -193,15 +202,30 @@ impl BrokerLink {
     /// Why it cannot.
     pub(super) async fn connect(&mut self, will: Will) -> Result<(), String> {
         let options = self.options.clone();
-        // Read for each attempt, so that renewed certificates are used without a restart.
-        let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
-        let config = config.map_err(|error| error.to_string())?;
-        let config = config.map_err(|error| error.to_string())?;
+        // Read for each attempt, so that renewed certificates and tokens are used without a restart.
+        let read = move || {
+            let config = tls::client_config(&options).map_err(|error| error.to_string())?;
+            let password = options.password.as_ref().map(Password::read).transpose()?;
+            Ok::<_, String>((config, password))
+        };
+        let read = tokio::task::spawn_blocking(read)
+            .await
+            .map_err(|error| error.to_string())?;
+        let (config, password) = read?;
+        if let Some((_, retry_at)) = self
+            .refused
+            .take_if(|(refused, _)| Some(&*refused) == password.as_ref())
+        {
+            // The same one would be refused again.
+            self.state = State::Down { retry_at };
+            return Ok(());
+        }
+        self.password.clone_from(&password);
         let will = self.will.will(will);
         let broker = self.broker();
         let target = (&broker, self.client_id.as_str());
         let dial = (self.dial.clone(), self.rotation.round());
-        let connection = Connection::open(&self.options, target, will, config, dial);
+        let connection = Connection::open(&self.options, target, (will, password), config, dial);
         self.state = State::Up(connection, Phase::Connecting);
         Ok(())
     }
@@ -264,6 +288,7 @@ impl BrokerLink {
         let (now, prefix, broker) = (Instant::now(), self.prefix, self.broker());
         let place = self.rotation.current();
         let before = self.turn_to_next(None, now);
+        self.read_password_again(why, now);
         if self
             .outages
             .get_mut(place)
@@ -286,6 +311,17 @@ impl BrokerLink {
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}{broker}: {words}");
         }
         before
+    }
+
+    /// A broker that does not accept the password any more may accept the one that the file has now.
+    fn read_password_again(&mut self, why: &str, now: Instant) {
+        let is_refused = CREDENTIALS.iter().any(|code| why.contains(code));
+        if let (true, Some(Password::File(_)), State::Down { retry_at }) =
+            (is_refused, &self.options.password, &mut self.state)
+        {
+            self.refused = self.password.take().map(|password| (password, *retry_at));
+            *retry_at = now;
+        }
     }
 
     /// Closes the connection, if there is one; the next attempt follows after `wait`.

@@ -34,8 +34,10 @@ mod link;
 mod offline;
 mod outage_log;
 mod outbox;
+mod password;
 mod payload;
 mod publisher;
+mod rate;
 mod record;
 mod reply;
 mod request;
@@ -67,15 +69,7 @@ pub use self::record::whole_records;
 pub use self::request::Incoming;
 pub use self::rights::BrokerRights;
 
-/// A secret that is not printed in logs.
-#[derive(Clone, PartialEq, Eq)]
-pub struct Secret(pub String);
-
-impl fmt::Debug for Secret {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("(secret)")
-    }
-}
+pub use self::password::{Password, Secret, SecretFault};
 
 /// Where a broker is.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -83,6 +77,8 @@ pub struct Broker {
     /// Host; an IPv6 address with or without brackets.
     pub host: String,
     pub port: u16,
+    /// Path of MQTT over WebSocket, from its `/` on; plain TCP where there is none.
+    pub path: Option<String>,
 }
 
 impl fmt::Display for Broker {
@@ -111,7 +107,11 @@ pub struct Options {
     pub client_id: String,
     /// User name, with password.
     pub username: Option<String>,
-    pub password: Option<Secret>,
+    pub password: Option<Password>,
+    /// Host and port of an HTTP proxy, by whose CONNECT all brokers are reached.
+    pub proxy: Option<(String, u16)>,
+    /// Most messages that each connection publishes in any second; any number with 0.
+    pub publish_limit: usize,
     /// CA certificates (PEM) for the broker; those of the system if absent.
     pub ca: Option<PathBuf>,
     /// Client certificate chain and key (PEM).

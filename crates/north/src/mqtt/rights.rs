@@ -63,6 +63,7 @@ mod tests {
         let broker = |port| Broker {
             host: "127.0.0.1".to_string(),
             port,
+            path: None,
         };
         let before = Options {
             brokers: vec![broker(1), broker(2)],

@@ -1,7 +1,7 @@
 //! `[modbus_tcp]`, its listeners and TLS.
 
 use super::forms::*;
-use crate::north::modbus_tcp::{Role, Uncached};
+use crate::north::modbus_tcp::{Registers, Role, Uncached};
 
 const CONNECTIONS: Number = Number(1..=10_000, None);
 pub(in crate::config) const ROLES: Words<Role> = Words(&[("monitor", Role::Monitor), ("control", Role::Control)]);
@@ -54,6 +54,15 @@ keys! {
         write: Vec<IpNet> = NETWORKS, or "that of `[modbus_tcp]`";
         /// Buses whose drives are served; any other unit gets exception 0x0A.
         buses: Vec<String> = BUSES, or "all";
+        /// Drive that units 0 and 255 are too, for clients whose unit cannot be set. The gateway's own registers, with stop
+        /// all, are then at no unit: 1 written to 0x0100 at units 0 and 255 stops that drive.
+        default_drive: String = Name("-_"), or "none";
+        /// `"model"`: the common model, and the drive's own registers below 0x8000. `"raw"`: only the drive's own, 0 to
+        /// 0xFFFF.
+        view: Registers = Words(&[("model", Registers::Model), ("raw", Registers::Raw)]), default "model";
+        /// Where the common model begins: 0x8000, or [0](modbus-tcp.md#clients-with-few-registers) for clients that know 40001 to
+        /// 49999 only. Not with `view = "raw"`.
+        model_at: u16 = Number(0..=0x8000, None), or "0x8000";
     }
 
     /// Modbus/TCP Security: TLS in which the clients present certificates.

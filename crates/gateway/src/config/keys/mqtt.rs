@@ -21,15 +21,19 @@ const SPARKPLUG_ID: Parsed<String> = Parsed {
 keys! {
     /// MQTT client; not started without this section.
     MQTT: Mqtt {
-        /// The broker; `mqtts` uses TLS, default port 8883.
+        /// The broker; `mqtts` uses TLS, default port 8883, `ws` and `wss` WebSocket, default ports 80 and 443.
         url: Broker = Parsed {
-            parse: parse_url, words: &[], pattern: "^mqtts?://",
-            range: "\"mqtt://host[:port]\" or \"mqtts://host[:port]\"",
+            parse: parse_url, words: &[], pattern: "^(mqtt|ws)s?://",
+            range: "\"mqtt://host[:port]\", \"mqtts://…\", \"ws://host[:port]/path\" or \"wss://…\"",
         }, default "mqtt://127.0.0.1:1883";
-        /// [Further brokers](mqtt.md#several-brokers), tried in order after `url`; with its credentials, all `mqtts://` or none.
+        /// [Further brokers](mqtt.md#several-brokers), tried in order after `url`; with its credentials and scheme.
         urls: Vec<Broker> = List {
             parse: parse_url, empty: None, range: "addresses such as [\"mqtt://broker-2:1883\"]",
         }, default [];
+        /// HTTP proxy by which the brokers are reached (CONNECT); it resolves their names, and nothing goes past it.
+        proxy: ProxyAddress = Parsed {
+            parse: parse_proxy, words: &[], pattern: "^http://", range: "\"http://host:port\"",
+        }, or "none";
         /// Client id, unique on the broker.
         client_id: String = Parsed { parse: parse_client_id, words: &[], pattern: "", range: "a string in quotes" },
             or "`drivegate-` and the gateway's name";
@@ -37,7 +41,8 @@ keys! {
         username: String = Parsed { parse: parse_username, words: &[], pattern: "", range: "a string in quotes" }, or "none";
         /// Password of the user; `password_file` is better.
         password: String = STRING, or "none";
-        /// File whose only line is the password, such as a systemd credential or a container secret.
+        /// File whose only line is the password, such as a systemd credential, a container secret or a token that another
+        /// program renews: it is read for each connection.
         password_file: PathBuf = PATH, or "none";
         /// PEM file with the CA certificates used to verify the broker's certificate.
         ca: PathBuf = PATH, or "the system's";
@@ -68,6 +73,8 @@ keys! {
         history: History = Words(&[
             ("off", History::Off), ("changes", History::Changes), ("all", History::All),
         ]), default "off";
+        /// Most messages that each connection publishes in any second; 0: no limit.
+        publish_limit: usize = Number(0..=100_000, None), default 0;
         /// How often values are published.
         publish: Present = Own { schema: Publish::schema, range: "[mqtt.publish]" }, or "the defaults";
         /// Whether commands are accepted on the set topics, for drives with `access = "control"`, from anyone the
@@ -154,6 +161,14 @@ pub(in crate::config) struct Broker {
     pub(in crate::config) host: String,
     pub(in crate::config) port: u16,
     pub(in crate::config) tls: bool,
+    /// Of WebSocket.
+    pub(in crate::config) path: Option<String>,
+}
+
+/// `http://host:port` of a proxy.
+pub(in crate::config) struct ProxyAddress {
+    pub(in crate::config) host: String,
+    pub(in crate::config) port: u16,
 }
 
 impl Broker {
@@ -202,13 +217,15 @@ fn parse_url(text: &str) -> Result<Broker, Finding> {
     let bad = |why: &str| {
         Finding::new(
             format!("`{}` {why}", hidden(text)),
-            "write \"mqtt://host:port\" or \"mqtts://host:port\"",
+            "write \"mqtt://host:port\" or \"mqtts://host:port\", or \"ws://host:port/path\" or \"wss://host:port/path\"",
         )
     };
     let (scheme, rest) = text.split_once("://").ok_or_else(|| bad("has no scheme"))?;
-    let (tls, port) = match scheme {
-        "mqtt" => (false, 1883),
-        "mqtts" => (true, 8883),
+    let (tls, port, web) = match scheme {
+        "mqtt" => (false, 1883, false),
+        "mqtts" => (true, 8883, false),
+        "ws" => (false, 80, true),
+        "wss" => (true, 443, true),
         _ => return Err(bad("is not an MQTT address")),
     };
     if rest.contains('@') {
@@ -217,9 +234,32 @@ fn parse_url(text: &str) -> Result<Broker, Finding> {
             "write username and password_file as separate keys",
         ));
     }
-    let server = rest.strip_suffix('/').unwrap_or(rest);
+    let (server, path) = match rest.split_once('/').filter(|_| web) {
+        Some((server, path)) => (server, format!("/{path}")),
+        None => (rest.strip_suffix('/').unwrap_or(rest), "/".to_string()),
+    };
     let (host, port) = values::host_port(server, Some(port)).ok_or_else(|| bad("has no valid host and port"))?;
-    Ok(Broker { host, port, tls })
+    if !path
+        .bytes()
+        .all(|byte| byte.is_ascii_graphic() && !b"\"<>\\^`{|}#".contains(&byte))
+    {
+        return Err(bad("has a path with characters that no URL has"));
+    }
+    let path = web.then_some(path);
+    Ok(Broker { host, port, tls, path })
+}
+
+fn parse_proxy(text: &str) -> Result<ProxyAddress, Finding> {
+    let bad = |why: &str| Finding::new(format!("`{}` {why}", hidden(text)), "write \"http://host:port\"");
+    if text.contains('@') {
+        return Err(bad("contains a user; proxies that ask for one are not supported"));
+    }
+    let server = text
+        .strip_prefix("http://")
+        .ok_or_else(|| bad("is not the address of an HTTP proxy"))?;
+    let server = server.strip_suffix('/').unwrap_or(server);
+    let (host, port) = values::host_port(server, None).ok_or_else(|| bad("has no valid host and port"))?;
+    Ok(ProxyAddress { host, port })
 }
 
 /// The address without what may be a password.

@@ -93,7 +93,7 @@ fn a_listener_for_each_line() {
         "the short form is not there unless it is written"
     );
     let [one, two] = [&options.listeners[0], &options.listeners[1]];
-    assert_eq!(one.buses.as_deref(), Some(&["line1".to_string()][..]));
+    assert_eq!(one.view.buses.as_deref(), Some(&["line1".to_string()][..]));
     assert_eq!(
         (one.allow[0].to_string(), one.write[0].to_string()),
         ("10.0.0.0/8".into(), "10.0.0.1/32".into())

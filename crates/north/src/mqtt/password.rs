@@ -1,0 +1,104 @@
+//! The password of the client: one for good, or that of a file, which is read for each connection, so that a token that
+//! another program renews is used without a restart.
+
+use std::fmt;
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+/// Most bytes of a secret: a longer file is not a password.
+const LONGEST: u64 = 16 << 10;
+
+/// A secret that is not printed in logs.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(pub String);
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("(secret)")
+    }
+}
+
+/// Where the password comes from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Password {
+    /// The configuration.
+    Fixed(Secret),
+    /// This file, whose only line it is.
+    File(PathBuf),
+}
+
+/// Why a file holds no secret.
+#[derive(Debug, thiserror::Error)]
+pub enum SecretFault {
+    /// The file cannot be read.
+    #[error("it cannot be read: {0}")]
+    Unreadable(#[from] io::Error),
+    /// The file has no text.
+    #[error("it is empty")]
+    Empty,
+    /// A password is one line.
+    #[error("it is not a password: it has several lines")]
+    Lines,
+}
+
+impl Secret {
+    /// The only line of a file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is empty, or has several lines.
+    pub fn read(path: &Path) -> Result<Secret, SecretFault> {
+        let mut text = String::new();
+        File::open(path)?.take(LONGEST).read_to_string(&mut text)?;
+        let line = text.lines().next().unwrap_or_default();
+        if line.is_empty() {
+            return Err(SecretFault::Empty);
+        }
+        if text.trim_end_matches(['\r', '\n']).contains('\n') || text.len() as u64 == LONGEST {
+            return Err(SecretFault::Lines);
+        }
+        Ok(Secret(line.to_string()))
+    }
+}
+
+impl Password {
+    /// The password now.
+    ///
+    /// # Errors
+    /// Why its file holds none, with its path.
+    pub(super) fn read(&self) -> Result<Secret, String> {
+        match self {
+            Password::Fixed(secret) => Ok(secret.clone()),
+            Password::File(path) => {
+                Secret::read(path).map_err(|why| format!("password_file {}: {why}", path.display()))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_text_that_the_file_has_now() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("token");
+        let password = Password::File(path.clone());
+        assert!(password.read().unwrap_err().contains("token: it cannot be read"));
+        for (text, expected) in [
+            ("one\n", Ok("one")),
+            ("two", Ok("two")),
+            ("", Err("it is empty")),
+            ("a\nb\n", Err("several lines")),
+        ] {
+            std::fs::write(&path, text).unwrap();
+            match (password.read(), expected) {
+                (Ok(secret), Ok(expected)) => assert_eq!(secret.0, expected),
+                (Err(why), Err(expected)) => assert!(why.contains(expected), "{why}"),
+                (found, expected) => panic!("{found:?}, {expected:?}"),
+            }
+        }
+        assert_eq!(format!("{:?}", Password::Fixed(Secret("x".into()))), "Fixed((secret))");
+    }
+}
