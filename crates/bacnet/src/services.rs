@@ -134,6 +134,9 @@ pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRe
             properties.push(property_ref(&mut reader, 0, 1)?);
         }
         reader.close(1)?;
+        if properties.is_empty() {
+            return Err(Reject::MissingRequiredParameter);
+        }
         all.push((object, properties));
     }
     match all.is_empty() {

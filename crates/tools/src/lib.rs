@@ -8,6 +8,7 @@ mod addresses;
 mod archive;
 mod audit;
 mod backup;
+mod certificate;
 mod check;
 mod client;
 mod completions;
@@ -176,6 +177,7 @@ commands! {
     Audit => audit,
     Token => token,
     User => user,
+    Certificate => certificate,
     Backup => backup,
     Restore => restore,
     Schema => schema,

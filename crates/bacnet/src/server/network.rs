@@ -84,6 +84,9 @@ impl Server {
         let target = match npdu.to {
             None => Target::Own,
             Some((_, _, 0)) => return,
+            // The router on the way to the virtual network takes the last hop.
+            Some((GLOBAL, _, 1)) => Target::Own,
+            Some((network, _, 1)) if network == self.options.network => return,
             Some((GLOBAL, ..)) => Target::All,
             Some((network, mac, _)) if network == self.options.network => match mac {
                 Mac::ALL => Target::Network,
@@ -113,8 +116,8 @@ impl Server {
                 let table = [1, network[0], network[1], 1, 0];
                 self.between(source, message::INITIALIZE_TABLE_ACK, &table, now);
             }
-            // Busy and available routers, numbers of networks, security, vendors: of no concern here.
-            (0x01..=0x13 | 0x80.., _) => {}
+            // Busy and available routers, numbers of networks, security: of no concern here.
+            (0x01..=0x13, _) => {}
             _ => self.reject(source, UNKNOWN_MESSAGE, 0, now),
         }
     }

@@ -1,4 +1,5 @@
-//! The sockets: one for what comes to this host, one for broadcasts, which Linux gives to a socket that is bound to their address.
+//! The sockets: one for what comes to this host, and for broadcasts, which Linux gives to a socket that is bound to their address,
+//! one for those of the network and one for 255.255.255.255, to which many clients send.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -14,7 +15,8 @@ pub(super) struct Sockets {
     pub(super) prefix: u8,
     pub(super) broadcast_to: SocketAddrV4,
     pub(super) unicast: UdpSocket,
-    pub(super) broadcast: Option<UdpSocket>,
+    /// For broadcasts; none where the first socket receives them itself.
+    pub(super) broadcasts: Vec<UdpSocket>,
 }
 
 impl Sockets {
@@ -33,16 +35,20 @@ impl Sockets {
         let to = broadcast_of(*listen.ip(), prefix);
         let broadcast_to = SocketAddrV4::new(to, port);
         // A socket that is bound to no address receives broadcasts itself.
-        let broadcast = match listen.ip().is_unspecified() {
-            true => None,
-            false => Some(shared(broadcast_to)?),
-        };
+        let mut broadcasts = Vec::new();
+        if !listen.ip().is_unspecified() {
+            broadcasts.push(shared(broadcast_to)?);
+            let widest = SocketAddrV4::new(Ipv4Addr::BROADCAST, port);
+            if widest != broadcast_to {
+                broadcasts.push(shared(widest)?);
+            }
+        }
         Ok(Sockets {
             address,
             prefix,
             broadcast_to,
             unicast,
-            broadcast,
+            broadcasts,
         })
     }
 
@@ -123,16 +129,18 @@ mod tests {
         other.set_broadcast(true).unwrap();
         other.send_to(b"all", sockets.broadcast_to).await.unwrap();
         let mut buffer = [0; 8];
-        let heard = sockets
-            .broadcast
-            .as_ref()
-            .unwrap()
-            .recv_from(&mut buffer)
-            .await
-            .unwrap();
+        let heard = sockets.broadcasts[0].recv_from(&mut buffer).await.unwrap();
         assert_eq!(
             (&buffer[..heard.0], heard.1),
             (&b"all"[..], other.local_addr().unwrap())
         );
+        let bound: Vec<SocketAddr> = sockets
+            .broadcasts
+            .iter()
+            .map(|socket| socket.local_addr().unwrap())
+            .collect();
+        let port = sockets.address.port();
+        let widest = SocketAddr::from((Ipv4Addr::BROADCAST, port));
+        assert_eq!(bound, [SocketAddr::V4(sockets.broadcast_to), widest]);
     }
 }

@@ -6,6 +6,7 @@ use std::net::{SocketAddr, SocketAddrV4};
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_bacnet::To;
@@ -58,7 +59,7 @@ pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
     /// Of the sockets: for this host, and for all.
-    readers: [Reader; 2],
+    readers: [Reader; 3],
     stats: Arc<NorthState>,
     busy: Arc<AtomicBool>,
     desk: Desk,
@@ -89,7 +90,7 @@ impl Task {
         Task {
             options,
             sockets,
-            readers: [waiting_reader(), waiting_reader()],
+            readers: [waiting_reader(), waiting_reader(), waiting_reader()],
             stats,
             busy,
             desk,
@@ -125,10 +126,10 @@ impl Task {
                 _ = ticks.tick() => self.tick(),
                 ready = self.sockets.unicast.readable(), if !self.retired => {
                     if ready.is_ok() {
-                        self.take(&mut buffer, false);
+                        self.take(&mut buffer, None);
                     }
                 }
-                () = heard(self.sockets.broadcast.as_ref()), if !self.retired => self.take(&mut buffer, true),
+                place = heard(&self.sockets.broadcasts), if !self.retired => self.take(&mut buffer, Some(place)),
                 Some(ended) = self.writes.next(), if waits => self.desk.ended(&ended, Instant::now()),
                 () = self.news.notified(), if subscribed && !due => due = true,
                 () = tokio::time::sleep_until(next_look.into()), if due => {
@@ -154,12 +155,13 @@ impl Task {
     }
 
     /// Processes received datagrams.
-    fn take(&mut self, buffer: &mut [u8], broadcast: bool) {
+    fn take(&mut self, buffer: &mut [u8], broadcast: Option<usize>) {
         let now = Instant::now();
-        let [unicast, of_all] = &self.readers;
+        let [unicast, of_network, of_all] = &self.readers;
         for place in 0..BATCH {
-            let (socket, reader) = match (broadcast, &self.sockets.broadcast) {
-                (true, Some(socket)) => (socket, of_all),
+            let (socket, reader) = match broadcast.map(|place| (place, self.sockets.broadcasts.get(place))) {
+                Some((0, Some(socket))) => (socket, of_network),
+                Some((_, Some(socket))) => (socket, of_all),
                 _ => (&self.sockets.unicast, unicast),
             };
             let Ok((length, SocketAddr::V4(from))) = socket.try_recv_from(buffer) else {
@@ -331,7 +333,7 @@ impl Task {
                 self.options = Arc::from(options);
                 if let Some(sockets) = sockets {
                     self.sockets = sockets;
-                    self.readers = [waiting_reader(), waiting_reader()];
+                    self.readers = [waiting_reader(), waiting_reader(), waiting_reader()];
                 }
                 self.see();
                 let now = Instant::now();
@@ -398,13 +400,12 @@ fn waiting_reader() -> Reader {
     reader
 }
 
-/// Waits for a broadcast.
-async fn heard(socket: Option<&UdpSocket>) {
-    match socket {
-        Some(socket) => {
-            // Whatever is wrong shows when it is read.
-            let _ = socket.readable().await;
-        }
-        None => std::future::pending().await,
-    }
+/// Waits for a broadcast; which of these sockets has it.
+async fn heard(sockets: &[UdpSocket]) -> usize {
+    std::future::poll_fn(|cx| {
+        // Whatever is wrong shows when it is read.
+        let ready = sockets.iter().position(|socket| socket.poll_recv_ready(cx).is_ready());
+        ready.map_or(Poll::Pending, Poll::Ready)
+    })
+    .await
 }

@@ -256,10 +256,9 @@ pub(super) fn error(outcome: &Outcome) -> Result<(), Error> {
 
 fn of_refusal(refusal: &Refusal) -> Error {
     match refusal {
-        Refusal::NotWritable(_) | Refusal::UnknownDrive(_) => Error::WRITE_ACCESS_DENIED,
+        Refusal::NotWritable(_) | Refusal::UnknownDrive(_) | Refusal::NotAllowed(_) => Error::WRITE_ACCESS_DENIED,
         Refusal::BadValue(_) => Error::VALUE_OUT_OF_RANGE,
-        Refusal::NotAllowed(_)
-        | Refusal::NotKnown(_)
+        Refusal::NotKnown(_)
         | Refusal::MotorRuns(_)
         | Refusal::OtherValue(_)
         | Refusal::HeldByOther(_)

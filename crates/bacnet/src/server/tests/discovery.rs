@@ -209,3 +209,38 @@ fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
         "answers are broadcast here and by the BBMD"
     );
 }
+
+/// The router on the way to the virtual network takes the last hop of a message.
+#[test]
+fn a_message_with_one_hop_left_is_not_delivered_further() {
+    let mut rig = ServerWithClients::new();
+    for (to, hops, wanted) in [
+        (npdu::GLOBAL, 2, &[100, 101, 102, 103][..]),
+        (npdu::GLOBAL, 1, &[100]),
+        (npdu::GLOBAL, 0, &[]),
+        (NETWORK, 2, &[101, 102, 103]),
+        (NETWORK, 1, &[]),
+    ] {
+        let mut bytes = who_is(Some((to, Mac::ALL)), None, None);
+        // The hop count stands before the APDU.
+        let place = bytes.len() - WHO_IS.len() - 1;
+        bytes[place] = hops;
+        rig.datagram(5, &bvlc::broadcast(&bytes));
+        let heard: Vec<u32> = present(&rig.out()).into_iter().map(|(instance, ..)| instance).collect();
+        assert_eq!(heard, wanted, "{to} {hops}");
+        rig.later(Duration::from_secs(1));
+    }
+}
+
+#[test]
+fn messages_between_routers_that_are_not_known_are_rejected() {
+    let mut rig = ServerWithClients::new();
+    for kind in [0x80, 0xFF, 0x14] {
+        let message = npdu::encode(None, None, false, Payload::Network(kind, &[0, 0]));
+        rig.datagram(5, &bvlc::unicast(&message));
+        let out: Vec<Vec<u8>> = rig.out().into_iter().map(|(.., content)| content).collect();
+        assert_eq!(out, [vec![0xFF, npdu::message::REJECT, 3, 0, 0]], "{kind:#x}");
+        rig.datagram(5, &bvlc::broadcast(&message));
+        assert!(rig.out().is_empty(), "none by broadcast");
+    }
+}
