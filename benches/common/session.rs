@@ -19,6 +19,7 @@ pub fn options(client_id: &str, host: &str, port: u16) -> Options {
         brokers: vec![Broker {
             host: host.to_string(),
             port,
+            path: None,
         }],
         tls: false,
         client_id: client_id.to_string(),
@@ -35,6 +36,8 @@ pub fn options(client_id: &str, host: &str, port: u16) -> Options {
         telemetry_qos: Qos::AtMostOnce,
         event_qos: Qos::AtLeastOnce,
         expiry: Some(Duration::from_secs(300)),
+        proxy: None,
+        publish_limit: 0,
         message_expiry: Some(Duration::from_secs(600)),
         min_interval: Duration::from_millis(50),
         max_interval: Duration::from_secs(60),

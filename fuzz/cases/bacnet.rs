@@ -84,10 +84,11 @@ pub(crate) fn run(data: &[u8]) {
     let options = Options {
         address: GATEWAY,
         prefix: 24,
-        network: NETWORK,
+        network: Some(NETWORK),
         vendor: (0, "fuzz".into()),
         version: "0".into(),
         bbmd: None,
+        foreign_devices: 2,
     };
     let devices = [None, Some(1), Some(2), Some(3)].map(|unit| device(100 + u32::from(unit.unwrap_or(0)), unit));
     let mut server = Server::new(options, devices.to_vec(), now);

@@ -1,6 +1,7 @@
 //! BACnet/IP from outside: bacpypes3 and node-bacnet, which know nothing of each other, against the real gateway with simulated
 //! drives; tshark reads what they say.
 
+mod layouts;
 mod rights;
 
 use std::io::{Read as _, Write as _};
@@ -26,7 +27,7 @@ pub(super) fn free_udp_port() -> u16 {
 struct Plant {
     site: Site,
     gateway: Running,
-    _drives: Running,
+    drives: Running,
     port: u16,
 }
 
@@ -41,7 +42,7 @@ fn plant(parts: &[&str], keys: &str, simulate: impl Fn(&Site) -> Running) -> Pla
     Plant {
         site,
         gateway,
-        _drives: drives,
+        drives,
         port,
     }
 }
@@ -62,10 +63,15 @@ impl Plant {
 
     /// The answers of bacpypes3, whose client is at that address.
     fn bacpypes(&self, host: u8, orders: &[Json]) -> Vec<Json> {
+        self.bacpypes_as(host, &[], orders)
+    }
+
+    /// The answers of bacpypes3 as a client of that kind.
+    fn bacpypes_as(&self, host: u8, kind: &[&str], orders: &[Json]) -> Vec<Json> {
         let own = format!("127.0.0.{host}/8:{}", free_udp_port());
         let script = root().join("tests/peers/bacnet_client.py").display().to_string();
         let mut command = Command::new(python());
-        command.args([&script, &own, &self.address(), "1001"]);
+        command.args([&script, &own, &self.address(), "1001"]).args(kind);
         asked(&mut command, orders)
     }
 
@@ -424,8 +430,8 @@ fn a_drive_that_is_away_is_silent_or_shows_its_fault() {
     let present = |plant: &Plant| plant.bacpypes(20, &[json!(["who_is", 101, 102, "global"])]).remove(0);
     assert_eq!(present(&plant), json!([101, 102]));
     // It takes its link away; another test might get the same pseudo-terminal.
-    plant._drives.signal("TERM");
-    plant._drives.ended();
+    plant.drives.signal("TERM");
+    plant.drives.ended();
     plant.site.until_state("pump-1", "offline");
     until("silence", || (present(&plant) == json!([])).then_some(()));
     plant.site.change("[bacnet]\n", "[bacnet]\noffline = \"fault\"\n");

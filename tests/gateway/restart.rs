@@ -1,5 +1,8 @@
 //! What is on the line when the gateway starts, dies and starts again; and a port that is not there.
 
+use std::collections::BTreeSet;
+use std::time::Duration;
+
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::SimulatedBus;
@@ -203,10 +206,21 @@ fn a_reload_does_not_end_supervision() {
 
 /// Leaves a process room for that many open files more, for good.
 fn leave_room_for(pid: u32, more: usize) {
-    let open: Vec<u32> = std::fs::read_dir(format!("/proc/{pid}/fd"))
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().to_string_lossy().parse().unwrap())
-        .collect();
+    let open = || -> BTreeSet<u32> {
+        let files = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap();
+        files
+            .map(|entry| entry.unwrap().file_name().to_string_lossy().parse().unwrap())
+            .collect()
+    };
+    // A file that is open for a moment would leave more room.
+    let mut before = BTreeSet::new();
+    let open = until("the same files at two moments", || {
+        std::thread::sleep(Duration::from_millis(200));
+        let now = open();
+        let same = now == before;
+        before.clone_from(&now);
+        same.then_some(now)
+    });
     let free = (0..).filter(|number| !open.contains(number));
     let limit = free.take(more).last().unwrap() + 1;
     let (pid, limit) = (pid.to_string(), format!("--nofile={limit}"));

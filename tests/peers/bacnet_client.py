@@ -1,7 +1,8 @@
-"""A BACnet client, bacpypes3: bacnet_client.py OWN GATEWAY NETWORK, addresses with ports. Takes orders line by line, as JSON lists, and
+"""A BACnet client, bacpypes3: bacnet_client.py OWN GATEWAY NETWORK ["foreign"], addresses with ports; a foreign device registers at
+the gateway. Takes orders line by line, as JSON lists, and
 prints the answer to each as JSON: a value, or {"error": [class, code]}, {"reject": reason}, {"abort": reason}.
 
-["who_is", LOW, HIGH, "global"|"local"] ["read", STATION, OBJECT, PROPERTY, INDEX] ["all", STATION, OBJECT...]
+["who_is", LOW, HIGH, "global"|"local"|"everywhere"] ["read", STATION, OBJECT, PROPERTY, INDEX] ["all", STATION, OBJECT...]
 ["write", STATION, OBJECT, PROPERTY, VALUE, PRIORITY] ["several", STATION, [OBJECT, PROPERTY, VALUE, PRIORITY]...]
 ["cov", STATION, OBJECT, CONFIRMED, SECONDS, COUNT] waits for so many notifications; STATION 0 is the gateway itself.
 """
@@ -22,7 +23,7 @@ from bacpypes3.apdu import (
 )
 from bacpypes3.basetypes import DateTime, PropertyIdentifier, PropertyValue
 from bacpypes3.constructeddata import Any, Array, List, Sequence, Choice
-from bacpypes3.ipv4.app import NormalApplication
+from bacpypes3.ipv4.app import ForeignApplication, NormalApplication
 from bacpypes3.json import sequence_to_json
 from bacpypes3.local.device import DeviceObject
 from bacpypes3.pdu import Address, IPv4Address
@@ -80,7 +81,7 @@ def written(value):
 
 
 class Client:
-    def __init__(self, own, gateway, network):
+    def __init__(self, own, gateway, network, kind="normal"):
         device = DeviceObject(
             objectIdentifier=("device", 4000),
             objectName="client",
@@ -89,14 +90,16 @@ class Client:
             segmentationSupported="segmentedBoth",
             maxSegmentsAccepted=64,
         )
-        self.app = NormalApplication(device, IPv4Address(own))
-        self.gateway, self.network = gateway, network
+        self.app = (ForeignApplication if kind == "foreign" else NormalApplication)(device, IPv4Address(own))
+        if kind == "foreign":
+            self.app.register(IPv4Address(gateway), 60)
+        self.gateway, self.network = gateway, int(network)
 
     def station(self, number):
         return Address(self.gateway if number == 0 else f"{self.network}:{number}@{self.gateway}")
 
     async def who_is(self, low, high, scope):
-        to = self.gateway if scope == "local" else f"*:*@{self.gateway}"
+        to = {"local": self.gateway, "everywhere": "*:*"}.get(scope, f"*:*@{self.gateway}")
         heard = await self.app.who_is(low, high, Address(to), timeout=1)
         return sorted(int(i_am.iAmDeviceIdentifier[1]) for i_am in heard)
 
@@ -144,8 +147,8 @@ class Client:
 
 
 async def main():
-    client = Client(*sys.argv[1:3], int(sys.argv[3]))
-    await asyncio.sleep(0.2)
+    client = Client(*sys.argv[1:])
+    await asyncio.sleep(0.2 if len(sys.argv) == 4 else 1)
     loop = asyncio.get_running_loop()
     while line := await loop.run_in_executor(None, sys.stdin.readline):
         name, *arguments = json.loads(line)

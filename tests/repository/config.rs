@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use drivegate::config::{Loaded, Settings};
 use drivegate::drive::Profile;
+use drivegate::north::mqtt::{Password, Secret};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -111,13 +112,16 @@ fn the_password_file_gives_its_line() {
         let env: Vec<_> = env.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect();
         Settings::parse(dir.path().join("t.toml"), source, env.into_iter())
     };
-    let password = |loaded: Loaded| loaded.settings.unwrap().mqtt.unwrap().password.unwrap().0;
-    assert_eq!(password(parse("open sesame\n", &[])), "open sesame");
-    assert_eq!(password(parse("open sesame", &[])), "open sesame");
+    let password = |loaded: Loaded| loaded.settings.unwrap().mqtt.unwrap().password.unwrap();
+    // The file is read for each connection.
+    assert_eq!(
+        password(parse("open sesame\n", &[])),
+        Password::File(dir.path().join("secret"))
+    );
     let env = [("DRIVEGATE__MQTT__PASSWORD", "12345")];
     assert_eq!(
         password(parse("open sesame", &env)),
-        "12345",
+        Password::Fixed(Secret("12345".to_string())),
         "the environment overrides the file"
     );
     for bad in ["", "\n", "two\nlines\n"] {

@@ -102,7 +102,8 @@ impl BacnetWorld {
         let options = Options {
             listen: "127.0.0.1:47808".parse().unwrap(),
             device: 100,
-            network: NETWORK,
+            network: Some(NETWORK),
+            foreign_devices: 0,
             offline: WhenOffline::Silent,
             commands: true,
             allow: everywhere(),

@@ -16,9 +16,24 @@ pub enum Bvlc<'a> {
     Broadcast(&'a [u8]),
     /// A broadcast that a BBMD passes on, with the host that sent it.
     Forwarded(SocketAddrV4, &'a [u8]),
-    /// A request that only a BBMD serves, with the code that refuses it.
+    /// A foreign device registers for so many seconds.
+    Register(u16),
+    /// A question for the foreign devices.
+    ReadForeign,
+    /// A foreign device is to be forgotten.
+    DeleteForeign(SocketAddrV4),
+    /// A message of a foreign device to all hosts of this network.
+    Distribute(&'a [u8]),
+    /// Any other request that only a BBMD serves, with the code that refuses it.
     ForBbmd(u16),
 }
+
+/// Result code: the registration of a foreign device is refused (J.2.1).
+pub const NO_REGISTRATION: u16 = 0x0030;
+/// Result code: the deletion of a foreign device is refused (J.2.1).
+pub const NO_DELETION: u16 = 0x0050;
+/// Result code: the distribution of a broadcast is refused (J.2.1).
+pub const NO_DISTRIBUTION: u16 = 0x0060;
 
 /// Reads a datagram; `None` where it is none of BACnet/IP, or of no valid length.
 pub fn decode(bytes: &[u8]) -> Option<Bvlc<'_>> {
@@ -42,10 +57,19 @@ pub fn decode(bytes: &[u8]) -> Option<Bvlc<'_>> {
             }
             _ => return None,
         },
-        0x05 => Bvlc::ForBbmd(0x0030),
-        0x06 => Bvlc::ForBbmd(0x0040),
-        0x08 => Bvlc::ForBbmd(0x0050),
-        0x09 => Bvlc::ForBbmd(0x0060),
+        0x05 => match rest {
+            [high, low] => Bvlc::Register(u16::from_be_bytes([*high, *low])),
+            _ => Bvlc::ForBbmd(NO_REGISTRATION),
+        },
+        0x06 => Bvlc::ReadForeign,
+        0x08 => match rest {
+            [a, b, c, d, high, low] => {
+                let port = u16::from_be_bytes([*high, *low]);
+                Bvlc::DeleteForeign(SocketAddrV4::new(Ipv4Addr::new(*a, *b, *c, *d), port))
+            }
+            _ => Bvlc::ForBbmd(NO_DELETION),
+        },
+        0x09 => Bvlc::Distribute(rest),
         0x0A => Bvlc::Unicast(rest),
         0x0B => Bvlc::Broadcast(rest),
         _ => return None,
@@ -81,6 +105,25 @@ pub fn register(seconds: u16) -> Vec<u8> {
     datagram(0x05, &seconds.to_be_bytes())
 }
 
+/// A message that is passed on for the host that sent it.
+pub fn forwarded(origin: SocketAddrV4, npdu: &[u8]) -> Vec<u8> {
+    datagram(0x04, &[&octets(origin)[..], npdu].concat())
+}
+
+/// The foreign devices: address, the time for which each registered, and what is left of it, seconds.
+pub fn foreign_devices(all: impl Iterator<Item = (SocketAddrV4, u16, u16)>) -> Vec<u8> {
+    let entry = |(host, time, left): (SocketAddrV4, u16, u16)| {
+        [&octets(host)[..], &time.to_be_bytes(), &left.to_be_bytes()].concat()
+    };
+    datagram(0x07, &all.flat_map(entry).collect::<Vec<u8>>())
+}
+
+fn octets(host: SocketAddrV4) -> [u8; 6] {
+    let [a, b, c, d] = host.ip().octets();
+    let [high, low] = host.port().to_be_bytes();
+    [a, b, c, d, high, low]
+}
+
 /// The result of a request.
 pub fn result(code: u16) -> Vec<u8> {
     datagram(0x00, &code.to_be_bytes())
@@ -96,7 +139,16 @@ mod tests {
         assert_eq!(decode(&unicast(&[1, 4])), Some(Bvlc::Unicast(&[1, 4])));
         assert_eq!(decode(&broadcast(&[1])), Some(Bvlc::Broadcast(&[1])));
         assert_eq!(register(60), [0x81, 5, 0, 6, 0, 60]);
-        assert_eq!(decode(&register(60)), Some(Bvlc::ForBbmd(0x30)));
+        assert_eq!(decode(&register(60)), Some(Bvlc::Register(60)));
+        assert_eq!(decode(&distribute(&[1])), Some(Bvlc::Distribute(&[1])));
+        let host = "10.0.0.9:47808".parse().unwrap();
+        assert_eq!(decode(&forwarded(host, &[1])), Some(Bvlc::Forwarded(host, &[1])));
+        let deletion = [0x81, 8, 0, 10, 10, 0, 0, 9, 0xBA, 0xC0];
+        assert_eq!(decode(&deletion), Some(Bvlc::DeleteForeign(host)));
+        assert_eq!(
+            foreign_devices([(host, 60, 90)].into_iter()),
+            [0x81, 7, 0, 14, 10, 0, 0, 9, 0xBA, 0xC0, 0, 60, 0, 90]
+        );
         assert_eq!(decode(&result(0)), Some(Bvlc::Result(0)));
         let forwarded = [0x81, 4, 0, 11, 10, 0, 0, 9, 0xBA, 0xC0, 1];
         let origin = "10.0.0.9:47808".parse().unwrap();

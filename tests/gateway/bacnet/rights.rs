@@ -129,7 +129,7 @@ fn a_write_behind_another_one_needs_the_right_that_its_client_has_then() {
             // Its bus, or its server, is another one.
             continue;
         }
-        plant._drives.signal("STOP");
+        plant.drives.signal("STOP");
         let several = json!(["several", 1, ["analog-value,1", PV, 20.0, 8], [RUN, PV, true, 8]]);
         let own = format!("127.0.0.20/8:{}", free_udp_port());
         let script = root().join("tests/peers/bacnet_client.py").display().to_string();
@@ -138,7 +138,7 @@ fn a_write_behind_another_one_needs_the_right_that_its_client_has_then() {
         let child = started(&mut command, std::slice::from_ref(&several));
         std::thread::sleep(Duration::from_millis(1000));
         plant.reload(&without);
-        plant._drives.signal("CONT");
+        plant.drives.signal("CONT");
         let answer = answers(child, 1).remove(0);
         assert_ne!(answer, json!("done"), "{what}");
         std::thread::sleep(Duration::from_millis(300));

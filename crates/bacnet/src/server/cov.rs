@@ -87,6 +87,7 @@ struct Outstanding {
 /// All subscriptions.
 #[derive(Debug, Default)]
 pub(super) struct Cov {
+    one_device: bool,
     of: BTreeMap<u32, Vec<Subscription>>,
     hosts: HashMap<Ipv4Addr, usize>,
     outstanding: HashMap<Address, Outstanding>,
@@ -98,6 +99,21 @@ pub(super) struct Cov {
 pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Told, f64)>;
 
 impl Cov {
+    /// Where all objects belong to one device, it may have as many subscriptions of a host as all devices.
+    pub(super) fn limited(one_device: bool) -> Cov {
+        Cov {
+            one_device,
+            ..Cov::default()
+        }
+    }
+
+    fn most_of_device(&self) -> usize {
+        match self.one_device {
+            true => MOST_OF_HOST,
+            false => MOST_OF_DEVICE,
+        }
+    }
+
     /// Subscribes, or renews; false where there is no room.
     pub(super) fn subscribe(
         &mut self,
@@ -117,7 +133,7 @@ impl Cov {
             due: None,
             lost: 0,
         };
-        let all = self.len();
+        let (all, most_of_device) = (self.len(), self.most_of_device());
         let of_device = self.of.entry(device).or_default();
         if let Some(known) = of_device.iter_mut().find(|s| s.key == key) {
             *known = renewed;
@@ -128,7 +144,7 @@ impl Cov {
             .filter(|s| s.key.subscriber.ip() == key.subscriber.ip())
             .count();
         let of_host = self.hosts.entry(key.subscriber.ip()).or_default();
-        if all >= MOST_SUBSCRIPTIONS || *of_host >= MOST_OF_HOST || own >= MOST_OF_DEVICE {
+        if all >= MOST_SUBSCRIPTIONS || *of_host >= MOST_OF_HOST || own >= most_of_device {
             self.tidy();
             return false;
         }

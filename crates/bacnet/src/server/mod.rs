@@ -3,6 +3,7 @@
 mod bbmd;
 mod cov;
 mod discovery;
+mod foreign_devices;
 mod network;
 mod notifying;
 mod reading;
@@ -28,6 +29,7 @@ pub use writing::Job;
 
 use bbmd::Foreign;
 use cov::Cov;
+use foreign_devices::ForeignDevices;
 use segments::Segments;
 use traffic::Traffic;
 use writing::Exchanges;
@@ -39,14 +41,16 @@ pub struct Options {
     pub address: SocketAddrV4,
     /// Bits of the mask of its network.
     pub prefix: u8,
-    /// The number of the virtual network, 1..=65534.
-    pub network: u16,
+    /// The number of the virtual network, 1..=65534; none where all objects belong to the device of the host.
+    pub network: Option<u16>,
     /// Identifier and name of the vendor.
     pub vendor: (u16, Arc<str>),
     /// The version of the program.
     pub version: Arc<str>,
     /// The BBMD at which it registers as a foreign device.
     pub bbmd: Option<SocketAddrV4>,
+    /// Most foreign devices that it serves as a BBMD.
+    pub foreign_devices: usize,
 }
 
 /// The application behind the server.
@@ -112,6 +116,7 @@ pub struct Server {
     by_station: HashMap<Mac, usize>,
     traffic: Traffic,
     foreign: Foreign,
+    foreign_devices: ForeignDevices,
     segments: Segments,
     cov: Cov,
     exchanges: Exchanges,
@@ -137,7 +142,7 @@ impl Server {
             vendor_name,
             version: options.version.clone(),
             port,
-            network: options.network,
+            network: options.network.unwrap_or_default(),
         };
         let mut server = Server {
             environment,
@@ -146,8 +151,9 @@ impl Server {
             by_station: HashMap::new(),
             traffic: Traffic::new(now),
             foreign: Foreign::new(options.bbmd, now),
+            foreign_devices: ForeignDevices::new(options.foreign_devices),
             segments: Segments::default(),
-            cov: Cov::default(),
+            cov: Cov::limited(options.network.is_none()),
             exchanges: Exchanges::default(),
             increments: HashMap::new(),
             quiet: HashMap::new(),

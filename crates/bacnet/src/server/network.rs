@@ -49,15 +49,52 @@ impl Server {
                 self.traffic.came(*from.ip(), bytes.len(), now);
                 self.traffic.answer(from, bvlc::result(code), now);
             }
+            Bvlc::Register(_) | Bvlc::ReadForeign | Bvlc::DeleteForeign(_) | Bvlc::Distribute(_) => {
+                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.of_foreign_device(from, datagram, app, now);
+            }
             Bvlc::Unicast(npdu) => {
                 self.traffic.came(*from.ip(), bytes.len(), now);
                 self.network(source(from, Way::Unicast), npdu, app, now);
             }
-            Bvlc::Broadcast(npdu) => self.network(source(from, Way::Broadcast), npdu, app, now),
+            Bvlc::Broadcast(npdu) => {
+                self.distribute(from, npdu, now);
+                self.network(source(from, Way::Broadcast), npdu, app, now);
+            }
             Bvlc::Forwarded(origin, npdu) if origin != self.options.address => {
                 self.network(source(origin, Way::Broadcast), npdu, app, now);
             }
             Bvlc::Forwarded(..) => {}
+        }
+    }
+
+    /// A request to this host as a BBMD.
+    fn of_foreign_device(&mut self, from: SocketAddrV4, request: Bvlc<'_>, app: &dyn Application, now: Instant) {
+        let done = |done: bool, code: u16| bvlc::result(if done { 0 } else { code });
+        let answer = match request {
+            Bvlc::Register(time) => done(self.foreign_devices.register(from, time, now), bvlc::NO_REGISTRATION),
+            Bvlc::DeleteForeign(host) => done(self.foreign_devices.delete(host, now), bvlc::NO_DELETION),
+            Bvlc::Distribute(_) if !self.foreign_devices.has(from, now) => bvlc::result(bvlc::NO_DISTRIBUTION),
+            Bvlc::Distribute(npdu) => {
+                self.traffic.broadcast(bvlc::forwarded(from, npdu), now);
+                self.distribute(from, npdu, now);
+                let source = Source {
+                    address: Address::local(from),
+                    way: Way::Broadcast,
+                };
+                return self.network(source, npdu, app, now);
+            }
+            _ if self.options.foreign_devices == 0 => bvlc::result(0x0040),
+            _ => bvlc::foreign_devices(self.foreign_devices.all(now)),
+        };
+        self.traffic.answer(from, answer, now);
+    }
+
+    /// Passes a broadcast on to the foreign devices, but for that from which it came.
+    fn distribute(&mut self, from: SocketAddrV4, npdu: &[u8], now: Instant) {
+        let others: Vec<SocketAddrV4> = self.foreign_devices.hosts(now).filter(|host| *host != from).collect();
+        for host in others {
+            self.traffic.answer(host, bvlc::forwarded(from, npdu), now);
         }
     }
 
@@ -76,7 +113,7 @@ impl Server {
             return;
         };
         // Nobody on this network is behind the network that it is the router for.
-        if npdu.from.is_some_and(|(network, _)| network == self.options.network) {
+        if npdu.from.is_some_and(|(network, _)| self.is_own(network)) {
             self.counters.discarded += 1;
             return;
         }
@@ -86,15 +123,17 @@ impl Server {
             Some((_, _, 0)) => return,
             // The router on the way to the virtual network takes the last hop.
             Some((GLOBAL, _, 1)) => Target::Own,
-            Some((network, _, 1)) if network == self.options.network => return,
+            Some((network, _, 1)) if self.is_own(network) => return,
             Some((GLOBAL, ..)) => Target::All,
-            Some((network, mac, _)) if network == self.options.network => match mac {
+            Some((network, mac, _)) if self.is_own(network) => match mac {
                 Mac::ALL => Target::Network,
                 mac => match self.by_station.get(&mac) {
                     Some(place) => Target::Device(*place),
                     None => return,
                 },
             },
+            // Only a router answers for networks.
+            Some(_) if self.options.network.is_none() => return,
             Some((network, ..)) => return self.reject(source, UNKNOWN_NETWORK, network, now),
         };
         match npdu.payload {
@@ -104,7 +143,9 @@ impl Server {
     }
 
     fn between_routers(&mut self, source: Source, target: Target, kind: u8, content: &[u8], now: Instant) {
-        let network = self.options.network.to_be_bytes();
+        let Some(network) = self.options.network.map(u16::to_be_bytes) else {
+            return;
+        };
         match (kind, content) {
             _ if !matches!(target, Target::Own | Target::All) => {}
             (message::WHO_IS_ROUTER, []) => self.announce_network(Some(source), now),
@@ -124,7 +165,9 @@ impl Server {
 
     /// Says for which network it is the router.
     pub(super) fn announce_network(&mut self, asked: Option<Source>, now: Instant) {
-        let network = self.options.network.to_be_bytes();
+        let Some(network) = self.options.network.map(u16::to_be_bytes) else {
+            return;
+        };
         match asked {
             Some(source) if source.way == Way::Unicast => self.between(source, message::I_AM_ROUTER, &network, now),
             _ => {
@@ -197,7 +240,7 @@ impl Server {
     /// The station of a device, as a sender.
     fn station(&self, device: u32) -> Option<(u16, Mac)> {
         let mac = self.device(device)?.station?;
-        Some((self.options.network, mac))
+        Some((self.options.network?, mac))
     }
 
     pub(super) fn message(&self, to: Address, device: u32, apdu: &[u8], expects: bool) -> Vec<u8> {
@@ -237,5 +280,11 @@ impl Server {
         if let Some(bbmd) = self.foreign.passes_on() {
             self.traffic.answer(bbmd, bvlc::distribute(npdu), now);
         }
+        self.distribute(self.options.address, npdu, now);
+    }
+
+    /// Whether that is the virtual network.
+    fn is_own(&self, network: u16) -> bool {
+        self.options.network == Some(network)
     }
 }

@@ -159,10 +159,11 @@ impl ServerWithClients {
         let options = Options {
             address: "10.0.0.1:47808".parse().unwrap(),
             prefix: 24,
-            network: NETWORK,
+            network: Some(NETWORK),
             vendor: (0, "test".into()),
             version: "1".into(),
             bbmd: None,
+            foreign_devices: 0,
         };
         let drives = (1..=drives).map(|unit| device(100 + u32::from(unit), Some(unit), more));
         let devices = [device(100, None, 0)].into_iter().chain(drives).collect();

@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::path::Path;
 
 use super::bus::Found;
-use super::keys::{BACNET, DRIVE};
+use super::keys::{BACNET, DRIVE, Layout};
 use super::settings::Unusable;
 use super::{files, mqtt, values};
 use crate::document::{Place, Reader};
@@ -19,6 +19,7 @@ pub(super) struct Bacnet {
     /// Absent when a part cannot be used, which is reported.
     pub(super) options: Option<Options>,
     device: (u32, Place),
+    layout: Layout,
     buses: Option<Vec<String>>,
     /// Whether any client could write.
     pub(super) commands: bool,
@@ -31,11 +32,35 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     let write = BACNET.write.get(reader);
     let commands = BACNET.commands.get(reader);
     let device = BACNET.device.get(reader);
-    let network = BACNET.network.read(reader);
+    let layout = BACNET.layout.get(reader);
+    let network = BACNET.network.read(reader).map(|network| match layout {
+        Layout::Routed => Some(network),
+        Layout::Flat => None,
+    });
+    if layout == Layout::Flat {
+        for key in [BACNET.network.name, BACNET.offline.name]
+            .into_iter()
+            .filter(|key| reader.has(key))
+        {
+            reader.problem(
+                key,
+                "layout = \"flat\" has no devices but the gateway's",
+                "leave one of them out; a drive that is away shows communication failure",
+            );
+        }
+    }
+    let foreign_devices = BACNET.foreign_devices.get(reader);
     let vendor = BACNET.vendor.read(reader);
     let offline = BACNET.offline.get(reader);
     let keep_priorities = BACNET.keep_priorities.get(reader);
     let bbmd = BACNET.bbmd.get(reader);
+    if foreign_devices > 0 && bbmd.is_some() {
+        reader.problem(
+            BACNET.foreign_devices.name,
+            "a BBMD is no foreign device of another one",
+            "leave `bbmd` or `foreign_devices` out",
+        );
+    }
     let password = read_password(reader, base);
     let buses = read_buses(reader, buses);
     let is_open = listen.is_some_and(|listen| listen.ip().is_unspecified()) && !reader.has(BACNET.allow.name);
@@ -51,6 +76,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
         listen,
         device,
         network,
+        foreign_devices,
         offline,
         commands,
         allow,
@@ -68,6 +94,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     reader.finish();
     Bacnet {
         device: (device, BACNET.device.place(reader)),
+        layout,
         commands: commands && options.as_ref().is_none_or(|options| !options.write.is_empty()),
         options: options.filter(|_| password.is_ok()),
         buses,
@@ -172,17 +199,22 @@ pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bac
         if let Some(other) = seen.insert(*unit, name) {
             reader.document().problem(
                 unit_place,
-                format!(
-                    "BACnet: drive `{name}` has the same device instance {} as drive `{other}`",
-                    device + u32::from(*unit)
-                ),
+                match bacnet.layout {
+                    Layout::Routed => format!(
+                        "BACnet: drive `{name}` has the same device instance {} as drive `{other}`",
+                        device + u32::from(*unit)
+                    ),
+                    Layout::Flat => {
+                        format!("BACnet: drive `{name}` has the same objects as drive `{other}`, by its unit {unit}")
+                    }
+                },
                 format!(
                     "give each its own `{}`, or serve fewer buses with `buses` of [bacnet]",
                     DRIVE.unit.name
                 ),
             );
         }
-        if device + u32::from(*unit) > MAX_INSTANCE {
+        if bacnet.layout == Layout::Routed && device + u32::from(*unit) > MAX_INSTANCE {
             reader.document().problem(
                 place,
                 format!(

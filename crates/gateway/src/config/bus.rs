@@ -199,7 +199,7 @@ fn check_only_one(reader: &Reader<'_>, drives: &[drive::Found], protocol: Protoc
         } else {
             reader.document().problem(
                 place,
-                "address 248 is for the only device of a line: one that answers at it answers at any address",
+                "a device that answers at address 248 answers at every address, so it must be the only one on its line",
                 "write an address from 1 to 247, or put the device on a bus of its own",
             );
         }

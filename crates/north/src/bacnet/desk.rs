@@ -68,6 +68,7 @@ fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
         address,
         prefix,
         network: view.options.network,
+        foreign_devices: view.options.foreign_devices,
         vendor: (view.options.vendor, VENDOR.into()),
         version: crate::version::VERSION.into(),
         bbmd: None,

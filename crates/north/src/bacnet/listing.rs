@@ -2,7 +2,7 @@
 
 use drivegate_bacnet::{Access, Kind, Object};
 
-use super::objects::{self, Shown};
+use super::objects::{self, Flat, Shown};
 use super::{Options, units};
 use crate::process_image::{BusSpec, DriveSpec};
 
@@ -51,11 +51,19 @@ pub fn devices<'s>(
     let served = buses.clone().filter(|(bus, _)| options.serves(&bus.name));
     let drives = served
         .flat_map(|(_, drives)| drives)
-        .map(|spec| objects::of_drive(spec, own));
-    [objects::of_gateway(own, buses.map(|(bus, _)| bus))]
-        .into_iter()
-        .chain(drives)
-        .collect()
+        .map(|spec| (spec.name.clone(), spec.unit, objects::of_drive(spec, own)));
+    let gateway_device = objects::of_gateway(own, buses.map(|(bus, _)| bus));
+    if options.network.is_some() {
+        return [gateway_device]
+            .into_iter()
+            .chain(drives.map(|(.., shown)| shown))
+            .collect();
+    }
+    let mut drives: Vec<(String, u8, Shown)> = drives.collect();
+    drives.sort_by_key(|(_, unit, _)| *unit);
+    let Flat { device, places } = objects::flat(own, gateway_device, drives.into_iter());
+    let meanings = places.into_iter().map(|(_, meaning)| meaning).collect();
+    vec![Shown { device, meanings }]
 }
 
 /// All objects of these devices.

@@ -58,8 +58,10 @@ pub struct Options {
     pub listen: SocketAddrV4,
     /// Instance of the gateway; that of a drive is greater by its unit.
     pub device: u32,
-    /// Number of the virtual network.
-    pub network: u16,
+    /// Number of the virtual network of the drives; none where all objects belong to the gateway's device (`layout = "flat"`).
+    pub network: Option<u16>,
+    /// Most foreign devices that it serves as a BBMD.
+    pub foreign_devices: usize,
     /// The behaviour of an offline drive.
     pub offline: WhenOffline,
     /// Whether clients may write at all.
@@ -128,13 +130,23 @@ impl Options {
 
     /// Files that the server has open.
     pub fn files(&self) -> usize {
-        3
+        4
     }
 
     /// Whether a server with these options can continue with those: its sockets and its identity for clients stay.
     fn continues(&self, other: &Options) -> bool {
-        (self.listen, self.device, self.network, self.vendor)
-            == (other.listen, other.device, other.network, other.vendor)
+        let identity = |options: &Options| {
+            let Options {
+                listen,
+                device,
+                network,
+                vendor,
+                foreign_devices,
+                ..
+            } = *options;
+            (listen, device, network, vendor, foreign_devices)
+        };
+        identity(self) == identity(other)
     }
 }
 

@@ -140,6 +140,51 @@ pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item =
     }
 }
 
+/// Numbers of objects of one drive, where all belong to the gateway's device.
+const PER_DRIVE: u32 = 1000;
+
+/// The objects of one device for all drives, with the unit of the drive of each; none for those of the gateway.
+#[derive(Debug, Clone)]
+pub struct Flat {
+    /// The device as BACnet sees it.
+    pub device: Arc<Device>,
+    /// The unit and the meaning of each object.
+    pub places: Vec<(Option<u8>, Meaning)>,
+}
+
+/// All objects of these devices, that of the gateway first, as those of one: numbers are unit * 1000 + n, names `drive.point`.
+pub fn flat((name, instance): (&str, u32), gateway: Shown, drives: impl Iterator<Item = (String, u8, Shown)>) -> Flat {
+    let mut objects = gateway.device.objects().to_vec();
+    let mut places: Vec<(Option<u8>, Meaning)> = gateway.meanings.iter().map(|meaning| (None, *meaning)).collect();
+    for (drive, unit, shown) in drives {
+        for (object, meaning) in shown.device.objects().iter().zip(&shown.meanings) {
+            // Beyond that they would be those of the next unit.
+            if object.id.instance >= PER_DRIVE {
+                continue;
+            }
+            objects.push(Object {
+                id: ObjectId::new(object.id.kind, u32::from(unit) * PER_DRIVE + object.id.instance),
+                name: format!("{drive}.{}", object.name).into(),
+                ..object.clone()
+            });
+            places.push((Some(unit), *meaning));
+        }
+    }
+    let about = (gateway.device.model.clone(), gateway.device.description.clone());
+    Flat {
+        device: Arc::new(Device::new(instance, None, name.to_string(), about, objects)),
+        places,
+    }
+}
+
+/// The unit of the drive to which an object of the one device belongs, and its number there.
+pub fn of_flat(object: ObjectId) -> Option<(u8, u32)> {
+    let unit = u8::try_from(object.instance / PER_DRIVE)
+        .ok()
+        .filter(|unit| *unit > 0)?;
+    Some((unit, object.instance % PER_DRIVE))
+}
+
 /// The points of the common model.
 fn model(spec: &DriveSpec, all: &mut Objects) {
     let index = |point: ModelPoint| spec.profile.model_index(point);

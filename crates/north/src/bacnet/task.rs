@@ -236,16 +236,19 @@ impl Task {
     /// Reports changes of drives with subscriptions.
     fn look(&mut self) {
         let now = Instant::now();
-        for device in self.desk.server.subscribed() {
-            let Some(drive) = self.desk.view.drives.get(&device) else {
-                continue;
-            };
-            let snapshot = drive.handle.image.snapshot();
-            let same = self.seen.get(&device).is_some_and(|seen| Arc::ptr_eq(seen, &snapshot));
-            if !same {
-                self.seen.insert(device, snapshot);
-                self.desk.changed(device, now);
+        let subscribed = self.desk.server.subscribed();
+        let mut changed = BTreeSet::new();
+        for (drive, shown) in &self.desk.view.drives {
+            let device = self.desk.view.shown_by(*drive);
+            let snapshot = shown.handle.image.snapshot();
+            let same = self.seen.get(drive).is_some_and(|seen| Arc::ptr_eq(seen, &snapshot));
+            if !same && subscribed.contains(&device) {
+                self.seen.insert(*drive, snapshot);
+                changed.insert(device);
             }
+        }
+        for device in changed {
+            self.desk.changed(device, now);
         }
     }
 

@@ -35,7 +35,8 @@ pub(super) fn options() -> Options {
     Options {
         listen: "127.0.0.1:0".parse().unwrap(),
         device: 100,
-        network: 1001,
+        network: Some(1001),
+        foreign_devices: 0,
         offline: WhenOffline::Silent,
         commands: true,
         allow: everywhere(),

@@ -13,7 +13,7 @@ use drivegate_bacnet::{
 };
 use subtle::ConstantTimeEq as _;
 
-use super::objects::{self, Meaning, Shown};
+use super::objects::{self, Flat, Meaning, Shown};
 use super::rights::HostRights;
 use super::{Options, WhenOffline};
 use crate::codec::Table;
@@ -39,6 +39,9 @@ pub(super) struct View {
     pub(super) options: Arc<Options>,
     pub(super) rights: HostRights,
     gateway: Shown,
+    /// All objects as those of one device.
+    flat: Option<Flat>,
+    /// By the instance of the gateway plus the unit, which is that of the drive's device where it has one.
     pub(super) drives: HashMap<u32, ShownDrive>,
     buses: Vec<BusHandle>,
     /// When it is looked at, by both clocks.
@@ -56,10 +59,20 @@ impl View {
             let shown = objects::of_drive(&handle.image.spec, gateway);
             (shown.device.instance, ShownDrive { handle, shown })
         });
-        let drives = drives.collect();
+        let drives: HashMap<u32, ShownDrive> = drives.collect();
         let shown = objects::of_gateway(gateway, buses.iter().map(|bus| &bus.image.spec));
+        let flat = options.network.is_none().then(|| {
+            let mut all: Vec<&ShownDrive> = drives.values().collect();
+            all.sort_by_key(|drive| drive.handle.image.spec.unit);
+            let all = all.into_iter().map(|drive| {
+                let spec = &drive.handle.image.spec;
+                (spec.name.clone(), spec.unit, drive.shown.clone())
+            });
+            objects::flat(gateway, shown.clone(), all)
+        });
         View {
             gateway: shown,
+            flat,
             drives,
             buses,
             plant,
@@ -71,6 +84,9 @@ impl View {
 
     /// The devices, that of the gateway first.
     pub(super) fn devices(&self) -> Vec<Arc<Device>> {
+        if let Some(flat) = &self.flat {
+            return vec![flat.device.clone()];
+        }
         let mut drives: Vec<_> = self.drives.values().map(|drive| drive.shown.device.clone()).collect();
         drives.sort_by_key(|device| device.instance);
         [self.gateway.device.clone()].into_iter().chain(drives).collect()
@@ -87,7 +103,28 @@ impl View {
         DateTime::from_unix_ms(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
     }
 
+    /// The device that shows a drive.
+    pub(super) fn shown_by(&self, drive: u32) -> u32 {
+        match self.flat {
+            Some(_) => self.options.device,
+            None => drive,
+        }
+    }
+
+    /// The drive to which an object belongs, and its number there.
+    fn owner(&self, device: u32, object: ObjectId) -> Option<(&ShownDrive, ObjectId)> {
+        if self.flat.is_none() {
+            return Some((self.drives.get(&device)?, object));
+        }
+        let (unit, number) = objects::of_flat(object)?;
+        let drive = self.drives.get(&(self.options.device + u32::from(unit)))?;
+        Some((drive, ObjectId::new(object.kind, number)))
+    }
+
     fn meaning(&self, device: u32, place: usize) -> Option<Meaning> {
+        if let Some(flat) = &self.flat {
+            return flat.places.get(place).map(|(_, meaning)| *meaning);
+        }
         let shown = match self.drives.get(&device) {
             Some(drive) => &drive.shown,
             None => &self.gateway,
@@ -97,6 +134,11 @@ impl View {
 
     /// The meaning of an object of a drive.
     pub(super) fn of_drive(&self, device: u32, place: usize) -> Option<(&DriveHandle, Meaning)> {
+        if let Some(flat) = &self.flat {
+            let (unit, meaning) = flat.places.get(place)?;
+            let drive = self.drives.get(&(self.options.device + u32::from((*unit)?)))?;
+            return Some((&drive.handle, *meaning));
+        }
         let drive = self.drives.get(&device)?;
         Some((&drive.handle, drive.shown.meanings.get(place).copied()?))
     }
@@ -280,7 +322,7 @@ impl Application for View {
     }
 
     fn answers(&self, device: u32) -> bool {
-        let Some(drive) = self.drives.get(&device) else {
+        let Some(drive) = self.drives.get(&device).filter(|_| self.flat.is_none()) else {
             return device == self.options.device;
         };
         let snapshot = drive.handle.image.snapshot();
@@ -336,7 +378,9 @@ impl Application for View {
     }
 
     fn denied(&self, from: &Address, device: u32, write: &WriteItem) {
-        let Some(drive) = self.drives.get(&device) else { return };
+        let Some((drive, _)) = self.owner(device, write.object) else {
+            return;
+        };
         let why = match self.options.commands {
             true => "the address is not in `write` of [bacnet]",
             false => "`commands` of [bacnet] is off",
@@ -350,22 +394,25 @@ impl Application for View {
     }
 
     fn stops(&self, device: u32, write: &WriteItem) -> bool {
-        let is_run = write.object == RUN && write.property.property == PropertyId::PRESENT_VALUE;
+        let Some((drive, object)) = self.owner(device, write.object) else {
+            return false;
+        };
+        let is_run = object == RUN && write.property.property == PropertyId::PRESENT_VALUE;
         let value = match write.value {
             Some(Data::Enumerated(0)) => Some(false),
             Some(Data::Null) => None,
             _ => return false,
         };
         let priority = write.priority.unwrap_or(16);
-        match (self.drives.get(&device).filter(|_| is_run), u8::try_from(priority)) {
-            (Some(drive), Ok(priority)) => drive.handle.priorities(|all| all.stops(priority, value)),
-            _ => false,
-        }
+        u8::try_from(priority).is_ok_and(|priority| is_run && drive.handle.priorities(|all| all.stops(priority, value)))
     }
 
     fn orders(&self, device: u32) -> u64 {
-        let drive = self.drives.get(&device);
-        drive.map_or(0, |drive| drive.handle.priorities(|all| all.orders()))
+        let of = |drive: &ShownDrive| drive.handle.priorities(|all| all.orders());
+        match self.flat {
+            Some(_) => self.drives.values().map(of).sum(),
+            None => self.drives.get(&device).map_or(0, of),
+        }
     }
 
     fn password(&self, given: &str) -> bool {

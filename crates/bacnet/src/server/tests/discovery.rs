@@ -244,3 +244,58 @@ fn messages_between_routers_that_are_not_known_are_rejected() {
         assert!(rig.out().is_empty(), "none by broadcast");
     }
 }
+
+/// Datagrams as they leave, each with where it goes.
+fn raw(rig: &mut ServerWithClients) -> Vec<(To, Vec<u8>)> {
+    std::iter::from_fn(|| rig.server.transmit()).collect()
+}
+
+#[test]
+fn foreign_devices_have_what_is_broadcast_on_both_sides() {
+    let mut rig = ServerWithClients::new();
+    rig.server.options.foreign_devices = 2;
+    rig.server.foreign_devices = ForeignDevices::new(2);
+    let host = ServerWithClients::client;
+    let result = |code: u16| bvlc::result(code);
+    let npdu = who_is(Some((npdu::GLOBAL, Mac::ALL)), None, Some((102, 102)));
+    // Nobody who has not registered has anything broadcast.
+    rig.datagram(7, &bvlc::distribute(&npdu));
+    assert_eq!(raw(&mut rig), [(To::Host(host(7)), result(0x60))]);
+    for (who, code) in [(7, 0), (8, 0), (9, 0x30)] {
+        rig.datagram(who, &bvlc::register(60));
+        assert_eq!(raw(&mut rig), [(To::Host(host(who)), result(code))], "{who}");
+    }
+    // From a host of this network: to the foreign devices, and so is the answer.
+    rig.datagram(5, &bvlc::broadcast(&npdu));
+    let out = raw(&mut rig);
+    for foreign in [7, 8] {
+        let came = bvlc::forwarded(host(5), &npdu);
+        assert!(out.contains(&(To::Host(host(foreign)), came)), "{out:?}");
+        let answers = out
+            .iter()
+            .filter(|(to, bytes)| *to == To::Host(host(foreign)) && bytes.ends_with(&[0x91, 1, 0x21, 0]));
+        assert_eq!(answers.count(), 1, "{out:?}");
+    }
+    // From a foreign device: to this network and to the others.
+    rig.later(Duration::from_secs(1));
+    rig.datagram(7, &bvlc::distribute(&npdu));
+    let out = raw(&mut rig);
+    let came = bvlc::forwarded(host(7), &npdu);
+    assert!(out.contains(&(To::Broadcast, came.clone())) && out.contains(&(To::Host(host(8)), came.clone())));
+    assert!(!out.contains(&(To::Host(host(7)), came)), "not to itself");
+    rig.datagram(5, &[0x81, 6, 0, 4]);
+    let [(To::Host(_), table)] = &raw(&mut rig)[..] else {
+        panic!()
+    };
+    assert_eq!((table[1], table.len()), (7, 4 + 2 * 10));
+    let deletion = [
+        &[0x81, 8, 0, 10, 10][..],
+        &host(8).ip().octets()[1..],
+        &host(8).port().to_be_bytes(),
+    ]
+    .concat();
+    for code in [0, 0x50] {
+        rig.datagram(5, &deletion);
+        assert_eq!(raw(&mut rig), [(To::Host(host(5)), result(code))]);
+    }
+}

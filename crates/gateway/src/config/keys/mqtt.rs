@@ -217,7 +217,7 @@ fn parse_url(text: &str) -> Result<Broker, Finding> {
     let bad = |why: &str| {
         Finding::new(
             format!("`{}` {why}", hidden(text)),
-            "write \"mqtt://host:port\" or \"mqtts://host:port\", or \"ws://host:port/path\" or \"wss://host:port/path\"",
+            "write \"mqtt://host:port\", \"mqtts://host:port\", \"ws://host:port/path\" or \"wss://host:port/path\"",
         )
     };
     let (scheme, rest) = text.split_once("://").ok_or_else(|| bad("has no scheme"))?;
