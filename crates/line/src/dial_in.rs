@@ -90,7 +90,7 @@ impl Place {
     fn of(address: &str, id: &str, allow: &[IpNet]) -> io::Result<Place> {
         let address: SocketAddr = address
             .parse()
-            .map_err(|_| io::Error::new(io::ErrorKind::InvalidInput, "it is no address and port"))?;
+            .map_err(|_| io::Error::new(io::ErrorKind::InvalidInput, "it is not an address with a port"))?;
         let mut places = PLACES.lock().unwrap_or_else(PoisonError::into_inner);
         places.retain(|place| place.strong_count() > 0);
         let known = places

@@ -17,7 +17,7 @@ const HEADER: usize = 6;
 const LENGTHS: std::ops::RangeInclusive<usize> = 2..=254;
 
 /// Why a connection is given up.
-const NO_MODBUS_TCP: &str = "what came is no Modbus TCP; write tcp:// if the server has a raw port";
+const NO_MODBUS_TCP: &str = "what came is not Modbus TCP; write tcp:// if the server has a raw port";
 
 /// A connection by Modbus TCP.
 #[derive(Debug)]

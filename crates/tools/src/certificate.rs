@@ -76,7 +76,7 @@ fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<Strin
         let _ = fs::remove_file(&key);
         return Err(error);
     }
-    let shown = |path: &Path| std::path::absolute(path).map_or_else(|_| path.to_path_buf(), |path| path);
+    let shown = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
     let [key, certificate] = [key, certificate].map(|path| format!("{:?}", shown(&path).display().to_string()));
     let (until, fingerprint) = (&made.until, &made.fingerprint);
     let names: Vec<String> = hosts

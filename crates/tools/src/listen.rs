@@ -79,7 +79,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
     if let Some((scheme @ ("modbus-tcp" | "udp"), _)) = args.port.split_once("://") {
         return Err(format!(
-            "behind {scheme}:// nobody else's frames are heard; --port; write a serial port or tcp://"
+            "a {scheme}:// port carries only the gateway's own requests and their replies; --port; write a serial port or tcp://"
         ));
     }
     let protocols = scan::protocols(&args.protocol)?;

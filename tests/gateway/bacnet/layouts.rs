@@ -41,7 +41,7 @@ fn one_device_has_the_objects_of_all_drives() {
     assert_eq!(answers[4..7], [json!("done"), json!("done"), json!(8)]);
     assert!(answers[7]["error"].is_array(), "pump-2 takes no orders: {}", answers[7]);
     assert!(
-        answers[8].get("failed").is_some() || answers[8].get("reject").is_some(),
+        answers[8].get("failed").is_some() || answers[8].get("abort").is_some(),
         "{}",
         answers[8]
     );

@@ -184,7 +184,7 @@ async fn function_23_writes_and_reads_behind_the_answer() {
     let answer = client.ask(1, &write_and_read((0x8101, &[2000]), (0x8000, 2))).await;
     assert_eq!(answer, expected);
     let reference = vec![("speed_reference".to_string(), Value::Number(20.0))];
-    assert_eq!(points(&rig), [reference.clone()]);
+    assert_eq!(points(&rig), std::slice::from_ref(&reference));
     // Registers that are not polled are read from the drive, after the write.
     let answer = client.ask(1, &write_and_read((0x8101, &[2000]), (300, 2))).await;
     assert_eq!(answer, registers(23, &[300, 301]));

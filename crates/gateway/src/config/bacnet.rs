@@ -57,7 +57,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[
     if foreign_devices > 0 && bbmd.is_some() {
         reader.problem(
             BACNET.foreign_devices.name,
-            "a BBMD is no foreign device of another one",
+            "a BBMD is not a foreign device of another one",
             "leave `bbmd` or `foreign_devices` out",
         );
     }

@@ -256,8 +256,11 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
         );
     }
     // A device on a network has any unit id, and one that answers at 248 has no address of its own.
-    let is_of_line = |address: &u8| !around.is_modbus_tcp && !(*address == RESERVED && *profile.addresses.end() == 247);
-    if let Some(address) = address.filter(|a| is_of_line(a) && !profile.addresses.contains(a)) {
+    let takes = |address: &u8| {
+        let has_none = *address == RESERVED && *profile.addresses.end() == 247;
+        around.is_modbus_tcp || has_none || profile.addresses.contains(address)
+    };
+    if let Some(address) = address.filter(|address| !takes(address)) {
         let (least, most) = profile.addresses.clone().into_inner();
         reader.problem(
             DRIVE.address.name,

@@ -95,7 +95,7 @@ pub(super) fn check_keys(reader: &Reader<'_>, port: &str, protocol: Protocol) {
         if BUS.mode.get(reader) == Mode::Listen {
             reader.problem(
                 BUS.mode.name,
-                format!("behind {scheme}:// nobody else's frames are heard"),
+                format!("a {scheme}:// port carries only the gateway's own requests and their replies"),
                 "leave `mode` out",
             );
         }

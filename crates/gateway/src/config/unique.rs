@@ -93,7 +93,7 @@ fn check_dial_in(document: &Document, buses: &[Found]) {
             });
             document.problem(
                 place,
-                format!("{id} cannot be told from {other} of another bus at {address}"),
+                format!("{id} cannot be distinguished from {other} of another bus at {address}"),
                 "give each bus at one address a text that is not the beginning of another one",
             );
         }

@@ -589,7 +589,9 @@ fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> 
 /// The refusal of what stands beside a stop that is carried out.
 fn not_readable(code: Exception, address: u16) -> Refusal {
     match code {
-        Exception::ADDRESS => Refusal::NotWritable(format!("there is no such register beside 0x{address:04X}")),
+        Exception::ADDRESS => {
+            Refusal::NotWritable(format!("0x{address:04X} is followed by a register that does not exist"))
+        }
         code => Refusal::BadValue(format!("register 0x{address:04X} cannot be read now ({code})")),
     }
 }

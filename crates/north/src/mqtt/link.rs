@@ -34,7 +34,7 @@ enum State {
     /// No connection; the next attempt follows then.
     Down { retry_at: Instant },
     /// A connection that the broker may not have accepted yet.
-    Up(Connection, Phase),
+    Up(Box<Connection>, Phase),
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -226,14 +226,14 @@ impl BrokerLink {
         let target = (&broker, self.client_id.as_str());
         let dial = (self.dial.clone(), self.rotation.round());
         let connection = Connection::open(&self.options, target, (will, password), config, dial);
-        self.state = State::Up(connection, Phase::Connecting);
+        self.state = State::Up(Box::new(connection), Phase::Connecting);
         Ok(())
     }
 
     /// The connection that the broker accepted, and what the broker can do.
     fn accepted(&mut self) -> Option<(&mut Connection, BrokerLimits)> {
         match &mut self.state {
-            State::Up(connection, phase) => phase.limits().map(|limits| (connection, *limits)),
+            State::Up(connection, phase) => phase.limits().map(|limits| (&mut **connection, *limits)),
             State::Down { .. } => None,
         }
     }
@@ -342,7 +342,7 @@ impl BrokerLink {
         let usual = self.rotation.next(held.unwrap_or_default());
         let retry_at = now + wait.unwrap_or(usual);
         match std::mem::replace(&mut self.state, State::Down { retry_at }) {
-            State::Up(connection, _) => Some(connection),
+            State::Up(connection, _) => Some(*connection),
             State::Down { .. } => None,
         }
     }
