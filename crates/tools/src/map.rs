@@ -14,7 +14,7 @@ use self::rows::{Row, gateway_rows};
 use super::failure::{Failure, Outcome};
 use super::{default_config, report};
 use crate::config::{BusSettings, Settings};
-use crate::north::modbus_tcp::Role;
+use crate::north::modbus_tcp::{Role, View};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{BusImage, DriveImage, DriveSpec};
 use crate::queue::CommandQueue;
@@ -61,10 +61,11 @@ pub(super) fn run(args: &Args) -> Outcome {
         return bacnet::run(&settings, args.csv, args.ede.as_deref());
     }
     let listeners = listeners(&settings);
-    let shown = match args.listener {
-        None => None,
-        Some(address) => match listeners.iter().find(|l| l.addresses.contains(&address)) {
-            Some(listener) => listener.buses.clone(),
+    let view = match (args.listener, listeners.as_slice()) {
+        (None, [only]) => only.view.clone(),
+        (None, _) => View::default(),
+        (Some(address), _) => match listeners.iter().find(|l| l.addresses.contains(&address)) {
+            Some(listener) => listener.view.clone(),
             None => return Err(Failure::Misused(unknown_listener(address, &listeners))),
         },
     };
@@ -74,7 +75,7 @@ pub(super) fn run(args: &Args) -> Outcome {
         _ => Format::Text,
     };
     let plant = plant(&settings).map_err(|why| format!("cannot build the map: {why}; map; free file descriptors"))?;
-    Ok(report::print(&render(&plant, &listeners, shown.as_deref(), format)))
+    Ok(report::print(&render(&plant, &listeners, &view, format)))
 }
 
 fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> String {
@@ -95,8 +96,8 @@ fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> String {
 struct Listener {
     addresses: Vec<SocketAddr>,
     tls: bool,
-    /// Buses that are shown; `None` shows all.
-    buses: Option<Vec<String>>,
+    /// What its clients see.
+    view: View,
     /// Who may write.
     writers: String,
 }
@@ -115,7 +116,7 @@ fn listeners(settings: &Settings) -> Vec<Listener> {
     let plain = options.listeners.iter().map(|listener| Listener {
         addresses: listener.listen.clone(),
         tls: false,
-        buses: listener.view.buses.clone(),
+        view: listener.view.clone(),
         writers: joined(listener.write.iter().map(ToString::to_string).collect()),
     });
     let tls = options.tls.iter().map(|tls| {
@@ -123,7 +124,10 @@ fn listeners(settings: &Settings) -> Vec<Listener> {
         Listener {
             addresses: tls.listen.clone(),
             tls: true,
-            buses: tls.buses.clone(),
+            view: View {
+                buses: tls.buses.clone(),
+                ..View::default()
+            },
             writers: joined(control.map(|(name, _)| format!("role {name}")).collect()),
         }
     });
@@ -150,17 +154,23 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
     ))
 }
 
-/// The map of the units on the buses that are `shown`, all without a choice.
-fn render(plant: &Plant, listeners: &[Listener], shown: Option<&[String]>, format: Format) -> String {
+/// The map that the clients of a listener see.
+fn render(plant: &Plant, listeners: &[Listener], view: &View, format: Format) -> String {
+    let shown = view.buses.as_deref();
     let drives = plant
         .drives()
         .filter(|d| shown.is_none_or(|names| names.contains(&d.image.spec.bus)))
         .collect();
+    let gateway = match view.default_drive {
+        None => gateway_rows(plant, shown),
+        Some(_) => Vec::new(),
+    };
     let map = Map {
         plant,
         drives,
-        gateway: gateway_rows(plant, shown),
+        gateway,
         listeners,
+        view,
     };
     match format {
         Format::Text => text::render(&map),
@@ -176,6 +186,7 @@ struct Map<'a> {
     /// Registers of the gateway itself.
     gateway: Vec<Row>,
     listeners: &'a [Listener],
+    view: &'a View,
 }
 
 #[cfg(test)]

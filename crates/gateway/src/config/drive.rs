@@ -257,7 +257,8 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
     }
     // A device on a network has any unit id, and one that answers at 248 has no address of its own.
     let takes = |address: &u8| {
-        let has_none = *address == RESERVED && *profile.addresses.end() == 247;
+        let is_modbus = around.protocol != Protocol::N2;
+        let has_none = is_modbus && *address == RESERVED && *profile.addresses.end() == 247;
         around.is_modbus_tcp || has_none || profile.addresses.contains(address)
     };
     if let Some(address) = address.filter(|address| !takes(address)) {
@@ -404,7 +405,12 @@ fn check_limits(
                 format!("write [{high}, {low}]"),
             ));
         }
-        _ => return Err(Finding::new("limits are two numbers", "write [lowest, highest]")),
+        _ => {
+            return Err(Finding::new(
+                "limits are two numbers",
+                "write [lowest, highest], decimals with a point, such as [0.0, 80.5]",
+            ));
+        }
     };
     let Some(point) = point else { return Ok(range) };
     let own = match point.model {

@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use super::keys::HTTP;
 use super::{files, values};
-use crate::document::{Place, Reader};
+use crate::document::{Finding, Place, Reader};
 use crate::north::http::{self, Credential, Credentials, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
@@ -79,7 +79,21 @@ fn credentials<C: Credential>(
     path: &Path,
     without: &str,
 ) -> Option<Credentials<C>> {
-    let text = std::fs::read_to_string(path).map_err(|error| files::cannot_read(path, &error));
+    let unread = |error: std::io::Error| {
+        let finding = files::cannot_read(path, &error);
+        match error.kind() {
+            std::io::ErrorKind::NotFound => Finding {
+                remedy: format!(
+                    "create it with `drivegate {} add --file {} NAME`",
+                    C::KIND,
+                    path.display()
+                ),
+                ..finding
+            },
+            _ => finding,
+        }
+    };
+    let text = std::fs::read_to_string(path).map_err(unread);
     let text = reader.accept(key, text)?;
     let (path, kind) = (path.display(), C::KIND);
     match Credentials::parse(&text) {

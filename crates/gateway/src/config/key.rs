@@ -283,8 +283,8 @@ fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T
     reader.accept(
         key,
         value.map_err(|error| match error {
-            // A range without an example says less than the type.
-            ValueError::Type(..) | ValueError::NotAList(..) if range.contains(['[', ',']) => {
+            // A range without an example or words says less than the type.
+            ValueError::Type(..) | ValueError::NotAList(..) if range.contains(['[', ',', '"']) => {
                 Finding::new(error.to_string(), format!("write {range}"))
             }
             error => error.into(),
@@ -435,7 +435,8 @@ impl<T: Clone> Words<T> {
 
 impl<T: Clone> Form<T> for Words<T> {
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<T> {
-        reader.parsed(key, |text| self.find(text))
+        let text: String = of_type(reader, key, &values::any_of(self.words()))?;
+        reader.accept(key, self.find(&text))
     }
 
     fn schema(&self) -> Value {

@@ -119,9 +119,9 @@ pub(super) fn check_keys(reader: &Reader<'_>, port: &str, protocol: Protocol) {
         }
     }
     if scheme != "tcp-listen" && reader.has(BUS.allow.name) {
-        reader.problem(
+        reader.warning(
             BUS.allow.name,
-            "`allow` says from where the device of a bus may dial in, and to this port none does",
+            "`allow` is where the device of a bus may dial in from, and has no effect on this port",
             "leave the key out, or write port = \"tcp-listen://address:port\"",
         );
     }

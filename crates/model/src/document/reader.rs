@@ -167,9 +167,12 @@ impl<'d> Reader<'d> {
                 env: node.env.clone(),
                 key: self.path(key),
             };
-            let remedy = match nearest(key, known.iter().map(String::as_str)) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("known here: {}", known.join(", ")),
+            let names = || known.iter().map(String::as_str);
+            let elsewhere = named_elsewhere(key).filter(|(own, _)| names().any(|name| name == *own));
+            let remedy = match (elsewhere, nearest(key, names())) {
+                (Some((own, example)), _) => format!("write `{own}`, such as {own} = {example}"),
+                (None, Some(near)) => format!("did you mean `{near}`?"),
+                (None, None) => format!("known here: {}", known.join(", ")),
             };
             self.document.problem(&place, format!("unknown key `{key}`"), remedy);
         }
@@ -222,6 +225,16 @@ fn without_numbers(path: &str) -> String {
         !number
     };
     path.chars().filter(keep).collect()
+}
+
+/// The key for what other programs name so, with an example of its value.
+fn named_elsewhere(key: &str) -> Option<(&'static str, &'static str)> {
+    match key {
+        "parity" | "stopbits" | "stop_bits" | "databits" | "data_bits" | "bytesize" => Some(("format", "\"8E1\"")),
+        "slave" | "slave_id" | "slaveid" | "station" | "node" | "node_id" => Some(("address", "1")),
+        "device" | "tty" | "com" => Some(("port", "\"/dev/serial/by-id/…\"")),
+        _ => None,
+    }
 }
 
 /// The known word nearest to `word`, if one is close enough to be a misspelling, or the only one that has its parts.

@@ -49,6 +49,32 @@ const FLOATS_AT: u16 = 0x0200;
 const DRIVE_AT: u16 = 0x0300;
 
 impl Registers {
+    /// How it is named where it is listed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Registers::Model => "model",
+            Registers::ModelAtZero => "model at 0",
+            Registers::Raw => "raw",
+        }
+    }
+
+    /// Where clients see a register of the common model, which is given by its address from 0x8000 on.
+    pub fn of_model(self, address: u16) -> Option<u16> {
+        let offset = address.checked_sub(FIRST)?;
+        let shown = match self {
+            Registers::Model => return Some(address),
+            Registers::Raw => return None,
+            Registers::ModelAtZero if (STOP_ALL..FLOATS_AT).contains(&offset) => offset + (COMMANDS_AT - STOP_ALL),
+            Registers::ModelAtZero => offset,
+        };
+        (self.of(shown) == At::Model(address)).then_some(shown)
+    }
+
+    /// Whether clients see the drive's own registers from `start` on.
+    pub fn shows_the_drives(self, start: u16, count: u16) -> bool {
+        self.at(start, count) == At::Drive
+    }
+
     /// Where the registers from `start` on are; a span that reaches from one kind into another is nowhere.
     pub(super) fn at(self, start: u16, count: u16) -> At {
         let last = u32::from(start) + u32::from(count.saturating_sub(1));
@@ -275,5 +301,23 @@ mod tests {
         let around = |start, count| Registers::ModelAtZero.around_the_command_word(start, count);
         assert_eq!((around(0x0100, 17), around(0x0100, 16)), (Some(0x80F0), None));
         assert_eq!((around(0x0110, 123), around(0x0111, 9)), (Some(0x8100), None));
+    }
+
+    #[test]
+    fn every_register_of_the_model_is_found_where_it_is_listed() {
+        for registers in [Registers::Model, Registers::ModelAtZero, Registers::Raw] {
+            let mut listed = 0;
+            for address in FIRST..=FIRST + 0x2FF {
+                if let Some(shown) = registers.of_model(address) {
+                    assert_eq!(registers.at(shown, 1), At::Model(address), "{registers:?}");
+                    listed += 1;
+                }
+            }
+            let seen = (0..=u16::MAX).filter(|shown| matches!(registers.at(*shown, 1), At::Model(FIRST..=0x82FF)));
+            assert_eq!(listed, seen.count(), "{registers:?}");
+        }
+        assert_eq!(Registers::ModelAtZero.of_model(0x8100), Some(0x0110));
+        assert!(!Registers::ModelAtZero.shows_the_drives(0x02FF, 2));
+        assert!(Registers::Raw.shows_the_drives(0xFFFF, 1) && !Registers::Model.shows_the_drives(0x7FFF, 2));
     }
 }

@@ -518,6 +518,11 @@ fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
 /// MQTT 5, and closes the connection; some close it at once.
 fn refusal(error: &ConnectionError) -> String {
     match error {
+        ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io)))
+            if is_closed(error) && tls_words::explain(io, tls_words::BROKER).is_none() =>
+        {
+            format!("{io}: {SCHEME}")
+        }
         // Of the network or of TLS: it has words of its own.
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(_))) => reason(error),
         ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
@@ -527,6 +532,10 @@ fn refusal(error: &ConnectionError) -> String {
         _ => reason(error),
     }
 }
+
+/// What to do about a broker that closes a connection before it accepts it.
+const SCHEME: &str = "the broker did not accept the connection; check the scheme in mqtt.url: mqtts:// for a port with TLS, \
+                      usually 8883, mqtt:// for one without, usually 1883";
 
 /// What to do about a broker of an older version.
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
@@ -568,6 +577,9 @@ fn reason(error: &ConnectionError) -> String {
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
             ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
             ConnectionError::Tls(tls) if tls_words::is_handshake_end(tls) => HANDSHAKE_END.to_string(),
+            ConnectionError::Io(io) if tls_words::explain(io, tls_words::BROKER).is_none() => {
+                format!("{io}; check mqtt.url, and whether the broker is running")
+            }
             // What cannot be decoded hides that it could not be read, as after an alert of TLS 1.3.
             ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io))) => in_words(io),
             _ => in_words(error),

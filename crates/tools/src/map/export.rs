@@ -16,7 +16,7 @@ fn rows(map: &Map<'_>) -> Vec<(u8, String, Row)> {
     let mut all = Vec::new();
     for drive in &map.drives {
         let spec = &drive.image.spec;
-        let rows = drive_rows(drive, spec.access);
+        let rows = drive_rows(drive, spec.access, map.view.registers);
         all.extend(rows.into_iter().map(|row| (spec.unit, spec.name.clone(), row)));
     }
     all.extend(map.gateway.iter().map(|row| (GATEWAY_UNIT, String::new(), row.clone())));
@@ -52,10 +52,16 @@ pub(super) fn quoted(text: &str) -> String {
 
 /// Listeners, units and registers; the keys of a register are the columns of the CSV.
 pub(super) fn json(map: &Map<'_>) -> String {
-    let listeners = map
-        .listeners
-        .iter()
-        .map(|l| json!({ "addresses": l.addresses, "tls": l.tls, "buses": l.buses, "writers": l.writers }));
+    let listeners = map.listeners.iter().map(|l| {
+        json!({
+            "addresses": l.addresses,
+            "tls": l.tls,
+            "buses": l.view.buses,
+            "writers": l.writers,
+            "view": l.view.registers.name(),
+            "default_drive": l.view.default_drive,
+        })
+    });
     let units = map.drives.iter().map(|drive| {
         let spec = &drive.image.spec;
         json!({

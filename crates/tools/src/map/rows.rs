@@ -3,7 +3,8 @@
 use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
-use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, FIRST};
+use crate::north::modbus_tcp::Registers;
+use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Access;
 
@@ -68,8 +69,8 @@ impl Row {
     }
 }
 
-/// The registers of one unit: the blocks of the common model, then the drive's own.
-pub(super) fn drive_rows(drive: &DriveHandle, access: Access) -> Vec<Row> {
+/// The registers of one unit, where clients see them: the blocks of the common model, then the drive's own.
+pub(super) fn drive_rows(drive: &DriveHandle, access: Access, registers: Registers) -> Vec<Row> {
     let spec = &drive.image.spec;
     let (profile, plan, raw_writes) = (&spec.profile, &drive.image.plan, &spec.raw_writes);
     let entries = BLOCKS
@@ -77,14 +78,19 @@ pub(super) fn drive_rows(drive: &DriveHandle, access: Access) -> Vec<Row> {
         .flatten()
         // Without [authority] nothing is there.
         .filter(|entry| entry.content != Content::Hold || drive.has_authority())
-        .map(|entry| entry_row(profile, plan, entry, access));
+        .filter_map(|entry| Some((entry, registers.of_model(entry.address)?)))
+        .map(|(entry, address)| Row {
+            address,
+            reference: reference(Table::Holding, address),
+            ..entry_row(profile, plan, entry, access)
+        });
     let mut raw: Vec<(&Point, &Raw)> = profile
         .points
         .iter()
         .filter(|p| !p.hidden)
         .filter_map(|p| Some((p, p.raw()?)))
-        // Registers from there on are the common model's.
-        .filter(|(_, raw)| raw.table.is_bits() || raw.address < FIRST)
+        // Others are hidden by the common model.
+        .filter(|(_, raw)| raw.table.is_bits() || registers.shows_the_drives(raw.address, raw.form.items()))
         .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw.into_iter().map(|(point, raw)| Row {

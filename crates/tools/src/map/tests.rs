@@ -4,6 +4,7 @@ use drivegate_testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx};
 
 use super::export::quoted;
 use super::*;
+use crate::north::modbus_tcp::Registers;
 use crate::process_image::Access;
 
 fn plant() -> Plant {
@@ -21,7 +22,7 @@ fn plant() -> Plant {
 
 #[test]
 fn csv_has_one_line_a_register() {
-    let csv = render(&plant(), &[], None, Format::Csv);
+    let csv = render(&plant(), &[], &View::default(), Format::Csv);
     let mut lines = csv.lines();
     let columns = lines.next().unwrap().split(',').count();
     assert_eq!(columns, 16);
@@ -41,7 +42,7 @@ fn csv_has_one_line_a_register() {
 
 #[test]
 fn text_tells_units_and_each_profile_once() {
-    let text = render(&plant(), &[], None, Format::Text);
+    let text = render(&plant(), &[], &View::default(), Format::Text);
     assert!(
         text.contains("\nProfile vacon-nx (Vacon NX, OPTC2/OPTC8 board, Modbus RTU), units 1, 2\n"),
         "{text}"
@@ -65,10 +66,10 @@ fn json_says_what_the_csv_says() {
     let listener = Listener {
         addresses: vec!["127.0.0.1:1802".parse().unwrap()],
         tls: true,
-        buses: None,
+        view: View::default(),
         writers: "role operator".to_string(),
     };
-    let json = render(&plant(), &[listener], None, Format::Json);
+    let json = render(&plant(), &[listener], &View::default(), Format::Json);
     let json: serde_json::Value = serde_json::from_str(&json).unwrap();
     assert_eq!(json["listeners"][0]["addresses"][0], "127.0.0.1:1802");
     assert_eq!(
@@ -76,7 +77,7 @@ fn json_says_what_the_csv_says() {
         (&2.into(), &"monitor".into())
     );
     let registers = json["registers"].as_array().unwrap();
-    let csv = render(&plant(), &[], None, Format::Csv);
+    let csv = render(&plant(), &[], &View::default(), Format::Csv);
     assert_eq!(registers.len(), csv.lines().count() - 1);
     let current = registers
         .iter()
@@ -95,8 +96,48 @@ fn json_says_what_the_csv_says() {
 fn a_listener_shows_its_buses() {
     let csv = |names: &[&str]| {
         let names: Vec<String> = names.iter().map(|n| n.to_string()).collect();
-        render(&plant(), &[], Some(&names), Format::Csv)
+        let view = View {
+            buses: Some(names),
+            ..View::default()
+        };
+        render(&plant(), &[], &view, Format::Csv)
     };
-    assert_eq!(csv(&["line1"]), render(&plant(), &[], None, Format::Csv));
+    assert_eq!(csv(&["line1"]), render(&plant(), &[], &View::default(), Format::Csv));
     assert_eq!(csv(&["line2"]).lines().count(), 1);
+}
+
+#[test]
+fn a_view_moves_or_hides_registers() {
+    let shown = |registers, default_drive: Option<&str>| {
+        let view = View {
+            registers,
+            default_drive: default_drive.map(str::to_string),
+            ..View::default()
+        };
+        let csv = render(&plant(), &[], &view, Format::Csv);
+        csv.lines()
+            .skip(1)
+            .filter(|line| !line.starts_with("2,"))
+            .map(str::to_string)
+            .collect::<Vec<_>>()
+    };
+    let zero = shown(Registers::ModelAtZero, Some("pump-1"));
+    for wanted in [
+        "1,pump-1,common,\"holding, input\",4,0x0004,400005,1,actual_speed,",
+        "1,pump-1,command,\"holding, input\",273,0x0111,400274,1,speed_reference,",
+        "1,pump-1,float,\"holding, input\",514,0x0202,400515,2,output_frequency,",
+        "1,pump-1,raw,\"holding, input\",2103,0x0837,402104,1,output_frequency,",
+    ] {
+        assert!(zero.iter().any(|line| line.starts_with(wanted)), "{wanted}: {zero:?}");
+    }
+    assert!(
+        zero.iter().all(|line| !line.contains(",gateway,\"input")),
+        "the gateway is at no unit"
+    );
+    let raw = shown(Registers::Raw, None);
+    assert!(
+        raw.iter()
+            .all(|line| line.contains(",raw,") || line.starts_with("255,")),
+        "{raw:?}"
+    );
 }

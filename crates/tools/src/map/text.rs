@@ -8,6 +8,7 @@ use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
 use crate::codec::Table;
 use crate::drive::raw_writes;
+use crate::north::modbus_tcp::Registers;
 use crate::north::register_map::GATEWAY_UNIT;
 use crate::printable;
 use crate::process_image::{Access, DriveSpec};
@@ -16,13 +17,25 @@ use crate::process_image::{Access, DriveSpec};
 pub(super) fn render(map: &Map<'_>) -> String {
     let specs: Vec<&DriveSpec> = map.drives.iter().map(|d| &d.image.spec).collect();
     let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", map.plant.gateway);
-    out += &units(&specs);
+    out += &units(&specs, map.view.default_drive.as_deref());
     if map.listeners.len() > 1 {
         out += "\nListeners\n";
         out += &listeners(map.listeners);
     }
-    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 \
-            on;\n32-bit values have the high word first; age and state show why a value is not available.\n";
+    out += "\nAddresses are PDU addresses, from 0.";
+    let model = match map.view.registers {
+        Registers::Model => "from 0x8000 on",
+        Registers::ModelAtZero => "below 0x0300",
+        Registers::Raw => "",
+    };
+    if !model.is_empty() {
+        let _ = write!(
+            out,
+            " Functions 03 and 04 read both tables of the blocks {model};\n32-bit values have the high word first; age \
+             and state show why a value is not available."
+        );
+    }
+    out.push('\n');
     let mut seen: Vec<&DriveSpec> = Vec::new();
     for drive in &map.drives {
         let spec = &drive.image.spec;
@@ -45,16 +58,18 @@ pub(super) fn render(map: &Map<'_>) -> String {
             units.join(", ")
         );
         // What a unit of this profile can have; the table above shows which units can be written.
-        out += &rows(&drive_rows(drive, Access::Control));
+        out += &rows(&drive_rows(drive, Access::Control, map.view.registers));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
         out += &ranges(spec);
     }
-    out += "\nThe gateway itself, unit 255\n";
-    out += &rows(&map.gateway);
+    if map.view.default_drive.is_none() {
+        out += "\nThe gateway itself, unit 255\n";
+        out += &rows(&map.gateway);
+    }
     out
 }
 
-fn units(specs: &[&DriveSpec]) -> String {
+fn units(specs: &[&DriveSpec], default_drive: Option<&str>) -> String {
     let units = specs.iter().map(|s| {
         let access = match s.access {
             Access::Monitor => "monitor: every write is refused",
@@ -71,7 +86,10 @@ fn units(specs: &[&DriveSpec]) -> String {
             access.to_string(),
         ]
     });
-    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
+    let gateway = match default_drive {
+        None => vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()],
+        Some(name) => vec![format!("0, {GATEWAY_UNIT}"), name.to_string()],
+    };
     table(
         &["unit", "drive", "bus", "address", "profile", "access"],
         units.chain([gateway]),
@@ -82,13 +100,25 @@ fn listeners(listeners: &[Listener]) -> String {
     let cells = listeners.iter().map(|listener| {
         let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
         let buses = listener
+            .view
             .buses
             .as_ref()
             .map_or_else(|| "all".to_string(), |names| names.join(", "));
         let tls = if listener.tls { "yes" } else { "no" };
-        vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
+        let default_drive = listener.view.default_drive.clone();
+        vec![
+            addresses.join(", "),
+            tls.to_string(),
+            buses,
+            listener.writers.clone(),
+            listener.view.registers.name().to_string(),
+            default_drive.unwrap_or_else(|| "gateway".to_string()),
+        ]
     });
-    table(&["address", "TLS", "buses", "who may write"], cells)
+    table(
+        &["address", "TLS", "buses", "who may write", "view", "units 0 and 255"],
+        cells,
+    )
 }
 
 fn rows(rows: &[Row]) -> String {

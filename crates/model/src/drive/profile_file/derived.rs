@@ -60,9 +60,10 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
 
 /// `of` and `weights` of a sum.
 fn read_sum(reader: &Reader<'_>, names: &[String]) -> Option<Derived> {
+    let weights: Option<Vec<f64>> = reader.optional("weights");
     let all: Vec<String> = reader.required("of")?;
     let of: Option<Vec<PointIndex>> = all.iter().map(|name| point_of(reader, "of", name, names)).collect();
-    let weights: Vec<f64> = reader.or("weights", vec![1.0; all.len()]);
+    let weights = weights.unwrap_or_else(|| vec![1.0; all.len()]);
     if all.len() < 2 {
         reader.problem("of", "a sum has two parts at least", "name the points in a list");
     }

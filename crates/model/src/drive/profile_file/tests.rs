@@ -90,7 +90,7 @@ x = "y"
         "meter.toml:13, point[1].at; add the range",
         "meter.toml:14, point[1].scael; did you mean `scale`?",
         "meter.toml:16, point[2].name",
-        "meter.toml:18, point[2].type; known: u16, i16, u32, i32, u64",
+        "meter.toml:18, point[2].type; known: i8, u16, i16, u32, i32, u64",
         "meter.toml:21, faults.x",
     ] {
         assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
@@ -122,7 +122,8 @@ at = "holding 1" / on_change = true                      -> only a writable poin
 at = "holding 1" / write_to = "b"                        -> there is no point `b`; m:13, point[0].write_to
 at = "holding 1" / write = true / write_to = "a"         -> does not accept commands itself; m:14
 at = "holding 1" / [point.texts] / on = "on"             -> `on` is not a whole number; m:14, point[0].texts.on
-derive = "sum"                                           -> unknown derivation `sum`; m:12, point[0].derive; known: band, percent
+derive = "product"                                       -> unknown derivation `product`; m:12, point[0].derive; known: band, percent
+derive = "sum"                                           -> `of` is missing; m:10
 derive = "zero"                                          -> `of` is missing; m:10
 derive = "zero" / of = "b"                               -> there is no point `b`; m:13, point[0].of
 derive = "zero" / of = "a"                               -> `a` is derived itself; m:12, point[0].derive
@@ -380,7 +381,7 @@ fn enumerations_have_texts() {
 fn the_page_names_every_key() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/profiles.md")).unwrap();
     let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/energy-meter.toml")).unwrap();
-    let choices = "[speed_reference]\nsigned = true\n[n2]\nstate_bit = 6\n";
+    let choices = "[speed_reference]\nsigned = true\n[n2]\nstate_bit = 6\n[[point]]\nname = \"t\"\nderive = \"sum\"\n";
     let mut known = std::collections::BTreeSet::new();
     let all = BUILT_IN.iter();
     for source in all.map(|(_, source)| *source).chain([meter.as_str(), choices]) {

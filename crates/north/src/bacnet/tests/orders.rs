@@ -81,7 +81,7 @@ fn errors_say_what_happened() {
         (Outcome::Purged, Error::SERVICE_REQUEST_DENIED),
         (
             Outcome::Refused(Refusal::NotAllowed(String::new())),
-            Error::SERVICE_REQUEST_DENIED,
+            Error::WRITE_ACCESS_DENIED,
         ),
         (
             Outcome::Refused(Refusal::BadValue(String::new())),
