@@ -53,7 +53,7 @@ struct State {
 struct Entry {
     id: Vec<u8>,
     allow: Vec<IpNet>,
-    /// Its bus is there.
+    /// The bus of this line is there.
     wanted: bool,
     /// A connection that its bus has not taken yet.
     waiting: Option<TcpStream>,
@@ -62,7 +62,7 @@ struct Entry {
 }
 
 impl Entry {
-    /// Its device has dialled in (again).
+    /// The device of this line has dialled in, for the first time or again.
     fn take(&mut self, stream: TcpStream) {
         let before = self.served.take().into_iter().chain(self.waiting.take());
         before.for_each(hang_up);

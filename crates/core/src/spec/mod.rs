@@ -108,7 +108,7 @@ pub struct DriveSpec {
     pub params: ParamsAccess,
     /// How often what was ordered last is written again, for its own timeout; none where it is not.
     pub refresh: Option<Duration>,
-    /// Its own times on the line.
+    /// Times of this drive on the line, where they are not those of its bus.
     pub timing: Timing,
 }
 

@@ -127,7 +127,7 @@ pub(super) fn check_keys(reader: &Reader<'_>, port: &str, protocol: Protocol) {
     }
 }
 
-/// Whoever dials in first would get the motors of a bus without a text.
+/// A bus whose drives are commanded needs a text: without one, any device that dials in would get their orders.
 pub(super) fn check_dial_in(reader: &Reader<'_>, port: &str, drives: &[drive::Found]) {
     let Some(place) = port.strip_prefix("tcp-listen://") else {
         return;

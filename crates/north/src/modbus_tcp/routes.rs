@@ -28,7 +28,7 @@ pub enum Registers {
     Model,
     /// The common model from 0 on, and those of the drive from 0x0300 on.
     ModelAtZero,
-    /// Those of the drive alone, at any address.
+    /// Only the drive's own registers, 0 to 0xFFFF.
     Raw,
 }
 

@@ -148,7 +148,7 @@ impl Aliases {
 #[derive(Debug)]
 struct Backlog {
     messages: AtomicUsize,
-    /// Those that it has written.
+    /// When rumqttc wrote its latest messages.
     rate: Mutex<Rate>,
     /// Whether the client waits for [`Step::Room`].
     room_wanted: AtomicBool,

@@ -216,7 +216,7 @@ impl BrokerLink {
             .refused
             .take_if(|(refused, _)| Some(&*refused) == password.as_ref())
         {
-            // The same one would be refused again.
+            // A password that was refused would be refused again.
             self.state = State::Down { retry_at };
             return Ok(());
         }

@@ -161,7 +161,7 @@ pub(in crate::config) struct Broker {
     pub(in crate::config) host: String,
     pub(in crate::config) port: u16,
     pub(in crate::config) tls: bool,
-    /// Of WebSocket.
+    /// Path of MQTT over WebSocket; plain TCP where there is none.
     pub(in crate::config) path: Option<String>,
 }
 

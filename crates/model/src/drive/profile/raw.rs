@@ -153,7 +153,7 @@ impl Raw {
     /// Whether there is a way back from a value to its registers.
     pub(in crate::drive) fn is_only_read(&self) -> bool {
         let derived = self.equals.is_some() || self.mask.is_some() || self.scaled_by().next().is_some();
-        // Of a byte, the register has another one beside it.
+        // A byte is written only with the other byte of its register.
         derived || matches!(self.form, Form::Text { .. } | Form::I8 { .. })
     }
 
