@@ -160,7 +160,7 @@ fn an_address_that_is_not_there_keeps_no_drive_from_being_polled() {
     until("the drive", || {
         (api(site.http, "pump-1")["online"] == true).then_some(())
     });
-    let (status, reasons) = get(site.http, "/readyz").unwrap();
+    let (status, reasons) = until("readiness", || get(site.http, "/readyz"));
     assert_eq!(status, 503);
     assert!(
         reasons.contains("Modbus TCP does not listen on 203.0.113.1"),

@@ -223,9 +223,9 @@ pub(crate) fn until_ready(http: u16) {
     });
 }
 
-/// A drive as `/api/v1/drives` shows it.
+/// A drive as `/api/v1/drives` shows it; a gateway that polls its drives already may open its HTTP server a moment later.
 pub(crate) fn api(http: u16, drive: &str) -> serde_json::Value {
-    let (status, body) = get(http, &format!("/api/v1/drives/{drive}")).expect("an answer");
+    let (status, body) = until("an answer over HTTP", || get(http, &format!("/api/v1/drives/{drive}")));
     assert_eq!(status, 200, "{body}");
     serde_json::from_str(&body).unwrap()
 }
