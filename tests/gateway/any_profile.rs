@@ -9,7 +9,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::sim::simulated_drive::ModelOptions;
 use serde_json::{Value, json};
 
-use crate::support::process::{Running, api, until, write_registers};
+use crate::support::process::{Running, api, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 use crate::support::tools::{root, run, run_well};
 
@@ -40,7 +40,7 @@ fn is_shown(site: &Site, point: &str, value: &Value) {
 /// The profiles at the beginning of the page, by their names.
 fn examples() -> Vec<(String, String)> {
     let page = std::fs::read_to_string(root().join("docs/profiles.md")).unwrap();
-    let (_, examples) = page.split_once("\n## Three examples\n").unwrap();
+    let (_, examples) = page.split_once("\n## Four examples\n").unwrap();
     let (examples, _) = examples.split_once("\n## ").unwrap();
     let blocks = examples
         .split("```toml\n")
@@ -56,11 +56,40 @@ fn examples() -> Vec<(String, String)> {
 /// What a drive of an example is sent, in the order of the comment below.
 type Words = (u16, u16, u16, &'static [u16], u16, f64);
 
+/// The meter of the page whose values depend on other registers, with the registers of its example.
+fn ratios_sums_and_bytes((name, text): &(String, String)) {
+    let site = site_of(name, text);
+    let set = [
+        "ct_ratio=40",
+        "pt_ratio=2",
+        "active_power=12.5",
+        "energy_kwh=999.9",
+        "energy_mwh=3",
+        "supply_temperature=-5",
+        "return_temperature=60",
+    ];
+    let options: Vec<&str> = set.iter().flat_map(|one| ["--set", one]).collect();
+    let _line = simulated(&site, name, &options);
+    let _gateway = site.run_ready();
+    for (point, value) in [
+        ("active_power", json!(12.5)),
+        ("energy", json!(3999.9)),
+        ("supply_temperature", json!(-5.0)),
+        ("return_temperature", json!(60.0)),
+    ] {
+        is_shown(&site, point, &value);
+    }
+    // The registers as the device has them: both ratios, both temperatures in one.
+    let raw = |start: u16, count: u16| read_registers(site.modbus, 1, start, count);
+    assert_eq!(raw(0x0006, 2), [40, 20]);
+    assert_eq!(raw(31, 3), [9999, 3, 0xFB3C]);
+}
+
 #[test]
 fn the_examples_of_the_page_are_simulated() {
     let examples = examples();
     let names: Vec<&str> = examples.iter().map(|(name, _)| name.as_str()).collect();
-    assert_eq!(names, ["small-meter", "bit-drive", "cia402-drive"]);
+    assert_eq!(names, ["small-meter", "ratio-meter", "bit-drive", "cia402-drive"]);
     let (name, meter) = &examples[0];
     let site = site_of(name, meter);
     let _line = simulated(
@@ -71,12 +100,13 @@ fn the_examples_of_the_page_are_simulated() {
     let _gateway = site.run_ready();
     is_shown(&site, "voltage_l1", &json!(231.5));
     is_shown(&site, "serial_number", &json!("SN-42"));
+    ratios_sums_and_bytes(&examples[1]);
     // The address of the reference, its count at 25 Hz, the words that start, one that stops, and the frequency in reverse.
     let drives: [Words; 2] = [
         (0x2502, 2500, 0x2501, &[1], 0, 25.0),
         (8502, 250, 8501, &[6, 7, 15], 7, 25.0),
     ];
-    for ((name, text), (reference, count, at, words, stop, hertz)) in examples[1..].iter().zip(drives) {
+    for ((name, text), (reference, count, at, words, stop, hertz)) in examples[2..].iter().zip(drives) {
         let site = site_of(name, text);
         let line = simulated(&site, name, &[]);
         let _gateway = site.run_ready();

@@ -177,22 +177,22 @@ fn generated(page: &str, name: &str, text: &str) {
     }
 }
 
-/// The three examples at the beginning of the page are profiles, read and commanded as it says.
+/// The four examples at the beginning of the page are profiles, read and commanded as it says.
 #[test]
-fn the_page_of_profiles_begins_with_three_profiles() {
+fn the_page_of_profiles_begins_with_four_profiles() {
     use drivegate::drive::control::Run;
     use drivegate::drive::{ModelPoint, Plan, PollClass, Profile};
     let page = read(&root().join("docs/profiles.md"));
-    let (_, examples) = page.split_once("\n## Three examples\n").unwrap();
+    let (_, examples) = page.split_once("\n## Four examples\n").unwrap();
     let (examples, _) = examples.split_once("\n## ").unwrap();
     let profiles: Vec<Profile> = blocks(examples, "toml")
         .iter()
         .map(|text| Profile::parse("p.toml", text, false).unwrap_or_else(|why| panic!("{text}\n{why:?}")))
         .collect();
-    let [meter, bits, cia402] = &profiles[..] else {
+    let [meter, ratios, bits, cia402] = &profiles[..] else {
         panic!("{} examples", profiles.len());
     };
-    for profile in [meter, bits, cia402] {
+    for profile in [meter, ratios, bits, cia402] {
         assert_eq!(profile.warnings, [], "{}", profile.name);
     }
     let text = &blocks(examples, "toml")[0];
@@ -213,6 +213,8 @@ fn the_page_of_profiles_begins_with_three_profiles() {
         (reads(meter, PollClass::Slow), reads(meter, PollClass::Once)),
         (vec![(8, 4)], vec![(20, 8)])
     );
+    // The counter's parts, and both bytes, come in one request.
+    assert_eq!(reads(ratios, PollClass::Slow), [(31, 3)]);
     let control = |profile: &Profile| profile.control.clone().unwrap();
     let at = control(bits).at;
     assert_eq!(bits.runs_by(at.table, at.address, 3), Some(true));

@@ -269,7 +269,7 @@ impl BusCore {
         let mut news = std::mem::take(&mut self.news);
         let next = self.master.next(now, &mut news);
         self.report_all(news, now);
-        self.report.tick(now);
+        self.report.tick(|| self.master.unanswered(), now);
         self.counters
             .look(&self.bus, &mut self.report.diagnosis, &self.writes, now);
         let turn = match next {

@@ -11,9 +11,9 @@ use crate::codec::{Reply, RequestPdu};
 use crate::diagnosis::figures::Sign;
 use crate::diagnosis::hold::{Change, Hold};
 use crate::diagnosis::{
-    Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules,
+    Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules, unanswered,
 };
-use crate::drive::{DriveIndex, PerDrive};
+use crate::drive::{DriveIndex, PerDrive, PlannedRead};
 use crate::process_image::BusImage;
 
 #[derive(Debug)]
@@ -26,6 +26,8 @@ pub(super) struct LineDiagnosis {
     gap: Duration,
     /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
     by_drive: PerDrive<Option<(CountedByDrive, CountedByDrive)>>,
+    /// Reads to which each drive never replies, as of the last step.
+    unanswered: PerDrive<Vec<PlannedRead>>,
     /// Since when each current verdict holds.
     since: Vec<(Cause, Option<DriveIndex>, SystemTime)>,
 }
@@ -54,6 +56,7 @@ impl LineDiagnosis {
             hold: Hold::default(),
             by_drive: vec![None; image.drives.len()].into(),
             gap: Duration::ZERO,
+            unanswered: vec![Vec::new(); image.drives.len()].into(),
             since: Vec::new(),
             image,
         }
@@ -111,6 +114,10 @@ impl LineDiagnosis {
         if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
             return;
         }
+        // Silence to a register that the drive never answers shows nothing of the line.
+        if end(&exchanged.ended) == End::Silent && self.is_unanswered(drive, &transaction.request().pdu) {
+            return;
+        }
         if let Some(baud) = exchanged.beats {
             self.figures.beats(baud);
         }
@@ -162,12 +169,35 @@ impl LineDiagnosis {
         });
     }
 
-    /// Applies the rules when a step has passed. Returns the changes, as text.
-    pub(super) fn tick(&mut self, now: Instant) -> Vec<(Option<DriveIndex>, String)> {
+    fn is_unanswered(&self, drive: DriveIndex, pdu: &RequestPdu) -> bool {
+        let reads = self.unanswered.get(drive);
+        reads.is_some_and(|reads| reads.iter().any(|read| read.pdu() == *pdu))
+    }
+
+    /// A verdict for each drive that never replies to some of its reads.
+    fn registers(&self) -> impl Iterator<Item = Finding> {
+        let all = self.unanswered.enumerate().zip(&self.image.drives);
+        let with = all.filter(|((_, reads), _)| !reads.is_empty());
+        with.map(|((drive, reads), image)| {
+            let answered = self.figures.drives.get(drive).map_or(0, |one| one.sum(Sign::Answered));
+            unanswered::finding(drive, &image.spec.profile, reads, answered)
+        })
+    }
+
+    /// Applies the rules when a step has passed; `unanswered` are the reads to which drives never reply. Returns the changes, as
+    /// text.
+    pub(super) fn tick(
+        &mut self,
+        unanswered: impl FnOnce() -> PerDrive<Vec<PlannedRead>>,
+        now: Instant,
+    ) -> Vec<(Option<DriveIndex>, String)> {
         if !self.figures.is_step_over(now) {
             return Vec::new();
         }
-        let changes = self.hold.take(rules::find(&self.figures, &self.names, now));
+        self.unanswered = unanswered();
+        let mut found = rules::find(&self.figures, &self.names, now);
+        found.extend(self.registers());
+        let changes = self.hold.take(found);
         self.show();
         self.figures.next_step(now);
         let tell = |change: &Change| match change {
@@ -203,7 +233,7 @@ impl LineDiagnosis {
                 certainty: finding.certainty,
                 meaning: finding.cause.meaning().to_string(),
                 evidence: format!("{}{}", finding.evidence, directions.next().unwrap_or_default()),
-                remedy: finding.cause.remedy().to_string(),
+                remedy: finding.remedy().to_string(),
                 steps: steps_of(&self.image, finding),
                 since: humantime::format_rfc3339_millis(since).to_string(),
             }
@@ -269,6 +299,6 @@ fn told(finding: &Finding) -> String {
         "{} ({}): {evidence}; {}",
         cause.meaning(),
         certainty.name(),
-        cause.remedy()
+        finding.remedy()
     )
 }

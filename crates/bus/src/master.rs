@@ -564,6 +564,11 @@ impl Master {
         (N2_LATE * longest).min(LONGEST_N2_LATE)
     }
 
+    /// The reads that each drive never answers while it answers others.
+    pub(crate) fn unanswered(&self) -> PerDrive<Vec<PlannedRead>> {
+        self.schedule.unanswered()
+    }
+
     /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.
     pub(crate) fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.waits.n2_late)

@@ -478,9 +478,9 @@ impl Report {
         self.diagnosis.exchanged(index, exchanged, turnaround, now);
     }
 
-    /// Runs the diagnosis every 5 s, and calculates the load once a second.
-    pub(super) fn tick(&mut self, now: Instant) {
-        for (drive, text) in self.diagnosis.tick(now) {
+    /// Runs the diagnosis every 5 s, with the reads to which drives never reply, and calculates the load once a second.
+    pub(super) fn tick(&mut self, unanswered: impl FnOnce() -> PerDrive<Vec<PlannedRead>>, now: Instant) {
+        for (drive, text) in self.diagnosis.tick(unanswered, now) {
             let drive = drive
                 .and_then(|drive| self.drive(drive))
                 .map(|drive| drive.spec.name.clone());

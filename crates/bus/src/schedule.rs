@@ -324,6 +324,11 @@ impl Schedule {
         }
     }
 
+    /// The reads that each drive never answers while it answers others.
+    pub(crate) fn unanswered(&self) -> PerDrive<Vec<PlannedRead>> {
+        self.drives.iter().map(DriveSchedule::unanswered).collect()
+    }
+
     /// The drive replied to a command: it is alive, and probed at once if it was offline.
     pub fn seen(&mut self, drive: DriveIndex, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {

@@ -161,7 +161,7 @@ impl ListenCore {
                 self.tell(index, commanded);
             }
         }
-        self.report.tick(now);
+        self.report.tick(PerDrive::default, now);
         let due = self.drives.iter().filter_map(|known| known.commands.due_at());
         let wake = due.chain(self.decoder.wake_at()).min();
         wake.unwrap_or(now + LOOK).clamp(now, now + LOOK)

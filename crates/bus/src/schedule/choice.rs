@@ -35,10 +35,16 @@ impl Schedule {
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online && !d.is_quiet(now))
         {
+            // Of the reads that may get no reply, one a round.
+            let mut mute = 0;
             let due = drive
                 .items
                 .iter()
-                .filter(|i| i.read.class == PollClass::Fast && i.due <= now);
+                .filter(|i| i.read.class == PollClass::Fast && i.due <= now)
+                .filter(|i| {
+                    mute += usize::from(i.mute);
+                    !i.mute || mute == 1
+                });
             reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
         }
         reads.sort_by_key(|(place, index, _)| (*place, *index));

@@ -11,8 +11,9 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 const DEAD_SHARE: f64 = 0.016;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Every so many probes ask for something else: what the others ask for may be what the drive never answers.
-const OTHER_PROBE: usize = 3;
+/// Every so many probes ask for something else: what the others ask for may be what the drive never answers. The second number
+/// is that of a drive with one read only, of which parts are asked.
+const OTHER_PROBE: (usize, usize) = (3, 2);
 /// When a drive that went away is probed first, whatever that costs: most outages are short. A drive that answers saves up
 /// for it, out of the same share.
 const EARLY_PROBES: [Duration; 3] = [
@@ -26,6 +27,10 @@ const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::f
 
 /// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
 pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+/// Pause before the next request of a drive that may get no reply, in times of the last one that got none: while the register
+/// is sought, and once it is known.
+const SOUGHT_PAUSE: u32 = 4;
+const KNOWN_PAUSE: u32 = 50;
 
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
@@ -328,23 +333,41 @@ impl DriveSchedule {
         }
     }
 
-    /// What it is asked to find out whether it answers: the first read that is not known to be in vain, whose reply may also be
-    /// that to the probe before; every third time another one.
+    /// What the drive is asked to find out whether it answers: the first read that is not known to be in vain, whose reply may
+    /// also be that to the probe before; every third time another one, parts of that read among them.
     pub(super) fn probe(&self) -> Option<PlannedRead> {
         let (known, mute): (Vec<&Item>, Vec<&Item>) = self.items.iter().partition(|item| !item.mute);
         let mut all = known.into_iter().chain(mute).map(|item| item.read);
         let first = all.next()?;
-        let others: Vec<PlannedRead> = all
+        let mut others: Vec<PlannedRead> = all
             .filter(|read| !matches!(read.class, PollClass::Fault | PollClass::Monitor))
             .collect();
-        let turn =
-            (self.probes % OTHER_PROBE == OTHER_PROBE - 1).then(|| self.probes / OTHER_PROBE % others.len().max(1));
+        let every = if others.is_empty() {
+            OTHER_PROBE.1
+        } else {
+            OTHER_PROBE.0
+        };
+        others.extend(parts(first));
+        let turn = (self.probes % every == every - 1).then(|| self.probes / every % others.len().max(1));
         turn.and_then(|turn| others.get(turn).copied()).or(Some(first))
     }
 
-    /// The drive, which answers others, did not answer this read as often as it is tried. A block of process data is read in
-    /// halves from now on, until what it does not answer is found; that is tried again after a pause that grows.
-    pub(super) fn in_vain(&mut self, read: PlannedRead, now: Instant) {
+    /// The drive, which answers others, did not answer this read as often as it is tried. A block is read in halves from now on,
+    /// until the register that silences the drive is found, which is tried again after a pause that grows.
+    /// `took` is the time of that request on the line.
+    pub(super) fn in_vain(&mut self, read: PlannedRead, took: Duration, now: Instant) {
+        self.divide(read, now);
+        for item in self.items.iter_mut().filter(|item| item.mute) {
+            let times = if item.failures > self.retries {
+                KNOWN_PAUSE
+            } else {
+                SOUGHT_PAUSE
+            };
+            item.due = item.due.max(now + took * times);
+        }
+    }
+
+    fn divide(&mut self, read: PlannedRead, now: Instant) {
         let retries = self.retries;
         let Some(index) = self.items.iter().position(|item| item.read == read) else {
             // The block was taken apart meanwhile: any of its parts may be what is not answered.
@@ -363,20 +386,54 @@ impl DriveSchedule {
         let vain = item.failures.saturating_sub(retries + 1);
         item.due = now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1);
         let origin = item.origin;
-        if read.class != PollClass::Fast {
+        if matches!(read.class, PollClass::Fault | PollClass::Monitor) {
             return;
         }
-        let Some((low, high)) = Plan::halves(read) else {
+        if !self.halve(index, now) {
             self.join(origin, now);
-            return;
+        }
+    }
+
+    /// Reads the halves of a block that was not answered instead of it; false where the block cannot be divided.
+    fn halve(&mut self, index: usize, now: Instant) -> bool {
+        let Some((item, (low, high))) = self
+            .items
+            .get(index)
+            .and_then(|item| Some((item, Plan::halves(item.read)?)))
+        else {
+            return false;
         };
-        let cost = item.cost;
+        let (origin, cost) = (item.origin, item.cost);
+        // The whole was tried often enough: each part is tried once.
         let halves = [low, high].map(|half| Item {
             mute: true,
+            failures: self.retries,
             whole_again: Some(now + REFUSED_PAUSE.1),
             ..Item::new(half, origin, cost, now)
         });
         self.items.splice(index..=index, halves);
+        true
+    }
+
+    /// The drive answered `part` of a block whose whole it does not answer: the part is read by itself.
+    pub(super) fn set_apart(&mut self, part: PlannedRead, now: Instant) {
+        let contains = |item: &Item| {
+            item.read.class == part.class && item.read.count > part.count && item.read.covers(part.table, part.start)
+        };
+        while let Some(index) = self.items.iter().position(contains) {
+            if !self.halve(index, now) {
+                return;
+            }
+        }
+    }
+
+    /// The reads that an answering drive never answers, and that cannot be divided further.
+    pub(super) fn unanswered(&self) -> Vec<PlannedRead> {
+        if self.presence != Presence::Online {
+            return Vec::new();
+        }
+        let vain = |item: &&Item| item.mute && item.failures > self.retries && Plan::halves(item.read).is_none();
+        self.items.iter().filter(vain).map(|item| item.read).collect()
     }
 
     /// Splits a refused block until the bad point is found, which is retried slowly.
@@ -444,6 +501,18 @@ impl DriveSchedule {
         }
         self.items = joined;
     }
+}
+
+/// Parts of a block, larger ones first, by which a drive is asked that answers all of it but for one register.
+fn parts(block: PlannedRead) -> Vec<PlannedRead> {
+    let halves = |of: &[PlannedRead]| -> Vec<PlannedRead> {
+        let halves = of.iter().filter_map(|part| Plan::halves(*part));
+        halves.flat_map(|(low, high)| [low, high]).collect()
+    };
+    let halved = halves(&[block]);
+    let quarters = halves(&halved);
+    let eighths = halves(&quarters);
+    [halved, quarters, eighths].concat()
 }
 
 /// The pause after this one between probes of a drive that stays away.

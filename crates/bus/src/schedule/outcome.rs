@@ -28,7 +28,8 @@ impl Schedule {
             drive.probes = 0;
             // The drive answers, but not what took it away.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
-                drive.in_vain(vain, now);
+                drive.in_vain(vain, Duration::ZERO, now);
+                drive.set_apart(poll.read, now);
             }
             if self.round_started.is_none() {
                 self.round_due = self.round_due.min(now);
@@ -36,7 +37,9 @@ impl Schedule {
             for item in &mut drive.items {
                 item.wanted = item.read.class != PollClass::Fault;
                 item.due = now;
-                item.failures = 0;
+                if !item.mute {
+                    item.failures = 0;
+                }
             }
         }
         let mut change = Change::None;
@@ -98,7 +101,7 @@ impl Schedule {
                 in_vain = item.failures > retries;
             }
             if in_vain {
-                drive.in_vain(poll.read, now);
+                drive.in_vain(poll.read, took, now);
             }
             self.ask_whether_it_answers(poll.drive, now);
             return Change::None;

@@ -134,6 +134,7 @@ mod tests {
             drive: None,
             certainty,
             evidence: String::new(),
+            remedy: None,
         }
     }
 

@@ -7,6 +7,7 @@
 //! - `known`: what is known of each drive, and which stand out.
 //! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
 //! - [`hold`]: a verdict changes only on lasting evidence.
+//! - [`unanswered`]: registers to which a drive never replies.
 //! - [`words`]: the texts of causes and remedies.
 
 pub mod counters;
@@ -15,6 +16,7 @@ pub mod hold;
 mod known;
 pub mod rules;
 pub mod signature;
+pub mod unanswered;
 pub mod words;
 
 use std::fmt;
@@ -63,13 +65,15 @@ pub enum Cause {
     ConnectionCloses,
     /// Replies arrive faster than the configured baud rate allows.
     FasterThanBaud,
+    /// The drive answers, but never reads of certain registers.
+    RegisterUnanswered,
     /// Errors without a pattern.
     Noise,
 }
 
 impl Cause {
     /// All causes, in the order of the documentation.
-    pub const ALL: [Cause; 17] = [
+    pub const ALL: [Cause; 18] = [
         Cause::AllSilent,
         Cause::OneDrive,
         Cause::FromAddress,
@@ -86,6 +90,7 @@ impl Cause {
         Cause::PortResets,
         Cause::ConnectionCloses,
         Cause::FasterThanBaud,
+        Cause::RegisterUnanswered,
         Cause::Noise,
     ];
 
@@ -108,6 +113,7 @@ impl Cause {
             Cause::PortResets => "port_resets",
             Cause::ConnectionCloses => "connection_closes",
             Cause::FasterThanBaud => "faster_than_baud",
+            Cause::RegisterUnanswered => "register_unanswered",
             Cause::Noise => "noise",
         }
     }
@@ -146,6 +152,15 @@ pub struct Finding {
     pub certainty: Certainty,
     /// The evidence, as text.
     pub evidence: String,
+    /// The remedy of this finding, where it says more than that of its cause.
+    pub remedy: Option<String>,
+}
+
+impl Finding {
+    /// What to do.
+    pub fn remedy(&self) -> &str {
+        self.remedy.as_deref().unwrap_or(self.cause.remedy())
+    }
 }
 
 /// A cause with its evidence, as it is shown.

@@ -86,6 +86,7 @@ impl Rules<'_> {
             drive,
             certainty,
             evidence,
+            remedy: None,
         });
     }
 

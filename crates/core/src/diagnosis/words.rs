@@ -29,6 +29,7 @@ impl Cause {
             Cause::PortResets => "the adapter keeps disconnecting",
             Cause::ConnectionCloses => "the device server keeps closing its connection",
             Cause::FasterThanBaud => "replies arrive faster than the configured baud rate allows",
+            Cause::RegisterUnanswered => "the drive answers, but never reads of certain registers",
             Cause::Noise => "errors without a pattern",
         }
     }
@@ -98,6 +99,7 @@ impl Cause {
                 "set baud of the bus to the rate of the line behind the device server: the time on the wire, and what \
                  counts as a late reply, are calculated from it"
             }
+            Cause::RegisterUnanswered => "leave the registers out of the profile, or correct their addresses",
             Cause::Noise => {
                 "check termination at both ends, the reference conductor, and the cable's shield and route; trying a \
                  lower baud rate shows whether it is the cable"
@@ -119,7 +121,8 @@ impl Cause {
             | Cause::SilenceTooShort
             | Cause::PortResets
             | Cause::ConnectionCloses
-            | Cause::FasterThanBaud => &[],
+            | Cause::FasterThanBaud
+            | Cause::RegisterUnanswered => &[],
         }
     }
 

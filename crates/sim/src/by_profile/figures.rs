@@ -8,7 +8,7 @@ use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
 use crate::codec::Table;
 use crate::drive::control::{Mask, OwnWord, Run, Until};
 use crate::drive::profile::{Form, Part, PollClass, Raw};
-use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source};
+use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source, Value};
 
 /// kW of the simulated motor.
 const NOMINAL_POWER: f64 = 3.0;
@@ -39,11 +39,11 @@ impl ProfileDrive {
                 },
             );
         }
-        // Those with a scale in another register come after it.
+        // Points with a scale or a factor in another register come after that register.
         let (scaled, plain): (Vec<PointIndex>, Vec<PointIndex>) = profile
             .points
             .indexes()
-            .partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scale_from.is_some()));
+            .partition(|index| raw_of(&profile, *index).is_some_and(|raw| raw.scaled_by().next().is_some()));
         for index in plain.into_iter().chain(scaled) {
             let Some((point, raw)) = profile.points.get(index).and_then(|point| Some((point, point.raw()?))) else {
                 continue;
@@ -83,17 +83,28 @@ impl ProfileDrive {
     }
 
     fn put_number(&mut self, profile: &Profile, raw: &Raw, number: f64) {
-        let power = raw.scale_from.and_then(|index| {
-            let from = raw_of(profile, index)?;
-            let words: Option<Vec<u16>> = from
-                .addresses()
-                .map(|address| self.registers.get(from.table, address))
-                .collect();
-            from.decode(&words?, profile.points.get(index)?.kind())
-        });
+        let power = raw.scale_from.and_then(|index| self.value_of(profile, index));
+        let factors = raw
+            .factor_from
+            .iter()
+            .filter_map(|index| self.value_of(profile, *index));
+        let factor: f64 = factors
+            .map(|factor| factor.as_f64())
+            .filter(|factor| *factor != 0.0)
+            .product();
         let number = if is_signed(raw) { number } else { number.abs() };
-        let parts = raw.number_parts(number, power.map_or(0, |power| power.as_f64() as i64));
+        let parts = raw.number_parts(number / factor, power.map_or(0, |power| power.as_f64() as i64));
         self.put(raw, &parts);
+    }
+
+    /// The value of a point as its registers hold it now.
+    fn value_of(&self, profile: &Profile, index: PointIndex) -> Option<Value> {
+        let raw = raw_of(profile, index)?;
+        let words: Option<Vec<u16>> = raw
+            .addresses()
+            .map(|address| self.registers.get(raw.table, address))
+            .collect();
+        raw.decode(&words?, profile.points.get(index)?.kind())
     }
 
     /// The reference as another master writes it.

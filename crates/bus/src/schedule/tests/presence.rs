@@ -154,14 +154,20 @@ fn what_a_drive_never_has_is_asked_ever_more_seldom() {
 #[test]
 fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
     let mut rig = PolledLine::new(1, Duration::from_millis(10));
-    let mut mute = 0;
-    let changes = rig.answer(Duration::from_secs(30), |poll, _| {
-        let silent = poll.read.class == PollClass::Once;
-        mute += usize::from(silent);
-        if silent { Polled::Failed } else { Polled::Ok }
-    });
-    assert!(!changes.contains(&Change::Offline));
-    assert_eq!(mute, 5, "first try and one retry, then after 2, 4, 8 s");
+    let mut silent_for = |time: Duration| {
+        let mut vain = 0;
+        let changes = rig.answer(time, |poll, _| {
+            let silent = poll.read.class == PollClass::Once;
+            vain += u32::from(silent);
+            if silent { Polled::Failed } else { Polled::Ok }
+        });
+        assert!(!changes.contains(&Change::Offline));
+        COST * vain
+    };
+    let sought = silent_for(Duration::from_secs(30));
+    assert!(sought < Duration::from_millis(300), "{sought:?}");
+    let known = silent_for(Duration::from_secs(60));
+    assert!(known < Duration::from_millis(120), "{known:?} of 60 s");
 }
 
 #[test]

@@ -55,6 +55,10 @@ impl Raw {
                 let mask = u64::from(low_mask(bits)) << first;
                 (mask, (count as u64) << first & mask)
             }
+            (None, Form::I8 { high }) => {
+                let shift = if high { 8 } else { 0 };
+                (0xFF << shift, u64::from(count as u8) << shift)
+            }
             (None, Form::Bcd16 | Form::Bcd32) => (all, to_digits(count as u64)),
             (None, form) => (all, form.bits_of(count)),
         };
