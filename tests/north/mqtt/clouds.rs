@@ -159,3 +159,110 @@ fn a_token_that_was_renewed_is_used_at_the_next_connection() {
     std::fs::write(&token, "second\n").unwrap();
     online(&broker, "second");
 }
+
+/// One packet of a client: its first byte and its body; `None` at the end of the connection.
+fn packet(client: &mut TcpStream) -> Option<(u8, Vec<u8>, Vec<u8>)> {
+    let mut raw = vec![0];
+    client.read_exact(&mut raw).ok()?;
+    let (mut length, mut shift) = (0, 0);
+    loop {
+        let mut byte = [0];
+        client.read_exact(&mut byte).ok()?;
+        raw.push(byte[0]);
+        length |= usize::from(byte[0] & 0x7F) << shift;
+        shift += 7;
+        if byte[0] & 0x80 == 0 {
+            break;
+        }
+    }
+    let mut body = vec![0; length];
+    client.read_exact(&mut body).ok()?;
+    raw.extend(&body);
+    Some((raw[0], body, raw))
+}
+
+/// What AWS IoT Core does not take, or `None`: a retained message, a topic with more than seven slashes, a ninth filter.
+fn beyond_limits(first: u8, body: &[u8]) -> Option<String> {
+    let text = |at: usize| -> Option<(String, usize)> {
+        let length = usize::from(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
+        let bytes = body.get(at + 2..at + 2 + length)?;
+        Some((String::from_utf8_lossy(bytes).into_owned(), at + 2 + length))
+    };
+    let slashes = |topic: &str| topic.matches('/').count() > 7;
+    match first >> 4 {
+        3 if first & 1 == 1 => Some(format!("retained: {}", text(0)?.0)),
+        3 if slashes(&text(0)?.0) => Some(format!("slashes: {}", text(0)?.0)),
+        8 => {
+            // The properties of the gateway's subscriptions are shorter than 128 bytes.
+            let mut at = 3 + usize::from(*body.get(2)?);
+            let mut filters = Vec::new();
+            while let Some((filter, end)) = text(at) {
+                filters.push(filter);
+                at = end + 1;
+            }
+            let bad = filters.len() > 8 || filters.iter().any(|filter| slashes(filter));
+            bad.then(|| format!("filters: {filters:?}"))
+        }
+        _ => None,
+    }
+}
+
+/// A way to the broker that closes a connection, without a reason, at what AWS IoT Core does not take: its port, and what
+/// that was.
+fn limited(broker: u16) -> (u16, Arc<Mutex<Vec<String>>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let closed: Arc<Mutex<Vec<String>>> = Arc::default();
+    let seen = closed.clone();
+    std::thread::spawn(move || {
+        for mut client in listener.incoming().map_while(Result::ok) {
+            let (seen, mut server) = (seen.clone(), TcpStream::connect(("127.0.0.1", broker)).unwrap());
+            let (mut from_server, mut to_client) = (server.try_clone().unwrap(), client.try_clone().unwrap());
+            std::thread::spawn(move || {
+                let _ = std::io::copy(&mut from_server, &mut to_client);
+                let _ = to_client.shutdown(Shutdown::Both);
+            });
+            std::thread::spawn(move || {
+                while let Some((first, body, raw)) = packet(&mut client) {
+                    if let Some(why) = beyond_limits(first, &body) {
+                        seen.lock().unwrap().push(why);
+                        break;
+                    }
+                    if server.write_all(&raw).is_err() {
+                        break;
+                    }
+                }
+                let _ = (client.shutdown(Shutdown::Both), server.shutdown(Shutdown::Both));
+            });
+        }
+    });
+    (port, closed)
+}
+
+/// The recipe of docs/mqtt.md for such a broker; without `retain = false` the log names what it closed the connection over.
+#[test]
+fn a_broker_that_closes_at_a_ninth_filter_or_a_retained_message_is_served() {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "drivegate/#");
+    let (port, closed) = limited(broker.port);
+    let mut options = options(port);
+    options.retain = false;
+    options.publish_limit = 100;
+    let gateway = Gateway::start(options.clone(), plant(&["p1", "p2", "p3"]));
+    watcher.wait("online", |seen| {
+        seen.topic == "drivegate/hall/status" && seen.payload == "online"
+    });
+    let topic = "drivegate/hall/drive/p3/set/speed_reference";
+    broker.publish(topic, "12", &[]);
+    watcher.wait("the result", |seen| seen.topic == "drivegate/hall/drive/p3/result");
+    watcher.wait("a value", |seen| seen.topic.ends_with("p3/point/actual_speed"));
+    drop(gateway);
+    assert_eq!(*closed.lock().unwrap(), [""; 0]);
+    options.retain = true;
+    let _gateway = Gateway::start(options, plant(&["p1"]));
+    wait_log(
+        port,
+        "the broker closed the connection without a reason; the last packet sent before was PUBLISH to ",
+    );
+    assert!(closed.lock().unwrap()[0].starts_with("retained: "));
+}

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::FutureExt;
-use rumqttc::mqttbytes::v5::Filter;
+use rumqttc::mqttbytes::v5::{Disconnect, Filter};
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
     AsyncClient, ConnectProperties, ConnectReturnCode, ConnectionError, DisconnectProperties, DisconnectReasonCode,
@@ -28,6 +28,7 @@ use super::outbox::Message;
 use super::password::Secret;
 use super::rate::Rate;
 use super::request::Incoming;
+use super::trail::Trail;
 use super::{Broker, Options};
 use crate::order::Arrival;
 use crate::reading::{Dated, Reader};
@@ -150,6 +151,8 @@ struct Backlog {
     messages: AtomicUsize,
     /// When rumqttc wrote its latest messages.
     rate: Mutex<Rate>,
+    /// What it wrote last.
+    trail: Mutex<Trail>,
     /// Whether the client waits for [`Step::Room`].
     room_wanted: AtomicBool,
 }
@@ -159,12 +162,25 @@ impl Backlog {
         Backlog {
             messages: AtomicUsize::new(0),
             rate: Mutex::new(Rate::new(publish_limit)),
+            trail: Mutex::default(),
             room_wanted: AtomicBool::new(false),
         }
     }
 
     fn rate(&self) -> MutexGuard<'_, Rate> {
         self.rate.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn trail(&self) -> MutexGuard<'_, Trail> {
+        self.trail.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Why a connection ended that the broker closed without a reason.
+    fn closed(&self) -> String {
+        match self.trail().last() {
+            Some(packet) => format!("{CLOSED}; the last packet sent before was {packet}"),
+            None => CLOSED.to_string(),
+        }
     }
 }
 
@@ -269,7 +285,10 @@ impl Connection {
         });
         packets(filters, limits.max_packet.min(SUBSCRIBE_BYTES))
             .into_iter()
-            .all(|packet| self.client.try_subscribe_many(packet).is_ok())
+            .all(|packet| {
+                self.backlog.trail().subscribes(packet.len());
+                self.client.try_subscribe_many(packet).is_ok()
+            })
     }
 
     /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
@@ -280,6 +299,7 @@ impl Connection {
             && let Some(question) = &self.question
             && self.client.try_subscribe_many([question.clone()]).is_ok()
         {
+            self.backlog.trail().subscribes(1);
             self.silence.asked();
         }
         verdict == Verdict::Lost
@@ -309,6 +329,9 @@ impl Connection {
         let retain = message.retain && limits.retains;
         let known = alias.is_some_and(|(_, known)| known);
         let topic = if known { "" } else { message.topic.as_ref() };
+        self.backlog
+            .trail()
+            .publishes(message.topic.clone(), message.payload.len(), retain);
         // Before the attempt: the event for the last message may come right after it.
         self.backlog.room_wanted.store(true, Ordering::SeqCst);
         let attempt = self
@@ -318,6 +341,8 @@ impl Connection {
             self.aliases.announced(&message.topic);
             self.backlog.room_wanted.store(false, Ordering::SeqCst);
             self.backlog.messages.fetch_add(1, Ordering::SeqCst);
+        } else {
+            self.backlog.trail().kept_back();
         }
         attempt.is_ok()
     }
@@ -442,6 +467,7 @@ fn target(broker: &Broker) -> rumqttc::Broker {
 /// Polls until the first error and reports the events.
 async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender<Step>, backlog: Arc<Backlog>) {
     let mut accepted = false;
+    let mut elsewhere = String::new();
     loop {
         let event_or_end = eventloop.poll().await;
         // Packets are read in batches: of all that was read and is not told yet, the earliest.
@@ -449,6 +475,7 @@ async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender
         let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
                 backlog.rate().sent(Instant::now());
+                backlog.trail().published();
                 let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
                 if left <= REQUESTS / 2
                     && backlog.room_wanted.swap(false, Ordering::SeqCst)
@@ -458,15 +485,23 @@ async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender
                 }
                 (packet != 0).then_some(Step::Sent(packet))
             }
-            Ok(event) => interpret(event, arrival),
+            Ok(event) => {
+                match &event {
+                    Event::Outgoing(Outgoing::Subscribe(_)) => backlog.trail().subscribed(),
+                    Event::Outgoing(Outgoing::PingReq) => backlog.trail().pinged(),
+                    Event::Incoming(Packet::Disconnect(told)) => elsewhere = reference(told),
+                    _ => {}
+                }
+                interpret(event, arrival)
+            }
             Err(ConnectionError::ConnectionRefused(ConnectReturnCode::QoSNotSupported)) => {
                 Some(Step::Refuses(Lack::Acknowledgements))
             }
             Err(ConnectionError::ConnectionRefused(ConnectReturnCode::RetainNotSupported)) => {
                 Some(Step::Refuses(Lack::Retained))
             }
-            Err(error) if accepted && is_closed(&error) => Some(Step::Lost(CLOSED.to_string())),
-            Err(error) if accepted => Some(Step::Lost(reason(&error))),
+            Err(error) if accepted && is_closed(&error) => Some(Step::Lost(backlog.closed())),
+            Err(error) if accepted => Some(Step::Lost(format!("{}{elsewhere}", reason(&error)))),
             Err(error) => Some(Step::Lost(refusal(&error))),
         };
         let Some(item) = item else { continue };
@@ -541,7 +576,25 @@ const SCHEME: &str = "the broker did not accept the connection; check the scheme
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
 
 /// The broker ended an accepted connection, and did not say why.
-pub(super) const CLOSED: &str = "the broker closed the connection";
+pub(super) const CLOSED: &str = "the broker closed the connection without a reason";
+
+/// The server that a broker names when it sends its clients to another one. The gateway does not follow: it would send its
+/// password to a server that nobody configured.
+fn reference(disconnect: &Disconnect) -> String {
+    let named = disconnect
+        .properties
+        .as_ref()
+        .and_then(|all| all.server_reference.as_deref());
+    match (disconnect.reason_code, named) {
+        (DisconnectReasonCode::UseAnotherServer, Some(server)) => {
+            format!("; the broker asks its clients to use {server:?} for now: add it to mqtt.urls")
+        }
+        (DisconnectReasonCode::ServerMoved, Some(server)) => {
+            format!("; the broker has moved to {server:?}: write that to mqtt.url")
+        }
+        _ => String::new(),
+    }
+}
 
 /// The broker ended the connection before TLS was there, and did not say why.
 const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: perhaps it does not use TLS \
@@ -620,6 +673,25 @@ fn packets(filters: Vec<Filter>, most: usize) -> Vec<Vec<Filter>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_broker_that_sends_its_clients_elsewhere_names_where() {
+        let told = |code, server: Option<&str>| {
+            let mut disconnect = Disconnect::new(code);
+            disconnect.properties = Some(DisconnectProperties {
+                session_expiry_interval: None,
+                reason_string: None,
+                user_properties: Vec::new(),
+                server_reference: server.map(str::to_string),
+            });
+            reference(&disconnect)
+        };
+        use DisconnectReasonCode::{ServerBusy, ServerMoved, UseAnotherServer};
+        assert!(told(UseAnotherServer, Some("b-2:8883")).contains("\"b-2:8883\" for now: add it to mqtt.urls"));
+        assert!(told(ServerMoved, Some("b-2:8883")).contains("moved to \"b-2:8883\": write that to mqtt.url"));
+        assert_eq!(told(ServerMoved, None), "");
+        assert_eq!(told(ServerBusy, Some("b-2:8883")), "");
+    }
 
     #[test]
     fn a_packet_with_subscriptions_has_eight_filters_and_so_many_bytes_at_most() {

@@ -289,10 +289,13 @@ impl BrokerLink {
         let place = self.rotation.current();
         let before = self.turn_to_next(None, now);
         self.read_password_again(why, now);
+        // Whatever the last packet was: a broker that closes without a reason is one reason.
+        let closed = why.starts_with(CLOSED);
+        let kind = if closed { CLOSED } else { why };
         if self
             .outages
             .get_mut(place)
-            .is_some_and(|outages| outages.permit(why, now))
+            .is_some_and(|outages| outages.permit(kind, now))
         {
             let hint = match why.contains("SessionTakenOver") {
                 true => "; another client has the same client id: give each gateway its own name or `client_id`",
@@ -306,7 +309,7 @@ impl BrokerLink {
         } else {
             tracing::debug!(target: "drivegate::north::mqtt", "{prefix}no connection to the broker at {broker}: {why}");
         }
-        if why == CLOSED && self.takeovers.closed(now) {
+        if closed && self.takeovers.closed(now) {
             let words = Takeovers::words(&self.client_id);
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}{broker}: {words}");
         }

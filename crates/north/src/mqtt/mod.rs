@@ -50,6 +50,7 @@ mod store;
 mod takeover;
 mod tls;
 mod topics;
+mod trail;
 
 use std::fmt;
 use std::path::PathBuf;
