@@ -16,6 +16,9 @@ use crate::diagnosis::{
 use crate::drive::{DriveIndex, PerDrive, PlannedRead};
 use crate::process_image::BusImage;
 
+/// One failed request of so many makes a line unsound: what is not answered there may have been lost.
+const UNSOUND: u32 = 20;
+
 #[derive(Debug)]
 pub(super) struct LineDiagnosis {
     image: Arc<BusImage>,
@@ -178,10 +181,23 @@ impl LineDiagnosis {
     fn registers(&self) -> impl Iterator<Item = Finding> {
         let all = self.unanswered.enumerate().zip(&self.image.drives);
         let with = all.filter(|((_, reads), _)| !reads.is_empty());
-        with.map(|((drive, reads), image)| {
-            let answered = self.figures.drives.get(drive).map_or(0, |one| one.sum(Sign::Answered));
-            unanswered::finding(drive, &image.spec.profile, reads, answered)
+        with.filter_map(|((drive, reads), image)| {
+            let [answered, failed] = self.answered_and_failed(drive);
+            let sound = failed * UNSOUND <= answered;
+            sound.then(|| unanswered::finding(drive, &image.spec.profile, reads, answered))
         })
+    }
+
+    /// Requests to that drive in the last minute, other than for registers that it never answers.
+    fn answered_and_failed(&self, drive: DriveIndex) -> [u32; 2] {
+        let sum = |signs: &[Sign]| {
+            let counts = self.figures.drives.get(drive);
+            counts.map_or(0, |counts| signs.iter().map(|sign| counts.sum(*sign)).sum())
+        };
+        [
+            sum(&[Sign::Answered]),
+            sum(&[Sign::Silent, Sign::Damaged, Sign::StartLost, Sign::CutEcho]),
+        ]
     }
 
     /// Applies the rules when a step has passed; `unanswered` are the reads to which drives never reply. Returns the changes, as

@@ -31,6 +31,8 @@ pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Dur
 /// is sought, and once it is known.
 const SOUGHT_PAUSE: u32 = 4;
 const KNOWN_PAUSE: u32 = 50;
+/// How often a register is tried again before it counts as one that the drive never answers.
+const TRIED_AGAIN: u32 = 3;
 
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
@@ -432,7 +434,10 @@ impl DriveSchedule {
         if self.presence != Presence::Online {
             return Vec::new();
         }
-        let vain = |item: &&Item| item.mute && item.failures > self.retries && Plan::halves(item.read).is_none();
+        let vain = |item: &&Item| {
+            let often = item.failures > self.retries + TRIED_AGAIN;
+            item.mute && often && Plan::halves(item.read).is_none()
+        };
         self.items.iter().filter(vain).map(|item| item.read).collect()
     }
 
