@@ -20,15 +20,15 @@ pub struct Accepts {
 pub enum Apdu<'a> {
     /// A request that is answered.
     Confirmed {
-        /// It comes in segments.
+        /// Whether the request comes in segments.
         segmented: bool,
-        /// What its client accepts.
+        /// The longest reply and the segments that the client accepts.
         accepts: Accepts,
-        /// Its number.
+        /// The invoke id, by which the client finds the reply to its request.
         invoke: u8,
-        /// What is requested.
+        /// Number of the requested service.
         service: u8,
-        /// Its content.
+        /// Parameters of the service, still encoded.
         data: &'a [u8],
     },
     /// A message that is not answered.
@@ -39,15 +39,15 @@ pub enum Apdu<'a> {
     ComplexAck(u8),
     /// Segments arrived.
     SegmentAck {
-        /// Not those that were expected.
+        /// A negative acknowledgement: segments arrived out of order.
         negative: bool,
-        /// A server says so.
+        /// Whether the sender acts as the server of the transaction.
         server: bool,
-        /// Of that exchange.
+        /// The invoke id of the transaction whose segments are acknowledged.
         invoke: u8,
         /// The last one that arrived.
         sequence: u8,
-        /// So many may follow at once.
+        /// Number of segments that may follow before the next acknowledgement.
         window: u8,
     },
     /// A request of ours failed.
@@ -56,9 +56,9 @@ pub enum Apdu<'a> {
     Reject(u8),
     /// An exchange ended.
     Abort {
-        /// A server says so.
+        /// Whether the sender acts as the server of the transaction.
         server: bool,
-        /// That one.
+        /// The invoke id of the transaction that ended.
         invoke: u8,
     },
 }

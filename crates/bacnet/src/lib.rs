@@ -1,8 +1,8 @@
 //! A BACnet/IP server without sockets, threads or a clock: datagrams go in with the time, datagrams come out.
 //!
 //! [`Server`] shows a device of its own and, behind a virtual network for which it is the router, any number of further ones. What
-//! they show comes from an [`Application`]; what clients write is handed out as a [`Job`] and answered when whoever carries it
-//! out knows how it ended, so that an acknowledgement can mean that something happened.
+//! they show comes from an [`Application`]; what clients write is handed out as a [`Job`] and answered only when the application
+//! reports how the write ended, so that an acknowledgement can mean that something happened.
 //!
 //! | module | what it is |
 //! |---|---|

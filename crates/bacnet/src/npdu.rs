@@ -16,7 +16,7 @@ pub struct Npdu<'a> {
     pub from: Option<(u16, Mac)>,
     /// An answer is expected.
     pub expects: bool,
-    /// Its content.
+    /// The message itself: to an application, or between routers.
     pub payload: Payload<'a>,
 }
 
@@ -77,7 +77,7 @@ pub fn decode(bytes: &[u8]) -> Option<Npdu<'_>> {
     let payload = match control & 0x80 != 0 {
         false => Payload::Application(rest),
         true => match rest {
-            // Those of vendors have an identifier before their content.
+            // Proprietary message types carry a vendor identifier before their content.
             [kind @ 0x80..=0xFF, _, _, rest @ ..] => Payload::Network(*kind, rest),
             [kind @ 0..=0x7F, rest @ ..] => Payload::Network(*kind, rest),
             _ => return None,

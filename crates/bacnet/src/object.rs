@@ -12,15 +12,15 @@ pub(crate) use properties::{Context, Environment, Port, cov_value, list, propert
 /// A device.
 #[derive(Debug, PartialEq)]
 pub struct Device {
-    /// Its instance, 0..=4194302, unique in the network.
+    /// Instance number of the device, 0..=4194302, unique in the network.
     pub instance: u32,
-    /// Its station on the virtual network; none: it is the device of the host itself.
+    /// Station of the device on the virtual network; none: the device of the host itself.
     pub station: Option<Mac>,
-    /// Its name, unique in the network.
+    /// Name of the device, unique in the network.
     pub name: String,
-    /// What it is.
+    /// Text for the Description property of the device.
     pub description: String,
-    /// Its model.
+    /// Text for the Model_Name property of the device.
     pub model: String,
     objects: Vec<Object>,
     by_id: HashMap<ObjectId, usize>,
@@ -30,11 +30,11 @@ pub struct Device {
 /// An object of a device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Object {
-    /// Its identifier, unique in the device.
+    /// Identifier of the object, unique in the device.
     pub id: ObjectId,
-    /// Its name, unique in the device.
+    /// Name of the object, unique in the device.
     pub name: Arc<str>,
-    /// What it is.
+    /// Text for the Description property of the object.
     pub description: Arc<str>,
     /// The kind of its values.
     pub kind: Kind,
@@ -45,9 +45,9 @@ pub struct Object {
 /// How an object is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Not at all.
+    /// Clients may read the object but not write it.
     Read,
-    /// Its Present_Value, without priorities.
+    /// Clients may write Present_Value; the object has no priority array.
     Write,
     /// By sixteen priorities.
     Command,
@@ -72,7 +72,7 @@ pub enum Kind {
         /// Their texts.
         texts: [Arc<str>; 2],
     },
-    /// One of several states, from 1.
+    /// A value that is one of several states, numbered from 1.
     MultiState {
         /// Their texts.
         texts: Arc<[String]>,
@@ -84,24 +84,24 @@ pub enum Kind {
 /// A value.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Datum {
-    /// Of an analog object.
+    /// Value of an analog object.
     Number(f64),
-    /// Of a binary object: active.
+    /// Value of a binary object: true is active.
     Bool(bool),
-    /// Of a multi-state object, from 1.
+    /// Value of a multi-state object: the state, from 1.
     State(u32),
-    /// Of a text.
+    /// Value of a character string object.
     Text(Arc<str>),
 }
 
 /// Whether a value can be relied on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reliability {
-    /// It can.
+    /// The value can be relied on.
     NoFault = 0,
-    /// Its source gives no valid one.
+    /// The source gives no valid value.
     UnreliableOther = 7,
-    /// Its source does not answer, or not in time.
+    /// The source does not answer, or not in time.
     CommunicationFailure = 12,
 }
 
@@ -110,7 +110,7 @@ pub enum Reliability {
 pub struct Sample {
     /// The last one; none was ever there.
     pub value: Option<Datum>,
-    /// Whether it can be relied on.
+    /// Whether the value can be relied on, and if not, why.
     pub reliability: Reliability,
     /// When it was read.
     pub at: Option<DateTime>,
@@ -119,7 +119,7 @@ pub struct Sample {
 /// Who wrote a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ValueSource {
-    /// Nobody is known.
+    /// The writer is not known.
     #[default]
     None,
     /// A client.
@@ -131,9 +131,9 @@ pub enum ValueSource {
 /// A slot of a priority array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Slot {
-    /// Its value.
+    /// The commanded value at this priority.
     pub value: Datum,
-    /// Who wrote it.
+    /// Who wrote the value.
     pub source: ValueSource,
     /// When.
     pub at: DateTime,
@@ -180,12 +180,12 @@ impl Device {
         }
     }
 
-    /// Its identifier.
+    /// The identifier of the Device object.
     pub fn id(&self) -> ObjectId {
         ObjectId::new(ObjectType::DEVICE, self.instance)
     }
 
-    /// Its objects, itself and its port apart.
+    /// The objects of the device, without the Device object and the Network Port.
     pub fn objects(&self) -> &[Object] {
         &self.objects
     }

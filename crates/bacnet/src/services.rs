@@ -31,7 +31,7 @@ pub mod unconfirmed {
 
 /// Services that are executed, as bits of Protocol_Services_Supported.
 ///
-/// Those that are only sent are not among them.
+/// Unconfirmed services that the server only sends are not listed.
 pub const SUPPORTED: [usize; 11] = [5, 12, 14, 15, 16, 17, 32, 33, 34, 36, 38];
 
 /// A property, or an element of it.
@@ -48,7 +48,7 @@ pub struct PropertyRef {
 pub struct Range(pub Option<(u32, u32)>);
 
 impl Range {
-    /// Whether it covers that instance.
+    /// Whether the range includes this instance.
     pub fn covers(&self, instance: u32) -> bool {
         self.0.is_none_or(|(low, high)| (low..=high).contains(&instance))
     }
@@ -68,7 +68,7 @@ impl Range {
 /// Reads Who-Is.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn who_is(data: &[u8]) -> Read<Range> {
     let mut reader = Reader::new(data);
     let range = Range::read(&mut reader)?;
@@ -88,7 +88,7 @@ pub enum Sought {
 /// Reads Who-Has.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn who_has(data: &[u8]) -> Read<(Range, Sought)> {
     let mut reader = Reader::new(data);
     let range = Range::read(&mut reader)?;
@@ -103,7 +103,7 @@ pub fn who_has(data: &[u8]) -> Read<(Range, Sought)> {
 /// Reads ReadProperty.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn read_property(data: &[u8]) -> Read<(ObjectId, PropertyRef)> {
     let mut reader = Reader::new(data);
     let object = reader.context_object(0)?;
@@ -122,7 +122,7 @@ fn property_ref(reader: &mut Reader<'_>, property: u8, index: u8) -> Read<Proper
 /// Reads ReadPropertyMultiple.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRef>)>> {
     let mut reader = Reader::new(data);
     let mut all = Vec::new();
@@ -161,7 +161,7 @@ pub struct WriteItem {
 /// Reads WriteProperty.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn write_property(data: &[u8]) -> Read<WriteItem> {
     let mut reader = Reader::new(data);
     let object = reader.context_object(0)?;
@@ -180,7 +180,7 @@ pub fn write_property(data: &[u8]) -> Read<WriteItem> {
 /// Reads WritePropertyMultiple.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn write_property_multiple(data: &[u8]) -> Read<Vec<WriteItem>> {
     let mut reader = Reader::new(data);
     let mut all = Vec::new();
@@ -242,7 +242,7 @@ pub struct Subscribe {
     pub object: ObjectId,
     /// Confirmed or not, and the lifetime in seconds, 0 without end; none: it ends.
     pub terms: Option<(bool, u32)>,
-    /// Of SubscribeCOVProperty: the property and the increment.
+    /// For SubscribeCOVProperty: the property and the increment.
     pub property: Option<(PropertyRef, Option<f32>)>,
 }
 
@@ -257,7 +257,7 @@ fn terms(confirmed: Option<bool>, lifetime: Option<u32>) -> Read<Option<(bool, u
 /// Reads SubscribeCOV.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn subscribe_cov(data: &[u8]) -> Read<Subscribe> {
     let mut reader = Reader::new(data);
     let (process, object) = (reader.context_u32(0)?, reader.context_object(1)?);
@@ -274,7 +274,7 @@ pub fn subscribe_cov(data: &[u8]) -> Read<Subscribe> {
 /// Reads SubscribeCOVProperty.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid, or the increment is negative or not finite.
 pub fn subscribe_cov_property(data: &[u8]) -> Read<Subscribe> {
     let mut reader = Reader::new(data);
     let (process, object) = (reader.context_u32(0)?, reader.context_object(1)?);
@@ -309,7 +309,7 @@ pub struct Control {
 /// Reads DeviceCommunicationControl.
 ///
 /// # Errors
-/// It is not valid.
+/// The encoding is not valid.
 pub fn device_communication_control(data: &[u8]) -> Read<Control> {
     let mut reader = Reader::new(data);
     let minutes = reader.optional_u32(0)?;

@@ -62,9 +62,9 @@ impl ObjectType {
 /// Identifier of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ObjectId {
-    /// Its type.
+    /// Type of the object.
     pub kind: ObjectType,
-    /// Its number, 0..=4194303.
+    /// Instance number of the object, 0..=4194303.
     pub instance: u32,
 }
 
@@ -143,9 +143,9 @@ pub enum ErrorClass {
 /// An error as a confirmed service is answered with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Error {
-    /// Its class.
+    /// Class of the error.
     pub class: ErrorClass,
-    /// Its code.
+    /// Code of the error.
     pub code: u16,
 }
 
@@ -205,7 +205,7 @@ impl Mac {
     /// The address that means all stations.
     pub const ALL: Mac = Mac { len: 0, octets: [0; 8] };
 
-    /// That address, unless it is longer than eight octets.
+    /// A MAC address of these octets; none where there are more than eight.
     pub fn new(octets: &[u8]) -> Option<Mac> {
         let mut mac = Mac::ALL;
         mac.octets.get_mut(..octets.len())?.copy_from_slice(octets);
@@ -213,7 +213,7 @@ impl Mac {
         Some(mac)
     }
 
-    /// Its octets.
+    /// The octets of the MAC address.
     pub fn octets(&self) -> &[u8] {
         self.octets.get(..usize::from(self.len)).unwrap_or_default()
     }
@@ -305,7 +305,8 @@ impl DateTime {
         time: [0xFF; 4],
     };
 
-    /// That many milliseconds after 1970; unspecified beyond the years that a date can tell.
+    /// The date and time at this number of milliseconds after 1970; unspecified beyond the years that a BACnet date can
+    /// represent.
     pub fn from_unix_ms(ms: u64) -> DateTime {
         let (days, of_day) = (ms / 86_400_000, ms % 86_400_000);
         // Days since 0000-03-01, in eras of 400 years.

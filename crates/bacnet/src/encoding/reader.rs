@@ -6,9 +6,9 @@ use crate::types::{Data, ObjectId, PropertyId, Reject};
 /// A tag as read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tag {
-    /// Of a primitive value by its type; for BOOLEAN the second is the value.
+    /// A primitive value with its application tag and its length; for BOOLEAN the second number is the value.
     App(u8, usize),
-    /// Of a primitive value in a context.
+    /// A primitive value with its context tag and its length.
     Context(u8, usize),
     /// Begins a constructed value.
     Open(u8),
@@ -47,7 +47,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// So many octets.
+    /// Takes the next `len` octets.
     ///
     /// # Errors
     /// There are fewer.
@@ -162,7 +162,7 @@ impl<'a> Reader<'a> {
     /// As [`Reader::context`], where that context comes next.
     ///
     /// # Errors
-    /// It is not valid.
+    /// The encoding is not valid.
     pub fn optional(&mut self, number: u8) -> Read<Option<&'a [u8]>> {
         match self.is_context(number) {
             true => self.context(number).map(Some),
@@ -178,10 +178,10 @@ impl<'a> Reader<'a> {
         u32_of(self.context(number)?)
     }
 
-    /// The same where it comes next.
+    /// The unsigned value with this context tag, where it comes next.
     ///
     /// # Errors
-    /// It is not valid.
+    /// The encoding is not valid, or the number exceeds 32 bits.
     pub fn optional_u32(&mut self, number: u8) -> Read<Option<u32>> {
         self.optional(number)?.map(u32_of).transpose()
     }
@@ -189,7 +189,7 @@ impl<'a> Reader<'a> {
     /// BOOLEAN in a context, where it comes next.
     ///
     /// # Errors
-    /// It is not valid.
+    /// The encoding is not valid.
     pub fn optional_bool(&mut self, number: u8) -> Read<Option<bool>> {
         match self.optional(number)? {
             None => Ok(None),
@@ -222,7 +222,7 @@ impl<'a> Reader<'a> {
     /// REAL in a context, where it comes next.
     ///
     /// # Errors
-    /// It is not valid.
+    /// The encoding is not valid.
     pub fn optional_real(&mut self, number: u8) -> Read<Option<f32>> {
         let Some(bytes) = self.optional(number)? else {
             return Ok(None);
@@ -234,7 +234,7 @@ impl<'a> Reader<'a> {
     /// A primitive value with its application tag; `None` where a constructed one, or one of a context, comes.
     ///
     /// # Errors
-    /// It is not valid.
+    /// The encoding is not valid.
     pub fn data(&mut self) -> Read<Option<Data>> {
         let (number, len) = match self.tag()? {
             Tag::App(number, len) => (number, len),
@@ -278,7 +278,7 @@ fn primitive(number: u8, bytes: &[u8]) -> Read<Data> {
 /// A CharacterString in one of the usual character sets.
 ///
 /// # Errors
-/// It is not valid, or of another set.
+/// The encoding is not valid, or the character set is not supported.
 pub fn text_of(bytes: &[u8]) -> Read<String> {
     let wrong = Reject::InvalidParameterDataType;
     let (set, text) = bytes.split_first().ok_or(wrong)?;
@@ -306,7 +306,7 @@ fn u64_of(bytes: &[u8]) -> Read<u64> {
 /// An Unsigned of at most 32 bits.
 ///
 /// # Errors
-/// It is longer, or empty.
+/// The number is empty or longer than 32 bits.
 pub fn u32_of(bytes: &[u8]) -> Read<u32> {
     u32::try_from(u64_of(bytes)?).map_err(|_| Reject::ParameterOutOfRange)
 }

@@ -30,7 +30,7 @@ pub(crate) struct Port {
     pub(crate) bbmd: Option<(SocketAddrV4, u16)>,
 }
 
-/// An object that is asked, with what it shows now.
+/// An object whose properties are read, with what it shows now.
 pub(crate) enum Context<'a> {
     Device {
         device: &'a Device,
@@ -260,7 +260,7 @@ fn arrays(
     let index = asked.index;
     Some(match (asked.property, of) {
         (P::PROPERTY_LIST, _) => {
-            // Those that every object has are not in it.
+            // Property_List leaves out the four properties that every object has.
             let left_out = [P::OBJECT_NAME, P::OBJECT_TYPE, P::OBJECT_IDENTIFIER, P::PROPERTY_LIST];
             let (required, optional) = list(of, environment);
             let all = required.into_iter().chain(optional);

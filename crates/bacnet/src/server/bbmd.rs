@@ -17,11 +17,11 @@ pub enum Registration {
     /// No BBMD is configured.
     #[default]
     None,
-    /// It has not answered.
+    /// The BBMD has not answered yet.
     Unanswered,
-    /// It does.
+    /// The BBMD accepted the registration.
     Registered,
-    /// It refused, with that code.
+    /// The BBMD refused the registration, with this result code.
     Refused(u16),
 }
 

@@ -1,5 +1,5 @@
-//! Subscriptions to changes of value (clauses 13.1, 13.14, 13.15): who is told what, and when again. What is told comes from the
-//! server; here is the bookkeeping, which is bounded.
+//! Subscriptions to changes of value (clauses 13.1, 13.14, 13.15): which client is notified of what, and when again. The values
+//! come from the server; this module is the bookkeeping, which is bounded.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::Ipv4Addr;
@@ -24,7 +24,7 @@ pub(super) struct Key {
     pub(super) subscriber: Address,
     pub(super) process: u32,
     pub(super) object: ObjectId,
-    /// One property instead of value and flags.
+    /// The one subscribed property; none: the value and the status flags of the object.
     pub(super) property: Option<PropertyRef>,
 }
 
@@ -38,7 +38,7 @@ pub(super) struct Told {
 }
 
 impl Told {
-    /// Whether a client that was told this is to be told that.
+    /// Whether the values differ enough from those last sent to a client to send a notification.
     fn differs(&self, now: &Told, increment: f64) -> bool {
         let moved = match (self.number, now.number) {
             (Some(before), Some(now)) => {
@@ -158,7 +158,7 @@ impl Cov {
         self.retain(|of, subscription| of != device || subscription.key != *key);
     }
 
-    /// Keeps those that `keep` says.
+    /// Keeps the subscriptions for which `keep` returns true.
     pub(super) fn retain(&mut self, mut keep: impl FnMut(u32, &Subscription) -> bool) {
         for (device, all) in &mut self.of {
             all.retain(|subscription| {
@@ -197,7 +197,7 @@ impl Cov {
         self.of.get(&device).map_or(&[], Vec::as_slice)
     }
 
-    /// Looks at the subscriptions of a device: those whose clients are to be told something become due.
+    /// Compares the subscriptions of a device with its values: those whose clients need a notification become due.
     pub(super) fn look(&mut self, device: u32, look: Look<'_>) {
         let Some(all) = self.of.get_mut(&device) else { return };
         for subscription in all.iter_mut().filter(|subscription| subscription.due.is_none()) {
@@ -216,8 +216,7 @@ impl Cov {
         }
     }
 
-    /// The subscription that is told something next: those that wait longest first, and one at a time of those that
-    /// acknowledge.
+    /// The subscription to notify next: the longest waiting first, and one at a time for a client that acknowledges.
     pub(super) fn next(&self) -> Option<(u32, Key, bool)> {
         let free = |s: &&Subscription| !s.confirmed || !self.outstanding.contains_key(&s.key.subscriber);
         let all = self
@@ -229,7 +228,8 @@ impl Cov {
         first.map(|(device, s)| (device, s.key, s.confirmed))
     }
 
-    /// That subscription was told this.
+    /// Records that a notification was sent: the subscription is no longer due, and later values are compared with
+    /// `told`.
     pub(super) fn told(&mut self, device: u32, key: &Key, told: Option<Told>) {
         let all = self.of.get_mut(&device);
         if let Some(subscription) = all.and_then(|all| all.iter_mut().find(|s| s.key == *key)) {

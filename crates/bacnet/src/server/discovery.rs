@@ -114,7 +114,7 @@ impl Server {
         apdu::unconfirmed(unconfirmed::I_AM, content.bytes())
     }
 
-    /// Says unasked that a device is there.
+    /// Sends I-Am for a device without a Who-Is.
     pub fn announce(&mut self, device: u32, app: &dyn Application, now: Instant) {
         let Some(known) = self.device(device).filter(|_| app.answers(device)) else {
             return;

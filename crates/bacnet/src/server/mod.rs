@@ -37,7 +37,7 @@ use writing::Exchanges;
 /// The settings of a server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
-    /// Its address.
+    /// UDP address of the server.
     pub address: SocketAddrV4,
     /// Bits of the mask of its network.
     pub prefix: u8,
@@ -70,7 +70,7 @@ pub trait Application {
     /// The value of the object at that place.
     fn sample(&self, device: u32, place: usize) -> Sample;
 
-    /// Its priorities.
+    /// The priority array and the relinquish default of a commandable object.
     fn commands(&self, device: u32, place: usize) -> Option<Commands>;
 
     /// A host that may not write tried to.
@@ -299,8 +299,8 @@ enum Target {
     Own,
     /// All devices.
     All,
-    /// Those of the virtual network.
+    /// All devices of the virtual network.
     Network,
-    /// That one, by its place.
+    /// The device at this place in the list of the server.
     Device(usize),
 }

@@ -112,7 +112,8 @@ impl Server {
             self.counters.discarded += 1;
             return;
         };
-        // Nobody on this network is behind the network that it is the router for.
+        // A source network equal to the virtual network is forged or looped: its devices send nothing through this
+        // socket.
         if npdu.from.is_some_and(|(network, _)| self.is_own(network)) {
             self.counters.discarded += 1;
             return;
@@ -132,7 +133,7 @@ impl Server {
                     None => return,
                 },
             },
-            // Only a router answers for networks.
+            // Without a virtual network the server is not a router, and only routers reject unknown networks.
             Some(_) if self.options.network.is_none() => return,
             Some((network, ..)) => return self.reject(source, UNKNOWN_NETWORK, network, now),
         };
@@ -163,7 +164,7 @@ impl Server {
         }
     }
 
-    /// Says for which network it is the router.
+    /// Sends I-Am-Router-To-Network for the virtual network.
     pub(super) fn announce_network(&mut self, asked: Option<Source>, now: Instant) {
         let Some(network) = self.options.network.map(u16::to_be_bytes) else {
             return;
@@ -268,7 +269,7 @@ impl Server {
         self.traffic.exempt(to.host, message);
     }
 
-    /// Says something to all, from a device: on this network, or on that which asked.
+    /// Broadcasts a message of a device: on this network, or on the network from which the request came.
     pub(super) fn tell_all(&mut self, device: u32, network: Option<u16>, apdu: &[u8], now: Instant) {
         let to = network.map(|network| (network, Mac::ALL));
         let npdu = npdu::encode(to, self.station(device), false, Payload::Application(apdu));

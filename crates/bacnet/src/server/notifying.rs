@@ -113,7 +113,7 @@ impl Server {
         })
     }
 
-    /// Looks whether what a device shows is to be told.
+    /// Checks whether values of a device have changed enough to notify subscribers.
     pub(super) fn look(&mut self, instance: u32, app: &dyn Application, now: Instant) {
         if self.cov.of(instance).is_empty() || self.quiet.contains_key(&instance) || !app.answers(instance) {
             return;

@@ -12,7 +12,7 @@ use crate::types::{Abort, Address, Error, ObjectId, ObjectType, PropertyId, Reje
 
 /// Longest answer, in all its segments.
 const LONGEST: usize = 64 * 1024;
-/// Longest time for which a device says nothing by itself.
+/// Longest time for which a device sends no notification by itself.
 const QUIET: Duration = Duration::from_secs(300);
 
 /// The content of an answer, which may be none.
@@ -256,7 +256,7 @@ impl Server {
             if one.property != PropertyId::REQUIRED {
                 wanted.extend(optional);
             }
-            // These two say what there is; neither is among what there is.
+            // ALL, REQUIRED and OPTIONAL expand to other properties; Property_List itself is left out.
             let own = |property: &PropertyId| *property != PropertyId::PROPERTY_LIST;
             let whole = |property| PropertyRef { property, index: None };
             all.extend(wanted.into_iter().filter(own).map(whole));

@@ -90,7 +90,7 @@ impl Segments {
             size: size.saturating_sub(SEGMENT_HEADER).max(1),
             first: 0,
             sent: 0,
-            // The first one goes alone: its acknowledgement tells how many may follow.
+            // The first segment goes alone: its acknowledgement says how many may follow at once.
             window: 1,
             tries: 1,
             until: now + WAIT,
@@ -115,7 +115,7 @@ impl Segments {
         let Some(sending) = self.sending.get_mut(place) else {
             return;
         };
-        // The one before the first that is not acknowledged says that none of the window arrived.
+        // An acknowledgement of the segment before `first` means that none of the window arrived.
         let base = sending.first;
         let ahead = usize::from(sequence.wrapping_sub((base & 0xFF) as u8).wrapping_add(1));
         if ahead > sending.sent - base {

@@ -21,7 +21,7 @@ mod writing;
 const NETWORK: u16 = 1001;
 const PV: u32 = 85;
 
-/// What stands behind the server of a test.
+/// The devices behind the server of a test.
 #[derive(Default)]
 struct Plant {
     values: RefCell<HashMap<(u32, usize), Sample>>,

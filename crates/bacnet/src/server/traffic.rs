@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 /// Octets that may go to an address within a second for each that came from it.
 const FACTOR: u64 = 8;
-/// And so many more.
+/// Octets that may go to an address within a second beyond the factor.
 const GRANT: u64 = 16 * 1024;
 /// Octets that may wait for an address, or for a broadcast.
 const WAITING: usize = 64 * 1024;
@@ -117,7 +117,7 @@ impl Traffic {
         u64::try_from(steps).unwrap_or(u64::MAX)
     }
 
-    /// So many octets came from that address.
+    /// Counts octets received from an address, which raise the limit of sending to it.
     pub(super) fn came(&mut self, from: Ipv4Addr, octets: usize, now: Instant) {
         let step = self.step(now);
         if let Some(known) = self.known(from, step) {

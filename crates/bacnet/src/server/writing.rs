@@ -20,7 +20,7 @@ const REMEMBERED: Duration = Duration::from_secs(10);
 /// Requests under way or remembered: of one host, and in all. Stops find room beyond that.
 const MOST_OF_HOST: usize = 64;
 const MOST_REQUESTS: usize = 1024;
-/// So many more.
+/// Requests beyond [`MOST_REQUESTS`] for which stops find room.
 const FOR_STOPS: usize = 256;
 
 /// A write to carry out.
@@ -65,7 +65,7 @@ struct Exchange {
     /// The write that is under way.
     current: Option<(ObjectId, PropertyRef)>,
     failed: Option<(Failure, Option<(ObjectId, PropertyRef)>)>,
-    /// Its client has since sent another request with the same number.
+    /// The client has since sent another request with the same invoke id: the answer is not sent.
     mute: bool,
     state: State,
 }
@@ -78,7 +78,8 @@ pub(super) struct Exchanges {
 }
 
 impl Exchanges {
-    /// A client asks a device for something else: what it asked before comes no more.
+    /// A client asks a device for something else: the answers to its earlier requests are forgotten, as no repetition
+    /// can follow.
     pub(super) fn next_request(&mut self, from: Address, device: u32) {
         self.all
             .retain(|e| matches!(e.state, State::Running) || (e.from, e.device) != (from, device));
@@ -128,9 +129,9 @@ impl Exchanges {
 
 /// The immediate result of a write.
 enum Step {
-    /// It is done.
+    /// The item needs no job: the write is complete.
     Done,
-    /// It is handed out.
+    /// The write is handed out to the application as a job.
     Job(usize, Option<Datum>, Option<u8>),
 }
 
@@ -314,7 +315,7 @@ impl Server {
         let is_device = item.object == device.id() || item.object == ObjectId::new(ObjectType::DEVICE, WILDCARD);
         let property = item.property.property;
         if is_device || item.object == ObjectId::new(ObjectType::NETWORK_PORT, 1) {
-            // All of it is what the configuration says.
+            // The properties of the Device and Network Port objects come from the configuration and are not writable.
             return Err(Error::WRITE_ACCESS_DENIED.into());
         }
         let place = device.find(item.object).ok_or(Error::UNKNOWN_OBJECT)?;

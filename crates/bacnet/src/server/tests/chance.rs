@@ -69,7 +69,7 @@ impl Dice {
         (self.0 % end.max(1) as u64) as usize
     }
 
-    /// One of the frames, a few octets of it others, fewer or more.
+    /// A copy of one of the frames with a few octets changed, removed or added.
     fn mangled(&mut self, frames: &[Vec<u8>]) -> Vec<u8> {
         let mut frame = frames[self.below(frames.len())].clone();
         for _ in 0..self.below(4) {

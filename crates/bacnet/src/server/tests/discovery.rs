@@ -79,7 +79,7 @@ fn a_question_from_behind_a_router_is_answered_there() {
     );
     let (to, remote, ..) = rig.out().remove(0);
     assert_eq!((to, remote), (To::Broadcast, Some((7, Mac::ALL, 255))));
-    // Nobody on this network is behind the network of the drives.
+    // A source network equal to the virtual network is forged and gets no answer.
     let forged = Some((NETWORK, Mac::new(&[1]).unwrap()));
     rig.datagram(5, &bvlc::unicast(&who_is(None, forged, None)));
     assert!(rig.out().is_empty());
@@ -159,7 +159,7 @@ fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
         rig.datagram(5, &request);
         assert_eq!(rig.server.transmit().unwrap().1, bvlc::result(code));
     }
-    // An own broadcast that comes back is nothing that came.
+    // A broadcast of the server that comes back to it is not counted as received.
     let before = rig.server.counters();
     let own = rig.server.options.address;
     rig.server.receive(own, &bvlc::broadcast(&[1, 0]), &rig.plant, rig.now);
@@ -258,7 +258,7 @@ fn foreign_devices_have_what_is_broadcast_on_both_sides() {
     let host = ServerWithClients::client;
     let result = |code: u16| bvlc::result(code);
     let npdu = who_is(Some((npdu::GLOBAL, Mac::ALL)), None, Some((102, 102)));
-    // Nobody who has not registered has anything broadcast.
+    // Only a registered foreign device has its messages broadcast.
     rig.datagram(7, &bvlc::distribute(&npdu));
     assert_eq!(raw(&mut rig), [(To::Host(host(7)), result(0x60))]);
     for (who, code) in [(7, 0), (8, 0), (9, 0x30)] {

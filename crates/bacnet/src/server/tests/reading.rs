@@ -85,7 +85,7 @@ fn what_is_not_there_is_an_error_and_what_is_no_request_is_rejected() {
     // A request in segments is not taken.
     rig.tell(5, Some(1), &[0x0A, 5, 9, 0, 4, 12, 1, 2]);
     assert_eq!(rig.out()[0].3, [0x71, 9, 4]);
-    // By broadcast nothing that is answered is carried out.
+    // A confirmed request that was broadcast is neither carried out nor answered.
     let to = Some((NETWORK, Mac::new(&[1]).unwrap()));
     let request = [&[0, 5, 1, c::READ_PROPERTY][..], &read(SPEED, PV)].concat();
     rig.datagram(
