@@ -41,7 +41,7 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     encode_frame(request.address, &pdu, out);
 }
 
-/// What `bytes` are as the answer to `request`. A reply's `used` counts the noise before it too.
+/// Decodes `bytes` as the answer to `request`. A reply's `used` counts the noise before it too.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let start = noise(bytes);
     let rest = bytes.get(start..).unwrap_or_default();

@@ -95,8 +95,8 @@ pub fn request_on(protocol: Protocol, pdu: &RequestPdu) -> String {
     own.unwrap_or_else(|| request(pdu))
 }
 
-/// What came back, against its request: `3 registers: 0023 2000 1388`, `exception 02 (illegal data address)`,
-/// `foreign: address 3, function 3, 2 registers`, `7 of 27 bytes`.
+/// Describes the bytes received in a transaction, against its request: `3 registers: 0023 2000 1388`, `exception 02
+/// (illegal data address)`, `foreign: address 3, function 3, 2 registers`, `7 of 27 bytes`.
 pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
     match protocol.decode(asked, bytes) {
         Decoded::Reply { reply, .. } if protocol == Protocol::N2 => n2_words::answer(&asked.pdu, &reply),

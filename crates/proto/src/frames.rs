@@ -13,10 +13,11 @@ use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rt
 pub const HELD_BACK: Duration = Duration::from_millis(30);
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
-/// So few characters before a reply are the glitch of a line that changes direction, and no request that was mangled.
+/// Up to this many characters before a reply count as a glitch of a line that changes direction, not as a damaged
+/// request.
 pub const GLITCH: usize = 2;
 
-/// What stands at the beginning of the bytes.
+/// The piece found at the beginning of the bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Cut {
     /// A request of the other master; the PDU is `None` where the codec has none for it.
@@ -30,10 +31,10 @@ pub enum Cut {
     Reply {
         /// The reply.
         reply: Reply,
-        /// It could be a request as well.
+        /// Whether the bytes could be a request of the other master as well.
         ambiguous: bool,
     },
-    /// Neither.
+    /// Bytes that are neither a request nor the reply.
     Garbage,
 }
 
@@ -47,10 +48,10 @@ pub struct Piece {
     pub ended: Instant,
 }
 
-/// What the bytes at one place are.
+/// Result of looking for a frame at one place in the bytes.
 enum Look {
     Is(usize, Cut),
-    /// It may become a frame. `true`: what is there already makes it likely.
+    /// The bytes may become a frame when more arrive. `true`: the part received already makes a reply likely.
     MayBecome(bool),
     Nothing,
 }
@@ -68,8 +69,8 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Nothing was received yet. Behind an incomplete frame that goes silent for `held_back`, on top of 3.5 characters,
-    /// the rest is no longer expected.
+    /// Starts without any received bytes. Behind an incomplete frame that goes silent for `held_back`, on top of 3.5
+    /// characters, the rest is no longer expected.
     pub fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
         Frames {
             protocol,
@@ -94,7 +95,7 @@ impl Frames {
         }
     }
 
-    /// When the bytes that wait for more are given up: whole frames that are no request the codec knows, sooner.
+    /// When bytes that wait for more are given up; sooner for whole frames that are not a request the codec knows.
     pub fn patience(&self) -> Option<Instant> {
         let last = self.last.filter(|_| !self.bytes.is_empty())?;
         let held_back = match self.protocol {
@@ -142,7 +143,8 @@ impl Frames {
                 _ => {}
             }
         }
-        // What is no frame so far waits for the next frame, or for silence, and is one piece then.
+        // Bytes that may still become a frame wait for the next frame or for silence; the rest becomes one piece of
+        // garbage.
         if incomplete {
             None
         } else {
@@ -162,7 +164,7 @@ impl Frames {
         let begin = begin_of(self.protocol, line);
         let frame = line.get(begin..).unwrap_or_default();
         let cut = line_cut(self.protocol, frame, open.filter(|_| begin <= GLITCH));
-        // What stands before a request is a piece of its own.
+        // Bytes before a request become a piece of their own.
         if begin > 0 && !matches!(cut, Cut::Reply { .. } | Cut::Garbage) {
             return self.cut(begin, Cut::Garbage);
         }
@@ -183,12 +185,12 @@ impl Frames {
     }
 }
 
-/// What stands at the beginning of `bytes` on a Modbus RTU line.
+/// Looks for a frame at the beginning of `bytes` on a Modbus RTU line.
 fn rtu_at(bytes: &[u8], open: Option<&Request>) -> Look {
     let reply = open.map_or(Look::Nothing, |open| rtu_reply(bytes, open));
     match (reply, rtu_request(bytes)) {
         (Look::Is(length, cut), _) => Look::Is(length, cut),
-        // Its head fits what was asked; a request has another one.
+        // The first three bytes fit the expected reply; a request would have another byte count there.
         (Look::MayBecome(true), _) => Look::MayBecome(true),
         (_, Look::Is(length, cut)) => Look::Is(length, cut),
         (Look::MayBecome(_), _) => Look::MayBecome(false),
@@ -222,7 +224,7 @@ fn rtu_reply(bytes: &[u8], open: &Request) -> Look {
     }
 }
 
-/// The third byte of a reply that says how long it is.
+/// The third byte of a reply to a read: its number of data bytes.
 fn announced(pdu: &RequestPdu) -> Option<u8> {
     match pdu {
         RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => u8::try_from(pdu.reply_len() - 2).ok(),
@@ -230,8 +232,8 @@ fn announced(pdu: &RequestPdu) -> Option<u8> {
     }
 }
 
-/// A PDU that answers `open` by its form. `None` for the request once more. A read's reply that would be a request as well is
-/// ambiguous: it may be that the other master asks again, for something else.
+/// Judges a PDU whose form answers `open`. `None` where the PDU repeats the open request. A reply to a read that would be a
+/// request as well is ambiguous: the other master may be asking for something else.
 fn reply_or_request(open: &Request, reply: &Reply, pdu: &[u8]) -> Option<Cut> {
     let request = RequestPdu::decode(pdu).ok();
     let reads = matches!(reply, Reply::Bits(_) | Reply::Registers(_));
@@ -272,8 +274,8 @@ fn rtu_request(bytes: &[u8]) -> Look {
     }
 }
 
-/// Whether bytes that are neither request nor reply are whole frames all the same: of a function that the codec does not know,
-/// or an answer that belongs to nobody.
+/// Whether bytes that are neither request nor reply still are whole frames: of a function that the codec does not know, or an
+/// answer to no request.
 pub fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
     match protocol {
         Protocol::ModbusRtu => {
@@ -329,7 +331,7 @@ fn begin_of(protocol: Protocol, line: &[u8]) -> usize {
     }
 }
 
-/// What a line is, from its beginning to its end.
+/// Decides what one whole line is: a request, the reply to the open request, or garbage.
 fn line_cut(protocol: Protocol, frame: &[u8], open: Option<&Request>) -> Cut {
     let reply = match open.map(|open| (open, protocol.decode(open, frame))) {
         Some((open, Decoded::Reply { reply, .. })) => Some((open, reply)),

@@ -94,7 +94,7 @@ impl Protocol {
         Protocol::ALL.into_iter().find(|p| p.name() == name)
     }
 
-    /// Whether the protocol can be spoken with these characters: bytes of 8 bits for RTU, 9600 8N1 for N2.
+    /// Whether the protocol can be used with this character format: bytes of 8 bits for RTU, 9600 8N1 for N2.
     pub fn allows(self, format: &LineFormat) -> bool {
         match self {
             Protocol::ModbusRtu => format.data_bits == 8,
@@ -130,7 +130,7 @@ impl Protocol {
         }
     }
 
-    /// What `bytes` are as an answer to `request`.
+    /// Decodes `bytes` as an answer to `request`.
     pub fn decode(self, request: &Request, bytes: &[u8]) -> Decoded {
         match self {
             Protocol::ModbusRtu => rtu::decode_reply(request, bytes),
@@ -201,11 +201,11 @@ impl Protocol {
         }
     }
 
-    /// Silence by which a drive knows that a request has ended, before its turnaround begins.
+    /// Silence after which a drive considers a request complete and starts its turnaround.
     pub fn recognition(self, format: &LineFormat) -> Duration {
         match self {
             Protocol::ModbusRtu => format.silence_chars(),
-            // The last character of the frame says so.
+            // ASCII and N2 frames end with a character of their own, so no silence is needed.
             Protocol::ModbusAscii | Protocol::N2 => Duration::ZERO,
         }
     }

@@ -8,9 +8,9 @@
 //! | AO n | holding register | 2 (n - 1) and the next, float, high word first | read of attribute 3; written by override |
 //! | ADI n | input register | 0x4000 + n - 1 | read of attribute 2 |
 //!
-//! A request without an object has no frame: it is never sent. What no manual says stands in one table, see
-//! [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated drive reads and
-//! answers with the same types.
+//! A request without an object has no frame: it is never sent. Behaviour that no manual specifies is listed in one
+//! table, see [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated
+//! drive reads and answers with the same types.
 
 pub mod assumptions;
 pub mod command;
@@ -46,7 +46,7 @@ pub const RETRIES: u32 = 2;
 /// Session messages to a drive, in addition to reads and writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Session {
-    /// Who is there? A drive that has restarted answers nothing else.
+    /// Identify device type. A restarted drive answers no other command before it.
     Identify,
     /// Poll for changes.
     Poll {
@@ -57,7 +57,7 @@ pub enum Session {
     Release {
         /// Table of the object.
         table: Table,
-        /// Its first address.
+        /// The first PDU address of the object to release.
         address: u16,
     },
 }
@@ -141,7 +141,7 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     }
 }
 
-/// What the regular reply to a request holds.
+/// Form of the data in the regular reply to a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
     /// A status byte with the state.
@@ -196,7 +196,7 @@ pub fn form(pdu: &RequestPdu) -> Option<Form> {
     })
 }
 
-/// What `bytes` are as the answer to `request`.
+/// Decodes `bytes` as the answer to `request`.
 ///
 /// A reply carries neither address nor command: only its form is checked against what was asked. Blank characters and
 /// the glitches of a line that changes direction are passed over before the first letter.
@@ -255,7 +255,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
         (Form::Identity, [device]) => Ok(Reply::Identified(*device)),
         (Form::State, [status]) => Ok(state(*status, &request.n2)),
         (Form::Integer, [a, b] | [_, a, b]) => Ok(Reply::Registers(vec![word(*a, *b)])),
-        // Whatever the bits are: what is no number becomes no value where the point is decoded.
+        // Any bit pattern is accepted here; NaN becomes "no value" where the point is decoded.
         (Form::Float, [a, b, c, d] | [_, a, b, c, d]) => Ok(Reply::Registers(vec![word(*a, *b), word(*c, *d)])),
         (Form::Acknowledgement, _) => Err("data where an acknowledgement was expected"),
         (_, []) => Err("an acknowledgement where data was expected"),

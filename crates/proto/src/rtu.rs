@@ -41,7 +41,7 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
     Some((address, pdu))
 }
 
-/// What `bytes` are as the answer to `request`.
+/// Decodes `bytes` as the answer to `request`.
 ///
 /// The end of a reply is known from its own first bytes, so no silence has to be waited for: the
 /// regular reply has a fixed length, an exception five characters, 43/14 counts its objects.
@@ -390,7 +390,8 @@ mod tests {
         let request = read(Table::Holding, 2100, 1);
         for function in [1, 2, 3, 4, 23] {
             assert_eq!(decode_reply(&request, &[1, function]), Decoded::Incomplete);
-            // 251 bytes of data make a frame of 256 characters; nobody sends it, as registers have two bytes.
+            // 251 bytes of data make a frame of 256 characters; no drive sends an odd count, as registers have two
+            // bytes.
             assert_eq!(decode_reply(&request, &[1, function, 251]), Decoded::Incomplete);
             for count in [252, 255] {
                 assert_eq!(decode_reply(&request, &[1, function, count]), too_long, "{function}");
@@ -408,7 +409,7 @@ mod tests {
         let header = |objects| [1, 43, 14, 1, 1, 0, 0, objects];
         assert_eq!(decode_reply(&identify, &header(123)), Decoded::Incomplete);
         assert_eq!(decode_reply(&identify, &header(124)), too_long);
-        // One object may have 244 characters, which makes 256 with header, id, length and CRC.
+        // A single object may have 244 characters, which makes 256 with header, id, length and CRC.
         for (length, decoded) in [(244, Decoded::Incomplete), (245, too_long.clone())] {
             let bytes = [&header(1)[..], &[0, length]].concat();
             assert_eq!(decode_reply(&identify, &bytes), decoded, "{length}");

@@ -28,7 +28,7 @@ pub struct LineFormat {
     pub stop_bits: u8,
 }
 
-/// Why a text is no character format.
+/// The text that could not be read as a character format.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{0}` is not a character format; write data bits 7 or 8, parity N, E or O, stop bits 1 or 2, such as 8N1")]
 pub struct BadFormat(pub String);

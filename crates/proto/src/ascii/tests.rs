@@ -377,7 +377,7 @@ proptest! {
         prop_assert_eq!(decode_reply(&request, &frame[..cut.index(frame.len())]), Decoded::Incomplete);
     }
 
-    /// One wrong character is never believed, a letter in the other case is no wrong character.
+    /// A frame with one wrong character is never accepted; a letter in the other case is not an error.
     #[test]
     fn one_wrong_character_is_found(
         seed: u16, count in 1u16..=16, at in any::<prop::sample::Index>(), character: u8,

@@ -34,7 +34,8 @@ pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
         },
         Reply::Written => "acknowledged".to_string(),
         Reply::Exception(code) if code.0 & 0x80 != 0 => format!("N{:02X}: {}", code.0 & 0x7F, code.meaning()),
-        // Not the drive's words: its own state was called unreliable.
+        // The reply is sound but its status byte marks the value as unreliable, so no exception of the drive is
+        // reported.
         Reply::Exception(_) if matches!(asked, RequestPdu::Read { .. }) => "unreliable".to_string(),
         _ => super::answer(reply),
     }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use super::n2_words;
 use crate::{Decoded, Protocol, Reply, Request, RequestPdu};
 
-/// What some bytes of a transaction are.
+/// Which part of a transaction some bytes are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// The request, echoed by the adapter.
@@ -14,14 +14,14 @@ pub enum Kind {
     Reply,
     /// A valid frame of another device.
     Foreign,
-    /// Not a valid frame.
+    /// Bytes that form no valid frame.
     Garbage,
 }
 
 /// A part of what was received in a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Part {
-    /// What it is.
+    /// Kind of this part.
     pub kind: Kind,
     /// Where it stands among the bytes.
     pub range: Range<usize>,

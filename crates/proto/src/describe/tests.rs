@@ -212,7 +212,7 @@ fn an_exchange_in_its_parts() {
     assert_eq!(kinds(&read, &noisy, false), [(Kind::Garbage, 16)]);
 }
 
-/// What the parts of an exchange in Modbus ASCII are.
+/// The parts of a transaction in Modbus ASCII: kind and length of each.
 fn in_ascii(asked: &Request, bytes: &[u8], answered: bool) -> Vec<(Kind, usize)> {
     let mut frame = Vec::new();
     ascii::encode_request(asked, &mut frame);

@@ -47,12 +47,12 @@ impl Exception {
         self == Exception::BUSY
     }
 
-    /// Whether a gateway says it instead of a drive that it does not reach: the drive answered nothing.
+    /// Whether a gateway sends the exception because it does not reach the drive: the drive answered nothing.
     pub fn is_no_answer(self) -> bool {
         matches!(self, Exception::GATEWAY_PATH | Exception::GATEWAY_TARGET)
     }
 
-    /// Whether it says nothing of the result of a write: the drive still works on it, or did not answer.
+    /// Whether the exception leaves the result of a write unknown: the drive still works on it, or did not answer.
     pub fn leaves_open(self) -> bool {
         self == Exception::ACKNOWLEDGE || self.is_no_answer()
     }

@@ -26,7 +26,7 @@ pub enum Reply {
 }
 
 impl Reply {
-    /// What was read: registers, or bits as 0 and 1.
+    /// The values that were read: registers, or bits as 0 and 1.
     pub fn words(&self) -> Option<Vec<u16>> {
         self.clone().into_words()
     }

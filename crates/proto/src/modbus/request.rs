@@ -77,7 +77,7 @@ pub enum RequestPdu {
         /// First object.
         object: u8,
     },
-    /// What only a bus of N2 says: no function of Modbus, never encoded as one.
+    /// Session commands that exist only on an N2 bus; never encoded as a Modbus function.
     N2(Session),
     /// A request that is passed on as it is: the PDU of a function that is not decoded here, or on N2 the digits of a command
     /// between address and checksum.

@@ -36,7 +36,7 @@ pub struct N2Options {
     pub region_width: RegionWidth,
     /// Number on the wire of the object that the maps call 1: some families count from 0.
     pub first_object: u8,
-    /// Drives are identified before they are asked anything else, and after a transaction that failed.
+    /// Whether drives are identified before the first request, and again after a transaction that failed.
     pub identify: bool,
     /// Device type that a drive is expected to report.
     pub device_type: u8,
@@ -73,14 +73,14 @@ pub const STATUS_OVERRIDE_BIT: u8 = 5;
 /// What the simulator sends for a limit that is switched off.
 pub const INVALID_FLOAT: u32 = 0x7FC0_0000;
 
-/// Something that no manual says.
+/// A behaviour of N2 drives that no manual specifies.
 #[derive(Debug, Clone, Copy)]
 pub struct Assumption {
     /// Key of `[n2]` in a profile that changes it; `None` where nothing needs to be changed.
     pub key: Option<&'static str>,
     /// The assumption.
     pub what: &'static str,
-    /// Its basis.
+    /// Why the assumption is made.
     pub why: &'static str,
     value: fn(&N2Options) -> String,
 }

@@ -82,9 +82,9 @@ impl Region {
 /// An object of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Object {
-    /// Its type.
+    /// Region of the object.
     pub region: Region,
-    /// Its network point address, as the manuals print it: their maps begin with 1.
+    /// Network point address of the object, as the manuals print it: their maps begin with 1.
     pub number: u8,
 }
 

@@ -165,7 +165,7 @@ fn requests_of_the_master() {
         frame(RequestPdu::N2(Session::Release { table, address })),
         ">017303018F\r"
     );
-    // What means no object has no frame.
+    // Requests that do not address exactly one object have no frame.
     for (table, start, count) in [
         (Table::Input, 1, 2),
         (Table::Input, 2, 1),
