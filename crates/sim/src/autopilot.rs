@@ -1,7 +1,7 @@
 //! Operates a drive of the demo: starts, ramps, reverses, stops, and now and then trips it.
 //!
-//! Pure and reproducible: the seed fixes what happens when. It acts as another master on the fieldbus would, through
-//! control word and reference, until the drive is commanded over the bus; then it lets go for good.
+//! The autopilot is pure and reproducible: the seed fixes what happens when. Like another master on the fieldbus it
+//! acts through control word and reference, until the drive is commanded over the bus; then it stops for good.
 
 use super::SimTime;
 use super::model::{Command, Model};

@@ -39,7 +39,7 @@ pub enum EndpointOptions {
         /// Where to listen; port 0 takes a free one.
         listen: SocketAddr,
     },
-    /// One frame of the line in each datagram.
+    /// Each datagram carries one frame of the line.
     Udp {
         /// Where to listen; port 0 takes a free one.
         listen: SocketAddr,
@@ -48,7 +48,7 @@ pub enum EndpointOptions {
     Dial {
         /// The gateway.
         server: SocketAddr,
-        /// What is said first.
+        /// Text sent first after connecting.
         text: String,
     },
 }
@@ -94,7 +94,7 @@ impl Endpoint {
         }
     }
 
-    /// What a master opens: a path, or `tcp://host:port`.
+    /// The port that a master opens: a path, or `tcp://host:port`.
     pub(super) fn address(&self) -> String {
         match self {
             Endpoint::Pty(pty) => pty.path().display().to_string(),
@@ -106,7 +106,7 @@ impl Endpoint {
         }
     }
 
-    /// What to wait for.
+    /// File descriptors to poll for input.
     pub(super) fn poll_fds(&self) -> Vec<PollFd<'_>> {
         let wanted = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
         match self {
@@ -128,7 +128,7 @@ impl Endpoint {
         match self {
             Endpoint::Pty(pty) => no_wait(pty.read(buffer)),
             Endpoint::Port(file, path) => match file.read(buffer) {
-                // With nothing to read a port says so; an end of file means that it was unplugged.
+                // A port without data returns WouldBlock; end of file means that it was unplugged.
                 Ok(0) => Err(io::Error::new(
                     ErrorKind::UnexpectedEof,
                     format!("{} is gone", path.display()),
@@ -137,7 +137,7 @@ impl Endpoint {
             },
             Endpoint::Tcp { listener, master } => {
                 let count = receive_from(master, buffer);
-                // A connection beside the first is closed at once; the first may have ended just now.
+                // A second connection is closed at once, unless the first has just ended.
                 if let Ok((stream, _)) = listener.accept()
                     && master.is_none()
                     && stream.set_nonblocking(true).is_ok()

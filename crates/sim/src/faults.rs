@@ -18,7 +18,7 @@ pub enum Foreign {
     Address,
     /// To another function.
     Function,
-    /// Of another length.
+    /// A reply of another length.
     Length,
     /// In nothing but its data.
     Data,
@@ -33,7 +33,7 @@ pub enum Fault {
     Drop,
     /// Only the first characters of the reply arrive.
     Truncate,
-    /// One bit of the reply is wrong.
+    /// A bit of the reply is wrong.
     Corrupt,
     /// The reply comes twice.
     Double,
@@ -59,11 +59,11 @@ pub enum Fault {
     ReplyStart,
     /// The last character of the request is lost: the adapter turns to receiving too early.
     CutRequest,
-    /// The same, and the adapter hears itself.
+    /// The last character of the request is lost, and the adapter echoes what it sends.
     CutEcho,
     /// A zero comes directly before the reply: the line floats until the drive takes it.
     ZeroBefore,
-    /// A stray character comes after the reply, while nobody speaks.
+    /// A stray character comes after the reply, while no device sends.
     IdleNoise,
     /// Another drive has the same address, and its reply begins somewhat later.
     Twin,
@@ -185,7 +185,7 @@ pub struct FaultPlan {
     /// A register that one drive refuses to read: address, table, register.
     refused: Option<(u8, Table, u16)>,
     while_running: bool,
-    /// Asked where this plan has no fault.
+    /// A second plan, used for requests that meet no fault in this plan.
     other: Option<Box<FaultPlan>>,
     random: Random,
     asked: u64,
@@ -234,7 +234,7 @@ impl FaultPlan {
         self
     }
 
-    /// A second cause beside this one.
+    /// Adds a second plan, used where this one has no fault.
     #[must_use]
     pub fn and(mut self, other: FaultPlan) -> FaultPlan {
         self.other = Some(Box::new(other));
@@ -248,7 +248,7 @@ impl FaultPlan {
         self
     }
 
-    /// The same plan without random and scripted faults: what a drive refuses it goes on refusing.
+    /// Drops random and scripted faults but keeps the refusals: a drive goes on refusing what it refused.
     #[must_use]
     pub fn without_faults(self) -> FaultPlan {
         FaultPlan {
@@ -269,7 +269,7 @@ impl FaultPlan {
         self.refused.is_some_and(reads)
     }
 
-    /// The fault that the next request, one to `address`, meets; `runs` tells whether a drive of the line runs.
+    /// The fault for the next request, addressed to `address`; `runs` returns whether a drive of the line runs.
     pub fn next(&mut self, address: u8, runs: impl Fn() -> bool) -> Option<Fault> {
         let own = self.own(address, &runs);
         own.or_else(|| self.other.as_mut()?.next_of_other(address, &runs))

@@ -1,10 +1,9 @@
 //! The simulated two-wire line: which character is on it when, silence, collisions. Pure; the time is an argument.
 //!
-//! A master on a pseudo-terminal writes a whole frame in no time. Here it takes the time that it would take on the
-//! wire: its first character begins when the bytes were read, or right after the characters before them. A frame is
-//! over when its protocol says so (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the drive takes
-//! its turnaround, then its reply begins. Bytes of the reply are due at the end of the character that completes a
-//! chunk, never before.
+//! A master on a pseudo-terminal writes a whole frame in no time. Here the frame takes as long as it would on the wire:
+//! its first character begins when the bytes were read, or right after the characters before them. A frame is over when
+//! its protocol says so (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the drive takes its
+//! turnaround, then its reply begins.
 //!
 //! A strict drive, as drives of the field do, does not hear a Modbus RTU request that begins before 3.5 characters of
 //! silence.
@@ -29,7 +28,7 @@ pub enum Delivery {
     Steps(Duration),
 }
 
-/// What is between the simulated drives and the master.
+/// The connection between the simulated drives and the master.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wire {
     /// A port without a baud rate of its own: the time on the wire is simulated.
@@ -43,7 +42,7 @@ pub enum Wire {
 /// How the line behaves.
 #[derive(Debug, Clone)]
 pub struct LineRules {
-    /// What the drives speak.
+    /// Protocol of the drives.
     pub protocol: Protocol,
     /// Baud and character format.
     pub format: LineFormat,
@@ -54,7 +53,7 @@ pub struct LineRules {
     pub strict: bool,
     /// How the bytes of a reply reach the master.
     pub delivery: Delivery,
-    /// What is between the drives and the master.
+    /// Connection between the drives and the master.
     pub wire: Wire,
 }
 
@@ -64,7 +63,7 @@ impl LineRules {
         LineRules::of(Protocol::ModbusRtu, format)
     }
 
-    /// The same for drives that speak `protocol`.
+    /// Default rules for drives of `protocol`.
     pub fn of(protocol: Protocol, format: LineFormat) -> LineRules {
         LineRules {
             protocol,
@@ -84,7 +83,7 @@ const TOLERANCE: f64 = 0.03;
 /// Bursts that may wait for delivery; late replies beyond that are lost.
 const MOST_OUTGOING: usize = 64;
 
-/// What the beginning of a request says about it.
+/// How the start of a request relates to the traffic before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
     Clean,
@@ -99,7 +98,7 @@ struct Incoming {
     end: SimTime,
     bytes: Vec<u8>,
     verdict: Verdict,
-    /// Its last character came, where a character ends a frame.
+    /// Whether the last character arrived, in a protocol in which a character ends a frame.
     ended: bool,
 }
 
@@ -141,20 +140,20 @@ pub struct HalfDuplex {
     faults: FaultPlan,
     incoming: Option<Incoming>,
     outgoing: Vec<Outgoing>,
-    /// When each drive will have said what it has to say.
+    /// Until when each drive is busy sending its replies, by address.
     said_until: BTreeMap<u8, SimTime>,
     /// End of the last frame that the master sent or could expect.
     last_end: Option<SimTime>,
     /// End of the last reply that the master could expect; it may lie ahead.
     reply_end: Option<SimTime>,
-    /// Time from the last reply to the request that was heard last.
+    /// Time from the last reply to the request received last.
     pause_before: Duration,
     /// End of the last characters that fault injection put there; it may lie ahead.
     provoked_end: Option<SimTime>,
     statistics: Statistics,
     lateness: Lateness,
     transcript: Transcript,
-    /// What the drives did since the last [`HalfDuplex::take_acts`]; `None` until its first call.
+    /// Actions of the drives since the last [`HalfDuplex::take_acts`]; `None` until its first call.
     acts: Option<Vec<Act>>,
 }
 
@@ -179,7 +178,7 @@ impl HalfDuplex {
         }
     }
 
-    /// What the drives did since the last call; from the first call on.
+    /// Returns the actions of the drives since the last call; recorded from the first call on.
     pub fn take_acts(&mut self) -> Vec<Act> {
         self.acts.replace(Vec::new()).unwrap_or_default()
     }
@@ -298,7 +297,7 @@ impl HalfDuplex {
         incoming.end
     }
 
-    /// What it means that a request begins at `start`.
+    /// Judges a request that begins at `start`: clean, too early, or in collision with a reply.
     fn verdict(&self, start: SimTime) -> Verdict {
         let least = self.silence().mul_f64(1.0 - TOLERANCE);
         if self.rules.wire == Wire::Instant {
@@ -349,7 +348,7 @@ impl HalfDuplex {
         now >= frame.end + Self::end_after(frame, rules)
     }
 
-    /// Pause after which a frame is over, unless a character ended it. Drivers and adapters of real ports hand bytes over with pauses, and an
+    /// Pause after which a frame is over, unless a character ended it. Drivers and adapters of real ports deliver bytes with pauses, and an
     /// instant line knows no time, so there a frame that is not yet whole is waited for.
     fn end_after(frame: &Incoming, rules: &LineRules) -> Duration {
         if rules.protocol != Protocol::ModbusRtu {
@@ -481,7 +480,7 @@ impl HalfDuplex {
         }
         for burst in bursts {
             if burst.kind == Kind::Echo {
-                // It cannot come earlier: only now is known that this request meets the fault.
+                // On a real wire the echo cannot come earlier: only now is known that this request meets the fault.
                 let start = if self.rules.wire == Wire::Real {
                     now
                 } else {

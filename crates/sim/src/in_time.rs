@@ -49,7 +49,7 @@ impl<D: Model> InTime<D> {
         }
     }
 
-    /// One register by function 6, several by function 16.
+    /// Writes one register with function 6, several with function 16.
     pub(crate) fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
         self.written(&match values {
             [value] => RequestPdu::write_register(start, *value),

@@ -3,8 +3,9 @@
 //! The pieces, from the drive to the port:
 //!
 //! - `motor`, `parameter_set`, `model`: what all drives have, and what a drive is to the line.
-//! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): what the drives with their boards
-//!   do, [`by_profile`] what a drive of any other profile does, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
+//! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): the behaviour of the drives with their boards;
+//!   [`by_profile`]: the behaviour of a drive of any other profile. All answer Modbus PDUs and are pure. `autopilot` runs one in a
+//!   demo.
 //! - [`simulated_drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
 //! - `n2`: the N2 board that a drive may have in the place of its Modbus board.

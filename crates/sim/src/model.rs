@@ -1,4 +1,4 @@
-//! What line, board, autopilot and tests need of a simulated drive, whatever its model.
+//! The interface of a simulated drive for line, board, autopilot and tests, whatever its model.
 
 use super::SimTime;
 use super::motor::{Load, Motor};
@@ -18,7 +18,7 @@ const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 /// Output and reference closer than this count as reached, Hz: below what a register can show.
 pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 
-/// Run, direction and speed from whoever commands a drive.
+/// Run, direction and speed from any source that commands a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Command {
     pub run: bool,
@@ -28,10 +28,10 @@ pub struct Command {
     pub reference: i16,
 }
 
-/// What any drive looks like from outside.
+/// State of any drive as seen from outside.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveState {
-    /// It would run if it were commanded to.
+    /// Whether the drive would run on a run command.
     pub ready: bool,
     /// The inverter feeds the motor.
     pub running: bool,
@@ -41,11 +41,11 @@ pub struct DriveState {
     pub fault: u16,
     /// Output frequency, Hz, negative for counterclockwise.
     pub output: f64,
-    /// It obeys the bus.
+    /// Whether the drive obeys the bus.
     pub remote: bool,
 }
 
-/// What every drive has, whatever its model.
+/// The parts that every drive has, whatever its model.
 #[derive(Debug, Clone)]
 pub(crate) struct Body {
     pub(super) motor: Motor,
@@ -93,25 +93,25 @@ impl Body {
 ///
 /// Pure: the time is an argument and never runs backwards. No method panics, whatever it is given.
 pub(crate) trait Model: fmt::Debug {
-    /// What it has in common with all drives.
+    /// The parts that the drive has in common with all models.
     fn body(&self) -> &Body;
 
-    /// The same, to change it.
+    /// The common parts, to change them.
     fn body_mut(&mut self) -> &mut Body;
 
-    /// One update period, which ends at `now`.
+    /// Advances the drive by one update period, which ends at `now`.
     fn step(&mut self, now: SimTime);
 
     /// Brings what a master reads up to date, after the last of some steps.
     fn refresh(&mut self) {}
 
-    /// Whether it would run if it were commanded to.
+    /// Whether the drive would run on a run command.
     fn ready(&self) -> bool;
 
     /// Frequency that it aims at by the command that holds, Hz, negative for counterclockwise.
     fn target(&self) -> f64;
 
-    /// Whether it obeys the bus.
+    /// Whether the drive obeys the bus.
     fn remote(&self) -> bool;
 
     /// Advances to `now`, in steps of [`UPDATE_PERIOD`].
@@ -173,7 +173,7 @@ pub(crate) trait Model: fmt::Debug {
         self.body_mut().trip(fault);
     }
 
-    /// What was written over the bus into parameters, by PDU address.
+    /// Writes over the bus into parameters, by PDU address.
     fn parameter_writes(&self) -> BTreeMap<u16, Writes>;
 
     /// Gives its parameters random values that it would take, but that it obeys the same commands as before.
@@ -195,7 +195,7 @@ pub(crate) trait Model: fmt::Debug {
     /// stay as they are.
     fn set_programming(&mut self, _on: bool) {}
 
-    /// What it looks like from outside.
+    /// State of the drive as seen from outside.
     fn state(&self) -> DriveState {
         let body = self.body();
         DriveState {
@@ -232,7 +232,7 @@ impl Beyond {
     }
 }
 
-/// What a write to a read-only register does.
+/// Reaction to a write to a read-only register.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ReadOnly {
     /// Exception 02.

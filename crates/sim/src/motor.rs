@@ -59,7 +59,7 @@ const COAST_TIME: f64 = 8.0;
 /// Sag of the DC link at nominal power, V.
 const DC_SAG: f64 = 6.0;
 
-/// What the inverter does with the motor.
+/// How the inverter feeds the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Feed {
     /// Nothing: the motor coasts or stands.
@@ -104,7 +104,7 @@ impl Motor {
         self.output = 0.0;
     }
 
-    /// One step of `dt` seconds.
+    /// Advances the motor by `dt` seconds.
     pub(crate) fn step(&mut self, dt: f64, feed: Feed, ratings: &Ratings, load: &Load) {
         let before = self.shaft;
         match feed {

@@ -6,7 +6,7 @@ use super::random::Random;
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Parameter {
-    /// Its ID or address.
+    /// ID or address of the parameter.
     pub key: u16,
     /// Least value.
     pub min: u16,
@@ -19,7 +19,7 @@ pub(crate) struct Parameter {
 /// Why a parameter cannot be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refused {
-    /// There is no such parameter.
+    /// No parameter has this key.
     Unknown,
     /// The value is outside the parameter's range, or beyond a parameter that limits it.
     Value,
@@ -30,7 +30,7 @@ pub enum Refused {
 pub struct Writes {
     /// Writes that the drive took.
     pub taken: u32,
-    /// Those of them during which the inverter fed the motor.
+    /// Number of writes during which the inverter fed the motor.
     pub while_fed: u32,
     /// Writes into the memory that keeps it without power; it stands a limited number of them.
     pub kept: u32,
@@ -47,7 +47,8 @@ pub(crate) struct ParameterSet {
 }
 
 impl ParameterSet {
-    /// Of (key, minimum, maximum, default); keys may come in any order, the first of equal ones counts.
+    /// A set of parameters from (key, minimum, maximum, default); keys may come in any order, the first of equal ones
+    /// counts.
     pub(crate) fn new(parameters: impl IntoIterator<Item = (u16, u16, u16, u16)>) -> ParameterSet {
         let mut all: Vec<Parameter> = parameters
             .into_iter()
@@ -131,7 +132,7 @@ impl ParameterSet {
         self.writes.entry(key).or_default().kept += 1;
     }
 
-    /// What was written over the bus, by key.
+    /// Writes that came over the bus, by key.
     pub(crate) fn writes(&self) -> &BTreeMap<u16, Writes> {
         &self.writes
     }

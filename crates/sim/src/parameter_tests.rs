@@ -116,7 +116,7 @@ impl DriveOnLine {
 /// The families with parameters, and where those of their simulated drives lie.
 fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
-    // Those of one application have the parameters of their base.
+    // Profiles of one application are left out: they have the parameters of their base.
     let all = all
         .iter()
         .filter(|profile| profile.base.is_none() && !profile.parameters.is_empty());
@@ -152,7 +152,7 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
         assert_eq!(left, left_out, "{}", profile.name);
         check_wear(&mut rig, &plan);
 
-        // The same, cut half way, is taken back.
+        // A restore that was cut half way is undone completely.
         let mut rig = DriveOnLine::filled(&profile, seed + 1000);
         for write in &plan.writes[..half] {
             assert_eq!(rig.write(write), Reply::Written);
@@ -178,7 +178,8 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
         }
         assert_eq!(ParameterFile::parse(&file.text()), Ok(file.clone()), "{}", profile.name);
 
-        // One that refuses function 08, and one that answers nothing behind its last parameter.
+        // A drive may refuse function 08, or stop answering after its last parameter; the reading is complete in both
+        // cases.
         for end in [Outcome::Exception(Exception(1)), Outcome::TimedOut] {
             let mut reading = Reading::new(profile.clone(), known.clone());
             let mut last = 0;
@@ -227,7 +228,7 @@ fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
     }
 }
 
-/// What the profile says of PRGM and DRIVE is what the drive does.
+/// A locked drive refuses exactly the parameters that the plan marks, by the profile's rule for PRGM and DRIVE.
 #[test]
 fn a_locked_drive_refuses_what_the_plan_says_it_will() {
     for (profile, known) in families() {

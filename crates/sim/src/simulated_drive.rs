@@ -25,7 +25,7 @@ const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 pub struct DriveOptions {
     /// Address on the line, 1..=247, with N2 to 255.
     pub address: u8,
-    /// What it is.
+    /// Model of the drive.
     pub model: ModelOptions,
     /// Seed of an autopilot that runs it until a master writes to it; `None` leaves it to the masters.
     pub autopilot: Option<u64>,
@@ -193,7 +193,7 @@ impl SimulatedDrive {
         drive.advance(now);
     }
 
-    /// Whether it answers: connected, and with supply.
+    /// Whether the drive answers: connected, and with supply.
     pub fn answers(&self) -> bool {
         self.alive && self.model.get().powered()
     }
@@ -246,7 +246,7 @@ impl SimulatedDrive {
         self.model.get().check_error()
     }
 
-    /// A broadcast, which is not answered; a write ends the autopilot for good.
+    /// A broadcast was received, which is not answered; a write ends the autopilot for good.
     pub(crate) fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
         if request.is_write() {
@@ -297,12 +297,12 @@ impl SimulatedDrive {
         self.power_cycles
     }
 
-    /// What it looks like from outside.
+    /// State of the drive as seen from outside.
     pub fn state(&self) -> DriveState {
         self.model.get().state()
     }
 
-    /// What was written over the bus into its parameters since it was made, by PDU address.
+    /// Writes over the bus into the drive's parameters since it was created, by PDU address.
     pub fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
         self.model.get().parameter_writes()
     }

@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 /// Address of a broadcast.
 const BROADCAST: u8 = 0;
 
-/// What a frame meant to the drives of a line.
+/// Meaning of a frame to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Heard {
     /// The check code is wrong, or it is not a frame at all.
@@ -33,7 +33,7 @@ pub enum Heard {
 /// A request that a drive of the line has to answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Asked {
-    /// What the line speaks.
+    /// Protocol of the line.
     pub protocol: Protocol,
     /// The drive's address.
     pub address: u8,
@@ -115,7 +115,7 @@ impl Slaves {
         }
     }
 
-    /// What a whole frame means; a broadcast is acted upon at once.
+    /// Reads a whole frame; a broadcast takes effect at once.
     pub fn hear(&mut self, protocol: Protocol, frame: &[u8], now: SimTime) -> Heard {
         if protocol == Protocol::N2 {
             return self.hear_n2(frame);
@@ -149,8 +149,8 @@ impl Slaves {
         })
     }
 
-    /// No manual says whom such an answer names: it has the address and function that were received, and what looks like
-    /// a broadcast gets none.
+    /// A damaged frame, answered by drives that report check errors. No manual specifies the address of such an answer:
+    /// it carries the address and function that were received, and a broadcast gets none.
     fn hear_damaged(&self, protocol: Protocol, frame: &[u8]) -> Option<Heard> {
         let (address, function) = framing::damaged(protocol, frame)?;
         let drive = self.drives.get(&address).filter(|drive| drive.answers())?;
@@ -183,7 +183,8 @@ impl Slaves {
         })
     }
 
-    /// The reply's frame, appended to `out`: the drive does what it is asked. Nothing is appended when it stays silent.
+    /// Lets the drive carry out the request and appends the frame of its reply to `out`. Nothing is appended when the
+    /// drive stays silent.
     pub fn answer(&mut self, asked: &Asked, now: SimTime, out: &mut Vec<u8>) {
         let Some(drive) = self.drives.get_mut(&asked.address) else {
             return;
@@ -221,7 +222,7 @@ impl Slaves {
     }
 }
 
-/// The frame of an exception to a request, appended to `out`; the drive is not asked.
+/// Appends the frame of an exception to `out`; the request does not reach the drive.
 pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
     if asked.command.is_some() {
         Answer::Nak(code_of(exception)).encode(out);
@@ -349,7 +350,7 @@ mod tests {
         frame
     }
 
-    /// What a PDU to a drive gets, in either framing.
+    /// Sends a PDU to a drive in the framing of `protocol` and returns the PDU of its answer.
     fn ask(line: &mut Slaves, protocol: Protocol, address: u8, pdu: &[u8]) -> Vec<u8> {
         let mut out = Vec::new();
         if let Heard::Request(asked) = line.hear(protocol, &framed(protocol, address, pdu), SimTime::ZERO) {

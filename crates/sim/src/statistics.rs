@@ -94,7 +94,7 @@ pub enum Direction {
 /// A frame on the line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Recorded {
-    /// Who sent it.
+    /// Sender of the frame.
     pub direction: Direction,
     /// When its first character began.
     pub start: SimTime,

@@ -1,7 +1,7 @@
 //! The simulated line as a thread behind a port, with true wire timing.
 //!
-//! One thread a line owns the port. It sleeps in `ppoll` until bytes come or the next character is due, with the timer
-//! slack of the kernel switched off, and watches the clock for the last microseconds before a delivery.
+//! Each line has one thread, which owns the port. The thread sleeps in `ppoll` until bytes come or the next character
+//! is due, with the timer slack of the kernel switched off, and busy-waits for the last microseconds before a delivery.
 
 use super::SimTime;
 use super::endpoint::{Endpoint, EndpointOptions};
@@ -27,13 +27,13 @@ pub struct SimulatedBusOptions {
     pub name: String,
     /// Where a master reaches it.
     pub endpoint: EndpointOptions,
-    /// How the line behaves. On a real serial port the wire keeps the time, whatever `wire` says, and silence is
+    /// Behaviour of the line. On a real serial port the wire keeps the time, whatever `wire` says, and silence is
     /// counted but not enforced: drivers and adapters hand bytes over late.
     pub rules: LineRules,
     pub drives: Vec<DriveOptions>,
     /// Options of their boards, where they speak N2.
     pub boards: BoardOptions,
-    /// What goes wrong.
+    /// Faults on the line.
     pub faults: FaultPlan,
     /// Frames that the transcript keeps; 0 for none.
     pub transcript: usize,
@@ -63,7 +63,7 @@ const IDLE: Duration = Duration::from_millis(100);
 const SETTLE_AFTER: Duration = Duration::from_secs(1);
 /// A port that went away is tried again so often.
 const REOPEN: Duration = Duration::from_secs(1);
-/// Longest wait for the thread to do as asked.
+/// Longest wait for the thread of the line to carry out an action.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Whether the port is to be there.
@@ -207,7 +207,7 @@ impl Drop for SimulatedBus {
 }
 
 impl SimulatedBus {
-    /// What a master opens: a path or `tcp://host:port`; empty while the port is away.
+    /// The port that a master opens: a path or `tcp://host:port`; empty while the port is away.
     pub fn address(&self) -> String {
         match &self.shared.port().found {
             Found::Present(address) => address.clone(),
@@ -215,7 +215,7 @@ impl SimulatedBus {
         }
     }
 
-    /// One line for people: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`, with the protocol
+    /// Description of the line in one row: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`, with the protocol
     /// where it is not Modbus RTU.
     pub fn description(&self) -> String {
         let (addresses, format, protocol) = {
@@ -295,7 +295,7 @@ impl SimulatedBus {
     /// The adapter is plugged in again: a new pseudo-terminal stands under the same link.
     ///
     /// # Errors
-    /// It cannot be opened again.
+    /// The port cannot be opened again.
     pub fn restore(&self) -> io::Result<()> {
         {
             let mut port = self.shared.port();

@@ -141,7 +141,7 @@ impl<'a> Client<'a> {
             window: connect.receive_maximum.min(MAX_INFLIGHT),
             inflight: BTreeSet::new(),
             last_pkid: 0,
-            // One and a half times, 3.1.1 section 3.1.2.10.
+            // One and a half keep-alive periods (3.1.1 section 3.1.2.10).
             silence: connect.keep_alive * 3 / 2,
             input,
             output: Vec::new(),
@@ -164,7 +164,7 @@ impl<'a> Client<'a> {
             }
         }
         let last_words = std::mem::take(&mut self.output);
-        // First the state, so that whoever sees the connection closed finds it done.
+        // The state is released before the connection closes, so that a peer that sees the close finds it done.
         drop(self);
         farewell(&mut stream, &last_words).await;
     }

@@ -1,11 +1,11 @@
 //! A small MQTT broker inside the process, **for the demo only, never for production**: no authentication, no TLS, and
 //! everything is kept in memory. In service, and in the tests of the gateway, the broker is a real one such as mosquitto.
 //!
-//! It serves MQTT 3.1.1 and 5.0 side by side: QoS 0 and 1, retained messages, wills, wildcards, the options of a v5
-//! subscription, keep alive, and take-over by a client with the same id. Response topic, correlation data, content type,
-//! payload format and user properties reach the subscribers as they came; message expiry counts down. It does not
-//! serve, and says so to v5 clients: QoS 2 (a subscription is granted QoS 1), sessions that outlive their connection,
-//! topic aliases, subscription identifiers, shared subscriptions.
+//! The broker serves MQTT 3.1.1 and 5.0 side by side: QoS 0 and 1, retained messages, wills, wildcards, the options of a
+//! v5 subscription, keep alive, and take-over by a client with the same id. Response topic, correlation data, content
+//! type, payload format and user properties reach the subscribers as they came; message expiry counts down. Not served,
+//! and reported so to v5 clients: QoS 2 (a subscription is granted QoS 1), sessions that outlive their connection, topic
+//! aliases, subscription identifiers, shared subscriptions.
 //!
 //! Everything is bounded, see the constants. A client that does not take its messages, or accepts no byte for
 //! `STALL_LIMIT`, loses its connection. A malformed packet closes the connection that it came from and nothing else.

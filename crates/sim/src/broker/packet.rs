@@ -56,11 +56,11 @@ mod property {
 
     /// Session expiry, authentication, problem and response information, receive maximum, alias maximum, packet size.
     pub(crate) const OF_CONNECT: &[u8] = &[17, 21, 22, 23, 25, 33, 34, USER, 39];
-    /// Those of a message: payload format, expiry, content type, response topic, correlation data, topic alias.
+    /// Properties of a message: payload format, expiry, content type, response topic, correlation data, topic alias.
     pub(crate) const OF_PUBLISH: &[u8] = &[1, 2, 3, 8, 9, 35, USER];
-    /// The same, with the delay in the place of the alias.
+    /// Properties of a will: those of a message, with the will delay in place of the topic alias.
     pub(crate) const OF_WILL: &[u8] = &[1, 2, 3, 8, 9, 24, USER];
-    /// Those that subscribers get as they came.
+    /// Properties that subscribers get as the publisher sent them.
     pub(crate) const FORWARDED: &[u8] = &[1, 3, 8, 9, USER];
     /// Reason string.
     pub(crate) const OF_ACK: &[u8] = &[31, USER];
@@ -86,7 +86,7 @@ pub(super) enum Qos {
 /// Why the broker ends a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Fault {
-    /// What v5 clients are sent, see [`reason`].
+    /// Reason code sent to v5 clients, see [`reason`].
     pub(super) reason: u8,
     /// For the log.
     pub(super) what: &'static str,
@@ -130,7 +130,7 @@ impl Message {
         self.lifetime.map(|lifetime| lifetime.saturating_sub(age))
     }
 
-    /// Whether it may still be delivered.
+    /// Whether the message has not expired and may still be delivered.
     pub(super) fn is_current(&self, now: Instant) -> bool {
         self.left(now) != Some(Duration::ZERO)
     }
@@ -150,11 +150,11 @@ pub(super) struct Connect {
     pub(super) max_packet: usize,
     /// Published when the connection ends without a good-bye.
     pub(super) will: Option<Message>,
-    /// It is well-formed, but asks for what is not served: reason code for the CONNACK.
+    /// Reason code for the CONNACK of a well-formed CONNECT that asks for something not served.
     pub(super) refused: Option<u8>,
 }
 
-/// One filter of a SUBSCRIBE with its options.
+/// A filter of a SUBSCRIBE with its options.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Subscription {
     pub(super) filter: String,
@@ -276,7 +276,7 @@ pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault
 /// Reads a packet that follows the CONNECT and came at `now`.
 ///
 /// # Errors
-/// It is malformed, or not served: close the connection.
+/// The packet is malformed or not served: close the connection.
 pub(super) fn read(version: Version, packet: &[u8], now: Instant) -> Result<Incoming, Fault> {
     let (first, mut body) = open(packet)?;
     let incoming = match first {
@@ -368,7 +368,7 @@ fn open(packet: &[u8]) -> Result<(u8, Reader<'_>), Fault> {
 }
 
 impl Qos {
-    /// Of two bits, QoS 2 being served as QoS 1.
+    /// Reads the two QoS bits; QoS 2 is served as QoS 1.
     fn of(bits: u8) -> Qos {
         if bits == 0 { Qos::AtMostOnce } else { Qos::AtLeastOnce }
     }

@@ -11,7 +11,7 @@ use tokio::sync::{Notify, oneshot};
 use super::packet::{Fault, Message, Qos, Subscription, reason};
 use super::{MAX_QUEUE_BYTES, MAX_QUEUE_MESSAGES, MAX_RETAINED_BYTES, MAX_RETAINED_MESSAGES, MAX_SUBSCRIPTIONS, topic};
 
-/// All that the broker knows.
+/// All state of the broker.
 #[derive(Debug, Default)]
 pub(super) struct State {
     /// By the number of their connection.
@@ -316,7 +316,8 @@ mod tests {
         }
         state.publish(1, message("t/1", b"x"), now);
         assert_eq!(waiting(&mut state, 1), [seen("t/1", b"x", false)]);
-        // Two filters match: once, and the flag as published if one of them wants it.
+        // A message that matches two filters arrives once, with the retain flag as published if one of the filters asks
+        // for that.
         let as_published = Subscription {
             retain_as_published: true,
             retain_handling: 2,

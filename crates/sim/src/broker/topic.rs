@@ -36,7 +36,7 @@ pub(super) fn matches(name: &str, filter: &str) -> bool {
     let mut names = name.split('/');
     for level in filter.split('/') {
         match (level, names.next()) {
-            // `a/#` has `a` itself too, hence before the check for a missing level.
+            // `a/#` matches `a` itself too, so this case comes before the check for a missing level.
             ("#", _) => return true,
             ("+", Some(_)) => {}
             (level, Some(name)) if level == name => {}

@@ -152,7 +152,7 @@ impl ProfileDrive {
         own || point.write && point.write_to.is_none()
     }
 
-    /// What the motor makes of a point.
+    /// The value that the simulated motor gives a point.
     fn figure(&self, index: PointIndex, point: &Point) -> Option<f64> {
         let (motor, ratings) = (&self.body.motor, &self.ratings);
         if self.options.values.contains_key(&index) || self.control.is_none() {
@@ -302,7 +302,7 @@ fn is_signed(raw: &Raw) -> bool {
     raw.form.is_signed() || matches!(raw.form, Form::F32 | Form::F64)
 }
 
-/// What a point without a motor behind it usually holds, within what it takes.
+/// A usual value for a point that no motor changes, within the point's range.
 fn usual(point: &Point, raw: &Raw) -> Option<Given> {
     if let Form::Text { .. } = raw.form {
         return Some(Given::Text("SIM-0001".to_string()));

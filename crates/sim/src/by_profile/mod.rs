@@ -1,5 +1,5 @@
-//! A drive or meter of any profile: its registers come from the points of the profile, what it does with its control word from the
-//! hand-written [`words`] where the family is known, else from `[control]` ([`said`]). Pure.
+//! A drive or meter of any profile. Its registers come from the points of the profile; its reaction to the control word comes from
+//! the hand-written [`words`] where the family is known, else from `[control]` ([`said`]). Pure.
 
 mod figures;
 mod registers;
@@ -34,13 +34,13 @@ const TRIP_ADDRESSES: [u16; 3] = [9998, 19_998, 29_998];
 /// Options of a drive of any profile.
 #[derive(Debug, Clone)]
 pub struct ProfileOptions {
-    /// What it is.
+    /// Profile of the drive.
     pub profile: Arc<Profile>,
     /// The registers that no real drive has are there: a fault code trips, and 1 behind it gives the drive to its panel.
     pub trip_register: bool,
     /// Time before a reply; none leaves it to the line.
     pub turnaround: Option<Duration>,
-    /// What points without a motor behind them hold, by index.
+    /// Values of points that the motor does not change, by index.
     pub values: BTreeMap<PointIndex, Given>,
 }
 
@@ -63,7 +63,8 @@ impl ProfileOptions {
         }
     }
 
-    /// Whether drives of the profile can be simulated: those of an N2 board cannot, nor does a name that nobody knows say anything.
+    /// Whether drives of the profile can be simulated: not those of an N2 board, and not those whose `simulator` is an unknown
+    /// name.
     pub fn knows(profile: &Profile) -> bool {
         let named = profile.simulator.as_deref();
         let known = named.is_none_or(|name| name == BY_CONTROL || FAMILIES.iter().any(|family| family.name == name));
@@ -85,7 +86,7 @@ impl ProfileOptions {
     }
 }
 
-/// `simulator` of a profile whose drive does what `[control]` says though its base is known by hand.
+/// `simulator` of a profile whose drive follows `[control]` although its base family has hand-written words.
 const BY_CONTROL: &str = "control";
 
 /// A simulated drive of any profile.
@@ -210,7 +211,7 @@ impl ProfileDrive {
         );
         if told.resets && self.body.latch.fault() != 0 {
             self.body.latch.reset();
-            // Otherwise the run command has to be seen off first.
+            // Other drives must first see the run command switched off.
             if restarts || self.run.is_none() {
                 self.body.latch.obeys(false);
             }

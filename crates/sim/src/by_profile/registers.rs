@@ -17,7 +17,7 @@ use crate::drive::{Point, Profile, Value};
 pub(super) struct Registers(BTreeMap<Key, u16>);
 
 impl Registers {
-    /// Those that the profile names, all 0.
+    /// All registers that the profile names, at 0.
     pub(super) fn new(profile: &Profile, control: Option<&Control>) -> Registers {
         let mut all = BTreeMap::new();
         for range in profile.ranges.iter().filter(|range| range.holes) {

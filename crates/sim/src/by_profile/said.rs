@@ -1,4 +1,4 @@
-//! What a drive does with the words that it gets, as `[control]` of its profile says it: for drives that are not known by hand.
+//! How a drive reacts to the words written to it, by `[control]` of its profile: for drives without hand-written words.
 
 use super::words::{Does, Known, Told};
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
@@ -7,7 +7,7 @@ fn place_of(setting: &Setting, control: &Control) -> ControlItem {
     setting.place.unwrap_or(control.at)
 }
 
-/// What is written to one of the places of the profile's commands.
+/// The effect of a word written to one of the places of the profile's commands.
 pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> Told {
     let own = place == control.at;
     let here = |setting: &Setting| place_of(setting, control) == place;
@@ -26,7 +26,7 @@ pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, wor
         (Run::Steps(_), Some(step)) => Does::Prepares(step + 1),
         _ if here(&control.stop) && holds(&control.stop) => Does::Stops,
         _ if control.is_stop(place, word) => Does::Coasts,
-        // A word without its constant bits is no command.
+        // A word without its constant bits has no effect.
         _ if own && !control.always.holds(word) => Does::Nothing,
         (Run::One(run), _) if holds(run) && concerns_run(control, place) => Does::Runs { reverse: reverse() },
         (Run::Pair { forward, reverse }, _) if here(forward) || here(reverse) => {

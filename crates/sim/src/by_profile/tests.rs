@@ -360,7 +360,7 @@ fn any_bench() -> impl Strategy<Value = (Arc<Profile>, Vec<(RequestPdu, u64)>)> 
 }
 
 proptest! {
-    /// Whatever a drive is asked, its reply fits, and it turns only where nothing is wrong.
+    /// Any request gets a reply that fits it, and the motor turns only while there is no fault.
     #[test]
     fn every_reply_fits_its_request((profile, requests) in any_bench()) {
         let mut rig = ProfiledDrive::of(&profile);
@@ -384,7 +384,7 @@ fn profile(text: &str) -> Arc<Profile> {
 
 const RANGE: &str = "[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 19\nread = 8\nwrite = 2\n";
 
-/// A drive that nobody knows by hand does what its profile says.
+/// A drive without hand-written words follows its own profile.
 #[test]
 fn a_profile_of_ones_own() {
     let text = format!(

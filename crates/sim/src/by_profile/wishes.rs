@@ -56,8 +56,8 @@ fn search(fixed: &Fixed, wishes: &[&Wish], base: &impl Fn(Key) -> u16, tries: &m
     all.find_map(|way| search(&way, rest, base, tries))
 }
 
-/// Every way to fulfil a wish beside what is decided: its alternatives in their order; ways to avoid it by what they change of
-/// `base`.
+/// Every way to fulfil a wish together with the bits already fixed: its alternatives in their order; ways to avoid it by how
+/// much they change `base`.
 fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
     match wish.want {
         true => wish.any.iter().filter_map(|bits| with(fixed, bits)).collect(),

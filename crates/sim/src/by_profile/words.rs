@@ -1,22 +1,22 @@
-//! What the families do with the words that they get, by hand from their manuals: no profile is read here.
+//! How the families react to the words written to them, by hand from their manuals: no profile is read here.
 
 use crate::codec::Table;
 use crate::drive::profile::Part;
 
-/// What a drive does with a word.
+/// Effect of a word on the motor and the start sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Does {
-    /// It goes on as before.
+    /// The drive goes on as before.
     Nothing,
-    /// It has come so far in its start sequence; the motor is not fed.
+    /// The drive has come to this position in its start sequence; the motor is not fed.
     Prepares(usize),
     Runs {
         /// In reverse, apart from the sign of the reference.
         reverse: bool,
     },
-    /// It brings the motor down; its start sequence begins anew.
+    /// The drive ramps the motor down; its start sequence starts again.
     Stops,
-    /// It lets the motor coast; likewise.
+    /// The drive lets the motor coast; its start sequence starts again.
     Coasts,
     /// An external fault.
     Trips,
@@ -26,13 +26,13 @@ pub(super) enum Does {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Told {
     pub(super) does: Does,
-    /// It resets a fault, before anything else.
+    /// Whether the word resets a fault, before anything else.
     pub(super) resets: bool,
     /// The word that counts from now on.
     pub(super) word: u16,
 }
 
-/// What a drive knows when it gets a word.
+/// State of the drive that decides what a word does.
 #[derive(Clone, Copy)]
 pub(super) struct Known<'d> {
     /// The word that counted last.
@@ -40,9 +40,9 @@ pub(super) struct Known<'d> {
     /// How far it has come in its start sequence.
     pub(super) position: usize,
     pub(super) faulted: bool,
-    /// The direction that it was told last.
+    /// Whether reverse was commanded last.
     pub(super) reverse: bool,
-    /// What stands at other addresses.
+    /// Reads the registers at other addresses.
     pub(super) at: &'d dyn Fn(Table, u16) -> u16,
 }
 
@@ -51,15 +51,15 @@ pub(super) struct Known<'d> {
 pub(super) struct Family {
     /// Name in profiles.
     pub(super) name: &'static str,
-    /// What it does with the control word.
+    /// Effect of the control word.
     pub(super) word: fn(&Known<'_>, u16) -> Told,
-    /// What it does with another register or coil.
+    /// Effect of another register or coil.
     pub(super) other: fn(Table, u16, u16) -> Option<Told>,
-    /// Its words act when they are written; none of them stands.
+    /// Words act once, when they are written, and are not kept as a standing command.
     pub(super) acts_once: bool,
     /// A reset while a run command stands starts the motor.
     pub(super) restarts_on_reset: bool,
-    /// Its status word beyond what a profile makes of it: PDU address of the holding register and bits.
+    /// Status word beyond what a profile makes of it: PDU address of the holding register and bits.
     pub(super) status: fn(&Shows) -> Option<(u16, Part)>,
 }
 

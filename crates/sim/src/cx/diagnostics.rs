@@ -46,7 +46,7 @@ impl Diagnostics {
         self.listen_only
     }
 
-    /// Whether the request ends Listen Only Mode, the only thing that it is heard for there.
+    /// Whether the request ends Listen Only Mode; in that mode all other requests are ignored.
     pub(super) fn is_reinitialise(subfunction: u16, data: u16) -> bool {
         subfunction == subfunction::REINITIALISE && matches!(data, 0 | 0xFF00)
     }
@@ -56,7 +56,7 @@ impl Diagnostics {
         *self = Diagnostics::default();
     }
 
-    /// Does what the subfunction asks; `None` for the one that is not answered.
+    /// Carries out the subfunction; `None` for the one that is not answered.
     pub(super) fn serve(&mut self, subfunction: u16, data: u16) -> Option<Reply> {
         if Self::is_reinitialise(subfunction, data) {
             self.reinitialise();

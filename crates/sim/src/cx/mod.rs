@@ -31,7 +31,7 @@ struct Coils {
     reset: bool,
 }
 
-/// What the drive counts over its life; it survives a power cycle.
+/// Lifetime counters of the drive; they survive a power cycle.
 #[derive(Debug, Clone, Copy)]
 struct Totals {
     /// Operating days.
@@ -67,7 +67,7 @@ pub struct CxDrive {
     options: CxOptions,
     parameters: Parameters,
     ratings: Ratings,
-    /// What the unit is built for, kW: that of the motor it was delivered for.
+    /// Rated power of the unit, kW: that of the motor it was delivered for.
     unit_power: f64,
     body: Body,
     totals: Totals,
@@ -77,7 +77,7 @@ pub struct CxDrive {
     reference: u16,
     /// Whether the fieldbus is the active control source.
     fieldbus: bool,
-    /// What the panel commands; obeyed while the fieldbus is not the control source.
+    /// Command from the panel; obeyed while the fieldbus is not the control source.
     local: Command,
     failed: bool,
     busy_until: SimTime,
@@ -110,7 +110,7 @@ impl CxDrive {
         }
     }
 
-    /// What the panel commands; obeyed while the fieldbus is not the control source.
+    /// Commands from the panel; obeyed while the fieldbus is not the control source.
     pub fn set_local(&mut self, command: Command) {
         self.local = command;
     }

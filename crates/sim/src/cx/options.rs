@@ -25,8 +25,8 @@ impl Default for Limits {
     }
 }
 
-/// What is added to the addresses of the manual's tables. Its start-up test uses some that are one higher, so some
-/// boards may have an offset of 1 (reference/drives.md 9.6).
+/// Offsets added to the addresses of the manual's tables. The start-up test of the manual uses some that are one
+/// higher, so some boards may have an offset of 1 (reference/drives.md 9.6).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct AddressOffset {
     pub coil: u16,
@@ -76,7 +76,7 @@ impl FromStr for AddressOffset {
     }
 }
 
-/// What a frequency reference outside Par 1.1 to Par 1.2 does.
+/// Reaction to a frequency reference outside Par 1.1 to Par 1.2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OutOfRange {
     /// Exception 03.
@@ -92,9 +92,9 @@ pub struct CxOptions {
     pub load: Load,
     /// Items per message.
     pub limits: Limits,
-    /// What is added to the addresses.
+    /// Offsets added to the addresses.
     pub offset: AddressOffset,
-    /// What a frequency reference outside Par 1.1 to Par 1.2 does.
+    /// Reaction to a frequency reference outside Par 1.1 to Par 1.2.
     pub reference_out_of_range: OutOfRange,
     /// Hz that one count of Par 1.1, 1.2 and 1.9 is. The manual's example reads 50 for Par 1.2.
     pub frequency_step: f64,

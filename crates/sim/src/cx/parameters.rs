@@ -108,7 +108,7 @@ impl Parameters {
         Ok(())
     }
 
-    /// What was written over the bus, by address.
+    /// Writes that came over the bus, by address.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         self.set.writes().clone()
     }

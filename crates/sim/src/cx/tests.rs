@@ -58,7 +58,7 @@ fn hex(text: &str) -> Vec<u8> {
         .collect()
 }
 
-/// What the drive with address 1 puts on the line for a frame.
+/// Reply of the drive with address 1 to a frame, as hexadecimal text.
 fn exchange(drive: &mut CxDrive, frame: &str, now: SimTime) -> String {
     let (address, request) = rtu::decode_request(&hex(frame)).unwrap();
     let mut out = Vec::new();

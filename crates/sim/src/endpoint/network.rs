@@ -19,9 +19,9 @@ const CONNECT: (Duration, Duration) = (Duration::from_millis(200), Duration::fro
 #[derive(Debug)]
 pub(crate) struct Network {
     way: Way,
-    /// What came of a request that is not whole.
+    /// Bytes of a request that is not complete yet.
     received: Vec<u8>,
-    /// What the line has answered so far.
+    /// Bytes that the line has answered so far.
     answered: Vec<u8>,
 }
 
@@ -79,7 +79,7 @@ impl Network {
         })
     }
 
-    /// What a master has as its port.
+    /// The port that a master configures for this network.
     pub(crate) fn address(&self) -> String {
         let at = |scheme: &str, address: io::Result<SocketAddr>| {
             address.map_or_else(|_| format!("{scheme}://?"), |address| format!("{scheme}://{address}"))
@@ -210,7 +210,7 @@ fn adu(id: [u8; 2], unit: u8, pdu: &[u8]) -> Vec<u8> {
     [&id[..], &[0, 0], &length, &[unit], pdu].concat()
 }
 
-/// Connects and says the text.
+/// Connects to the server and sends the text.
 fn dialled(server: SocketAddr, text: &str) -> Option<TcpStream> {
     let connect = || {
         let mut stream = TcpStream::connect_timeout(&server, CONNECT.0)?;

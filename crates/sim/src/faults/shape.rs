@@ -1,4 +1,4 @@
-//! What comes over the line under a fault.
+//! The bytes that come over the line under a fault.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use crate::framing;
 use crate::random::Random;
 
 impl FaultPlan {
-    /// What comes over the line for `reply` to `request` under a fault, in order.
+    /// The bytes that come over the line for `reply` to `request` under a fault, in order.
     pub fn shape(
         &mut self,
         fault: Option<Fault>,
@@ -83,16 +83,16 @@ impl FaultPlan {
     }
 }
 
-/// What a burst is to the line.
+/// How a burst of bytes relates to the reply that the master expects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// It stands where the reply is expected.
+    /// The burst comes where the reply is expected.
     Regular,
     /// As regular, but delivered character by character.
     Split,
     /// The master cannot expect it: a request that meets it is not the master's doing.
     Provoked,
-    /// It comes together with the request, not after it.
+    /// The burst comes together with the request, not after it.
     Echo,
 }
 
@@ -103,14 +103,14 @@ pub struct Burst {
     pub gap: Duration,
     /// The characters.
     pub bytes: Vec<u8>,
-    /// What it is to the line.
+    /// How the burst relates to the expected reply.
     pub kind: Kind,
 }
 
-/// Two replies at once: while both drives speak a low bit of either wins, and the later one is heard to its end.
+/// Two replies at once: while both drives send, a low bit of either wins, and the later reply is received to its end.
 fn twin(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<Vec<u8>> {
     let later = match foreign(Foreign::Data, protocol, &reply) {
-        // A frame of N2 names nobody.
+        // N2 replies carry no address, so the second reply equals the first.
         none if none.is_empty() => reply.clone(),
         later => later,
     };
@@ -141,7 +141,8 @@ fn corrupt(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     }
 }
 
-/// Not just any bit of any character: bit 5 of a letter is its case, which is not an error.
+/// Damages one digit so that the check fails. Flipping any bit would not do: bit 5 of a letter is its case, which is
+/// not an error.
 fn garble(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     let digits = reply.len().saturating_sub(3) as u64;
     let at = random.within(1..=digits.max(1)) as usize;
@@ -181,7 +182,8 @@ pub(super) fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8
         Foreign::Address => address = if address >= 247 { 1 } else { address + 1 },
         Foreign::Function => {
             if let Some(function) = pdu.first_mut() {
-                // Also of an exception: the function that was asked for would be an answer.
+                // The function of an exception is changed too: with the requested function, the frame would be an
+                // answer.
                 *function = if *function & 0x7F == 3 { 4 } else { 3 };
             }
             // Whatever it was, it becomes a reply of one register unless it has registers already.

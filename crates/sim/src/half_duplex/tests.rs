@@ -121,7 +121,7 @@ fn the_silence_between_frames() {
         );
         assert_eq!(s.collisions, 0);
     }
-    // After a frame that nobody answers, and after a broadcast, the same silence.
+    // The silence is also required after a frame that no drive answers, and after a broadcast.
     for first in [[9, 3, 8, 0x34, 0, 11, 0, 0], [0, 6, 7, 0xD0, 0, 0, 0x88, 0x96]] {
         let mut line = line(rules(), FaultPlan::default());
         line.on_bytes(&first, us(0));
@@ -251,7 +251,7 @@ fn a_flood_is_bounded() {
     assert_eq!(run(&mut line, Duration::from_secs(2001)).len(), 1);
 }
 
-/// The same request and the length of its reply in Modbus ASCII.
+/// [`READ_STATUS`] and the length of its reply in Modbus ASCII.
 const ASCII_READ_STATUS: &[u8; 17] = b":01030834000BB5\r\n";
 const ASCII_REPLY_CHARS: usize = 1 + 2 * 26 + 2;
 
@@ -277,7 +277,7 @@ fn an_ascii_reply_begins_a_turnaround_after_the_line_feed() {
         (1, replied, ASCII_REPLY_CHARS)
     );
     assert!(seen[0].1.starts_with(b":0103160541"), "{:?}", seen[0].1);
-    // No silence is asked for between frames.
+    // Modbus ASCII requires no silence between frames.
     line.on_bytes(ASCII_READ_STATUS, replied);
     assert_eq!(run(&mut line, us(2_000_000)).len(), 1);
     let s = line.statistics();

@@ -20,16 +20,16 @@ pub enum Backing {
 /// One object of a board.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
-    /// Its type.
+    /// Region of the object.
     pub region: Region,
     pub number: u8,
-    /// What stands behind it.
+    /// The register or bit of the drive behind the object.
     pub place: Backing,
     /// Limits of the drive's parameter; without them those of the register hold.
     pub limits: Option<(f64, f64)>,
 }
 
-/// What a board does with an override beyond the limits of the parameter.
+/// Reaction of a board to an override beyond the limits of the parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Beyond {
     /// Acknowledges it and takes the limit, if the value fits the variable (Vacon, Eaton).

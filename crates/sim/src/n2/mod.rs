@@ -1,8 +1,8 @@
 //! The N2 board of a simulated drive: it waits for Identify, has objects with attributes, reports changes and takes
 //! overrides (n2.md; reference/drives.md 6.2 to 6.7). Pure: the time is an argument.
 //!
-//! The drive behind it is asked through the same requests as by Modbus, see [`maps`]. What no manual says is an option
-//! or stands in [`crate::codec::n2::assumptions`].
+//! The drive behind the board gets requests as over Modbus, see [`maps`]. Behaviour that no manual specifies is an
+//! option or an entry of [`crate::codec::n2::assumptions`].
 
 pub(crate) mod maps;
 #[cfg(test)]
@@ -55,11 +55,11 @@ pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 /// The board of one drive.
 #[derive(Debug, Clone)]
 pub struct Board {
-    /// Its options; may change at any time.
+    /// Options of the board; may change at any time.
     pub options: BoardOptions,
     map: &'static Map,
     waiting: bool,
-    /// What the bus set: configuration bytes, limits and times, by object and attribute.
+    /// Attributes set over the bus: configuration bytes, limits and times, by object and attribute.
     attributes: BTreeMap<(Object, u8), Vec<u8>>,
     /// Overridden objects and the values that they were given.
     overridden: BTreeMap<Object, Vec<u8>>,
@@ -401,7 +401,7 @@ fn store(address: u16, value: u16, model: Model<'_>) -> Result<(), u8> {
     }
 }
 
-/// The board's code for what the drive says on Modbus.
+/// The error code of the board for an exception that the drive answers on Modbus.
 pub(crate) fn code_of(exception: Exception) -> u8 {
     match exception.0 {
         0x01 => UNKNOWN,

@@ -1,4 +1,4 @@
-//! What the Eaton SVX and HVX do otherwise than the Vacon NX (reference/drives.md 3 and 9).
+//! Differences of the Eaton SVX and HVX from the Vacon NX (reference/drives.md 3 and 9).
 
 use super::tests::NxInTime;
 use super::*;

@@ -109,7 +109,7 @@ impl ControlPlace {
     }
 }
 
-/// What a drive looks like from outside, for tests and for the demo's display.
+/// State of a drive as seen from outside, for tests and for the demo's display.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NxState {
     /// Status word, ID 2101.
@@ -199,7 +199,7 @@ impl NxDrive {
         self.settings = self.parameters.settings();
     }
 
-    /// What panel and terminals command; obeyed while one of them is the control place.
+    /// Commands from panel and terminals; obeyed while one of them is the control place.
     pub fn set_local(&mut self, command: Command) {
         self.local = command;
     }
@@ -209,7 +209,7 @@ impl NxDrive {
         self.switched_off = off;
     }
 
-    /// What the drive looks like from outside.
+    /// State of the drive as seen from outside.
     pub fn state(&self) -> NxState {
         NxState {
             status: self.status(),
@@ -240,8 +240,8 @@ impl NxDrive {
         }
     }
 
-    /// The drive's own bus watchdog and P2.7.22 (reference/drives.md 3.11). It starts with the first message: a board that never
-    /// heard a master waits for one.
+    /// The drive's own bus watchdog and P2.7.22 (reference/drives.md 3.11). The watchdog starts with the first message: a board
+    /// that never received one waits.
     fn supervise(&mut self, now: SimTime) {
         let Some(heard) = self.heard else { return };
         let limit = self.options.timeout;
@@ -325,7 +325,7 @@ impl Model for NxDrive {
         &mut self.body
     }
 
-    /// One update period: supervision, commands, motor.
+    /// Advances by one update period: supervision, commands, motor.
     fn step(&mut self, now: SimTime) {
         self.supervise(now);
         let command = self.take_over();

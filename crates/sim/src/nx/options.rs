@@ -4,17 +4,17 @@ use super::super::motor::Load;
 use super::{Beyond, Hole, Limits, ReadOnly, StatusBits};
 use std::time::Duration;
 
-/// What the read-only registers hold.
+/// Content of the read-only registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Values {
-    /// What the simulated motor does.
+    /// Values of the simulated motor.
     Physical,
     /// `tag` in the high byte, the low byte of the register's PDU address in the low byte: proves in a test that a
     /// value came from that register of that drive.
     Tagged(u8),
 }
 
-/// What 100 % of the speed reference is (reference/drives.md 9.2).
+/// The range that 100 % of the speed reference stands for (reference/drives.md 9.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Base {
     /// The band from the minimum frequency (0 %) to the maximum frequency (100 %).
@@ -23,7 +23,7 @@ pub enum Base {
     Maximum,
 }
 
-/// What one count of the speed reference is (reference/drives.md 9.3).
+/// Unit of one count of the speed reference (reference/drives.md 9.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// 0.01 %.
@@ -37,9 +37,9 @@ pub enum Unit {
 pub struct SpeedReference {
     /// Whether a negative reference is allowed; it turns the direction round.
     pub signed: bool,
-    /// What 100 % is.
+    /// The range that 100 % stands for.
     pub base: Base,
-    /// What one count of ID 2003 is; ID 2103 is always 0.01 %.
+    /// Unit of one count of ID 2003; ID 2103 is always 0.01 %.
     pub unit: Unit,
 }
 
@@ -63,9 +63,9 @@ pub struct NxOptions {
     /// Hz that one count of the output frequency is, 0.01 or 0.1 (reference/drives.md 9.1).
     pub frequency_step: f64,
     /// Whether the control word has the bits of the HVX: bypass (3), pass-through to RO1, RO2 and DO1 (10 to 12) and
-    /// fire mode (13). The others only hand them on to the application.
+    /// fire mode (13). Other drives only pass them on to the application.
     pub hvac_control: bool,
-    /// What the read-only registers hold.
+    /// Content of the read-only registers.
     pub values: Values,
     /// Parameters to start with: ID and value; those that a drive does not have or not allow are passed over.
     pub parameters: Vec<(u16, u16)>,

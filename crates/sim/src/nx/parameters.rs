@@ -106,7 +106,7 @@ impl Parameters {
         Ok(())
     }
 
-    /// What was written over the bus, by PDU address.
+    /// Writes that came over the bus, by PDU address.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         let writes = self.0.writes().iter();
         writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
@@ -147,7 +147,7 @@ impl Parameters {
     }
 }
 
-/// What the drive does with the motor when it stops.
+/// How the drive stops the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StopFunction {
     /// Lets it run out.

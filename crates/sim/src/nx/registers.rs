@@ -19,7 +19,7 @@ pub struct Limits {
     pub beyond: Beyond,
 }
 
-/// What a register without a meaning inside 2012..=2099 and 2112..=2199 does.
+/// Reaction of a register without a meaning inside 2012..=2099 and 2112..=2199.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Hole {
     /// Exception 02.
@@ -107,7 +107,7 @@ impl NxDrive {
         }
     }
 
-    /// The first ID and the one group that holds all registers asked for.
+    /// The first ID and the group that holds all requested registers; an error where they span two groups.
     fn group_of(&self, start: u16, count: u16) -> Result<(u16, Group), Exception> {
         let first = start.checked_add(1).ok_or(Exception::ADDRESS)?;
         let last = start.checked_add(count).ok_or(Exception::ADDRESS)?;

@@ -3,7 +3,7 @@
 use super::super::model::Model;
 use super::{AT_REFERENCE_BAND, ControlPlace, NxDrive};
 
-/// What a status bit can show.
+/// A state that a status bit can show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Signal {
     Ready,
@@ -35,8 +35,7 @@ enum Signal {
 pub enum StatusBits {
     /// All bits of the Vacon NX: 0x0541 when idle and healthy (reference/drives.md 3.6, 3.7).
     Full,
-    /// Of the status word only those bits that all drives of the family share, as the worked frames of reference/drives.md print
-    /// them.
+    /// Only the status bits that all drives of the family share, as the worked frames of reference/drives.md print them.
     Common,
     /// Eaton SVX: the shared bits, and nothing in the general status word; 0x0001 when idle and healthy.
     Svx,

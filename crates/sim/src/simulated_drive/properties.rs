@@ -1,4 +1,4 @@
-//! What holds for every model, whatever it is asked and however it is treated.
+//! Properties of every model, for any requests and any treatment.
 
 use super::*;
 use crate::codec::Table;
@@ -73,7 +73,7 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-/// What one who commands a drive does.
+/// An action of a user who commands a drive.
 #[derive(Debug, Clone)]
 enum Act {
     Run(bool),

@@ -184,8 +184,8 @@ impl TecoDrive {
             .min(bound(parameters::CN_14))
     }
 
-    /// What takes effect at once when a command or a terminal changes: an external fault, and a run command that is seen
-    /// off.
+    /// Effects that a change of a command or a terminal has at once: an external fault, and a run command that is
+    /// switched off.
     fn take_over(&mut self) {
         if self.control.operation & operation::EXTERNAL_FAULT != 0 || self.terminals & terminal::EXTERNAL_FAULT != 0 {
             self.trip(fault::EXTERNAL);

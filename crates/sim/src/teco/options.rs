@@ -25,7 +25,7 @@ pub enum Digits {
 }
 
 impl Digits {
-    /// What one digit of 1 adds to the register, from the last digit to the first.
+    /// Value that a 1 in each digit adds to the register, from the last digit to the first.
     fn weights(self) -> [u16; 4] {
         match self {
             Digits::Bits => [1, 2, 4, 8],
@@ -85,8 +85,8 @@ pub struct TecoOptions {
     pub parameters: Vec<(u16, u16)>,
     /// Time between a message and its answer; `None` leaves it to the line.
     pub turnaround: Option<Duration>,
-    /// Whether a request with a wrong check code is answered by error 00H. Its error table has that code; what stands
-    /// beside it, and everything else about messages, says that there is no answer (reference/drives.md 9.8).
+    /// Whether a request with a wrong check code is answered by error 00H. The manual's error table has that code; the
+    /// text next to it, and everything else about messages, describes no answer (reference/drives.md 9.8).
     pub answer_check_error: bool,
     /// Makes 09FFH a register of the simulator: writing a fault mask as 0021H shows it trips the drive. No real drive has
     /// it.

@@ -11,7 +11,7 @@ use super::super::parameter_set::{Parameter, ParameterSet, Writes};
 use super::super::random::Random;
 use super::options::Digits;
 
-/// One group of parameters.
+/// A group of parameters.
 struct Group {
     first: u16,
     last: u16,
@@ -151,14 +151,14 @@ const KNOWN: [(u16, u16, u16, u16); 52] = [
 /// PID differential time, 0.01 s.
 const BN_16: (u16, u16, u16, u16) = (0x050F, 0, 100, 0);
 
-/// Upper and lower bounds by their names, Cn-14 and Cn-15, Cn-23 and Cn-24, Cn-45 and Cn-47, Cn-46 and Cn-48; that the drive
-/// refuses a crossing no manual says.
+/// Upper and lower bounds by their names, Cn-14 and Cn-15, Cn-23 and Cn-24, Cn-45 and Cn-47, Cn-46 and Cn-48. No manual says
+/// that the drive refuses values that cross; this is assumed.
 const LIMITS: [(u16, u16); 4] = [(CN_14, CN_14 + 1), (0x0216, 0x0217), (0x022C, 0x022E), (0x022D, 0x022F)];
 
 /// cos phi of the motor; no parameter holds it.
 const COS_PHI: f64 = 0.85;
 
-/// What a register of the parameters is.
+/// Properties of a register of the parameters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RegisterKind {
     /// Written in PRGM mode only.
@@ -167,7 +167,7 @@ pub(super) struct RegisterKind {
     pub(super) reserved: bool,
 }
 
-/// What the register is, if it belongs to the parameters.
+/// Properties of the register, if it belongs to the parameters.
 pub(super) fn place(register: u16) -> Option<RegisterKind> {
     GROUPS
         .iter()
@@ -186,7 +186,7 @@ pub(super) struct Parameters {
 }
 
 impl Parameters {
-    /// Both images alike.
+    /// Creates RAM and EEPROM with equal values.
     pub(super) fn new(digits: Digits, set: &[(u16, u16)]) -> Parameters {
         let serial = digits.register([true, true, false, false]);
         let four = digits.register([true; 4]);
@@ -255,12 +255,12 @@ impl Parameters {
         }
     }
 
-    /// What a power cycle does: RAM is as the EEPROM.
+    /// Simulates a power cycle: RAM takes the values of the EEPROM.
     pub(super) fn reload(&mut self) {
         self.ram.take_values(&self.eeprom);
     }
 
-    /// What was written over the bus, by register.
+    /// Writes that came over the bus, by register.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         self.ram.writes().clone()
     }

@@ -22,7 +22,7 @@ const MOST_FREQUENCY: u16 = 18_000;
 /// PA-C software version 1.0.
 const VERSION: u16 = 10;
 
-/// What a register is.
+/// Part of the drive that a register belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Register {
     Control,

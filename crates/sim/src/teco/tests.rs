@@ -51,7 +51,7 @@ impl TecoInTime {
     }
 }
 
-/// What the drive with address 1 puts on the line for a frame, without CR LF.
+/// Reply of the drive with address 1 to a frame, without CR LF.
 fn exchange(drive: &mut TecoDrive, frame: &str, now: SimTime) -> String {
     let bytes: Vec<u8> = (1..frame.len() - 1)
         .step_by(2)

@@ -8,7 +8,7 @@ use super::{Fault, Qos, Subscription, Version, malformed, property, protocol, re
 pub(super) struct Properties {
     numbers: Vec<(u8, u32)>,
     seen: u64,
-    /// Those for subscribers, as they came.
+    /// Properties for subscribers, encoded as they were received.
     pub(super) forwarded: Vec<u8>,
 }
 

@@ -1,4 +1,4 @@
-//! What is read is what was written, and nothing panics.
+//! Packets are read as they were written, and no input makes a reader panic.
 
 use super::writer::{packet, variable};
 use super::*;
@@ -47,7 +47,7 @@ fn a_connect_is_read_with_its_will() {
     }
 }
 
-/// What subscribers get is what was published, as the library of the gateway reads it.
+/// Subscribers receive what was published, read here with the MQTT library of the gateway.
 #[test]
 fn a_message_keeps_its_properties_and_its_life_counts_down() {
     let now = Instant::now();
@@ -163,7 +163,7 @@ proptest! {
             if let Ok(Some(length)) = whole
                 && let Ok(Incoming::Publish(message, pkid)) = read(version, &bytes[..length], now)
             {
-                // What comes in well goes out so that it is read as the same.
+                // A message that was read and written again is read back equal.
                 let out = publish(version, &message, message.retain, pkid, now);
                 prop_assert_eq!(read(version, &out, now), Ok(Incoming::Publish(message, pkid)));
             }
