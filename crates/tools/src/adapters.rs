@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// A serial port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Adapter {
-    /// Its name in a configuration: the persistent one, where there is one.
+    /// Name of the adapter in a configuration: the persistent one, where there is one.
     pub(super) port: String,
     /// The device behind a persistent name.
     pub(super) device: Option<String>,

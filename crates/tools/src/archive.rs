@@ -51,11 +51,11 @@ pub(super) struct Manifest {
 pub(super) struct Member {
     /// `config/…` or `state/…`.
     pub(super) name: String,
-    /// Its size.
+    /// Size of the file.
     pub(super) bytes: u64,
     /// Permissions.
     pub(super) mode: u32,
-    /// Of its content, in hexadecimal.
+    /// SHA-256 of the content, in hexadecimal.
     pub(super) sha256: String,
 }
 
@@ -71,9 +71,9 @@ pub(super) struct LeftOut {
 /// The directories of members.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Root {
-    /// That of the configuration.
+    /// Below the directory of the configuration.
     Config,
-    /// That of the state.
+    /// Below the directory of the state.
     State,
 }
 
@@ -107,7 +107,7 @@ pub(super) fn place(name: &str) -> Result<(Root, PathBuf), String> {
     };
     let path = PathBuf::from(rest);
     let normal = |part: Component<'_>| matches!(part, Component::Normal(_));
-    // What the components make together again is the name itself: no `//`, no `.` and no slash at the end.
+    // The components joined again must equal the name: no `//`, no `.` and no slash at the end.
     let same = path.components().collect::<PathBuf>().as_os_str() == rest;
     if rest.is_empty() || rest.contains('\0') || !same || !path.components().all(normal) {
         return bad();
@@ -124,7 +124,8 @@ pub(super) struct Content<R> {
 /// Writes an archive: the manifest, then each member as it is in it.
 ///
 /// # Errors
-/// It cannot be written, a file is no longer as its member says, or [`read`] would not take it.
+/// The archive cannot be written, a file no longer matches its member in the manifest, or [`read`] would refuse the
+/// archive.
 pub(super) fn write<R: Read>(
     to: impl Write,
     manifest: &Manifest,
@@ -162,7 +163,7 @@ fn header(name: &str, bytes: u64, mode: u32) -> io::Result<Header> {
 /// errors.
 ///
 /// # Errors
-/// What is wrong with it; members before that were taken.
+/// The archive is damaged or not a backup: the defect; `take` has already received the members before it.
 pub(super) fn read(
     from: impl Read,
     mut take: impl FnMut(&Member, Root, &Path, &mut dyn Read) -> io::Result<()>,

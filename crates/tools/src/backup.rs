@@ -151,7 +151,7 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
         } else if !kind.is_file() {
             sources.leave_out(&path, "it is not a regular file");
         } else if path.extension().is_some_and(|ending| ending == "tar") {
-            // Else each backup would have those before it.
+            // Archives are left out, because each backup would contain all earlier ones.
             sources.leave_out(&path, "it is an archive");
         } else if let Err(error) = sources.add(Root::State, dir, &below)
             && error.kind() != io::ErrorKind::NotFound
@@ -205,7 +205,7 @@ fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
     let mut name = file.file_name().unwrap_or_default().to_os_string();
     name.push(".partial");
     let aside = file.with_file_name(name);
-    // What a backup that was killed left behind.
+    // Removes the partial file of a backup that was killed.
     let _ = fs::remove_file(&aside);
     let written = OpenOptions::new()
         .write(true)

@@ -58,7 +58,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(report::print(&new(hosts, out, *days, SystemTime::now())?))
 }
 
-/// Both files are written, or none.
+/// Writes both files, or none.
 fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<String, String> {
     let made = Made::new(hosts, days, now)?;
     let (key, certificate) = (out.join(KEY), out.join(CERTIFICATE));

@@ -123,8 +123,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     }
 }
 
-/// Restores of parameters that were cut off and belong to no drive of this configuration. A state directory that only the gateway may
-/// read is no fault of the configuration.
+/// Restores of parameters that were interrupted and belong to no drive of this configuration. A state directory that only the gateway
+/// may read is not an error of the configuration.
 fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
     let orphans = orphans(&settings.params.dir, settings.drives())
         .unwrap_or_default()
@@ -229,8 +229,8 @@ fn refused(drive: &DriveSpec) -> impl Iterator<Item = Refused<'_>> {
 /// Most drives that a line names.
 const NAMED: usize = 4;
 
-/// What raw writes may not set, one line for the drives that have it in common; empty without Modbus TCP, by which
-/// alone raw writes come.
+/// Values that raw writes may not set, one line for the drives that have them in common; empty without Modbus TCP,
+/// which is the only way for raw writes.
 fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
     let mut alike: Vec<(&DriveSpec, Vec<&str>)> = Vec::new();
     for drive in commanded(bus).filter(|_| settings.modbus_tcp.is_some()) {
@@ -379,7 +379,8 @@ fn functions(bus: &BusSettings) -> String {
 /// Octets of a notification of a change, with the headers of UDP, IP and Ethernet.
 const NOTIFICATION: usize = 120;
 
-/// What BACnet shows, and what it costs to tell all of it once; it adds nothing to the lines of the drives.
+/// The devices and objects that BACnet shows, and the size of one notification of all of them; BACnet adds no requests
+/// to the lines of the drives.
 fn bacnet(settings: &Settings) -> String {
     let (Some(options), Some(devices)) = (&settings.bacnet, super::map::bacnet::devices(settings)) else {
         return String::new();

@@ -74,7 +74,7 @@ impl From<ClientError> for String {
     }
 }
 
-/// Why there is no gateway at its sockets.
+/// Why no gateway was found at the sockets.
 #[derive(Debug, Default)]
 pub(crate) struct NotFound {
     /// Sockets that cannot be opened.
@@ -109,7 +109,7 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// Of whichever gateway is there.
+    /// A client of any gateway behind this door.
     pub(crate) fn through(door: Door) -> Client {
         Client {
             doors: vec![door],
@@ -195,7 +195,7 @@ impl Client {
     /// [`Client::ask`], outside of a runtime.
     ///
     /// # Errors
-    /// Those of [`Client::ask`], as a message.
+    /// The errors of [`Client::ask`], as a message.
     pub(crate) fn ask_now(&self, asked: &Asked) -> Result<Reply, String> {
         Ok(crate::runtime()?.block_on(self.ask(asked))?)
     }

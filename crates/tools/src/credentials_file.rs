@@ -15,9 +15,9 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// How often that is looked for.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// What is kept in a file.
+/// A kind of credential that is kept in a file.
 pub(super) trait Filed: Credential + Send + Sync + 'static {
-    /// What the file is, in messages.
+    /// Kind of the file, for messages.
     const FILE: &'static str;
     /// Permissions of a new one; those of an old one stay.
     const MODE: u32;
@@ -33,7 +33,7 @@ pub(super) struct CredentialsFile<C: Filed> {
 }
 
 impl<C: Filed> CredentialsFile<C> {
-    /// Its text.
+    /// Reads the text of the file.
     ///
     /// # Errors The fault, as a message.
     fn read(&self) -> Result<String, String> {
@@ -42,17 +42,17 @@ impl<C: Filed> CredentialsFile<C> {
             .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
     }
 
-    /// Its content.
+    /// Reads the credentials in the file.
     ///
     /// # Errors The fault, as a message.
     pub(super) fn list(&self) -> Result<Credentials<C>, String> {
         parsed(&self.path, &self.read()?)
     }
 
-    /// Adds one, and says whether it took the place of that of the same name, if it may.
+    /// Adds a credential; one of the same name is replaced if `may_replace`. Returns whether there was one.
     ///
     /// # Errors
-    /// It may not, or what is wrong with the file.
+    /// The name exists and may not be replaced, or the file cannot be read or written.
     pub(super) fn put(&self, new: &C, may_replace: bool) -> Result<bool, String> {
         let (mut is_known, line) = (false, new.to_string());
         self.change(|text| {
@@ -87,7 +87,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// Changes its text; a file that there is not yet has none. Others who change it wait meanwhile, so that no change is lost.
     ///
     /// # Errors
-    /// That of `change`, or what the system reports; the file is as it was.
+    /// The error of `change`, or of the system; the file is unchanged.
     fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
         // A link stays one.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());
@@ -131,7 +131,7 @@ impl<C: Filed> CredentialsFile<C> {
         let mut name = path.as_os_str().to_owned();
         name.push(".new");
         let new = PathBuf::from(name);
-        // What a change that was killed left behind.
+        // Removes the new file of a change that was killed.
         let _ = remove_file(&new);
         let old = metadata(path).ok();
         let mut options = OpenOptions::new();
@@ -173,7 +173,7 @@ fn like(file: &File, old: &Metadata) -> io::Result<()> {
     file.set_permissions(Permissions::from_mode(old.mode() & 0o777))
 }
 
-/// What stands in the text of a file.
+/// Reads the credentials from the text of a file.
 fn parsed<C: Credential>(path: &Path, text: &str) -> Result<Credentials<C>, String> {
     Credentials::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
 }

@@ -41,7 +41,7 @@ pub(super) struct Args {
     pub log: String,
 }
 
-/// One simulated line of the demo.
+/// A simulated line of the demo.
 struct DemoLine {
     name: &'static str,
     protocol: Protocol,
@@ -75,7 +75,7 @@ const LINES: [DemoLine; 5] = [
         name: "line3",
         protocol: Protocol::ModbusRtu,
         baud: 19_200,
-        // Of a Vacon CX; the others accept it.
+        // The character format of a Vacon CX; the other drives accept it.
         format: "8N2",
         cadence: ["250ms", "2s"],
         drives: &[
@@ -334,7 +334,7 @@ fn configuration(place: &DemoPlace, sides: &Sides) -> String {
 mod tests {
     use super::*;
 
-    /// What newcomers read first has nothing to be warned of, and its drives outlast a busy machine.
+    /// The demo's configuration, which newcomers read first, gives no warning, and its timeouts suit a busy machine.
     #[test]
     fn the_configuration_of_the_demo_has_no_warnings() {
         let place = DemoPlace {

@@ -1,8 +1,8 @@
 //! The common part of commands about one drive: finding the drive and its gateway.
 //!
-//! A running gateway owns the line, so a command asks it, at its local socket or by `--url`; only where none runs does the
-//! command start the gateway's own bus in this process, and ask that. Either way the same routes answer, so the answers are
-//! the same.
+//! A running gateway owns the line, so a command sends its request to it, at its local socket or by `--url`; only where
+//! none runs does the command start the gateway's own bus in this process and send the request there. The same routes
+//! answer either way, so the answers are the same.
 
 mod conversation;
 mod direct;
@@ -44,7 +44,7 @@ impl OneDrive {
 pub(super) struct Target {
     pub(super) drive: String,
     client: Client,
-    /// `None`: the gateway knows what it is, and there is no line here.
+    /// The drive in the configuration; `None` with `--url`: the gateway knows the drive, and there is no line here.
     configured: Option<Box<Configured>>,
 }
 
@@ -115,7 +115,7 @@ impl Target {
     /// Sends the request to the running gateway.
     ///
     /// # Errors
-    /// Why there is no reply, as a message.
+    /// There is no reply: the reason, as a message.
     pub(super) fn ask_gateway(&self, asked: &Asked) -> Result<Reply, String> {
         super::runtime()?
             .block_on(self.client.ask(asked))
@@ -128,11 +128,11 @@ impl Target {
             })
     }
 
-    /// Sends the request to the running gateway or, where there is none, to the parts of one in this process, once its bus
-    /// knows what the request `needs`.
+    /// Sends the request to the running gateway or, where there is none, to a gateway's parts in this process, once the
+    /// bus has read the values that the request `needs`.
     ///
     /// # Errors
-    /// Why there is no reply, as a message.
+    /// There is no reply: the reason, as a message.
     pub(super) fn ask(&self, asked: &Asked, needs: Needs<'_>) -> Result<(Reply, Way), String> {
         super::runtime()?.block_on(async {
             let (conversation, reply) = Conversation::begin(self, asked, needs).await?;
@@ -161,10 +161,10 @@ pub(super) fn point(profile: &Profile, name: &str) -> Result<PointIndex, String>
 }
 
 impl Configured {
-    /// Why no gateway was asked, for the message when the port cannot be opened either.
+    /// Why no gateway was found, for the message when the port cannot be opened either.
     ///
     /// # Errors
-    /// One may run all the same, and the line must not be tried.
+    /// A gateway may run although its socket cannot be opened, so the line must not be tried.
     fn not_found(&self, missed: &NotFound, doors: &[Door]) -> Result<String, String> {
         // A serial port is locked by its owner; with a device server there would be two masters on the line.
         if !missed.closed.is_empty() && self.bus.spec.port.contains("://") {

@@ -12,11 +12,11 @@ pub(super) type Outcome = Result<ExitCode, Failure>;
 /// Why a command ends early.
 #[derive(Debug)]
 pub(super) enum Failure {
-    /// What is wrong; where; what to do.
+    /// Work failed: the error, its place and the remedy.
     Failed(String),
-    /// The same, about the command line.
+    /// The command line is wrong: the error and the remedy.
     Misused(String),
-    /// What is wrong with a configuration or a profile.
+    /// A configuration or a profile has these problems.
     Invalid(Vec<Problem>),
     /// Already reported.
     Reported(u8),

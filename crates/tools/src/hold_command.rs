@@ -73,7 +73,7 @@ async fn hold(args: &Args) -> Result<(Hold, Json), String> {
     };
     let reply = args.gateway.client()?.ask(&asked).await?;
     match reply.parsed().zip(reply.parsed()) {
-        // Of either status.
+        // Replies of success and of refusal both carry the state of the hold.
         Some(hold) => Ok(hold),
         None => Err(reply.refusal(&asked).to_string()),
     }

@@ -16,7 +16,7 @@ const GROUP: &str = "drivegate";
 const VARIABLE: &str = "drivegate_configuration";
 /// The keys whose value is a secret, and the key that names its file instead.
 const SECRETS: [([&str; 2], &str); 1] = [(["mqtt", "password"], "password_file")];
-/// What begins a template in a string of Ansible.
+/// Beginnings of a template in a string of Ansible.
 const TEMPLATES: [&str; 3] = ["{{", "{%", "{#"];
 
 /// Prints a configuration as an Ansible inventory (YAML): the gateway as a host of group `drivegate`, the file as its variable

@@ -260,7 +260,7 @@ fn seconds(time: Option<Duration>) -> String {
     time.map_or("-".to_string(), |time| format!("{:.1}", time.as_secs_f64() * 1e3))
 }
 
-/// Who is asked what how often.
+/// The requests on the line: to which address, how often, with which result.
 fn words(survey: &Survey, profiles: &Profiles, protocol: Protocol) -> String {
     let mut text = String::new();
     let mut table = report::table(["address", "request", "seen", "answered", "refused", "cycle ms"]);

@@ -53,7 +53,7 @@ impl Loading {
         let (sender, loaded) = oneshot::channel();
         let path = path.to_path_buf();
         let read = move || {
-            // Nobody listens after the time limit.
+            // After the time limit the receiver is gone.
             let _ = sender.send(Settings::load_proved(&path, config::environment()));
             drop(reader);
         };
@@ -104,7 +104,7 @@ impl Loads {
     /// Begins to read the configuration in `path`, or does so after the one that is being read.
     ///
     /// # Errors
-    /// It cannot be read now.
+    /// The configuration cannot be read now.
     pub(super) fn begin(&mut self, path: &Path) -> Result<(), NotLoaded> {
         if self.loading.is_some() {
             self.again = true;

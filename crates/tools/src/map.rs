@@ -96,9 +96,9 @@ fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> String {
 struct Listener {
     addresses: Vec<SocketAddr>,
     tls: bool,
-    /// What its clients see.
+    /// The register view that clients see.
     view: View,
-    /// Who may write.
+    /// Clients that may write.
     writers: String,
 }
 

@@ -198,11 +198,11 @@ fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, Failu
 /// Interval of progress lines when the output is not a terminal.
 const SAID_EVERY: Duration = Duration::from_secs(60);
 
-/// One line on a terminal, kept up to date; elsewhere a line once a minute.
+/// A status line on a terminal, kept up to date; elsewhere a line once a minute.
 #[derive(Debug, Default)]
 struct StatusLine {
     shown: bool,
-    /// When it began, or said something last, off a terminal.
+    /// When the status line started, or last printed a line, off a terminal.
     said: Option<Instant>,
 }
 

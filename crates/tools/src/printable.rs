@@ -22,8 +22,8 @@ fn is_unsafe(c: char) -> bool {
         )
 }
 
-/// One line or a part of one, with `\n` and `\u001b` instead of such characters. In a line of JSON they can only stand
-/// in strings, where that means the same.
+/// A line or a part of one, with `\n` and `\u001b` instead of such characters. In a line of JSON these characters can
+/// only be within strings, where the escapes mean the same.
 pub(super) fn line(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {

@@ -139,7 +139,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
     let first = packets.first().map_or(Duration::ZERO, |packet| packet.at);
     let mut now = Duration::ZERO;
     for packet in packets {
-        // Of a request the capture has the time when it was given to the port.
+        // For a request, the capture has the time when it was given to the port, so its time on the wire is added.
         let wire = if packet.sent {
             bus.spec.format.chars(packet.bytes.len())
         } else {
@@ -157,7 +157,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
 }
 
 impl Player {
-    /// Lets time go by from `now` to `until`; time never goes back, whatever the capture says.
+    /// Advances the time from `now` to `until`; time never goes back, whatever the capture says.
     fn wait(&mut self, now: &mut Duration, until: Duration) {
         while *now < until {
             let wake = self
@@ -191,7 +191,7 @@ impl Player {
             let profile = &drive.spec.profile;
             for (index, name) in public_points(profile) {
                 let sample = reading.sample(index);
-                // What was never heard is no line.
+                // Points that were never received get no row.
                 let Some(value) = sample.value else { continue };
                 let unit = profile.points.get(index).map_or("", |point| point.unit.as_str());
                 table.add_row([

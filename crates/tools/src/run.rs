@@ -60,13 +60,13 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
         .for_each(|problem| tracing::warn!(target: "drivegate::cli::run", "{problem}"));
     let runtime = watched_runtime()?;
     let mut signals = Signals::within(&runtime)?;
-    // What these ones came too late for.
+    // Signals that arrived before the new handlers were installed are still in the early ones.
     while let Some(signal) = early.next().now_or_never() {
         early.wanted.add(signal);
     }
     signals.wanted = early.wanted;
     let code = runtime.block_on(serve(settings, path, &log, signals));
-    // What is being written is written; threads that a disk holds up end with the process.
+    // Writes in progress may finish; threads that wait for a disk end with the process.
     runtime.shutdown_timeout(LAST_WRITES);
     Ok(code)
 }
@@ -101,7 +101,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
     ExitCode::SUCCESS
 }
 
-/// Tells systemd, if it started this process.
+/// Notifies systemd, if it started this process.
 fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::debug!(target: "drivegate::cli::run", "cannot notify systemd: {error}");

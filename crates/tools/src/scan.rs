@@ -95,7 +95,7 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
     snippet.text()
 }
 
-/// What was found, as JSON; `error`: what ended the scan early.
+/// The drives found, as JSON; `error`: what ended the scan early.
 fn document(args: &Args, search: &Search<'_>, error: Option<&String>) -> Json {
     let drive = |found: &Found| {
         json!({

@@ -52,7 +52,7 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
     let asked = Asked::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
     let reply = args.gateway.client()?.ask(&asked).await?;
     match reply.parsed() {
-        // Of either status.
+        // Replies of success and of failure both carry the report.
         Some(stopped) => Ok(stopped),
         None => Err(reply.refusal(&asked).to_string()),
     }

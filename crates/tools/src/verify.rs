@@ -125,7 +125,7 @@ mod tests {
         assert!(!super::text(&without_commands(), &rows, "").contains("run=true"));
     }
 
-    /// One that is only read.
+    /// A profile without commands: its drive is only read.
     fn without_commands() -> Profile {
         let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
              [[point]]\nname = \"energy\"\nat = \"holding 1\"\n";

@@ -84,14 +84,14 @@ async fn watch(args: &Args) -> Outcome {
     }
 }
 
-/// Buses and drives as the gateway tells them.
+/// Buses and drives as the gateway reports them.
 async fn document(client: &Client) -> Result<Value, String> {
     let buses: Value = client.view("/api/v1/buses").await?;
     let drives: Value = client.view("/api/v1/drives").await?;
     Ok(json!({ "buses": buses, "drives": drives }))
 }
 
-/// One line, also where there is no answer.
+/// A JSON line, also where there is no answer.
 fn json_line(document: Result<Value, String>) -> Vec<u8> {
     let document = document.unwrap_or_else(|why| json!({ "error": why }));
     format!("{document}\n").into_bytes()
@@ -153,7 +153,7 @@ fn table(drives: &Value) -> String {
         "turnaround ms",
         "fault",
     ];
-    // Only where `[authority]` is on.
+    // The column exists only where `[authority]` is on.
     let held = drives
         .as_array()
         .into_iter()
@@ -166,7 +166,7 @@ fn table(drives: &Value) -> String {
     for drive in drives.as_array().into_iter().flatten() {
         let good = |name: &str, digits: usize| {
             let point = at(drive, &format!("/points/{name}"));
-            // Only good values are shown, and none that a newer state contradicts.
+            // Values that are not good, or that a newer state contradicts, are left out.
             if at(point, "/quality") == "good" && at(point, "/contradicted") != true {
                 fixed(at(point, "/value"), digits)
             } else {
@@ -194,7 +194,7 @@ fn table(drives: &Value) -> String {
     report::lines(&table)
 }
 
-/// Who has the drive, and for how long.
+/// The holder of the drive, and the seconds left.
 fn holder(drive: &Value) -> String {
     let who = || format!("{} ({})", text(at(drive, "/holder")), text(at(drive, "/holder_rank")));
     let left = || at(drive, "/hold_left_s").as_u64().unwrap_or_default();

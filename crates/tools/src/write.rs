@@ -31,7 +31,7 @@ pub(super) struct Args {
     json: bool,
 }
 
-/// One value of a command, and how it is shown.
+/// A value of a command, and how it is shown.
 #[derive(Debug)]
 struct Setting {
     point: String,
@@ -56,7 +56,7 @@ struct Written {
     latency_ms: f64,
     confirmed_ms: Option<f64>,
     error: Option<WriteError>,
-    /// What is known where no read shows the effect.
+    /// Note on the result, where no read shows the effect.
     note: Option<String>,
 }
 
@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     documented(args.json && !printed, outcome)
 }
 
-/// Sends the command; `printed` tells whether a document was printed.
+/// Sends the command; `printed` is set when a document was printed.
 fn write(args: &Args, printed: &mut bool) -> Outcome {
     let target = args.drive.target()?;
     let setting = |text: &String| parse(target.profile().map(|profile| &**profile), text);
@@ -109,7 +109,7 @@ fn parse(profile: Option<&Profile>, text: &str) -> Result<Setting, String> {
     })?;
     let (name, value) = (name.trim(), value.trim());
     match profile {
-        // The gateway knows the point.
+        // Without a profile here the gateway checks the point.
         None => Ok(Setting {
             point: name.to_string(),
             value: serde_json::from_str(value)
@@ -139,7 +139,7 @@ fn of_profile(profile: &Profile, name: &str, text: &str) -> Result<Setting, Stri
         .map(|meaning| format!(" ({meaning})"))
         .unwrap_or_default();
     let shown = format!("{}={value}{meaning} {}", point.name, point.unit);
-    // The text of an enumeration is left to the gateway: its profile says which code that is.
+    // The text of an enumeration is left to the gateway, whose profile knows the code for it.
     let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text);
     Ok(Setting {
         point: point.name.clone(),

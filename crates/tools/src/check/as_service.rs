@@ -11,18 +11,18 @@ use crate::config::{NamedFile, environment, named_files};
 use crate::document::{Finding, Problem};
 
 const UNIT: &str = "drivegate.service";
-/// The group of the shipped unit, where there is no systemd to ask.
+/// Group of the shipped unit, used where systemd cannot be queried.
 const SHIPPED_GROUP: &str = "dialout";
 /// Made by systemd for the service while it runs.
 const CREDENTIALS: &str = "/run/credentials/";
 const READ: u32 = 0o4;
 const SEARCH: u32 = 0o1;
 
-/// What a unit hides with `ProtectHome=` and with `PrivateTmp=`.
+/// Directories that a unit hides with `ProtectHome=` and with `PrivateTmp=`.
 const HOMES: [&str; 3] = ["/home", "/root", "/run/user"];
 const TEMPORARY: [&str; 2] = ["/tmp", "/var/tmp"];
 
-/// Who reads the files.
+/// User and groups of the service that reads the files.
 #[derive(Debug, PartialEq, Eq)]
 struct Service {
     /// The user; `None` for one that exists only while the service runs, and owns nothing.
@@ -34,7 +34,7 @@ struct Service {
     shown: String,
 }
 
-/// What is asked of a file or directory, and what it grants.
+/// Owner and permissions of a file or directory.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     mode: u32,
@@ -83,7 +83,7 @@ impl Service {
             [] => "no group".to_string(),
             names => format!("the groups {}", names.join(", ")),
         };
-        // What `DynamicUser=` implies is in the answer of systemd, too.
+        // The answer of systemd already includes the settings that `DynamicUser=` implies.
         let hides = |key: &str, ways: &[&str]| !loaded || ways.contains(&value(key));
         let homes = hides("ProtectHome", &["yes", "tmpfs"]).then_some(HOMES.as_slice());
         let temporary = hides("PrivateTmp", &["yes", "disconnected"]).then_some(TEMPORARY.as_slice());
@@ -118,7 +118,7 @@ fn id(table: &str, name: &str) -> Option<u32> {
     found.or_else(|| name.parse().ok())
 }
 
-/// What the service could not read of the configuration `path` and the files it names.
+/// Files that the service could not read: the configuration `path` and the files it names.
 pub(super) fn problems(path: &Path) -> Vec<Problem> {
     let service = Service::of_unit();
     let files = named_files(path, environment());

@@ -1,4 +1,4 @@
-//! One way to a gateway, and the connection to it.
+//! A way to reach a gateway, and the connection through it.
 
 use std::fmt;
 use std::io;
@@ -15,21 +15,21 @@ use super::{ClientError, Url};
 use crate::north::http::{InProcess, basic_authorization};
 use crate::north::{GATEWAY, client_tls, explain};
 
-/// What to do about a handshake that says nothing of its own.
+/// Remedy for a failed handshake that suggests none itself.
 const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
 
-/// One way to a gateway.
+/// A way to reach a gateway.
 #[derive(Debug, Clone)]
 pub(crate) enum Door {
-    /// Its HTTP server.
+    /// The HTTP server of the gateway.
     Network(Network),
-    /// Its local socket.
+    /// The local socket of the gateway.
     Socket(PathBuf),
     /// The parts of one in this process.
     InProcess(Arc<InProcess>),
 }
 
-/// An HTTP server, and who asks it.
+/// An HTTP server, with the CA and the token for it.
 #[derive(Debug, Clone)]
 pub(crate) struct Network {
     pub(crate) url: Url,
@@ -43,7 +43,7 @@ pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
-/// Why there is no connection.
+/// Reason why a connection was not made.
 #[derive(Debug)]
 pub(super) enum NotConnected {
     /// No gateway listens there.
@@ -69,7 +69,7 @@ impl Door {
         matches!(self, Door::Network(_))
     }
 
-    /// What the path of a request begins with, and the host.
+    /// The path prefix of a request, and the host.
     pub(super) fn base(&self) -> (&str, &str) {
         match self {
             Door::Network(network) => (&network.url.path, &network.url.authority),
@@ -77,10 +77,10 @@ impl Door {
         }
     }
 
-    /// What to send as `Authorization`.
+    /// Value of the `Authorization` header.
     ///
     /// # Errors
-    /// Its file cannot be read.
+    /// The token file cannot be read.
     pub(super) fn authorization(&self) -> Result<Option<String>, ClientError> {
         match self {
             Door::Network(network) => network.token_file.as_deref().map(authorization).transpose(),
@@ -91,7 +91,7 @@ impl Door {
     /// Connects.
     ///
     /// # Errors
-    /// Nobody listens, or the TLS handshake fails.
+    /// No gateway listens, or the TLS handshake fails.
     pub(super) async fn connect(&self) -> Result<Box<dyn Stream>, NotConnected> {
         match self {
             Door::Network(network) => network.connect().await,

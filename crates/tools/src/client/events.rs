@@ -17,9 +17,9 @@ const MOST_BYTES: usize = 1 << 20;
 /// An event of a stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct StreamEvent {
-    /// Its name; empty for an ordinary one.
+    /// Name of the event; empty for an ordinary one.
     pub(crate) name: String,
-    /// Its text.
+    /// Text of the event.
     pub(crate) data: String,
 }
 

@@ -1,4 +1,4 @@
-//! One request and its reply.
+//! A request and its reply.
 
 use std::fmt;
 use std::future::poll_fn;
@@ -41,7 +41,7 @@ pub(crate) struct Asked {
 }
 
 impl Asked {
-    /// What is known already.
+    /// A GET of a view of values that the gateway has already: answered at once, so with a short time limit.
     pub(crate) fn view(path: impl Into<String>) -> Asked {
         Asked {
             within: SHOWN_WITHIN,
@@ -86,7 +86,7 @@ impl Asked {
         Asked { refused, ..self }
     }
 
-    /// Whether it may be sent again without doing anything twice.
+    /// Whether the request may be sent again without doing anything twice.
     pub(super) fn only_reads(&self) -> bool {
         self.method == Method::GET
     }
@@ -113,7 +113,7 @@ impl Opened {
     /// Sends a request over a connection, and waits for the head of its reply.
     ///
     /// # Errors
-    /// What the connection reports.
+    /// The error that the connection reports.
     pub(super) async fn send(
         stream: Box<dyn Stream>,
         door: &Door,
@@ -174,7 +174,7 @@ impl Opened {
     /// The reply with its body.
     ///
     /// # Errors
-    /// It does not come whole.
+    /// The reply does not arrive complete.
     pub(super) async fn whole(mut self, asked: &Asked) -> Result<Reply, ClientError> {
         let place = self.place.clone();
         let whole = async {
@@ -239,7 +239,7 @@ impl Reply {
     /// The document of a reply of any status.
     ///
     /// # Errors
-    /// It is not such a one.
+    /// The reply is not such a document.
     pub(crate) fn document<T: DeserializeOwned>(self) -> Result<T, ClientError> {
         serde_json::from_slice(&self.text).map_err(|error| self.strange(format!("unexpected reply ({error})")))
     }

@@ -9,7 +9,7 @@ use crate::config::{Settings, environment};
 use crate::north::http::messages::Expected;
 use crate::north::local::{RuntimeDirectories, SocketPath, absolute};
 
-/// Where `[http]` listens unless it says otherwise.
+/// Address where `[http]` listens by default.
 const USUAL: &str = "http://127.0.0.1:9488";
 
 /// The options that select the gateway and how to reach it.
@@ -80,7 +80,8 @@ impl Gateway {
 }
 
 impl Client {
-    /// Of the gateway that runs with that configuration: through its local socket, or where that is off by HTTP.
+    /// A client of the gateway that runs with this configuration: through its local socket, or where that is off by
+    /// HTTP.
     ///
     /// # Errors It cannot be reached in any way.
     pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
@@ -95,7 +96,7 @@ impl Client {
         Ok(client)
     }
 
-    /// Of the gateway that is expected, at its socket.
+    /// A client of the expected gateway, at its socket.
     pub(crate) fn at(socket: &SocketPath, expected: Expected) -> Client {
         let paths = socket.of_client(&RuntimeDirectories::of_this_process());
         Client {

@@ -1,4 +1,5 @@
-//! What the demo prints: its lines, and commands that can be copied whole. Pure, but for the path of the program.
+//! The text that the demo prints: its lines, and commands that can be copied whole. Pure, but for the path of the
+//! program.
 
 use super::{DemoLine, DemoPlace, LINES, Sides};
 

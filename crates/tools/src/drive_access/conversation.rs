@@ -12,7 +12,7 @@ pub(super) struct Conversation {
 }
 
 impl Conversation {
-    /// Asks the gateway or, where there is none, opens the port; the first reply.
+    /// Sends the first request to the gateway or, where there is none, opens the port; returns the reply.
     ///
     /// # Errors
     /// Why there is none, as a message.
@@ -49,7 +49,7 @@ impl Conversation {
     /// A further request.
     ///
     /// # Errors
-    /// Why there is no reply, as a message.
+    /// There is no reply: the reason, as a message.
     pub(super) async fn ask(&self, asked: &Asked) -> Result<Reply, String> {
         self.client.ask(asked).await.map_err(|error| match error {
             ClientError::NotFound(_) => "the gateway is gone; the local socket; start it and try again".to_string(),

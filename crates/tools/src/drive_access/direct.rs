@@ -27,16 +27,16 @@ const LOOK: Duration = Duration::from_millis(5);
 /// Cadence of process data where the line is there for parameters.
 const RESTFUL: Duration = Duration::from_secs(1);
 
-/// What the bus must know of the drive before a request is carried out.
+/// Values of the drive that the bus must have read before a request is carried out.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Needs<'n> {
     /// All that is polled.
     All,
-    /// These points.
+    /// The named points.
     Points(&'n [String]),
-    /// What commands of these points are turned into: all, if one of them is derived.
+    /// The points into which commands of the named points are translated: all polled points, if a command is derived.
     Commands(&'n [String]),
-    /// What the drive is, for its parameters.
+    /// The identification of the drive, for its parameters.
     Identification,
 }
 
@@ -50,12 +50,12 @@ impl Direct {
     /// Opens the port and waits until the drive answers, and has answered what the request needs.
     ///
     /// # Errors
-    /// What is wrong, where, and what to do.
+    /// The bus cannot be started: the message with place and remedy.
     pub(super) async fn start(target: &Configured, needs: Needs<'_>, not_found: &str) -> Result<Direct, String> {
         let mut spec = target.spec.clone();
         let mut bus = target.bus.clone();
         if let Needs::Identification = needs {
-            // Nobody looks at its process data.
+            // No process data is shown, so the cycle may be slow.
             bus.spec.cycle = RESTFUL.max(bus.spec.cycle);
         }
         // The drive keeps what was commanded when this process ends.

@@ -1,5 +1,5 @@
-//! Readings and restores of parameters: started, then asked for until they have ended, through the gateway or on a bus
-//! of its own.
+//! Readings and restores of parameters: started, then polled until they have ended, through the gateway or on a bus of
+//! the command.
 
 use std::time::Duration;
 
@@ -55,11 +55,12 @@ impl Target {
         text
     }
 
-    /// Does that with a restore of the drive, or only looks at it, and waits until it has ended; a restore that is
-    /// prepared is carried out if `agreed` says so. `progress` gets how far it is. The last that is known of it.
+    /// Starts an action on a restore of the drive, or without one only follows the restore, and waits until it has
+    /// ended; a prepared restore is carried out if `agreed` returns true. `progress` gets each state. Returns the last
+    /// known state.
     ///
     /// # Errors
-    /// Why it could not be started, or is no longer known, as a message.
+    /// The restore could not be started, or is no longer known: the reason, as a message.
     pub(crate) fn restore_parameters(
         &self,
         act: Option<RestoreAct>,

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use toml::{Table, Value};
 
-/// What YAML 1.1 takes for something else than a string.
+/// Words that YAML 1.1 reads as something other than a string.
 const WORDS: [&str; 9] = ["y", "n", "yes", "no", "on", "off", "true", "false", "null"];
 
 /// The value, a table, as a document.

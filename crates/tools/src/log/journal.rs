@@ -13,7 +13,7 @@ use tracing::field::{Field, Visit};
 use crate::printable;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// What journald knows under its own names.
+/// Fields that journald has under names of its own.
 const OWN_FIELDS: [&str; 4] = ["MESSAGE", "PRIORITY", "SYSLOG_IDENTIFIER", "TARGET"];
 /// Longest entry, bytes; a datagram has no more than the send buffer of its socket, 200 KiB.
 const LONGEST: usize = 64 << 10;
@@ -23,7 +23,7 @@ const LONGEST: usize = 64 << 10;
 pub(super) struct Journal(Arc<UnixDatagram>);
 
 impl Journal {
-    /// The journal, if it is what standard error is connected to, as `JOURNAL_STREAM` tells.
+    /// The journal, if standard error is connected to it, which `JOURNAL_STREAM` shows.
     pub(super) fn of_stderr() -> Option<Journal> {
         if !reads_stderr() {
             return None;

@@ -1,4 +1,4 @@
-//! One log line. Whatever its fields hold, it is one line of plain text; warnings of libraries are limited.
+//! A log line is one line of plain text, whatever its fields hold; warnings of libraries are limited.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write};
@@ -95,7 +95,7 @@ where
 }
 
 impl LogLine {
-    /// What stands before the fields: for the journal the priority, which it reads, and no time, which it adds.
+    /// The part before the fields: for the journal the priority, which it reads, and no time, which it adds.
     fn head(&self, metadata: &Metadata<'_>, writer: &mut Writer<'_>) -> fmt::Result {
         let colour = match *metadata.level() {
             Level::ERROR => 31,
@@ -132,7 +132,7 @@ fn priority(level: Level) -> u8 {
 /// A place in the source of a library: target and line.
 type Kind = (String, Option<u32>);
 
-/// What libraries logged: others decide how often they have something to say.
+/// Messages of libraries seen recently: how often libraries log is outside the gateway's control.
 #[derive(Debug, Default)]
 struct Libraries(BTreeMap<Kind, (Instant, u64)>);
 

@@ -30,7 +30,7 @@ fn refused(spec: &DriveSpec) -> Vec<Value> {
     ranges.iter().map(range).collect()
 }
 
-/// One line for each register of each unit.
+/// CSV with a line for each register of each unit.
 pub(super) fn csv(map: &Map<'_>) -> String {
     let mut out = format!("unit,drive,{}\n", COLUMNS.join(","));
     for (unit, drive, row) in rows(map) {

@@ -8,7 +8,7 @@ use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entr
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Access;
 
-/// One line of the map.
+/// A row of the map.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Row {
     pub(super) view: &'static str,

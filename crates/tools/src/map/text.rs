@@ -57,7 +57,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             printable::line(&profile.title),
             units.join(", ")
         );
-        // What a unit of this profile can have; the table above shows which units can be written.
+        // Registers that a unit of this profile can have; the table above shows which units can be written.
         out += &rows(&drive_rows(drive, Access::Control, map.view.registers));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
         out += &ranges(spec);

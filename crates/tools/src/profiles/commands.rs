@@ -50,7 +50,7 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
     lines
 }
 
-/// What a refresh writes again, and whether it is on by itself.
+/// The value that a refresh writes again, and whether refresh is on by default.
 fn refresh(profile: &Profile, control: &Control) -> String {
     let repeats = match profile.repeats() {
         Ok(repeats) => repeats,

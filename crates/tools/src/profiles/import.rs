@@ -30,7 +30,7 @@ const COLUMNS: [&str; 17] = [
     "min",
 ];
 const MAX: &str = "max";
-/// Items of a read request, where the list says nothing of it.
+/// Items of a read request, where the list gives no number.
 const READ: u16 = 16;
 /// Longest list.
 const MOST_ROWS: usize = 10_000;
@@ -38,7 +38,7 @@ const MOST_ROWS: usize = 10_000;
 /// The profile that the list `text` of the file `path` makes.
 ///
 /// # Errors
-/// What is wrong, with the line of the list.
+/// The problems of the list, each with its line.
 pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
     let file = path.display().to_string();
     let mut problems: Vec<Problem> = Vec::new();
@@ -342,7 +342,7 @@ fn written(name: &str, points: &[(usize, Row)]) -> String {
     text
 }
 
-/// What the profile has against a point is told of its line in the list.
+/// Reports the problems of the profile's points at their lines in the list.
 fn check(file: &str, text: &str, points: &[(usize, Row)]) -> Result<(), Vec<Problem>> {
     let Err(problems) = Profile::parse(file, text, false) else {
         return Ok(());

@@ -77,7 +77,7 @@ mod tests {
     use super::*;
     use crate::drive::profile::Profiles;
 
-    /// What is printed is a profile, with its remarks taken as lines too.
+    /// The printed text is a valid profile, also with its commented lines switched on.
     #[test]
     fn every_beginning_is_a_profile() {
         let read = |text: &str| Profile::parse("p.toml", text, false);

@@ -52,10 +52,10 @@ impl Destination {
 
 impl Drop for Destination {
     fn drop(&mut self) {
-        // What is left of it is found by its name.
+        // An error is ignored: the name of the remaining directory shows where it comes from.
         let _ = fs::remove_dir_all(&self.aside);
         if self.is_new {
-            // Only if nothing was put in place.
+            // A new directory is removed only if it is empty, so if nothing was put in place.
             let _ = fs::remove_dir(&self.to);
         }
     }
@@ -65,7 +65,7 @@ impl Staging {
     /// For these destinations, which are created if necessary.
     ///
     /// # Errors
-    /// They cannot be written to.
+    /// The directories cannot be written to.
     pub(super) fn new(config: &Path, state: &Path) -> Result<Staging, String> {
         Ok(Staging {
             config: Destination::new(config)?,
@@ -107,7 +107,7 @@ impl Staging {
     /// Makes a directory for the configuration. `path` has normal components only.
     ///
     /// # Errors
-    /// It cannot be made.
+    /// The directory cannot be created.
     pub(super) fn make_directory(&mut self, path: &Path) -> Result<(), String> {
         let to = self.config.aside.join(path);
         let failed = |error: io::Error| format!("cannot create {}: {error}", to.display());
@@ -143,7 +143,7 @@ impl Staging {
     /// Puts everything in place, the configuration last; the files get the owner of their directory. What is in place.
     ///
     /// # Errors
-    /// One file cannot be put in place: which, and what is in place already.
+    /// A file cannot be put in place: its name, and the files in place already.
     pub(super) fn place(&self) -> Result<Vec<PathBuf>, String> {
         for path in &self.directories {
             let failed = |error: io::Error| format!("cannot create {}: {error}", path.display());
@@ -176,7 +176,7 @@ impl Staging {
 /// Gives a file or directory the owner of the directory that it is for.
 fn give(path: &Path, directory: &Path) -> io::Result<()> {
     let owner = fs::metadata(directory)?;
-    // Only root may, and without it all files are the user's own.
+    // Only root may change the owner; without root all files are the user's own, so an error is ignored.
     let _ = chown(path, Some(owner.uid()), Some(owner.gid()));
     Ok(())
 }

@@ -17,12 +17,12 @@ use super::watch::Watch;
 pub(super) struct Reloads<'p> {
     path: &'p Path,
     loads: Loads,
-    /// Who waits for the one that is in progress, and for the one after it.
+    /// Requests that wait for the reload in progress, and for the one after it.
     waiting: [Vec<ReloadOrder>; 2],
 }
 
 impl Reloads<'_> {
-    /// Those of a gateway that runs with the configuration in `path`.
+    /// Reloads of a gateway that runs with the configuration in `path`.
     pub(super) fn new(path: &Path) -> Reloads<'_> {
         Reloads {
             path,
@@ -58,7 +58,7 @@ impl Reloads<'_> {
         watch.reloaded(&outcome);
         let [current, next] = &mut self.waiting;
         for order in current.drain(..) {
-            // Who asked may have gone.
+            // The client that requested the reload may be gone.
             let _ = order.answer.send(outcome.clone());
         }
         std::mem::swap(current, next);

@@ -29,12 +29,12 @@ pub(super) struct Watch<'l> {
     feed: Interval,
     /// When the last reload was refused, and why.
     refused: Option<(SystemTime, String)>,
-    /// What was told last.
+    /// Status text that was sent to systemd last.
     status: String,
 }
 
 impl Watch<'_> {
-    /// That of a gateway.
+    /// Watches a running gateway for systemd.
     pub(super) fn new<'l>(daemon: &Daemon, log: &'l LogHandle) -> Watch<'l> {
         let watchdog = sd_notify::watchdog_enabled();
         let every = watchdog.map_or(Duration::from_secs(5), |time| time / 2);

@@ -1,4 +1,4 @@
-//! What is known of a drive that answered. Pure.
+//! The facts known of a drive that answered. Pure.
 
 use std::time::Duration;
 
@@ -37,7 +37,7 @@ impl Found {
         }
     }
 
-    /// What it means that its answers match, if they do not prove the family.
+    /// Meaning of the matching answers, where they do not prove the family.
     pub(super) fn identified(&self, profiles: &Profiles) -> Option<String> {
         let text = |name: &String| profiles.get(name).map(|profile| profile.identified.clone());
         self.profiles.iter().filter_map(text).find(|text| !text.is_empty())

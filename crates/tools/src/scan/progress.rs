@@ -24,7 +24,7 @@ pub(super) struct Progress {
     done: usize,
     /// Time of all remaining steps if no drive replies.
     patience: Duration,
-    /// What the last steps took, and what they would have taken at most.
+    /// Time that each of the last steps took, and the longest that it could have taken.
     steps: VecDeque<(Duration, Duration)>,
     begun: Instant,
     shown: Option<Instant>,
@@ -65,7 +65,7 @@ impl Progress {
         self.print(&text);
     }
 
-    /// One address is done, which could have taken `patience`.
+    /// Counts an address as done; the step could have taken `patience`.
     pub(super) fn step(&mut self, patience: Duration) {
         self.done = (self.done + 1).min(self.total);
         self.patience = self.patience.saturating_sub(patience);

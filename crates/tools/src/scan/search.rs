@@ -17,7 +17,7 @@ use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
 
-/// What was received apart from replies.
+/// Bytes received apart from replies.
 #[derive(Debug, Default)]
 pub(crate) struct Heard {
     /// Settings and addresses that were answered with invalid frames.

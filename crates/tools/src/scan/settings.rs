@@ -22,7 +22,7 @@ const ASSUMED_BAUD: u32 = 38_400;
 const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Addresses that are tried first with all settings: most lines have a drive among them.
 const LIKELY_ADDRESSES: u8 = 10;
-/// So many addresses are tried in one go.
+/// Up to this many addresses are tried in one go.
 const FEW_ADDRESSES: usize = 32;
 
 /// What is to be tried.
@@ -126,7 +126,7 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
     Ok(settings)
 }
 
-/// Behind Modbus TCP there is no line whose settings could be wrong.
+/// The only setting behind Modbus TCP, where there is no line whose settings could be wrong.
 fn network_settings(args: &Options) -> Result<Vec<Setting>, String> {
     if !args.baud.is_empty() || !args.format.is_empty() {
         return Err(
@@ -265,7 +265,7 @@ mod tests {
         assert_eq!(usual.first().unwrap(), "modbus-rtu 9600 8N1");
         assert_eq!(usual.last().unwrap(), "n2 9600 8N1");
         assert_eq!(usual.len(), 3 * 3 + 4 * 3 + 1);
-        // What the switches of a TECO card can set, and nothing else.
+        // ASCII settings are those that the switches of a TECO card can set.
         let ascii: Vec<&String> = usual.iter().filter(|one| one.starts_with("modbus-ascii")).collect();
         assert_eq!(ascii[0], "modbus-ascii 19200 7N2");
         assert_eq!(ascii[11], "modbus-ascii 2400 7O1");

@@ -14,7 +14,7 @@ use crate::drive::profile::Profiles;
 /// Where the status page is.
 const HTTP: &str = "127.0.0.1:9488";
 
-/// What a configuration is made of.
+/// The parts of a configuration snippet.
 pub(crate) struct Snippet<'a> {
     /// The port as a configuration names it.
     pub(crate) port: &'a str,
@@ -157,7 +157,7 @@ impl Snippet<'_> {
     }
 }
 
-/// A measured time to begin a reply, in whole milliseconds, if it is longer than the prediction would have it.
+/// A measured time to begin a reply, in whole milliseconds, if it is longer than the usual time.
 fn slower_than(measured: Duration, usual: Duration) -> Option<Duration> {
     let whole = Duration::from_millis(u64::try_from(measured.as_micros().div_ceil(1000)).unwrap_or(u64::MAX));
     let whole = whole.min(Duration::from_secs(1));

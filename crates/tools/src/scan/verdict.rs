@@ -1,4 +1,4 @@
-//! What the line is likely to lack when no drive answered, by what was received. Pure.
+//! The likely defect of the line when no drive answered, judged by the bytes received. Pure.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::drive::profile::{Profile, Profiles};
 /// Bytes that come of switching the port on, or are single disturbances.
 const FEW_BYTES: usize = 8;
 
-/// What to do if bytes came before anything was sent.
+/// Error and remedy if bytes came before anything was sent.
 pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> Option<String> {
     (heard.unasked >= FEW_BYTES).then(|| {
         format!(
@@ -69,7 +69,7 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     )
 }
 
-/// What the shape of the bytes says, where it says something.
+/// The fault that the shape of the received bytes shows, if it shows one.
 fn told_by_shape(heard: &Heard) -> Option<String> {
     let Heard {
         start_lost,
@@ -99,7 +99,7 @@ fn told_by_shape(heard: &Heard) -> Option<String> {
     (count >= 2).then(|| format!("{seen}: {}; {}", cause.meaning(), cause.remedy()))
 }
 
-/// What is to be said of a line on which drives answered, too.
+/// A remark on a line on which drives answered but invalid bytes came too.
 pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     if let Some(told) = told_by_shape(heard) {
         return Some(told);
@@ -112,11 +112,11 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     ))
 }
 
-/// What shows more at the drives: of the families of the manuals that speak one of the protocols tried; those of the other
-/// families would fill pages.
+/// Where to look at the drives: for the families of the manuals whose protocol was tried; the other families would fill
+/// pages.
 pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Profiles) -> String {
     let speaks = |profile: &&Profile| tried.iter().any(|one| profile.protocols.contains(&one.protocol));
-    // Those with a base have its lines.
+    // Profiles with a base have the lines of their base.
     let families = profiles
         .iter()
         .map(AsRef::as_ref)
@@ -135,7 +135,7 @@ pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Prof
     )
 }
 
-/// What the families that answered need before the first command.
+/// Steps that the families that answered need before the first command.
 pub(crate) fn before_commands(found: &[Found], profiles: &Profiles) -> String {
     let mut seen = BTreeSet::new();
     let names = found

@@ -38,10 +38,10 @@ pub(super) fn ask(question: &str, stop: &Stop) -> Option<String> {
     None
 }
 
-/// The adapter to use: lists them and asks; `None` after a signal.
+/// Lists the adapters and asks which one to use; `None` after a signal.
 ///
 /// # Errors
-/// There is none, or nobody to ask.
+/// There is no adapter, or no terminal for the question.
 pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, Failure> {
     let found = adapters();
     if found.is_empty() {

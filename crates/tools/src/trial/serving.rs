@@ -33,7 +33,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
                 .into(),
         );
     }
-    // What a gateway keeps on disk, and its socket, are not for a trial.
+    // A trial writes nothing to disk and has no local socket.
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
     settings.keeps_history = false;
@@ -91,7 +91,7 @@ fn values(plant: &SharedPlant) -> String {
     let mut table = report::table(["drive", "address", "profile", "state", "Hz", "rpm", "A", "fault"]);
     for drive in plant.load().drives() {
         let (spec, reading) = (&drive.image.spec, drive.reading(Instant::now()));
-        // Only good values are shown.
+        // Values whose quality is not good are left out.
         let good = |point: ModelPoint| {
             let sample = reading.model(point);
             let value = sample.value.filter(|_| sample.quality == Quality::Good);
