@@ -95,7 +95,7 @@ pub enum EventKind {
     HoldBroken,
     /// A drill has ended.
     Drill,
-    /// The process, or a thread of it, stood still for longer than a second.
+    /// The process, or one of its threads, did not run for longer than a second.
     Paused,
     /// A BACnet client lost its right to write, and with it what it had in a slot.
     SlotVoid,
@@ -258,12 +258,12 @@ pub struct Event {
 /// A recording that was made.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct RecordingMade {
-    /// Its id.
+    /// Id of the recording.
     pub id: String,
-    /// Its trigger.
+    /// Trigger of the recording.
     #[schema(value_type = String)]
     pub trigger: Cow<'static, str>,
-    /// Its summary.
+    /// Summary of the recording.
     pub summary: String,
 }
 
@@ -351,7 +351,7 @@ pub struct Events {
 /// thousands of them come and go for months, small blocks are what the free memory ends up scattered between.
 #[derive(Debug)]
 struct Store {
-    /// Of the last event of this run.
+    /// Number of the last event of this run.
     number: u64,
     /// Events of earlier runs, all before those of this one.
     earlier: u64,
@@ -403,7 +403,7 @@ impl Events {
             tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, count = event.count, "{}", event.text);
         }
         store.keep(&event);
-        // Nobody listening is no error.
+        // Sending fails when there is no subscriber, which is not an error.
         let _ = self.sender.send(Arc::new(event));
     }
 
@@ -489,7 +489,7 @@ impl Events {
         all.into_iter().filter_map(of_this_run).collect()
     }
 
-    /// The same as events.
+    /// The recent events, parsed.
     pub fn recent(&self) -> Vec<Event> {
         let lines = self.recent_lines().into_iter();
         lines.filter_map(|(_, line)| from_line(line.as_bytes()).ok()).collect()

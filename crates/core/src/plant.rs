@@ -36,14 +36,14 @@ static ADDED: AtomicU64 = AtomicU64::new(STOPS_OF_ONE);
 /// More stops than one drive gets. Few enough that the stops of all drives of a bus can be added, after any number of reloads.
 const STOPS_OF_ONE: u64 = 1 << 32;
 
-/// One bus: its image and its queue.
+/// A bus: its image and its queue.
 #[derive(Debug, Clone)]
 pub struct BusHandle {
     /// The process image.
     pub image: Arc<BusImage>,
     /// The command queue.
     pub queue: Arc<CommandQueue>,
-    /// What the names and units of its drives meant before reloads.
+    /// Earlier meanings of the names and units of its drives, before reloads.
     pub formerly: Arc<Formerly>,
 }
 
@@ -70,7 +70,7 @@ impl BusHandle {
             self.formerly.take_over(index, &bus.formerly, place);
             let inheritance = bus.queue.lock().gate.inheritance(place);
             self.queue.lock().gate.inherit(index, inheritance);
-            // What is only monitored from now on is sent nothing.
+            // A drive that is only monitored from now on gets no orders.
             if drive.spec.access == Access::Control {
                 bus.queue.hand_over(place, &self.queue, index, now);
             }
@@ -107,7 +107,7 @@ pub struct DriveHandle {
 }
 
 impl Plant {
-    /// One in which nothing has happened yet.
+    /// A plant in which nothing has happened yet.
     pub fn new(gateway: impl Into<String>, stale_after: Duration, buses: Vec<BusHandle>) -> Plant {
         Plant {
             gateway: gateway.into(),
@@ -199,7 +199,7 @@ impl DriveHandle {
         joins
     }
 
-    /// Who gave the last stop that was taken in; none before the first one.
+    /// Origin of the last accepted stop; none before the first one.
     pub(crate) fn last_stop_by(&self) -> Option<Origin> {
         self.bus.queue.lock().gate.last_stop_by(self.index).cloned()
     }

@@ -1,4 +1,4 @@
-//! How long a thread stood still, and what that means for the date of what it reads. Pure: time is an argument.
+//! How long a thread did not run, and the effect on the date of the bytes that it reads. Pure: time is an argument.
 //!
 //! A process can stand still as a whole (it is stopped, its virtual machine is saved, the machine is suspended, the
 //! host is full), and so can one thread. What is found in a socket afterwards may have come at any time in between, in
@@ -12,34 +12,36 @@ pub use self::pauses::{Heartbeat, Pauses};
 
 /// A thread that reads runs at least this often.
 pub const TICK: Duration = Duration::from_millis(100);
-/// Longest time between two turns of a thread that is no stall. A tick is late by some milliseconds on any machine; by
-/// half of its time only where the thread did not get the processor. Any stall of 150 ms or more is seen.
+/// Longest time between two turns of a thread that is not a stall. A tick is late by some milliseconds on any machine;
+/// by half of its time only where the thread did not get the processor. Any stall of 150 ms or more is detected.
 pub const UNNOTICED: Duration = Duration::from_millis(150);
-/// What came during a stall is read within this time after it, unless its reader finds nothing left before: a thousand
-/// connections are read in a few milliseconds.
+/// Bytes that came during a stall are read within this time after it, unless the reader finds nothing left before: a
+/// thousand connections are read in a few milliseconds.
 pub const READ_WITHIN: Duration = Duration::from_millis(250);
 /// A longer stall is a pause: clients may have given up by then (many wait for a second), and sent again. A hiccup of a
 /// busy machine is shorter.
 const PAUSE: Duration = Duration::from_secs(1);
-/// What a client's system could not deliver during a pause it sends again at intervals that double, so within as long
-/// again; never longer apart than this (RFC 6298 and Linux: 120 s).
+/// Longest interval between two retransmissions (RFC 6298 and Linux: 120 s). A client's system sends data undelivered
+/// during a pause again at intervals that double, so within the length of the pause again.
 const RESENT_WITHIN: Duration = Duration::from_secs(120);
-/// And what is sent again has this time on its way, and to be read.
+/// Time for retransmitted data to arrive and to be read.
 const ON_ITS_WAY: Duration = Duration::from_secs(1);
 
 /// A time in which a thread did not run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stall {
-    /// When it ran last. Before a machine was suspended: as long ago as it really was, though the clock stood.
+    /// When the thread ran last. If the machine was suspended, this is moved back by the time of the suspension, during
+    /// which the clock did not advance.
     pub began: Instant,
     /// When it ran again.
     pub ended: Instant,
-    /// For how long of it the machine was suspended, in which its clock stood: what is dated before is older by it.
+    /// Part of the stall during which the machine was suspended and its clock did not advance: dates before it are
+    /// older by this time.
     pub slept: Duration,
 }
 
 impl Stall {
-    /// One of a machine that was not suspended.
+    /// A stall of a machine that was not suspended.
     pub fn new(began: Instant, ended: Instant) -> Stall {
         Stall {
             began,
@@ -53,7 +55,7 @@ impl Stall {
         self.ended.saturating_duration_since(self.began)
     }
 
-    /// Whether it was longer than a hiccup.
+    /// Whether the stall was so long that clients may have given up.
     pub fn is_pause(&self) -> bool {
         self.length() > PAUSE
     }
@@ -91,7 +93,7 @@ pub struct Stalls {
 }
 
 impl Stalls {
-    /// Of a thread that runs at `now`; `boot` is the time since the machine was started, suspensions included.
+    /// Observes a thread that runs at `now`; `boot` is the time since the machine was started, suspensions included.
     pub fn new(now: Instant, boot: Duration) -> Stalls {
         Stalls {
             ran: now,
@@ -132,7 +134,7 @@ impl Stalls {
         if stall.is_pause() {
             self.pause = Some(stall);
         }
-        // What came during the one before may still be unread.
+        // Bytes that came during the previous stall may still be unread, so both are joined.
         let before = self.last.filter(|last| stall.began < last.ended + TICK);
         self.last = Some(Stall {
             began: before.map_or(stall.began, |before| before.began.min(stall.began)),
@@ -162,9 +164,9 @@ impl Stalls {
         last.max(self.pause.map(|pause| pause.over()))
     }
 
-    /// The date of bytes that are read at `now`. No unread byte came before `floor`: then the reader found nothing left,
-    /// or that is the date of the bytes before these. `waited`: the reader has waited for them since, so that they came just
-    /// now, unless its thread stood still.
+    /// The date of bytes that are read at `now`. No unread byte came before `floor`: the reader found nothing left then, or
+    /// that is the date of the bytes before these. `waited`: the reader has waited for them since, so that they came just
+    /// now, unless its thread did not run.
     pub fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
         let since = self.last.filter(|stall| floor < stall.ended);
         let slept = since.map_or(Duration::ZERO, |stall| stall.slept);
@@ -207,7 +209,7 @@ mod tests {
             self.start + MS * ms
         }
 
-        /// It runs at each of these times, in milliseconds, the clock of a suspended machine being ahead by `slept`.
+        /// The thread runs at each of these times, in milliseconds; the suspended time `slept` is not part of them.
         fn runs(&mut self, times: &[(u32, u32)]) -> Vec<(i64, i64, u128)> {
             let mut all = Vec::new();
             for (ms, slept) in times {
@@ -237,7 +239,7 @@ mod tests {
             (&[(100, 0), (200, 0), (349, 0)][..], &[][..]),
             (&[(100, 0), (251, 0)], &[(100, 251, 0)]),
             (&[(100, 0), (3100, 0), (3200, 0)], &[(100, 3100, 0)]),
-            // Suspended for an hour: the clock stood.
+            // The machine was suspended for an hour, during which its clock did not advance.
             (&[(100, 0), (150, 3_600_000)], &[(-3_599_900, 150, 3_600_000)]),
             (&[(100, 0), (2100, 3000), (2200, 3000)], &[(-2900, 2100, 3000)]),
             // The two clocks are not read at the same moment.

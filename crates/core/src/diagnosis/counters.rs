@@ -104,7 +104,7 @@ impl InPhase {
 pub struct Contrast {
     /// Transactions under each condition.
     pub asked: [f32; 2],
-    /// Those of them that failed.
+    /// Transactions that failed under each condition.
     pub failed: [f32; 2],
 }
 
@@ -129,7 +129,7 @@ impl Contrast {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Running {
     pub(super) runs: bool,
-    /// Asked and failed in this slot and in the one before.
+    /// Transactions and failures in the current slot and in the one before.
     slots: [(f32, f32); 2],
     slot_ends: Option<Instant>,
     /// Age of the state before it was read again, at most lately.
@@ -137,7 +137,7 @@ pub(super) struct Running {
     pub(super) contrast: Contrast,
 }
 
-/// So long, at least, a change of state may stay unknown.
+/// Least time for which a change of the running state may stay unknown.
 const UNKNOWN: Duration = Duration::from_secs(1);
 
 impl Running {

@@ -16,7 +16,7 @@ use crate::drive::{DriveIndex, PerDrive};
 
 /// Maximum memory per drive; a line has at most 2 KiB in addition.
 pub const BYTES_PER_DRIVE: usize = 512;
-/// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
+/// Number of requests in a row without a reply that count as absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
 /// A reply within this time behind a request that got none may be a late one.
 const LATE: Duration = Duration::from_secs(5);
@@ -40,7 +40,7 @@ pub enum End {
     Silent,
     /// An invalid reply.
     Damaged,
-    /// A reply that may belong to another request: it says nothing about the line.
+    /// A reply that may belong to another request, so no evidence about the line.
     Doubtful,
 }
 
@@ -55,7 +55,7 @@ pub struct Exchange<'e> {
     pub seen: &'e [u8],
     /// Bytes after the reply.
     pub behind: &'e [u8],
-    /// They include foreign frames or stray bytes.
+    /// Whether foreign frames or stray bytes are among `seen`.
     pub foreign: bool,
     /// How it ended.
     pub end: End,
@@ -95,7 +95,7 @@ pub struct Figures {
     running: Running,
     /// Close behind a reply, after a pause.
     pub pause: Contrast,
-    /// Sound replies of an address that was not asked, by step.
+    /// Sound replies from an address that was not addressed, by step.
     wrong: Window<1>,
     idle: Vec<u8>,
     last: Option<(DriveIndex, End)>,
@@ -181,7 +181,8 @@ impl Figures {
         self.early.add(BAUDS.partition_point(|usual| *usual < baud), 1);
     }
 
-    /// Such replies in the last minute, by the lowest of [`BAUDS`] that they fit; the last ones fit none.
+    /// Replies in the last minute that were too early for the configured baud rate, by the lowest of [`BAUDS`] that
+    /// they fit; the last count is of those that fit none.
     pub fn early(&self) -> [u32; BAUDS.len() + 1] {
         std::array::from_fn(|place| self.early.sum(place))
     }
@@ -223,7 +224,7 @@ impl Figures {
         self.drives.iter().map(|drive| drive.sum(sign)).sum()
     }
 
-    /// Sound replies of addresses that were not asked, in the last minute.
+    /// Sound replies from addresses that were not addressed, in the last minute.
     pub fn wrong_address(&self) -> u32 {
         self.wrong.sum(0)
     }
@@ -460,7 +461,7 @@ impl Figures {
         true
     }
 
-    /// Time went by: whether a step has ended, so that the rules are to be asked.
+    /// Whether a step has ended by `now`, so that the rules are to be evaluated.
     pub fn is_step_over(&self, now: Instant) -> bool {
         now >= self.step_ends
     }

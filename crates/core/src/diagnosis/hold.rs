@@ -21,11 +21,11 @@ struct Held {
 /// A change of a verdict.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
-    /// It holds from now on.
+    /// The finding holds from now on.
     Came(Finding),
-    /// It is more certain than it was.
+    /// The finding is more certain than before.
     Firmer(Finding),
-    /// It does not hold any more.
+    /// The finding no longer holds.
     Went(Finding),
 }
 

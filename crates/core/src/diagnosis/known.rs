@@ -10,7 +10,7 @@ const KNOWN: u32 = 15;
 pub(super) const LASTING: usize = 3;
 /// Anything seen less often in a minute is chance.
 pub(super) const FEW: u32 = 5;
-/// So many standard deviations are no chance.
+/// Number of standard deviations that rule out chance.
 pub(super) const SIGNIFICANT: f64 = 5.0;
 /// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
 pub(super) const ENOUGH: f64 = 6.0;
@@ -48,7 +48,7 @@ pub(super) fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32
         .fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
 }
 
-/// Whether `failed` of `asked` are more than chance allows where `rate` is usual.
+/// Whether `failed` of `asked` requests are more than chance allows at the usual `rate`.
 pub(super) fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
     let expected = f64::from(asked) * rate;
     f64::from(failed) > expected + SIGNIFICANT * expected.max(1.0).sqrt()
@@ -72,7 +72,7 @@ impl Known {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
         let asked = others + silent + damaged;
-        // A bad drive is asked less and less often.
+        // A bad drive is polled less often over time, so a few failures are enough.
         (asked >= KNOWN || silent + damaged >= FEW).then(|| Known {
             place,
             asked,

@@ -5,7 +5,8 @@
 //! - [`counters`]: the kinds of counters.
 //! - [`figures`]: what was counted in the last minute, for each drive and for the line. Bounded: see [`figures::BYTES_PER_DRIVE`].
 //! - `known`: what is known of each drive, and which stand out.
-//! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
+//! - [`rules`]: one rule for each cause. A rule that compares drives finds nothing until most of them have had enough
+//!   requests.
 //! - [`hold`]: a verdict changes only on lasting evidence.
 //! - [`unanswered`]: registers to which a drive never replies.
 //! - [`words`]: the texts of causes and remedies.
@@ -35,7 +36,7 @@ pub use figures::{Drive, End, Exchange, Figures, Line};
 pub enum Cause {
     /// No drive answers.
     AllSilent,
-    /// One drive is bad, the others are good.
+    /// A single drive is bad, the others are good.
     OneDrive,
     /// All drives are bad from one address on.
     FromAddress,
@@ -123,11 +124,11 @@ impl Cause {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Certainty {
-    /// It would explain the symptoms, but so would other causes.
+    /// The cause would explain the symptoms, but so would other causes.
     Fits,
     /// Other causes would show otherwise as a rule.
     Likely,
-    /// It was seen itself.
+    /// The cause itself was observed.
     Certain,
 }
 
@@ -175,13 +176,13 @@ pub struct Verdict {
     /// How far the evidence goes.
     #[schema(value_type = String)]
     pub certainty: Certainty,
-    /// Its meaning, in a few words.
+    /// Meaning of the cause, in a few words.
     pub meaning: String,
     /// The evidence.
     pub evidence: String,
     /// The remedy.
     pub remedy: String,
-    /// What to check and set on drives of these families, from their profiles.
+    /// Points to check and set on drives of these families, from their profiles.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub steps: Vec<String>,
     /// Since when it holds, RFC 3339.
@@ -195,7 +196,7 @@ pub struct Diagnosis {
     pub at: Option<SystemTime>,
     /// The present verdicts, most significant first.
     pub verdicts: Vec<Verdict>,
-    /// Sound replies of addresses that were not asked, in the last minute.
+    /// Sound replies from addresses that were not addressed, in the last minute.
     pub wrong_address: u32,
     /// The counters of the last minute, one entry per drive in the order of the file.
     pub drives: Vec<Counted>,
@@ -204,7 +205,7 @@ pub struct Diagnosis {
 /// The counters of one drive in the last minute.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Counted {
-    /// Its name.
+    /// Name of the drive.
     pub drive: String,
     /// Transactions with a valid reply.
     pub answered: u32,
@@ -212,9 +213,9 @@ pub struct Counted {
     pub silent: u32,
     /// Invalid replies.
     pub damaged: u32,
-    /// Of those, and of the valid ones: a stray byte before the reply.
+    /// Replies, damaged or valid, with a stray byte before them.
     pub stray_before: u32,
-    /// Of the damaged: the beginning was lost, the rest was valid.
+    /// Damaged replies that lost their beginning; the rest was valid.
     pub start_lost: u32,
     /// Replies after the time limit.
     pub late: u32,
@@ -238,7 +239,7 @@ pub struct CountedByDrive {
     pub exceptions: u16,
     /// Messages to it.
     pub own: u16,
-    /// Of those: without an answer; broadcasts are among them [inference].
+    /// Messages to the drive without an answer; broadcasts are among them [inference].
     pub unanswered: u16,
 }
 

@@ -1,4 +1,4 @@
-//! One rule for each cause. What is counted is judged against chance, and a comparison between drives needs most of them.
+//! A rule for each cause. Counts are judged against chance, and a comparison between drives needs most of them.
 
 mod timing;
 
@@ -10,7 +10,7 @@ use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, s
 use super::{Cause, Certainty, Finding};
 use crate::drive::DriveIndex;
 
-/// The same for verdicts about the whole line.
+/// Failures that a verdict about the whole line needs at least.
 const FEW_OF_LINE: u32 = 10;
 /// Requests after which a drive that never replied is reported.
 const IN_VAIN: u16 = 6;
@@ -26,7 +26,7 @@ pub struct Rules<'f> {
     names: &'f [String],
     now: Instant,
     known: Vec<Known>,
-    /// That many failures of other drives are caused by drives that reply to requests for others.
+    /// Failures of other drives that are explained by a drive that replies to requests for others.
     disturbed: u32,
     /// Drives that are neither known nor absent.
     waiting: usize,
@@ -144,7 +144,7 @@ impl Rules<'_> {
             .drives
             .iter()
             .all(|drive| drive.sum(Sign::Tried) + drive.sum(Sign::Damaged) >= 2);
-        // A single drive that has answered is off; its event says so.
+        // A single drive that has answered before is just off, which its own event reports.
         let is_one = drives < 2 && figures.answered_since_opened();
         if !each || is_one || tried + damaged < 6 || explained > (tried + damaged) / 4 {
             return false;
@@ -184,7 +184,8 @@ impl Rules<'_> {
                 .is_some_and(|drive| drive.steps(&shows) >= LASTING);
             let of_others = seconds - second - overlong;
             let enough = second >= FEW || (second + overlong >= FEW - 1 && overlong * 5 >= known.damaged * 3);
-            // A line that repeats everything is no second drive.
+            // Second replies that follow those of other drives too come from a line that repeats everything, not from a
+            // second drive.
             if !lasts
                 || !enough
                 || of_others * 5 > second + overlong
@@ -262,7 +263,7 @@ impl Rules<'_> {
         self.add(Cause::Mains, None, certainty, evidence);
     }
 
-    /// One drive, or all from one address on.
+    /// Finds one bad drive, or a line that is bad from one address on.
     fn single_drives(&mut self) {
         if self.has(Cause::WhileRunning) || self.has(Cause::Mains) || self.may_be_of_running() {
             return;
@@ -282,8 +283,8 @@ impl Rules<'_> {
             return;
         };
         let (bad, good) = known.split_at(count);
-        // Whether it is one drive or several shows when all of them were bad for some time, and all others were asked so often that
-        // they would have failed by now, too.
+        // Whether one drive or several are bad is known only after all of them were bad for some time and all others had so many
+        // requests that they would have failed by now, too.
         let least = bad.iter().map(Known::share).fold(1.0, f64::min);
         let is_good =
             |one: &Known| f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least);
@@ -302,7 +303,8 @@ impl Rules<'_> {
         }
     }
 
-    /// A drive that is configured and not there, or set up otherwise. It is asked every ten seconds, so it is not compared.
+    /// Finds a configured drive that is not there, or has other settings. Such a drive gets a request every ten seconds
+    /// only, so its failures are not compared with others.
     fn never_answered(&mut self) {
         let silent = |(place, drive): (DriveIndex, &super::Drive)| {
             let asked = drive.in_vain().filter(|asked| *asked >= IN_VAIN)?;

@@ -1,4 +1,4 @@
-//! What the bytes of one transaction show about the line.
+//! Evidence about the line in the bytes of one transaction.
 
 use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
@@ -37,7 +37,7 @@ pub struct Signature {
     pub shape: Shape,
 }
 
-/// What `seen` shows, all that came behind the request `frame`; `answered`: a reply was found in it.
+/// Evaluates `seen`, all bytes received behind the request `frame`; `answered`: a reply was found among them.
 pub fn of(protocol: Protocol, request: &Request, frame: &[u8], seen: &[u8], answered: bool) -> Signature {
     let is_read = matches!(request.pdu, RequestPdu::Read { .. }) || protocol == Protocol::N2;
     let echoed = is_read && !frame.is_empty() && seen.starts_with(frame);

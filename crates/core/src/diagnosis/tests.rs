@@ -1,4 +1,4 @@
-//! The page holds what the code says.
+//! The page of the documentation lists what the code implements.
 
 use super::*;
 

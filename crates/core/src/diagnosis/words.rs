@@ -10,7 +10,7 @@ use crate::drive::{Profile, Step};
 const MOST_STEPS: usize = 96;
 
 impl Cause {
-    /// Its meaning, in a few words.
+    /// Meaning of the cause, in a few words.
     pub const fn meaning(self) -> &'static str {
         match self {
             Cause::AllSilent => "no drive answers",
@@ -34,7 +34,7 @@ impl Cause {
         }
     }
 
-    /// Its remedy.
+    /// Remedy for the cause.
     pub const fn remedy(self) -> &'static str {
         match self {
             Cause::AllSilent => {
@@ -126,7 +126,7 @@ impl Cause {
         }
     }
 
-    /// Those steps in the words of these profiles: what to look at and to set at their drives.
+    /// The steps in the words of these profiles: what to check and to set at their drives.
     pub fn steps_of<'p>(self, profiles: impl IntoIterator<Item = &'p Profile>) -> Vec<String> {
         told(profiles, self.steps())
     }
@@ -150,7 +150,7 @@ mod tests {
     use crate::codec::Protocol;
     use crate::drive::profile::Profiles;
 
-    /// Of every family whose manual is at hand, what a silent one has to be looked at for, and nothing is cut off.
+    /// Every family with a manual has its checks for a silent drive in the text, and nothing is cut off.
     #[test]
     fn steps_are_those_of_the_families_on_the_line() {
         let all = Profiles::built_in();

@@ -1,9 +1,9 @@
 //! Drills: a motor is started at a low speed and stopped in each way by which it is to stop, and how long that took is kept.
 //!
-//! [`Drills::arm`] says what is to be tried, [`Drills::start`] begins it within [`ARMED`] and by the same client, and a task of the
-//! gateway calls [`Drills::look`] while one is running. One at a time. Every drill ends with a stop, also one that a crash interrupts:
-//! where drills are kept on disk, the motor starts only after the start was written, and the next process sends the stop. Pure: time
-//! is an argument.
+//! [`Drills::arm`] prepares a drill, [`Drills::start`] begins it within [`ARMED`] for the same client, and a task of the gateway calls
+//! [`Drills::look`] while it is running. Only one drill runs at a time. Every drill ends with a stop, also one that a crash
+//! interrupts: where drills are kept on disk, the motor starts only after the start was written, and the next process sends the stop.
+//! Pure: time is an argument.
 
 mod report;
 mod run;
@@ -47,10 +47,10 @@ pub enum DrillRefusal {
     /// There is none of that name.
     #[error("there is no drill `{0}`")]
     Unknown(String),
-    /// It cannot be done.
+    /// The drill is not possible on this drive.
     #[error("{0}; nothing was started")]
     NotPossible(String),
-    /// Not now, or not by this client.
+    /// The drill is not possible now, or not for this client.
     #[error("{0}; nothing was started")]
     NotNow(String),
 }
@@ -154,7 +154,7 @@ impl Drills {
     /// Starts an armed drill, by who armed it.
     ///
     /// # Errors
-    /// It is not armed, or not by this client; nothing was started.
+    /// The drill is not armed, or not by this client; nothing was started.
     pub fn start(
         &self,
         plant: &Plant,
@@ -234,7 +234,7 @@ impl Drills {
         current.chain(state.ended.iter().rev().cloned()).collect()
     }
 
-    /// One of them.
+    /// The report of one drill.
     pub fn report(&self, id: &str) -> Option<DrillReport> {
         self.state().report(id)
     }
@@ -250,7 +250,7 @@ impl Drills {
             .collect()
     }
 
-    /// What drills have proven of each way that can be tried on that drive at `time`; none where drills are off.
+    /// Results of drills for each way to stop that can be tried on the drive at `time`; none where drills are off.
     pub fn stops(&self, drive: &DriveHandle, time: SystemTime) -> Option<Vec<StopProof>> {
         let state = self.state();
         let every = state.options?.every;
@@ -289,7 +289,7 @@ impl Drills {
         self.state().keeps = keeps;
     }
 
-    /// What to write and its generation, until that is reported as [`kept`](Drills::kept).
+    /// The state to write and its generation, until that generation is reported as [`kept`](Drills::kept).
     pub fn to_keep(&self) -> Option<(u64, SavedDrills)> {
         let state = self.state();
         if state.kept == state.generation {
@@ -376,7 +376,7 @@ impl State {
         current.chain(&self.ended).find(|report| report.id == id).cloned()
     }
 
-    /// An armed drill that nobody started is over.
+    /// Ends an armed drill that was not started in time.
     fn drop_armed(&mut self, now: Instant, time: SystemTime) {
         if let Some(run) = &mut self.run
             && run.expires(now, time)

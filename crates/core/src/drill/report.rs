@@ -12,7 +12,7 @@ use crate::process_image::Machine;
 pub enum Kind {
     /// A stop command.
     Order,
-    /// Its client goes silent: the lease of its supervision expires.
+    /// The client of the drill goes silent: the lease of its supervision expires.
     Client,
     /// The gateway goes silent: the drive's own fieldbus supervision acts.
     Gateway,
@@ -22,7 +22,7 @@ impl Kind {
     /// All, in the order of the tests: after the last one a drive may have a fault.
     pub const ALL: [Kind; 3] = [Kind::Order, Kind::Client, Kind::Gateway];
 
-    /// Its name.
+    /// Name of the way to stop.
     pub fn name(self) -> &'static str {
         match self {
             Kind::Order => "order",
@@ -51,7 +51,7 @@ pub enum DrillState {
 }
 
 impl DrillState {
-    /// Its name.
+    /// Name of the state.
     pub fn name(self) -> &'static str {
         match self {
             DrillState::Armed => "armed",
@@ -63,7 +63,7 @@ impl DrillState {
         }
     }
 
-    /// Whether it has ended.
+    /// Whether the drill has ended.
     pub fn is_over(self) -> bool {
         !matches!(self, DrillState::Armed | DrillState::Running)
     }
@@ -93,11 +93,11 @@ pub struct DrillStep {
 /// A drill.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillReport {
-    /// Its name.
+    /// Name of the report.
     pub id: String,
     /// The drive.
     pub drive: String,
-    /// Its bus.
+    /// Bus of the drive.
     pub bus: String,
     /// Port, address and profile: whose proof it is, whatever it is called.
     pub port: String,
@@ -105,7 +105,7 @@ pub struct DrillReport {
     pub address: u8,
     /// Name of its profile.
     pub profile: String,
-    /// Who armed it.
+    /// Client that armed the drill.
     pub who: String,
     /// Progress or result.
     pub state: DrillState,
@@ -143,7 +143,7 @@ impl DrillReport {
     }
 }
 
-/// What drills have proven about one way to stop.
+/// Result of the last drill for one way to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 pub struct StopProof {
     /// Which way.
@@ -159,7 +159,7 @@ pub struct StopProof {
 /// The last completed test of a way to stop on a machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Proof {
-    /// Of which machine.
+    /// The machine that was tested.
     #[serde(flatten)]
     pub machine: Machine,
     /// Which way.
@@ -181,7 +181,7 @@ impl Proof {
         }
     }
 
-    /// Its age at `time`; 0 if the clock was set back.
+    /// Age of the proof at `time`; 0 if the clock was set back.
     pub fn age(&self, time: SystemTime) -> Duration {
         let at = SystemTime::UNIX_EPOCH + Duration::from_millis(self.at_ms.min(LATEST_MS));
         time.duration_since(at).unwrap_or_default()
@@ -193,7 +193,7 @@ const LATEST_MS: u64 = 253_370_764_800_000;
 /// Form of the file.
 const VERSION: u32 = 1;
 
-/// What is kept of drills over a restart.
+/// State of drills that survives a restart.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SavedDrills {
     drivegate_drills: u32,
@@ -212,7 +212,7 @@ impl SavedDrills {
         }
     }
 
-    /// Of these ways those that were not proven on that machine within `every` before `time`.
+    /// The ways among `kinds` that were not proven on the machine within `every` before `time`.
     pub fn unproven(&self, machine: &Machine, kinds: &[Kind], every: Duration, time: SystemTime) -> Vec<Kind> {
         let proven = |kind: &&Kind| {
             let mut proofs = self
@@ -227,7 +227,7 @@ impl SavedDrills {
     /// Reads the file.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// The file is damaged or of another version: the reason.
     pub fn from_json(bytes: &[u8]) -> Result<SavedDrills, String> {
         let saved: SavedDrills = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
         match saved.drivegate_drills {

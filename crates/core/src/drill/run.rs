@@ -17,7 +17,7 @@ use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 use crate::process_image::{Machine, Reading, Standstill};
 use crate::stop_all::OneStop;
 
-/// Maximum time to write the start of a drill to disk; a motor must not start when nobody expects it any more.
+/// Maximum time to write the start of a drill to disk; after that the operator no longer expects the motor to start.
 const KEEP: Duration = Duration::from_secs(5);
 /// Expiry of the start; a guard may delay it.
 const START: Duration = Duration::from_secs(60);
@@ -47,7 +47,7 @@ pub(super) struct Run {
     report: DrillReport,
     machine: Machine,
     drive: DriveHandle,
-    /// Who armed it.
+    /// Client that armed the drill.
     who: Origin,
     /// The origin of the drill's own commands.
     own: Origin,
@@ -72,7 +72,7 @@ pub(super) struct Run {
 #[derive(Debug)]
 enum Step {
     Armed,
-    /// The start is being written to disk as that generation, so that the next process knows of the motor.
+    /// The start is being written to disk in this generation, so that the next process knows of the running motor.
     Keeping(u64),
     /// The start was refused; it is retried.
     Waiting,
@@ -93,7 +93,7 @@ enum Step {
     Over,
 }
 
-/// What should stop the motor.
+/// The event that should stop the motor.
 #[derive(Debug)]
 enum Cause {
     Order(Placed),
@@ -239,7 +239,7 @@ impl Run {
         self.who.client() == who.client()
     }
 
-    /// Whether it was armed and not started in time; it is over then.
+    /// Ends the drill if it was armed and not started in time; whether that happened.
     pub(super) fn expires(&mut self, now: Instant, time: SystemTime) -> bool {
         let expired = matches!(self.step, Step::Armed) && now.saturating_duration_since(self.since) > ARMED;
         if expired {
@@ -276,19 +276,19 @@ impl Run {
         }
     }
 
-    /// Whether it waits for its start to be on disk.
+    /// Whether the drill waits for its start to be on disk.
     pub(super) fn waits_for_disk(&self) -> bool {
         matches!(self.step, Step::Keeping(_))
     }
 
-    /// What was started before generation `kept` was written may begin.
+    /// Begins the drill if its start is on disk, which holds for all generations up to `kept`.
     pub(super) fn kept(&mut self, kept: u64, now: Instant) {
         if matches!(self.step, Step::Keeping(generation) if generation <= kept) {
             self.begin_step(now);
         }
     }
 
-    /// Its start cannot be written: nothing is started. Whether it was waiting for that.
+    /// The start of the drill cannot be written, so nothing is started. Returns whether the drill was waiting for that.
     pub(super) fn not_kept(&mut self, why: &str, time: SystemTime) -> bool {
         let waits = self.waits_for_disk();
         if waits {
@@ -341,7 +341,7 @@ impl Run {
     pub(super) fn abort(&mut self, why: &str, now: Instant, time: SystemTime) {
         match self.step {
             Step::Armed | Step::Keeping(_) => self.finish(DrillState::Aborted, why.to_string(), time),
-            // Its stop comes in any case.
+            // The step already leads to a stop, so the abort changes nothing.
             Step::CutOff | Step::Ending(..) | Step::Over => {}
             _ => self.end(DrillState::Aborted, why.to_string(), now),
         }
@@ -443,7 +443,7 @@ impl Run {
     }
 
     fn look_at_speed(&mut self, turned: Option<Instant>, reading: &Reading<'_>, now: Instant) {
-        // Only a client that is there keeps the lease: the drill is, until it falls silent.
+        // The lease is kept only by a client that shows it is alive; the drill does so until it goes silent on purpose.
         self.drive.heartbeat(&self.own, now);
         let turns = matches!(reading.standstill(None), Standstill::Turns(_));
         let turned = if turns { turned.or(Some(now)) } else { None };
@@ -476,7 +476,7 @@ impl Run {
     fn look_steady(&mut self, reading: &Reading<'_>, now: Instant, time: SystemTime) {
         self.drive.heartbeat(&self.own, now);
         let passed = now.saturating_duration_since(self.since);
-        // What stands before its cause proves nothing.
+        // A motor that stands before the cause of the drill proves nothing about that cause.
         let turns = match reading.standstill(Some(self.since)) {
             Standstill::Turns(_) => true,
             Standstill::Stands => {

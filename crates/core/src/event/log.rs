@@ -23,9 +23,9 @@ pub struct Search {
     pub bus: Option<String>,
     /// With these words in any of its texts, upper and lower case alike.
     pub text: Option<String>,
-    /// Only what comes before.
+    /// Only events before this one.
     pub before: Option<Before>,
-    /// So many at most.
+    /// Largest number of events.
     pub limit: usize,
 }
 
@@ -60,7 +60,7 @@ pub(super) fn newest<'l>(
     let words = search.text.as_ref().map(|text| text.to_lowercase());
     let read = |line: &str| from_line(line.as_bytes()).ok();
     let end = match &search.before {
-        // One that is no longer kept had older ones before it, which are gone as well.
+        // An event that is no longer kept had only older ones before it, which are gone as well.
         Some(Before::Event(boot, id)) => {
             let is_it = |event: Event| event.boot == *boot && event.id >= *id;
             all.clone().position(|line| read(line).is_some_and(is_it)).unwrap_or(0)
@@ -75,10 +75,10 @@ pub(super) fn newest<'l>(
 /// Why a line is not an event.
 #[derive(Debug, thiserror::Error)]
 pub enum LineError {
-    /// It is no JSON object with the fields of an event.
+    /// The line is not a JSON object with the fields of an event.
     #[error("{0}")]
     Form(#[from] serde_json::Error),
-    /// Its time is none.
+    /// The time of the event is not valid.
     #[error("its time is not RFC 3339: {0}")]
     Time(#[from] humantime::TimestampError),
 }
@@ -86,7 +86,7 @@ pub enum LineError {
 /// An event from its JSON, as [`Event`] is serialized.
 ///
 /// # Errors
-/// The line is no event, or one of a newer version.
+/// The line is not an event, or of a newer version.
 pub fn from_line(line: &[u8]) -> Result<Event, LineError> {
     #[derive(Deserialize)]
     struct Line {

@@ -35,8 +35,8 @@ impl Keeper {
         &self.dir
     }
 
-    /// Writes pending data, as far as the disk accepts it, and ends the thread. A hanging disk blocks it for good: wait
-    /// with a limit.
+    /// Writes pending data, as far as the disk accepts it, and ends the thread. A hanging disk blocks this forever:
+    /// wait with a limit.
     pub async fn stop(self) {
         let Keeper { end, mut ended, .. } = self;
         drop(end);

@@ -22,7 +22,7 @@ pub use rotated::Rotated;
 /// Ending of a file that is not written to its end.
 pub const PARTIAL: &str = "partial";
 
-/// Gives a file that cannot be used another name, and says so for the log.
+/// Renames a file that cannot be used, and returns the result as text for the log.
 pub fn set_aside(path: &Path, aside: &Path) -> String {
     match fs::rename(path, aside) {
         Ok(()) => format!("it is kept as {}", aside.display()),
@@ -33,7 +33,7 @@ pub fn set_aside(path: &Path, aside: &Path) -> String {
 /// The content of a file of at most `longest` bytes; `None` where there is no file.
 ///
 /// # Errors
-/// It cannot be read, or is longer and so not one of ours.
+/// The file cannot be read, or is longer and so not written by the gateway.
 pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
     let length = match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -48,7 +48,7 @@ pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
 /// Puts `bytes` in the place of a file: after a power failure it has the old content or the new one. Makes its directory.
 ///
 /// # Errors
-/// It cannot be written; the old content is left.
+/// The file cannot be written; the old content is left.
 pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let dir = path.parent();
     if let Some(dir) = dir {
@@ -61,7 +61,7 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
         file.sync_all()
     };
     if let Err(error) = write().and_then(|()| fs::rename(&aside, path)) {
-        // It may not have been created at all.
+        // The partial file may not exist, so an error is ignored.
         let _ = fs::remove_file(&aside);
         return Err(error);
     }

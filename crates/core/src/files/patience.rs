@@ -54,7 +54,7 @@ impl Patience {
         None
     }
 
-    /// What `read` finds, away from the runtime.
+    /// Runs `read` on a thread of its own and waits for its result within the limit.
     ///
     /// # Errors
     /// The disk does not answer in time, or `read` panicked, which is logged.
@@ -109,7 +109,7 @@ mod tests {
         let (_answer, hangs) = oneshot::channel::<()>();
         assert_eq!(patience.wait(hangs).await, None);
         assert_eq!(begun.elapsed(), DISK / 4 + NEXT);
-        // A disk that answers is still heard.
+        // An answer that comes in time is still used.
         let answers = async {
             tokio::time::sleep(NEXT / 2).await;
             7

@@ -63,7 +63,7 @@ impl Rotated {
     /// Opens the file for this process alone, with its directory; its size in bytes.
     ///
     /// # Errors
-    /// It cannot be opened, or another process has it.
+    /// The file cannot be opened, or another process has it open.
     pub fn open(&mut self) -> io::Result<(&mut File, u64)> {
         self.open = None;
         if let Some(dir) = self.path.parent() {
@@ -100,7 +100,8 @@ impl Rotated {
     /// Appends bytes, whole or not at all.
     ///
     /// # Errors
-    /// They cannot be written, or the file is not open. What was written of them is removed, as far as that is possible.
+    /// The bytes cannot be written, or the file is not open. A part that was written is removed, as far as that is
+    /// possible.
     pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
         let open = self.open.as_mut().ok_or_else(|| io::Error::other("it is not open"))?;
         if let Err(error) = open.file.write_all(bytes) {
@@ -112,7 +113,7 @@ impl Rotated {
         Ok(())
     }
 
-    /// What was appended survives a power failure.
+    /// Flushes the appended bytes to disk, so that they survive a power failure.
     ///
     /// # Errors
     /// The disk does not take it.

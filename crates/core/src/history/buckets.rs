@@ -10,7 +10,7 @@ pub(super) struct Buckets<T> {
 }
 
 impl<T: Copy + Default> Buckets<T> {
-    /// So many steps, all empty: as the default of `T`.
+    /// Creates `steps` empty slots, each the default of `T`.
     pub(super) fn new(steps: usize) -> Buckets<T> {
         Buckets {
             slots: vec![T::default(); steps].into(),
@@ -55,7 +55,7 @@ impl<T: Copy + Default> Buckets<T> {
             return self.slots.get_mut(self.place);
         }
         if number > self.newest {
-            // What was a lap before is not of this time.
+            // Slots of the previous lap are cleared before they are used for new times.
             let first = (self.newest + 1).max((number + 1).saturating_sub(self.len()));
             for stale in first..=number {
                 let place = self.place(stale);

@@ -53,8 +53,8 @@ impl Budget {
         needs
     }
 
-    /// What the drives of a bus need so that nothing is left out of a recording: as often as they are to be read or, where the
-    /// line cannot carry that, as often as it can at best. A bus whose recorder is off needs nothing.
+    /// Memory for the drives of a bus so that nothing is left out of a recording: for reads as often as configured or, where
+    /// the line cannot carry that, as often as it can at best. A bus whose recorder is off needs none.
     pub fn of(bus: &BusSpec, drives: &[DriveSpec], options: &RecorderOptions) -> Budget {
         if options.max_count == 0 {
             return Budget {

@@ -24,12 +24,13 @@ const LONGEST: usize = 1 << 20;
 pub struct Packet {
     /// Since 1970.
     pub at: Duration,
-    /// They were sent: `at` is when they were given to the port. Else it is when the last of them had come.
+    /// Whether the bytes were sent: `at` is then the time when they were given to the port, else the time when the last
+    /// of them had arrived.
     pub sent: bool,
     pub bytes: Vec<u8>,
 }
 
-/// Why a file is no capture that can be read, and from which byte on.
+/// Reason why a file is not a readable capture, and the offset of the fault.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{what}, at byte {offset}")]
 pub struct CaptureError {
@@ -57,7 +58,7 @@ pub struct LineCapture {
 /// Reads a capture as far as it goes. Packets of other interfaces than serial lines are left out.
 ///
 /// # Errors
-/// The file is no capture of a serial line, or broken before its first packet with bytes.
+/// The file is not a capture of a serial line, or is broken before its first packet with bytes.
 pub fn read(file: &[u8]) -> Result<LineCapture, CaptureError> {
     let mut packets = Vec::new();
     let read = match file.first_chunk::<4>() {

@@ -1,7 +1,7 @@
 //! Starts, run time and energy of a drive, as the gateway sees them. Pure: time is an argument.
 //!
 //! Only observed time is counted: while a drive is offline, or its running bit is not good, neither time nor starts are
-//! counted.
+//! added.
 
 use std::time::{Duration, Instant};
 
@@ -24,7 +24,7 @@ pub struct Totals {
 }
 
 impl Totals {
-    /// These, counted after `before`.
+    /// These totals added to the totals `before`.
     #[must_use]
     pub fn after(self, before: Totals) -> Totals {
         Totals {
@@ -65,8 +65,8 @@ impl Counters {
         self.totals
     }
 
-    /// The drive was read, and reads as `reading` now; `known` is the drive as its image has it, which knows for how long a
-    /// value is good.
+    /// Counts a read of the drive; `reading` has the values of that read, `known` those of the drive's image, which has the
+    /// time for which a value is good.
     pub fn read(&mut self, reading: &Reading<'_>, known: &Reading<'_>) {
         let profile = &reading.spec.profile;
         if let Some(index) = profile.model_index(ModelPoint::Running) {
@@ -86,7 +86,7 @@ impl Counters {
             let Some(passed) = at.checked_duration_since(before).filter(|passed| !passed.is_zero()) else {
                 return;
             };
-            // The same reading at the same rate is the usual case.
+            // A motor that stood and still stands adds nothing, so the costly part is skipped.
             if ran || running {
                 let seen = passed <= good_for();
                 if seen && ran {

@@ -9,8 +9,8 @@ use serde_json::{Map, Value as Json, json};
 
 use super::recording::{CommandNote, EventNote, Frame, Header, Recording};
 
-/// One JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, `frames`. It is written a
-/// sample at a time: as a tree, a recording of 1 MB takes 10 MB of memory.
+/// The recording as a JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, `frames`.
+/// The text is written a sample at a time: as a tree, a recording of 1 MB takes 10 MB of memory.
 pub fn json(recording: &Recording) -> String {
     let mut header = match serde_json::to_value(&recording.header) {
         Ok(Json::Object(header)) => header,

@@ -56,7 +56,7 @@ pub fn keep(
     let (found, earlier) = oneshot::channel();
     let keeper = Keeper::start("history", dir, move |end| {
         let earlier = if first { writer.remember() } else { Vec::new() };
-        // Nobody waits any longer for a disk that was slow.
+        // The receiver is gone where the disk was too slow.
         let _ = found.send(earlier);
         writer.run(end);
     })?;
@@ -125,7 +125,7 @@ impl Writer {
         let (mut earlier, mut wrong) = (Vec::new(), 0u64);
         for path in self.events.all() {
             let Ok(bytes) = fs::read(&path) else {
-                // Not all of them need be there.
+                // Rotated files need not all exist.
                 continue;
             };
             for line in bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {

@@ -23,7 +23,7 @@ pub const BYTES: (usize, usize) = (2 * STEPS * size_of::<Bucket>(), STEPS * size
 pub struct Exchanges {
     /// All.
     pub all: u32,
-    /// Those without a valid reply.
+    /// Transactions without a valid reply.
     pub failed: u32,
 }
 
@@ -67,7 +67,7 @@ fn exchanges(drive: &DriveImage) -> (u64, u64) {
 }
 
 impl LineHistory {
-    /// Of a bus that is about to start.
+    /// The history of a bus that is about to start.
     pub fn new(bus: &BusImage, clock: Clock) -> LineHistory {
         let drive = |drive| DriveLine {
             steps: Buckets::new(STEPS),
@@ -117,7 +117,7 @@ impl LineHistory {
     pub fn last_hour(&self, clock: Clock) -> LastHour {
         let now = number(clock.now.saturating_duration_since(self.epoch), STEP);
         let figures = |bucket: Bucket| (!bucket.is_empty()).then_some((bucket.min, bucket.max, bucket.last));
-        // Of the first step, which may lie before the beginning.
+        // Start time of the first step, which may lie before the history began.
         let first = (now + 1) as i64 - STEPS as i64;
         let apart = STEP * u32::try_from(first.unsigned_abs()).unwrap_or(u32::MAX);
         let begin = clock.wall_at(self.epoch);

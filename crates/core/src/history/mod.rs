@@ -85,7 +85,7 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// Both as they are.
+    /// Reads both clocks.
     pub fn read() -> Clock {
         Clock {
             now: Instant::now(),

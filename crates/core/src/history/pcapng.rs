@@ -80,7 +80,7 @@ fn comment(recording: &Recording, frame: &Frame, protocol: Option<Protocol>, byt
         let opened = protocol.open_frame(bytes).filter(|_| frame.verdict == Verdict::Sent);
         match opened.and_then(|(_, pdu)| RequestPdu::decode(&pdu).ok()) {
             Some(pdu) => describe::request_on(protocol, &pdu),
-            // It was requested, unless the verdict says otherwise.
+            // The prefix `foreign` is cut off: only the verdict of the frame says whether the reply was requested.
             None => describe::stray(protocol, bytes)
                 .trim_start_matches("foreign: ")
                 .to_string(),

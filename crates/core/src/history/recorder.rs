@@ -28,7 +28,7 @@ const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 pub struct Note {
     /// When.
     pub at: Instant,
-    /// What.
+    /// Content of the note.
     pub body: NoteBody,
 }
 
@@ -45,9 +45,9 @@ pub enum NoteBody {
     Command {
         /// Kind of the source.
         source: &'static str,
-        /// Who.
+        /// Client that gave the command.
         client: String,
-        /// What.
+        /// The command, as text.
         command: String,
         /// The result code.
         result: &'static str,
@@ -70,7 +70,7 @@ impl Timed for Note {
     }
 }
 
-/// A drive as its samples tell, with the reads that only a fault asks for.
+/// An empty snapshot of a drive for its samples, including the reads made only on a fault.
 pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     let mut plan = Plan::of(&spec.profile);
     plan.reads.extend_from_slice(&plan.on_fault);
@@ -104,7 +104,7 @@ pub struct Capture {
     pub trigger: Trigger,
     /// Further triggers meanwhile.
     pub more: Vec<Trigger>,
-    /// Its beginning and end.
+    /// First and last time of the recording.
     pub span: (Instant, Instant),
     /// The state of the drive before the first sample.
     pub base: Arc<Snapshot>,
@@ -122,7 +122,7 @@ pub struct Capture {
 struct DriveRing {
     image: Arc<DriveImage>,
     history: Arc<DriveHistory>,
-    /// Whether it answered when it was last looked at, and since when.
+    /// Whether the drive answered when it was last checked, and since when.
     link: Link,
     samples: PackedRing<TapedRead>,
     notes: Ring<Note>,
@@ -236,8 +236,8 @@ impl Recorder {
         })
     }
 
-    /// Starts a recording of a drive, or notes the trigger in the one in progress. Returns its id; none if there is no
-    /// such drive, or it had one of that kind a moment ago.
+    /// Starts a recording of a drive, or notes the trigger in the one in progress. Returns its id; none if the drive is
+    /// unknown, or had a trigger of the same kind very recently.
     pub fn trigger(&mut self, drive: &str, trigger: Trigger, clock: Clock) -> Option<String> {
         let mut drives = self.lines.iter_mut().flat_map(|line| &mut line.drives);
         drives

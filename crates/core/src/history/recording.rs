@@ -25,16 +25,16 @@ pub const ENDING: &str = "dgrec";
 pub struct Header {
     /// [`VERSION`]; its presence marks the file as a recording.
     pub drivegate_recording: u32,
-    /// Its id: time of the trigger and the drive.
+    /// Id of the recording: time of the trigger and the drive.
     pub id: String,
     /// Time of the trigger, RFC 3339 with microseconds, UTC. All times below are seconds from it.
     pub time: String,
-    /// Its trigger.
+    /// Trigger of the recording.
     #[schema(value_type = String)]
     pub trigger: TriggerKind,
-    /// Its summary, in one sentence.
+    /// Summary of the recording, in one sentence.
     pub summary: String,
-    /// It is among the first of a storm of recordings, which are kept longer.
+    /// Whether the recording is among the first of a storm of recordings, which are kept longer.
     pub first: bool,
     /// Further triggers meanwhile.
     pub more: Vec<Further>,
@@ -61,7 +61,7 @@ pub struct Header {
 pub struct Further {
     /// When.
     pub t: f64,
-    /// What.
+    /// Kind of the further trigger.
     #[schema(value_type = String)]
     pub trigger: TriggerKind,
     /// In words.
@@ -114,7 +114,7 @@ pub struct Read {
     pub points: Vec<usize>,
 }
 
-/// One read; its values: [`Recording::values`].
+/// A read of the drive; its values: [`Recording::values`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// When it was read.
@@ -142,9 +142,9 @@ pub struct CommandNote {
     pub t: f64,
     /// Kind of the source.
     pub source: String,
-    /// Who.
+    /// Client that gave the command.
     pub client: String,
-    /// What.
+    /// The command, as text.
     pub command: String,
     /// Result code.
     pub result: String,
@@ -158,9 +158,9 @@ pub struct CommandNote {
 pub struct Frame {
     /// A request: when it was given to the port. Else when the last of it came.
     pub t: f64,
-    /// Place of the drive that was asked.
+    /// Place of the drive that was addressed.
     pub drive: Option<usize>,
-    /// Its verdict.
+    /// Verdict on the frame.
     #[schema(value_type = String)]
     pub verdict: Verdict,
     /// The bytes; in the file two hexadecimal digits each.
@@ -217,7 +217,7 @@ struct End {
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recording {
-    /// Its header.
+    /// Header of the recording.
     pub header: Header,
     /// The samples, oldest first.
     pub samples: Vec<Sample>,

@@ -33,9 +33,9 @@ impl Storm {
 /// A recording, as far as it matters here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Kept {
-    /// Its size.
+    /// Size of the file.
     pub bytes: u64,
-    /// It is among the first of its storm.
+    /// Whether the recording is among the first of its storm.
     pub first: bool,
 }
 

@@ -23,18 +23,18 @@ const MOST_BYTES: u64 = 1 << 30;
 /// A recording in short.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Entry {
-    /// Its id.
+    /// Id of the recording.
     pub id: String,
     /// Time of the trigger, RFC 3339.
     pub time: String,
     /// The drive.
     pub drive: String,
-    /// Its bus.
+    /// Bus of the drive.
     pub bus: String,
-    /// Its trigger.
+    /// Trigger of the recording.
     #[schema(value_type = String)]
     pub trigger: TriggerKind,
-    /// Its summary.
+    /// Summary of the recording.
     pub summary: String,
     /// Size of its file.
     pub bytes: u64,
@@ -68,7 +68,7 @@ pub enum ReadError {
         /// Why not.
         error: io::Error,
     },
-    /// Its content is not a recording.
+    /// The content of the file is not a recording.
     #[error("{path}: {error}")]
     Content {
         /// The file.
@@ -193,13 +193,13 @@ impl Store {
     /// Writes a recording at the time `now`, then removes those that have to go for it.
     ///
     /// # Errors
-    /// It cannot be written, or is greater than all may be together; nothing of it is left then.
+    /// The file cannot be written, or alone exceeds the limit for all recordings; nothing of it is left then.
     pub fn write(&mut self, recording: &mut Recording, now: SystemTime) -> io::Result<Arc<Entry>> {
         let time = humantime::parse_rfc3339(&recording.header.time).unwrap_or(SystemTime::UNIX_EPOCH);
         recording.header.first = self.storm.is_first(time);
         let id = recording.header.id.clone();
         let taken = |id: &str| self.entries.iter().any(|entry| entry.id == id);
-        // Only after the clock was set back.
+        // An id is taken twice only after the clock was set back.
         let mut others = (2..).map(|n| format!("{id}-{n}")).filter(|id| !taken(id));
         if taken(&id) {
             recording.header.id = others.next().unwrap_or(id);

@@ -32,7 +32,7 @@ pub enum NotRecorded {
     /// The recorder is off.
     #[error("the recorder is off (max_count of [recordings] is 0)")]
     Off,
-    /// There is no such drive.
+    /// No drive has this name.
     #[error("there is no drive `{0}`")]
     UnknownDrive(String),
 }
@@ -83,10 +83,10 @@ impl Recordings {
         self.shared().made.clone()
     }
 
-    /// Reads a recording; none where there is no such one. Takes the time that the disk takes.
+    /// Reads a recording; none where the id is unknown. Blocks while the disk is read.
     ///
     /// # Errors
-    /// Its file cannot be read.
+    /// The file of the recording cannot be read.
     pub fn read(&self, id: &str) -> Option<Result<Recording, ReadError>> {
         let path = {
             let shared = self.shared();
@@ -103,7 +103,7 @@ impl Recordings {
     /// Starts a recording of a drive, requested by `who`. Returns its id, and the time after which it is complete.
     ///
     /// # Errors
-    /// The recorder is off, or there is no such drive.
+    /// The recorder is off, or no drive has this name.
     pub async fn record(&self, drive: &str, who: &str) -> Result<(String, Duration), NotRecorded> {
         let (reply, begun) = oneshot::channel();
         let after = {
@@ -231,7 +231,7 @@ impl Taker {
         loop {
             let order = orders.recv_timeout(TICK);
             let clock = Clock::read();
-            // What was taped before a command belongs before it.
+            // Notes are taken first, since entries taped before an order belong before it.
             self.take_notes(clock);
             let mut captures = self.recorder.tick(clock);
             match order {
@@ -387,7 +387,7 @@ impl Writer {
                     };
                     publish(&self.events, bus, Some(drive), text, Some(made));
                 }
-                // Told once: the disk stays as it is until someone sees to it.
+                // The failure is reported once: the disk stays faulty until an operator acts.
                 Err(_) if self.failing => {}
                 Err(error) => {
                     self.failing = true;

@@ -126,7 +126,7 @@ impl Default for Bucket {
 
 impl Bucket {
     pub(super) fn add(&mut self, value: f32) {
-        // `min` and `max` take the other one where one is no number.
+        // `min` and `max` ignore a value that is NaN.
         self.min = self.min.min(value);
         self.max = self.max.max(value);
         self.last = value;
@@ -140,7 +140,7 @@ impl Bucket {
 /// The values of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Step {
-    /// Its beginning, ms since 1970.
+    /// Start of the step, ms since 1970.
     pub at: u64,
     /// The least value.
     pub min: f32,
@@ -176,7 +176,7 @@ struct PointTrend {
     index: PointIndex,
     /// Where its value is read from.
     registers: Vec<Registers>,
-    /// It rests on points that are read elsewhere, too.
+    /// Whether the point is derived from points that are read elsewhere, too.
     derived: bool,
     /// `None` before the first value.
     kept: Option<Kept>,
@@ -232,9 +232,9 @@ impl DriveTrend {
         self.reach.ranges()
     }
 
-    /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `known` is the drive as its
-    /// image has it: it knows whether a point that is made of others is good, since they may have been read before the drive
-    /// was away, and for how long a value is good. A value stands for the steps until the next one, as far as it is good so long.
+    /// Adds the values that `read` shows; `reading` has the drive's values right after it. `known` is the drive's image: it knows
+    /// whether a derived point is good, since its sources may have been read before the drive was away, and for how long a value
+    /// is good. A value counts for the steps until the next one, as long as it is good.
     pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
         for point in &mut self.points {
             if !point.registers.iter().any(|registers| shows(read, registers)) {
@@ -281,7 +281,7 @@ impl DriveTrend {
         let now = number(clock.now);
         let oldest = (now + 1).saturating_sub(range.buckets() as u64);
         let (first, end) = (number(from).clamp(oldest, now), number(to).clamp(oldest, now));
-        // Steps that follow each other have times that follow each other, whatever the clock says meanwhile.
+        // Successive steps have successive times, whatever the clock does meanwhile.
         let at = clock.wall_at(self.epoch) + range.step * u32::try_from(first).unwrap_or(u32::MAX);
         let from = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let from = (from.as_micros() as u64).div_ceil(1000);

@@ -51,7 +51,7 @@ impl TriggerKind {
         TriggerKind::Command,
     ];
 
-    /// Whether it has its own event, which gives the cause.
+    /// Whether the trigger has an event of its own, which gives the cause.
     pub(crate) fn has_event(self) -> bool {
         match self {
             TriggerKind::Fault
@@ -104,7 +104,7 @@ pub struct Trigger {
     pub kind: TriggerKind,
     /// When.
     pub at: Instant,
-    /// Its text.
+    /// Text of the trigger.
     pub text: String,
 }
 
@@ -151,7 +151,7 @@ impl Watch {
         };
         let came = fault && self.fault.replace(fault) == Some(false);
         self.fault = Some(fault);
-        // The code may be read after the fault, which is no other fault.
+        // A fault code that is read only after the fault is not another fault.
         let before = std::mem::replace(&mut self.code, code);
         let changed = fault && before != 0 && code != 0 && before != code;
         (came || changed).then(|| (TriggerKind::Fault, "fault".to_string()))

@@ -17,7 +17,7 @@ struct Way {
 }
 
 impl Connection {
-    /// One that was opened then.
+    /// A connection that was opened at this time.
     pub fn opened(at: Instant) -> Connection {
         Connection(Arc::new(Way {
             opened: at,
@@ -30,7 +30,7 @@ impl Connection {
         self.0.opened
     }
 
-    /// Its client has closed or reset it.
+    /// Marks that the client has closed or reset the connection.
     pub fn hang_up(&self) {
         self.0.gone.store(true, Ordering::Release);
     }
@@ -66,7 +66,7 @@ impl Arrival {
         Arrival::over(Connection::opened(now), now)
     }
 
-    /// An order that came at `asked` over that connection, while its reader ran.
+    /// An order that came at `asked` over this connection, while its reader ran.
     pub fn over(connection: Connection, asked: Instant) -> Arrival {
         Arrival {
             asked,

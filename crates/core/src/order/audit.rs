@@ -27,7 +27,7 @@ const UNSENT_KEPT: usize = 500;
 /// Name of the log events of commands that were sent: the log has a way of its own for them.
 pub const SENT: &str = "sent command";
 
-/// One value that a command sets.
+/// A value that a command sets.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 #[schema(as = AuditChange)]
 pub struct Change {
@@ -41,15 +41,15 @@ pub struct Change {
     #[serde(serialize_with = "bare")]
     #[schema(value_type = serde_json::Value)]
     pub new: Value,
-    /// Its effect on the run command: run or stop, if any.
+    /// Effect on the run command: run or stop, if any.
     #[serde(skip)]
     pub run: Option<bool>,
-    /// It resets a fault.
+    /// Whether the value resets a fault.
     #[serde(skip)]
     pub resets: bool,
 }
 
-/// One command and the result.
+/// A command and its result.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct AuditRecord {
     /// When the outcome was known.
@@ -98,7 +98,7 @@ pub fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::
     serializer.serialize_f64((time.as_secs_f64() * 1e6).round() / 1e3)
 }
 
-/// The same, `null` without a time.
+/// Writes a time in milliseconds, `null` without a time.
 pub fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
     match time {
         Some(time) => milliseconds(time, serializer),
@@ -109,21 +109,21 @@ pub fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: 
 /// How far a command got.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Reach {
-    /// It was sent to the drive, or started.
+    /// The command was sent to the drive, or started.
     Sent,
-    /// It was in the queue and was not sent.
+    /// The command was in the queue and was not sent.
     Queued,
-    /// It was turned away.
+    /// The command was refused.
     Refused,
 }
 
 impl AuditRecord {
-    /// Its effect on the run command: run or stop, if any.
+    /// Effect on the run command: run or stop, if any.
     pub(crate) fn run(&self) -> Option<bool> {
         self.points.iter().rev().find_map(|change| change.run)
     }
 
-    /// Whether it resets a fault.
+    /// Whether the command resets a fault.
     pub(crate) fn resets(&self) -> bool {
         self.points.iter().any(|change| change.resets)
     }
@@ -174,7 +174,7 @@ pub struct Audit {
 pub struct RunOrdered {
     /// Run, or stop.
     pub run: bool,
-    /// Its source and client.
+    /// Source and client of the order.
     pub who: String,
     /// When its result arrived, or the wait was given up.
     pub at: Instant,

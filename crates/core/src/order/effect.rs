@@ -1,13 +1,13 @@
-//! What a command does to the drives that it reaches, by their profiles: decided once, when it is accepted. Pure.
+//! Effects of a command on the drives that it reaches, by their profiles: decided once, when it is accepted. Pure.
 
 use super::{Order, Touched, Urgency, written};
 use crate::codec::Table;
 use crate::drive::{DriveIndex, ModelPoint, Profile};
 
-/// What a command requires of the hold of a drive.
+/// Rights that a command requires from the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Asks {
-    /// It may start the motor: needs the hold, takes a free drive.
+    /// An order that may start the motor: needs the hold, takes a free drive.
     Run,
     /// A reference or a direction needs the hold and takes a free drive likewise, but starts nothing.
     Steer,
@@ -20,7 +20,7 @@ pub enum Asks {
 }
 
 impl Asks {
-    /// What an order with that effect requires.
+    /// Rights that an order with this effect requires.
     pub fn of(order: &Order, effect: Effect) -> Asks {
         match order {
             _ if effect.stops => Asks::Stop,
@@ -31,16 +31,16 @@ impl Asks {
         }
     }
 
-    /// Whether it takes a free drive.
+    /// Whether the order takes the hold of a free drive.
     pub fn takes(self) -> bool {
         matches!(self, Asks::Run | Asks::Steer)
     }
 }
 
-/// What a command does to one drive.
+/// Effect of a command on one drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Effect {
-    /// It takes the run command away, with the rights of a stop.
+    /// Whether the command takes the run command away, with the rights of a stop.
     pub stops: bool,
     /// The run command.
     pub run: Option<bool>,
@@ -48,7 +48,7 @@ pub struct Effect {
     pub reverse: Option<bool>,
     /// A reference.
     pub reference: bool,
-    /// A raw word at the place of the run command that is no stop.
+    /// Whether a raw word is written at the place of the run command that is not a stop.
     pub word: bool,
 }
 
@@ -70,17 +70,17 @@ impl Effect {
         }
     }
 
-    /// Whether it starts a motor that stands.
+    /// Whether the effect starts a motor that stands.
     pub fn starts(self) -> bool {
         !self.stops && self.run == Some(true)
     }
 
-    /// Whether it writes a run command, or a word at its place that is no stop.
+    /// Whether the effect writes a run command, or a word at its place that is not a stop.
     pub fn may_run(self) -> bool {
         self.run == Some(true) || self.word
     }
 
-    /// Whether it sets a reference or a direction.
+    /// Whether the effect sets a reference or a direction.
     pub fn steers(self) -> bool {
         self.reverse.is_some() || self.reference
     }
@@ -127,7 +127,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
         let mut items = items.iter();
         items.any(|(address, word)| profile.runs_by(table, *address, *word) == Some(wanted))
     };
-    // One that says both is a stop.
+    // A write with both a run and a stop in it counts as a stop.
     let run = match (runs(false), runs(true)) {
         (true, _) => Some(false),
         (false, true) => Some(true),
@@ -160,7 +160,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
     }
 }
 
-/// What a command does to all drives that it reaches.
+/// Effects of a command on all drives that it reaches.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Effects {
     on: Vec<(DriveIndex, Effect)>,
@@ -169,7 +169,7 @@ pub struct Effects {
 }
 
 impl Effects {
-    /// Those of a command to one drive.
+    /// Effects of a command on one drive.
     pub fn on_one(drive: DriveIndex, effect: Effect, touches: Touched) -> Effects {
         Effects {
             on: vec![(drive, effect)],
@@ -177,7 +177,7 @@ impl Effects {
         }
     }
 
-    /// Those of a command to several drives.
+    /// Effects of a command on several drives.
     pub fn on_all(on: Vec<(DriveIndex, Effect)>, touches: Touched) -> Effects {
         Effects { on, touches }
     }
@@ -187,7 +187,7 @@ impl Effects {
         self.on.iter().map(|(drive, _)| *drive)
     }
 
-    /// What it does to that drive; nothing to one that it does not reach.
+    /// Effect on this drive; none on a drive that the command does not reach.
     pub fn on(&self, drive: DriveIndex) -> Effect {
         let on = self.on.iter().find(|(of, _)| *of == drive);
         on.map(|(_, effect)| *effect).unwrap_or_default()

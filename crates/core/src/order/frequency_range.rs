@@ -18,8 +18,8 @@ pub struct FrequencyRange {
 }
 
 impl FrequencyRange {
-    /// Whether it still is as it was; a command may have changed the drive's own range at `written`, and what was read
-    /// before says nothing then.
+    /// Whether the range is unchanged; a command may have changed the drive's own range at `written`, and a range read
+    /// before that is not valid.
     pub fn holds(&self, drive: &Reading<'_>, written: Option<Instant>) -> bool {
         let read_before = |end: PointIndex| {
             drive
@@ -37,7 +37,8 @@ impl FrequencyRange {
     }
 }
 
-/// The ranges on which it rests that a command to `asked` sets a register, given as point and value, and keeps the limits.
+/// The frequency ranges that decide whether a command to `asked` sets the register to this point and value, and keeps the
+/// limits.
 pub(crate) fn rests_on(drive: &Reading<'_>, asked: PointIndex, written: (PointIndex, Value)) -> Vec<FrequencyRange> {
     let mut ranges = Vec::new();
     for (index, point) in drive.spec.profile.points.enumerate() {

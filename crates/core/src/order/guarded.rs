@@ -7,7 +7,7 @@ use std::time::Duration;
 pub enum Reason {
     /// Too many starts within the last hour.
     StartsPerHour,
-    /// The motor has not stood long enough.
+    /// The motor has not been stopped for long enough.
     MinOff,
     /// Another drive of the group was started just now.
     Stagger,

@@ -1,5 +1,5 @@
-//! What an order is: its content, what it does to each drive that it reaches, when it came and until when it may be sent,
-//! who gave it, and the ticket by which it gets exactly one result.
+//! An order: its content, its effect on each drive that it reaches, when it came and until when it may be sent, its
+//! origin, and the ticket by which it gets exactly one result.
 //!
 //! A way in gives an [`Order`]; [`crate::permit::admit`] checks and converts it; the [`Command`] made of it waits in the
 //! [`crate::queue`] of its bus. The [`Ticket`] inside a command yields its result when it is used or dropped, so a
@@ -70,7 +70,7 @@ pub enum Order {
     Write(RequestPdu),
     /// A raw read outside the plan.
     Read(RequestPdu),
-    /// One parameter set by a restore, while the motor is stopped.
+    /// A parameter that a restore sets, while the motor is stopped.
     Parameter(ParameterOrder),
 }
 
@@ -90,9 +90,9 @@ pub enum Urgency {
 pub struct Admitted {
     /// The order, derived points replaced by the points they rest on.
     pub order: Order,
-    /// Its rank.
+    /// Rank of the order.
     pub urgency: Urgency,
-    /// It sets references only.
+    /// Whether the order sets references only.
     pub reference_only: bool,
     /// Frequency ranges on which it rests.
     pub ranges: Vec<FrequencyRange>,
@@ -105,7 +105,7 @@ pub enum Haste {
     AtOnce,
     /// Where it is the first stop of the client that started the motor.
     Usual,
-    /// It waits until the motor has run for that time.
+    /// The stop waits until the motor has run for the minimum time.
     Delayed,
 }
 
@@ -114,7 +114,7 @@ pub enum Haste {
 pub struct Stop {
     /// Whether it may be delayed.
     pub haste: Haste,
-    /// Those who wait for the same stop, and until when.
+    /// Clients that wait for the same stop, and until when.
     pub joined: Vec<(Ticket, Instant)>,
     /// Another bus accepted it before a reload: what follows for holds and priorities was noted there.
     pub is_inherited: bool,
@@ -133,23 +133,23 @@ impl Stop {
     }
 }
 
-/// A command that sets something and is no stop.
+/// A command that sets something and is not a stop.
 #[derive(Debug, Default)]
 pub struct Set {
-    /// It sets references only: a newer one of the same points replaces it.
+    /// Whether the command sets references only: a newer one of the same points replaces it.
     pub reference_only: bool,
-    /// It is the rest of a command whose stop goes first, and is not sent if that fails.
+    /// Result of the stop that goes first, where this command is its rest; the rest is not sent if the stop fails.
     pub behind: Option<StopEnd>,
 }
 
-/// What a command is among the commands of its bus.
+/// Kind of a command among the commands of its bus.
 #[derive(Debug)]
 pub enum Work {
-    /// It takes the run command away.
+    /// The command takes the run command away.
     Stop(Stop),
-    /// It sets anything else.
+    /// The command sets anything else.
     Set(Set),
-    /// It reads outside the plan.
+    /// The command reads outside the plan.
     Read,
     /// A tool's write, or a broadcast, which goes to all drives that hear it.
     PassedOn(PassedOn),
@@ -160,22 +160,22 @@ pub enum Work {
 pub struct Window {
     /// When its first byte came.
     pub arrival: Arrival,
-    /// Not sent after this.
+    /// The command is not sent after this time.
     pub expires: Instant,
     /// A start that must wait does so until then; else it is refused.
     pub waits: bool,
 }
 
-/// What the rules ask about: which command it is, what it does where, and when it came.
+/// The part of a command that the rules judge: its identity, its effect on each drive, and when it came.
 #[derive(Debug, Clone)]
 pub struct Intent {
     /// Names the command: no other one of the process has the same number.
     pub number: u64,
     /// Index of the drive on its bus.
     pub drive: DriveIndex,
-    /// Its content.
+    /// Content of the order.
     pub order: Order,
-    /// What it does to each drive that it reaches.
+    /// Effects on each drive that the order reaches.
     pub effects: Effects,
     /// Frequency ranges on which its values rest.
     pub ranges: Vec<FrequencyRange>,
@@ -188,11 +188,11 @@ pub struct Intent {
 /// A command on its way to the bus.
 #[derive(Debug)]
 pub struct Command {
-    /// What it does, where, and when it came.
+    /// Content, effects and time of the command.
     pub intent: Intent,
-    /// What it is among the commands of its bus.
+    /// Kind of the command among the commands of its bus.
     pub work: Work,
-    /// Its ticket.
+    /// Ticket of the command.
     pub ticket: Ticket,
     /// Younger commands that went before it.
     pub(crate) overtaken: usize,
@@ -205,7 +205,7 @@ fn next_number() -> u64 {
 }
 
 impl Intent {
-    /// Of a new command.
+    /// Intent of a new command.
     pub fn new(drive: DriveIndex, order: Order, effects: Effects, window: Window) -> Intent {
         Intent {
             number: next_number(),
@@ -279,7 +279,7 @@ impl Command {
         }
     }
 
-    /// Its rank on the bus. What is passed on has that of a command, whatever it does.
+    /// Rank of the command on the bus. A request passed on for a tool has the rank of a command, whatever it does.
     pub fn urgency(&self) -> Urgency {
         match self.work {
             Work::Stop(_) => Urgency::Stop,
@@ -293,22 +293,22 @@ impl Command {
         self.intent.effects.drives()
     }
 
-    /// Whether it reaches that drive.
+    /// Whether the command reaches this drive.
     pub fn reaches(&self, drive: DriveIndex) -> bool {
         self.reach().any(|reached| reached == drive)
     }
 
-    /// What it does to that drive.
+    /// Effect of the command on this drive.
     pub fn effect(&self, drive: DriveIndex) -> Effect {
         self.intent.effects.on(drive)
     }
 
-    /// Whether it takes the run command of that drive away.
+    /// Whether the command takes the run command of this drive away.
     pub fn stops(&self, drive: DriveIndex) -> bool {
         self.effect(drive).stops
     }
 
-    /// Whether it is a stop that takes place before everything else to its drive.
+    /// Whether the command is a stop, which goes before everything else to its drive.
     pub fn is_stop(&self) -> bool {
         matches!(self.work, Work::Stop(_))
     }
@@ -318,22 +318,22 @@ impl Command {
         matches!(&self.work, Work::Stop(stop) if stop.is_inherited)
     }
 
-    /// Whether it sets something and is no stop.
+    /// Whether the command sets something and is not a stop.
     pub(crate) fn is_command(&self) -> bool {
         self.urgency() == Urgency::Command
     }
 
-    /// Whether it sets references only.
+    /// Whether the command sets references only.
     pub(crate) fn is_reference_only(&self) -> bool {
         matches!(&self.work, Work::Set(set) if set.reference_only)
     }
 
-    /// Whether it may start a drive that it does not stop.
+    /// Whether the command may start a drive that it does not stop.
     pub(crate) fn may_start(&self) -> bool {
         self.is_command() && !self.is_reference_only()
     }
 
-    /// What is passed on for a tool, where it is that.
+    /// The request passed on for a tool, where the command is one.
     pub fn as_passed_on(&self) -> Option<&PassedOn> {
         match &self.work {
             Work::PassedOn(passed_on) => Some(passed_on),
@@ -341,18 +341,19 @@ impl Command {
         }
     }
 
-    /// Whether it is a stop that `min_run` delays.
+    /// Whether the command is a stop that `min_run` delays.
     pub fn is_delayed_stop(&self) -> bool {
         matches!(&self.work, Work::Stop(stop) if stop.haste == Haste::Delayed)
     }
 
-    /// Whether it may go while the gateway ends: a stop, and the broadcast that stops a whole line.
+    /// Whether the command may still be sent while the gateway shuts down: a stop, and the broadcast that stops a whole
+    /// line.
     pub(crate) fn ends_the_gateway(&self) -> bool {
         let is_shutdown = self.ticket.origin().kind == SourceKind::Shutdown;
         self.is_stop() || (is_shutdown && self.as_passed_on().is_some())
     }
 
-    /// Those who gave it: the client whose order it is, then those that joined.
+    /// The clients of the command: the one whose order it is, then those that joined.
     pub fn origins(&self) -> impl Iterator<Item = &Origin> {
         let joined = match &self.work {
             Work::Stop(stop) => stop.joined.as_slice(),

@@ -1,4 +1,4 @@
-//! Who commands.
+//! The origin of a command.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -99,7 +99,7 @@ pub enum Authority {
     ReadOnly,
 }
 
-/// What a client's connection proves about it.
+/// Facts that a client's connection proves about it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Proof {
     /// Nothing.
@@ -129,13 +129,13 @@ pub enum Acting {
     /// As itself.
     #[default]
     Usual,
-    /// Its stop is a new one, also where the client repeats its word all the time.
+    /// Each stop of this client is a new one, even if the client repeats its command word continuously.
     Insisting,
     /// The drill that it armed gives the order.
     Drill,
 }
 
-/// Who commands: for the audit, and as a client among others.
+/// The origin of a command: for the audit, and as a client among others.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Origin {
     /// Kind of the source.
@@ -150,22 +150,23 @@ pub struct Origin {
 }
 
 impl Origin {
-    /// Who acts when a lease expires.
+    /// Name of the origin when a lease expires.
     pub const LEASE: &str = "supervision";
     /// The client name for a stop that is written again because an earlier write may still be on its way.
     pub const REPEATED_STOP: &str = "repeated stop";
     /// The client name for the stop of a drive that was switched to local control with its run command set.
     pub const LOCAL: &str = "local control place";
 
-    /// One that is a client by itself.
+    /// An origin that is a client by itself.
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
         let client = format!("{} {who}", kind.name()).into();
         Origin::of(client, kind, who)
     }
 
-    /// One that is `client` in all that is shared among clients: turns and places in the queue, records of the audit. A
-    /// client gains nothing there by more connections or topics, as long as they all name the same `client`.
+    /// An origin that counts as `client` wherever clients share something: turns and places in the queue, records of
+    /// the audit. A client gains nothing there by more connections or topics, as long as they all name the same
+    /// `client`.
     pub fn of(client: Arc<str>, kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
         Origin {
@@ -179,7 +180,7 @@ impl Origin {
         }
     }
 
-    /// The same, of whom its connection proves that.
+    /// Sets the facts that the connection of the client proves.
     pub fn proven(mut self, proof: Proof) -> Origin {
         self.proof = proof;
         self
@@ -192,7 +193,7 @@ impl Origin {
         self
     }
 
-    /// This client, whose stop is a new one even if it repeats its word all the time.
+    /// Marks each stop of the client as a new one, even if it repeats its command word continuously.
     pub(crate) fn insisting(mut self) -> Origin {
         self.acting = Acting::Insisting;
         self
@@ -208,18 +209,18 @@ impl Origin {
         self.acting == Acting::Drill
     }
 
-    /// The same with that right to write.
+    /// Sets the right to write.
     pub fn with_right(mut self, right: Right) -> Origin {
         self.right = right;
         self
     }
 
-    /// The same for what has begun and has to come to its end, whatever a reload takes away.
+    /// Gives a right that no reload takes away, for an action that has started and must be completed.
     pub fn lasting(self) -> Origin {
         self.with_right(Right::lasting())
     }
 
-    /// Its right to write.
+    /// The right of the client to write.
     pub fn right(&self) -> &Right {
         &self.right
     }
@@ -229,7 +230,7 @@ impl Origin {
         &self.proof
     }
 
-    /// The same with a login, which may renew the lease of the drive until another client commands it.
+    /// Sets a login, which may renew the lease of the drive until another client commands it.
     pub fn with_login(mut self, login: Arc<str>) -> Origin {
         self.login = Some(login);
         self
@@ -240,7 +241,7 @@ impl Origin {
         self.login.as_ref()
     }
 
-    /// Whether it is the lease of a drive, and no other stop of the gateway's own.
+    /// Whether the origin is the lease of a drive, not another stop of the gateway itself.
     pub fn is_lease(&self) -> bool {
         self.kind == SourceKind::Supervision && self.who == Origin::LEASE
     }

@@ -7,12 +7,12 @@ use super::audit::Reach;
 use super::{CAPACITY, Guarded};
 use crate::codec::{Exception, Reply};
 
-/// What interrupted a started command.
+/// Event that interrupted a started command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interruption {
     /// A stop arrived.
     Stop,
-    /// Its time expired.
+    /// The time of the command expired.
     Expired,
     /// The port was lost.
     BusDown,
@@ -41,7 +41,7 @@ pub enum Outcome {
     TimedOut,
     /// The drive's reply was invalid: wrong check code or length.
     Garbled,
-    /// It expired before its turn; not sent.
+    /// The command expired before its turn; not sent.
     Expired,
     /// A newer reference took its place; not sent.
     Replaced,
@@ -51,11 +51,11 @@ pub enum Outcome {
     Withdrawn,
     /// The drive acknowledged it and shows another value.
     NotTaken(String),
-    /// It was started and was interrupted: whether the drive took it, or a part of it, is not known.
+    /// The command was started and interrupted: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
     /// The rest of a command whose stop failed; not sent.
     NotStopped,
-    /// Of a command that stops and does more, the drive acknowledged the stop; the result of the rest.
+    /// The drive acknowledged the stop of a command that also does more; the result of the rest.
     StopOnly(Box<Outcome>),
     /// The stop of such a command failed, in that way, and the rest was not sent.
     StopFailed(Box<Outcome>),
@@ -221,8 +221,8 @@ pub enum Refusal {
     /// The point or address cannot be written, or does not exist.
     #[error("{0}")]
     NotWritable(String),
-    /// It depends on a value that was not read from the drive yet; for a silent drive, its absence is the reason
-    /// instead.
+    /// The command depends on a value that was not read from the drive yet; for a silent drive, its absence is the
+    /// reason instead.
     #[error("{0}")]
     NotKnown(String),
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
@@ -240,7 +240,7 @@ pub enum Refusal {
     /// A client refused after a stop repeats run, or renews a hold it does not have.
     #[error("{0}")]
     NeedsTake(Box<Holder>),
-    /// There is no drive of that name.
+    /// No drive has this name.
     #[error("{0}")]
     UnknownDrive(String),
     /// The drive reports that its motor runs: no parameter is written.
@@ -254,11 +254,11 @@ pub enum Refusal {
 /// The client that blocks a drive for others.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Holder {
-    /// Who.
+    /// Client that holds the drive.
     pub who: String,
     /// By which right.
     pub rank: String,
-    /// What is held, and how that ends.
+    /// The point that is held, and how the hold ends.
     pub keeps: String,
     /// Seconds until it ends by itself, if it does.
     pub left_s: Option<u64>,

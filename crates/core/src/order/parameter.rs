@@ -3,12 +3,12 @@
 use crate::codec::{RequestPdu, Table};
 use crate::drive::parameters::RawValue;
 
-/// One parameter to set. The bus reads the value and whether the motor runs, writes, and reads the value back; nothing
+/// A parameter to set. The bus reads the value and whether the motor runs, writes, and reads the value back; nothing
 /// else is sent between the reply that the motor is stopped and the write. A drive that already has the value is not
 /// written, to save its memory: the reply is then that of the read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterOrder {
-    /// Its id in the family.
+    /// Id of the parameter in its family.
     pub id: String,
     /// PDU address of its (first) holding register.
     pub address: u16,

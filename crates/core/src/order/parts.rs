@@ -10,20 +10,20 @@ use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 /// A command, its stop taken out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Parts {
-    /// It stops nothing, or does nothing else.
+    /// The order stops nothing, or does nothing else.
     One(Order),
-    /// Its stop, and the rest.
+    /// The stop of the order, and the rest.
     Two(Order, Order),
 }
 
 /// The role of a point in a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
-    /// It takes the run command away.
+    /// The point takes the run command away.
     Stop,
-    /// It sets the run command.
+    /// The point sets the run command.
     Run,
-    /// It takes another command away (direction, reset), as the word of a stop does; alone it is no stop.
+    /// The point takes another command away (direction, reset), as the word of a stop does; alone it is not a stop.
     Clears,
     Other,
 }
@@ -112,7 +112,7 @@ impl StopEnd {
         let _ = self.0.set(outcome.is_ok());
     }
 
-    /// Whether it ended without the drive's acknowledgement.
+    /// Whether the stop ended without the drive's acknowledgement.
     pub fn has_failed(&self) -> bool {
         self.0.get() == Some(&false)
     }

@@ -1,4 +1,4 @@
-//! What is passed on to the line as it is: for a tool, as a broadcast, or for work of the gateway that has time.
+//! Requests passed on to the line unchanged: for a tool, as a broadcast, or for background work of the gateway.
 
 use std::time::Instant;
 
@@ -39,15 +39,15 @@ pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
 pub struct PassedOn {
     /// The address on the line; 0 is the broadcast, except on N2.
     pub address: u8,
-    /// It may change any value of every drive that receives it.
+    /// Whether the request may change any value of every drive that receives it.
     pub may_write: bool,
-    /// It stops all drives that receive it, and precedes all waiting commands.
+    /// Whether the request stops all drives that receive it, and precedes all waiting commands.
     pub first: bool,
     /// Receives the reply frame, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
 }
 
-/// A request of the lowest rank: one transaction with one drive, which is no command to it.
+/// A request of the lowest rank: one transaction with one drive, which is not a command to it.
 #[derive(Debug)]
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
@@ -56,11 +56,11 @@ pub struct BackgroundRequest {
     pub pdu: RequestPdu,
     /// How much of a busy line it may take.
     pub pace: Pace,
-    /// Not sent after this.
+    /// The request is not sent after this time.
     pub expires: Instant,
-    /// Its ticket.
+    /// Ticket of the request.
     pub ticket: Ticket,
-    /// Who gets the frame of the reply, for a tool; none for a request of the gateway itself.
+    /// Receiver of the reply's frame, for a tool; none for a request of the gateway itself.
     pub passed_on: Option<PassedOn>,
 }
 

@@ -17,8 +17,8 @@ impl Grants for AtomicBool {
     }
 }
 
-/// The right of a client to write. Commands that wait, sequences that have begun and slots of priority arrays carry the
-/// right of their client, so that a reload which takes it away ends them.
+/// The right of a client to write. Commands that wait, sequences that have started and slots of priority arrays carry
+/// the right of their client, so that a reload which takes it away ends them.
 #[derive(Debug, Clone, Default)]
 pub struct Right(Option<Arc<dyn Grants>>);
 
@@ -28,7 +28,8 @@ impl Right {
         Right(Some(grants))
     }
 
-    /// A right that no reload takes away: that of the gateway itself, and of what was begun and has to come to its end.
+    /// A right that no reload takes away: for the gateway itself, and for an action that has started and must be
+    /// completed.
     pub const fn lasting() -> Right {
         Right(None)
     }

@@ -55,7 +55,7 @@ impl Commanded {
 pub struct Entry {
     /// The value, in the unit of the point.
     pub value: Value,
-    /// Who wrote it.
+    /// The client that wrote the entry.
     pub origin: Origin,
     /// When.
     pub at: Instant,
@@ -110,7 +110,7 @@ impl SlotWrite {
         }
     }
 
-    /// The same, planned with that entry governing as a result.
+    /// Plans the write with `entry` as the one that governs as a result.
     pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
         self.heir = Some(entry.number);
         self

@@ -127,7 +127,7 @@ impl Ticket {
         receiver
     }
 
-    /// Who commanded.
+    /// The origin of the command.
     pub fn origin(&self) -> &Origin {
         &self.origin
     }
@@ -169,7 +169,7 @@ impl Ticket {
         let _ = sender.send(answer);
     }
 
-    /// Who started or stopped a motor is asked as soon as the next read shows it.
+    /// Records who started or stopped a motor: the next read that shows the change asks for it.
     fn note_run(&self, outcome: &Outcome, now: Instant) {
         let run = self.changes.iter().rev().find_map(|change| change.run);
         let may_be_done = outcome.reach() == Reach::Sent && !matches!(outcome, Outcome::Exception(_));
@@ -232,7 +232,7 @@ impl Receipt {
         let time = now.saturating_duration_since(self.0.accepted);
         self.0.confirmed = Some(time);
         if let Some(sender) = self.0.confirmation.take() {
-            // The client may have gone, or never asked.
+            // The client may be gone, or may not have requested the confirmation.
             let _ = sender.send(Ok(time));
         }
     }
@@ -245,7 +245,7 @@ impl Receipt {
         }
     }
 
-    /// Nothing was written: it takes effect later, as `why` says.
+    /// Nothing was written yet: the write takes effect later, for the reason `why`.
     pub fn waits(mut self, why: &str) {
         self.0.waits = true;
         self.cannot_be_seen(why);

@@ -13,9 +13,9 @@ pub enum Touched {
     /// Which ones is not known.
     #[default]
     Anything,
-    /// These.
+    /// The known registers.
     These {
-        /// It sets them.
+        /// Registers that the command sets.
         sets: Vec<Item>,
         /// By them its values were converted or limited.
         rests_on: Vec<Item>,
@@ -52,7 +52,7 @@ impl Touched {
         })
     }
 
-    /// Whether it is the same which of the two goes first.
+    /// Whether the order in which the two commands are sent makes no difference.
     pub(crate) fn commutes(&self, other: &Touched) -> bool {
         let (
             Touched::These { sets, rests_on },

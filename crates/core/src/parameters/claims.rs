@@ -1,5 +1,6 @@
-//! Assigns the journals of interrupted restores to the configured drives. A journal belongs to a machine; if that is no
-//! longer configured, it is unknown whether a drive in its place, or with its name, is the half-restored one. Pure.
+//! Assigns the journals of interrupted restores to the configured drives. A journal belongs to a machine; if that
+//! machine is no longer configured, it is unknown whether a drive in its place, or with its name, is the half-restored
+//! one. Pure.
 
 use super::journal::{JournalFile, Owner};
 use crate::process_image::Machine;
@@ -7,18 +8,18 @@ use crate::process_image::Machine;
 /// Why a journal concerns a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Claim {
-    /// It belongs to this machine.
+    /// The journal belongs to this machine.
     Own,
-    /// Its machine is no longer configured. At its address is this one, of another profile.
+    /// The journal's machine is no longer configured. At its address is this one, of another profile.
     Place,
-    /// Its machine is no longer configured. This one has the name.
+    /// The journal's machine is no longer configured. This one has its name.
     Name,
 }
 
 /// The claims of the journals on the configured drives.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Claims {
-    /// Of each drive, in order: the journal that concerns it, if there is one, and why.
+    /// For each drive, in order: the journal that concerns it, if there is one, and why.
     pub drives: Vec<Option<(usize, Claim)>>,
     /// Journals that belong to no configured drive.
     pub orphans: Vec<usize>,
@@ -32,7 +33,7 @@ pub fn claims(journals: &[(JournalFile, Result<Owner, String>)], drives: &[(Mach
     };
     for (journal, (file, owner)) in journals.iter().enumerate() {
         let machine = owner.as_ref().ok().and_then(|owner| owner.machine.as_ref());
-        // One that does not say where it belongs concerns the drive of its name, as it always did.
+        // A journal without a machine concerns the drive of its name, as in earlier versions.
         let directory = file.drive();
         let name = owner.as_ref().map_or(directory.as_str(), |owner| &owner.drive);
         let named = || drives.iter().position(|(_, other)| *other == name);

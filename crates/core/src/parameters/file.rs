@@ -14,7 +14,7 @@
 //! 117 = ?      # not read: the drive refused it with exception 03
 //! ```
 //!
-//! What follows `#` is as text. A value without a decimal point is a register, one with it an analog output of N2.
+//! Text behind `#` is kept as text. A value without a decimal point is a register, one with it an analog output of N2.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
@@ -85,7 +85,7 @@ impl fmt::Display for Id {
 /// A parameter in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
-    /// Its value, or why it was not read.
+    /// Value of the parameter, or why it was not read.
     pub value: Result<RawValue, String>,
     /// As text: value in its unit, and name.
     pub note: String,
@@ -108,7 +108,7 @@ pub struct ParameterFile {
     pub values: BTreeMap<Id, Entry>,
 }
 
-/// Why a text is no file of parameters.
+/// Reason why a text is not a file of parameters.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FileError {
     /// Something else.

@@ -46,11 +46,11 @@ const RELEASED: &str = "restore.released";
 /// The phase of a restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Phase {
-    /// It writes the new values.
+    /// The restore writes the new values.
     Writing,
     /// All are written; the drive is being made to save them.
     Saving,
-    /// It writes the former values.
+    /// The restore writes the former values.
     TakingBack,
     /// All former values are written; the drive is being made to save them.
     SavingBack,
@@ -92,7 +92,7 @@ impl Owner {
     /// The head of a journal, whether or not the rest of it is understood.
     ///
     /// # Errors
-    /// What is wrong.
+    /// The text is not a journal: the reason.
     pub fn parse(text: &str) -> Result<Owner, String> {
         owner(&mut body_of(text)?.lines())
     }
@@ -169,9 +169,9 @@ pub struct Journal {
     pub of: Owner,
     /// When the restore began, RFC 3339.
     pub begun: String,
-    /// Who began it.
+    /// Client that started the restore.
     pub by: String,
-    /// Its phase.
+    /// Phase of the restore.
     pub phase: Phase,
     /// Parameters of this phase that were done when the journal was written; perhaps more were.
     pub done: usize,
@@ -231,7 +231,7 @@ impl Journal {
     /// Reads a journal of a drive of that family.
     ///
     /// # Errors
-    /// What is wrong.
+    /// The text is not a journal of this family: the reason.
     pub fn parse(text: &str, profile: &Profile) -> Result<Journal, String> {
         let body = body_of(text)?;
         let mut lines = body.lines();
@@ -456,7 +456,7 @@ pub(super) mod tests {
             file.remove(&other).unwrap();
             assert_eq!(file.read().unwrap(), Some(earlier.text(&profile)));
         }
-        // Resumed, it says where it belongs; another machine of that name no longer takes it.
+        // Once resumed, the journal names its machine; another machine of the same name no longer takes it.
         let taken_up = Journal {
             of: owner_at(1),
             ..earlier

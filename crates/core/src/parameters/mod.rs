@@ -1,6 +1,6 @@
-//! The parameter vault: the parameters of drives read, kept, compared and restored. What a reading asks next, what a restore
-//! writes next, files and differences are pure; `store` and `journal` have the files on disk, `vault` the readings and
-//! restores that go on; `north::parameter_jobs` does them.
+//! The parameter vault: the parameters of drives read, kept, compared and restored. The next request of a reading, the next
+//! write of a restore, files and differences are pure; `store` and `journal` have the files on disk, `vault` the readings
+//! and restores in progress; `north::parameter_jobs` carries them out.
 
 mod claims;
 mod difference;

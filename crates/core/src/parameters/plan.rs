@@ -33,9 +33,10 @@ pub struct ParameterWrite {
 pub struct Need {
     /// Point of the profile (index) that shows it.
     pub point: PointIndex,
-    /// The required reading of the point. It is no guarantee: the drive may still refuse.
+    /// The required reading of the point. Even then the drive may still refuse.
     pub value: bool,
-    /// Exception code by which the drive refuses a write otherwise, N2 codes with 0x80 added; none where no manual says.
+    /// Exception code with which the drive refuses a write otherwise, N2 codes with 0x80 added; none where no manual
+    /// gives it.
     pub exception: Option<u8>,
     /// The remedy: `switch the operator to PRGM`.
     pub remedy: String,
@@ -67,7 +68,7 @@ pub struct Plan {
 /// The parameters the user named, and whether the risks are accepted.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Wishes {
-    /// These alone; also those that are never restored otherwise. Empty: all.
+    /// Only these parameters, including those that are never restored otherwise. Empty: all.
     pub only: Vec<Id>,
     /// Treat refusals that can be forced as risks.
     pub force: bool,

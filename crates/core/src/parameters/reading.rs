@@ -20,9 +20,9 @@ use crate::order::Outcome;
 const TRIES: u32 = 4;
 /// Tries of a request to a drive that is busy.
 const BUSY_TRIES: u32 = 20;
-/// Pause before a busy drive is asked again.
+/// Pause before a request to a busy drive is repeated.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
-/// Pause before a drive is asked again that is away.
+/// Pause before a request to an absent drive is repeated.
 const AWAY_PAUSE: Duration = Duration::from_secs(1);
 
 /// The next step after a reply.
@@ -32,7 +32,7 @@ pub enum Next {
     Go,
     /// The next request after that time, for the reason given.
     Pause(Duration, String),
-    /// It cannot continue.
+    /// The reading cannot continue.
     Failed(String),
 }
 
@@ -61,13 +61,13 @@ pub struct Reading {
 enum Counters {
     /// The family has none, or the drive does not give them.
     Absent,
-    /// Those read so far, and the tries of the next one.
+    /// Counters read so far, and the tries of the next one.
     Reading(Vec<u16>, u32),
     Read(CountedByDrive),
 }
 
 impl Reading {
-    /// Of a drive of that family; `known` are the addresses that an earlier reading found.
+    /// Starts a reading of a drive of this family; `known` are the addresses that an earlier reading found.
     pub fn new(profile: Arc<Profile>, known: BTreeSet<u16>) -> Reading {
         let mut reading = Reading {
             profile,
@@ -132,7 +132,7 @@ impl Reading {
         self.todo.extend(block);
     }
 
-    /// The request to send; nothing when everything was asked.
+    /// The next request to send; none when everything was requested.
     pub fn request(&self) -> Option<RequestPdu> {
         let Some(block) = self.todo.front() else {
             return match &self.counters {
@@ -147,7 +147,7 @@ impl Reading {
         })
     }
 
-    /// Addresses that were asked, and all.
+    /// Number of addresses requested so far, and of all.
     pub fn progress(&self) -> (usize, usize) {
         let open: usize = self.todo.iter().map(|block| usize::from(block.count)).sum();
         (self.total.saturating_sub(open), self.total)
@@ -238,7 +238,7 @@ impl Reading {
     }
 
     fn take(&mut self, address: u16, words: &[u16]) {
-        // What lies in the hole of a block is no parameter.
+        // Words in the hole of a block are not parameters.
         if self.profile.parameters.id(address).is_none() {
             return;
         }
@@ -252,7 +252,7 @@ impl Reading {
         self.found.insert(address, value);
     }
 
-    /// One by one: which of them is it?
+    /// Requests each address of a refused block alone, to find the one that is refused.
     fn split(&mut self, block: Block) {
         let words = self.profile.parameter_words();
         for place in (0..block.count).rev() {
@@ -267,7 +267,7 @@ impl Reading {
         }
     }
 
-    /// There is none at that address. One that was there has gone: everything is asked.
+    /// No parameter exists at this address. If an earlier reading found one there, all addresses are requested again.
     fn absent(&mut self, address: u16) -> Next {
         if self.known.contains(&address) {
             self.known.clear();

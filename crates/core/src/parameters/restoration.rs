@@ -15,7 +15,7 @@ use crate::order::{Outcome, ParameterOrder, Refusal};
 
 /// A restore that cannot continue for that long ends.
 const MOST_WAIT: Duration = Duration::from_secs(3600);
-/// Pause before a busy drive is asked again.
+/// Pause before a request to a busy drive is repeated.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
 /// Pause before the next try where someone has to do something: the motor runs, the drive is away.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -29,7 +29,7 @@ const MOST_SAVES: u32 = 3;
 pub enum Wanted {
     /// The journal as it is now must be on disk before anything else.
     Record,
-    /// This order is given to the bus.
+    /// The next order for the bus.
     Set(ParameterOrder),
     /// The journal is removed.
     Remove,
@@ -42,7 +42,7 @@ pub enum Wanted {
 pub enum Then {
     /// The next step.
     Go,
-    /// The same again after that time, for the reason given.
+    /// The step again after this time, for the reason given.
     Pause(Duration, String),
 }
 
@@ -53,9 +53,9 @@ pub enum End {
     Done,
     /// The drive has all former values.
     TakenBack,
-    /// It was given up before anything was written: why.
+    /// The restore was given up before anything was written: the reason.
     NothingWritten(String),
-    /// It was given up with the drive half restored, perhaps, and the journal left: why.
+    /// The restore was given up with the drive possibly half restored, and the journal left: the reason.
     Unfinished(String),
 }
 
@@ -65,7 +65,7 @@ enum State {
     Recording(usize),
     /// The parameter at that place has its turn; behind the last one the save.
     Setting(usize),
-    /// It has ended, but for the journal.
+    /// The restore has ended; only its journal still has to be removed.
     Removing(End),
     Over(End),
 }
@@ -98,7 +98,7 @@ impl Restoration {
         Restoration::of(journal, true, now)
     }
 
-    /// One that was cut off is taken back.
+    /// Undoes a restore that was interrupted.
     pub fn undo(mut journal: Journal, now: Instant) -> Restoration {
         journal.phase = Phase::TakingBack;
         Restoration::of(journal, true, now)
@@ -237,7 +237,7 @@ impl Restoration {
         self.pause(PAUSE, why, now)
     }
 
-    /// It cannot continue: it was stopped from outside.
+    /// Ends the restore from outside, as it cannot continue.
     pub fn give_up(&mut self, why: String) {
         self.state = match self.touched {
             true => State::Over(End::Unfinished(why)),
@@ -336,7 +336,7 @@ impl Restoration {
         Then::Pause(pause, why.to_string())
     }
 
-    /// It ends at the present order.
+    /// Ends the restore at the present order.
     fn stop(&mut self, why: String) -> Then {
         let place = match &self.state {
             State::Setting(place) => self.writes.get(*place).map(|write| write.line.clone()),
@@ -361,8 +361,7 @@ mod tests {
         Restoration::begin(journal, now)
     }
 
-    /// What is wanted until it has ended, of a drive that loses what is not saved when it is told to save for the first
-    /// time, if it `forgets`.
+    /// The orders of a restore until it has ended; with `forgets` the drive loses unsaved values at its first save.
     fn wanted_ids(restoration: &mut Restoration, mut forgets: bool, now: Instant) -> Vec<String> {
         let (mut all, mut has) = (Vec::new(), std::collections::BTreeSet::new());
         let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));
@@ -407,7 +406,7 @@ mod tests {
             ]
         );
         assert_eq!(restoration.end(), Some(&End::Done));
-        // What was told to be kept is told to be kept again when it is taken back; what was not, is not.
+        // The undo saves exactly the values that were saved before.
         let mut saved = restoration.journal().clone();
         let mut back = Restoration::undo(saved.clone(), now);
         assert_eq!(

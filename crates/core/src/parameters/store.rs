@@ -25,12 +25,12 @@ pub struct Store {
 pub struct Kept {
     /// Name of the drive.
     pub drive: String,
-    /// Its file.
+    /// Path of the file.
     pub path: PathBuf,
 }
 
 impl Store {
-    /// That directory, which need not exist.
+    /// A store in this directory, which need not exist.
     pub fn new(dir: PathBuf) -> Store {
         Store { dir }
     }

@@ -15,15 +15,15 @@ use crate::process_image::{Hold, Machine};
 /// How far the reading of a drive is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Status {
-    /// Its number: a later reading has a higher one.
+    /// Number of the reading: a later one has a higher number.
     pub number: u64,
-    /// Addresses that were asked, and all.
+    /// Number of addresses requested so far, and of all.
     pub progress: (usize, usize),
     /// Estimated remaining time.
     pub remaining: Option<Duration>,
     /// Why it waits.
     pub waits: Option<String>,
-    /// Its result; none while it is in progress.
+    /// Result of the reading; none while it is in progress.
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 
@@ -34,13 +34,13 @@ pub enum RestoreStage {
     Reading,
     /// The plan is ready; the requester decides.
     Prepared,
-    /// It may not be done: the reasons.
+    /// The restore may not be carried out: the reasons.
     Refused(Vec<String>),
     /// Parameters are written.
     Working,
-    /// It has ended, with a summary.
+    /// The restore has ended, with a summary.
     Ended(String),
-    /// It was given up: the reason and the remedy.
+    /// The restore was given up: the reason and the remedy.
     Failed(String),
 }
 
@@ -56,17 +56,17 @@ pub struct Prepared {
 /// How far the restore of a drive is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RestoreStatus {
-    /// Its number: a later one has a higher one.
+    /// Number of the restore: a later one has a higher number.
     pub number: u64,
-    /// Its stage.
+    /// Stage of the restore.
     pub stage: RestoreStage,
     /// Addresses that were read, or parameters that were written, and all.
     pub progress: (usize, usize),
     /// Why it waits.
     pub waits: Option<String>,
-    /// Its plan, once known.
+    /// Plan of the restore, once known.
     pub prepared: Arc<Prepared>,
-    /// Someone wants it to end before the next parameter.
+    /// Whether someone wants the restore to end before the next parameter.
     pub is_unwanted: bool,
 }
 
@@ -116,7 +116,7 @@ impl Vault {
         self.lock().others = others;
     }
 
-    /// Those drives.
+    /// The drives of the configuration that this process does not serve, with their names.
     pub fn others(&self) -> Vec<(Machine, String)> {
         self.lock().others.clone()
     }
@@ -136,7 +136,7 @@ impl Vault {
         self.lock().changed.clone()
     }
 
-    /// So many more changed.
+    /// Adds `count` to the changed parameters of the drive.
     pub fn count_changed(&self, bus: &str, drive: &str, count: u64) {
         *self
             .lock()
@@ -256,7 +256,7 @@ impl Vault {
     /// The restore of that number, which is prepared, begins to write; what.
     ///
     /// # Errors
-    /// It is not the last one, or not prepared.
+    /// The restore is not the last one, or not prepared.
     pub fn carry_out(&self, drive: &Machine, name: &str, number: u64) -> Result<Arc<Prepared>, String> {
         let mut state = self.lock();
         let restore = state.restores.get_mut(drive).filter(|restore| restore.number == number);

@@ -89,7 +89,7 @@ fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal>
     Ok(())
 }
 
-/// The refusal of a write that would command the drive, though it is no command.
+/// The refusal of a write that would command the drive, although it is not an order of the model.
 fn past_commands(drive: &Reading<'_>, what: &str) -> Refusal {
     Refusal::NotWritable(format!(
         "{what} of `{}` lies where the drive is commanded, so writing it could start the motor; nothing was written",
@@ -263,8 +263,8 @@ fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     )))
 }
 
-/// Checks the limits of points for the same quantity: a command in Hz keeps the limits in percent, and vice versa.
-/// `asked` itself is already checked.
+/// Checks the limits of points for the same quantity: a command in Hz keeps the limits in percent, and vice versa. The
+/// limit of `asked` is already checked.
 fn related_limits(drive: &Reading<'_>, asked: PointIndex, index: PointIndex, value: Value) -> Result<(), Refusal> {
     let written = (index, as_held(drive, (index, value)));
     for (other, point) in drive.spec.profile.points.enumerate() {
@@ -328,7 +328,7 @@ fn resolve(
                 .map_err(|why| Refusal::BadValue(format!("`{}`: {why}; nothing was written", point.name)))?;
             Ok((index, value))
         }
-        // It is made into control words when its turn comes.
+        // A derived command is converted into control words when its turn comes.
         Source::Derived(Derived::State { .. }) if point.write => Ok((index, value)),
         Source::Derived(derived) => {
             let name = &point.name;

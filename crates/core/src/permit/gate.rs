@@ -1,5 +1,5 @@
-//! What is known of the drives of a bus that decides about orders: stops, who holds them, priorities, drills, starts. Pure:
-//! time is an argument.
+//! The state of the drives of a bus that decides about orders: stops, holders, priorities, drills, starts. Pure: time is an
+//! argument.
 //!
 //! The gate is part of the queue of the bus, so that orders and what they change here have one order of acceptance.
 
@@ -31,14 +31,14 @@ pub struct DrillLock {
     pub quiet_until: Option<Instant>,
 }
 
-/// What is known of one drive.
+/// State of one drive that decides about its orders.
 #[derive(Debug, Default)]
 pub(super) struct DriveGate {
     /// Stops accepted so far.
     stops: u64,
     /// The last ones, as far as they decide on orders that were given before.
     pub(super) last_stops: LastStops,
-    /// Who gave the last one.
+    /// Origin of the last stop.
     stopped_by: Option<Origin>,
     /// The number of the last command accepted that may start the drive; 0 where there was none.
     last_starter: u64,
@@ -56,7 +56,7 @@ pub(super) struct DriveGate {
     unheld: u64,
 }
 
-/// What is known of the drives of a bus.
+/// State of the drives of a bus that decides about their orders.
 #[derive(Debug, Default)]
 pub struct Gate {
     /// `[authority]`, where it is on.
@@ -71,7 +71,7 @@ pub struct Gate {
     hold_news: HoldNews,
 }
 
-/// What a bus hands over of a drive to the bus that takes its place.
+/// State of a drive that a bus hands to the bus that replaces it.
 #[derive(Debug)]
 pub(crate) struct Inheritance {
     stops: u64,
@@ -95,7 +95,7 @@ impl DriveGate {
 }
 
 impl Gate {
-    /// The drive's part, which begins when it is asked for first.
+    /// The state of the drive, created at the first use.
     pub(super) fn drive(&mut self, drive: DriveIndex) -> &mut DriveGate {
         self.drives.entry(drive).or_default()
     }
@@ -251,7 +251,7 @@ impl Gate {
         self.paused
     }
 
-    /// The bus stood still.
+    /// Records that the bus did not run for a time.
     pub fn note_pause(&mut self, pause: Stall) {
         self.paused = Some(pause);
     }
@@ -274,7 +274,7 @@ impl Gate {
         self.drives.get(&drive).map_or(0, |drive| drive.stops)
     }
 
-    /// Who gave the last stop of that drive that was accepted.
+    /// Origin of the last accepted stop of the drive.
     pub(crate) fn last_stop_by(&self, drive: DriveIndex) -> Option<&Origin> {
         self.drives.get(&drive)?.stopped_by.as_ref()
     }
@@ -317,7 +317,7 @@ impl Gate {
         self.starts = starts;
     }
 
-    /// What the bus that takes the place of this one is to know of a drive.
+    /// State of the drive for the bus that replaces this one.
     pub(crate) fn inheritance(&mut self, drive: DriveIndex) -> Inheritance {
         let of_drive = self.drive(drive);
         Inheritance {
@@ -344,7 +344,7 @@ impl Gate {
             priorities,
             mut holding,
         } = from;
-        // The next reading says it again.
+        // Local control is not taken over: the next reading reports it again.
         holding.set_local(false, &mut Vec::new());
         let of_drive = self.drive(drive);
         (of_drive.stops, of_drive.last_stops, of_drive.stopped_by) = (stops, last_stops, stopped_by);

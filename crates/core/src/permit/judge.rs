@@ -12,51 +12,51 @@ use crate::process_image::Reading;
 /// A moment at which an order is judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
-    /// It is complete and takes its place in the queue.
+    /// The order is complete and takes its place in the queue.
     Accept,
     /// The line is free for it.
     Turn,
-    /// Its next frame is about to go.
+    /// The next frame of the order is about to be sent.
     Write,
 }
 
-/// What is to become of an order.
+/// Result of judging an order.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
-    /// It goes on.
+    /// The order goes on.
     Go,
-    /// It is judged again at that time.
+    /// The order is judged again at this time.
     Wait(Instant),
     /// The state of the drive is read first, in the same command, and it is judged by that.
     LookFirst,
-    /// It ends so.
+    /// The order ends with this outcome.
     Refuse(Outcome),
 }
 
 impl Verdict {
-    /// It ends with that refusal.
+    /// The order ends with this refusal.
     pub(super) fn refuse(refusal: Refusal) -> Verdict {
         Verdict::Refuse(Outcome::Refused(refusal))
     }
 
-    /// It goes on unless it is refused.
+    /// The order goes on unless there is a refusal.
     pub(super) fn unless(refusal: Option<Refusal>) -> Verdict {
         refusal.map_or(Verdict::Go, Verdict::refuse)
     }
 }
 
-/// What is seen of a drive when an order to it is judged.
+/// State of a drive when an order to it is judged.
 #[derive(Debug)]
 pub struct Seen<'a> {
-    /// Its image.
+    /// Process image of the drive.
     pub reading: Reading<'a>,
     /// When its reference and its frequency range were written last, if the order has its turn.
     pub written: Option<LastWritten>,
 }
 
-/// What is seen of the drives of a bus.
+/// Access to the state of the drives of a bus.
 pub trait Facts {
-    /// What is seen of that drive; none where there is no such drive.
+    /// State of the drive; none where the place has no drive.
     fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>>;
 }
 
@@ -67,7 +67,7 @@ impl Facts for () {
     }
 }
 
-/// One question: may this order go on, as far as that drive is concerned?
+/// The input of a rule: an order, one drive that it reaches, and the moment.
 #[derive(Debug)]
 pub struct Ask<'a> {
     /// The moment.
@@ -78,32 +78,32 @@ pub struct Ask<'a> {
     pub drive: DriveIndex,
     /// The order.
     pub intent: &'a Intent,
-    /// Who gave it.
+    /// Origin of the order.
     pub origin: &'a Origin,
-    /// What is seen of the drive.
+    /// State of the drive.
     pub seen: Option<&'a Seen<'a>>,
 }
 
 impl Ask<'_> {
-    /// What the order does to the drive.
+    /// Effect of the order on the drive.
     pub fn effect(&self) -> Effect {
         self.intent.effects.on(self.drive)
     }
 
-    /// What it requires of the hold of the drive.
+    /// Rights that the order requires from the hold of the drive.
     pub fn asks(&self) -> Asks {
         Asks::of(&self.intent.order, self.effect())
     }
 
-    /// Whether it is a write, and no stop.
+    /// Whether the order is a write, but not a stop.
     pub(super) fn changes(&self) -> bool {
         !self.effect().stops && !matches!(self.intent.order, Order::Read(_))
     }
 }
 
-/// One rule.
+/// A rule with the moments at which it applies.
 pub(super) struct Rule {
-    /// The moments at which it is asked; its file says why not at others.
+    /// The moments at which the rule is evaluated; the rule's file explains why not at others.
     pub(super) stages: &'static [Stage],
     /// Whether stops are judged by it, too.
     pub(super) binds_stops: bool,
@@ -111,7 +111,7 @@ pub(super) struct Rule {
     pub(super) judge: fn(&Ask<'_>, &DriveGate, &Gate) -> Verdict,
 }
 
-/// All rules, in the order in which they are asked.
+/// All rules, in the order in which they are evaluated.
 const RULES: [Rule; 9] = [
     rules::access::RULE,
     rules::age::RULE,
@@ -124,7 +124,7 @@ const RULES: [Rule; 9] = [
     rules::limits::RULE,
 ];
 
-/// Judges an order by every rule that is asked at its moment. The first refusal ends it; of several waits the longest counts.
+/// Judges an order by every rule of its moment. The first refusal ends it; of several waits the longest counts.
 pub(super) fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     let stops = ask.effect().stops;
     let mut verdict = Verdict::Go;

@@ -25,7 +25,7 @@ pub const PROTECTING: u8 = 5;
 pub enum Follows {
     /// Nothing: it does not govern, or the drive stays as it is.
     Nothing,
-    /// This value of a point becomes a command of anyone who wrote it.
+    /// The value of this point becomes an order of the client that wrote it.
     Order(Commanded, Box<Entry>),
     /// The last value of `run` is given back: a stop.
     Stop,
@@ -38,7 +38,7 @@ pub enum Settled {
     Done,
     /// Nothing was done: the slot is as it was.
     Failed,
-    /// Whether it was done is not known: the next reading shows it.
+    /// The result is not known: the next reading shows it.
     Unknown,
 }
 
@@ -113,16 +113,16 @@ pub struct Priorities {
     arrays: Option<Box<Arrays>>,
     /// Commands that were accepted so far.
     orders: u64,
-    /// Who gave the last one, and when.
+    /// Origin and time of the last order.
     last: Option<(Origin, Instant)>,
 }
 
-/// Who blocks commands from other interfaces.
+/// Slot that blocks commands from other interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Protects {
     /// The client.
     pub client: String,
-    /// Its priority.
+    /// Priority of the slot.
     pub priority: u8,
     /// The point it blocks.
     pub what: ModelPoint,
@@ -161,7 +161,7 @@ impl Priorities {
         self.orders
     }
 
-    /// Who gave the last order, and when.
+    /// Origin and time of the last order.
     pub fn last(&self) -> Option<&(Origin, Instant)> {
         self.last.as_ref()
     }
@@ -272,7 +272,7 @@ impl Priorities {
                 continue;
             };
             let (_, entry) = slot.asked.remove(place);
-            // Of two writes the later one stands, whichever is answered first.
+            // The later of two writes counts, whichever is answered first.
             if id < slot.by {
                 continue;
             }
@@ -318,7 +318,7 @@ impl Priorities {
         }
     }
 
-    /// Who keeps a command of another side from being accepted.
+    /// The slot that keeps a command of another interface from being accepted.
     pub fn refuses(&self, origin: &Origin, effect: Effect) -> Option<Protects> {
         if origin.kind == SourceKind::Bacnet || !origin.kind.is_client() {
             return None;

@@ -10,7 +10,7 @@ use crate::drive::{Bound, Derived, PointIndex, Profile, Source, Value};
 use crate::order::{Order, Refusal, written};
 use crate::process_image::Reading;
 
-/// When reference and range of a drive were written last; what was read before says nothing then.
+/// When reference and range of a drive were written last; values read before that are not valid.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LastWritten {
     /// A reference.

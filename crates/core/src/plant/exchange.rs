@@ -19,7 +19,7 @@ use crate::permit::{Stage, client_access};
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
 
-/// Who on the line is asked.
+/// Receiver of a request on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Target {
     /// The configured drive at that place of the bus.
@@ -31,17 +31,17 @@ pub enum Target {
 /// A tool's request. The caller has checked that a write is allowed.
 #[derive(Debug, Clone)]
 pub struct Question {
-    /// Who is asked.
+    /// Receiver of the request.
     pub target: Target,
-    /// What.
+    /// The request.
     pub pdu: RequestPdu,
-    /// Whether it may change anything: then it is counted and audited as a command.
+    /// Whether the request may change anything: then it is counted and audited as a command.
     pub may_write: bool,
     /// How it came.
     pub arrival: Arrival,
-    /// Not sent after this.
+    /// The request is not sent after this time.
     pub expires: Instant,
-    /// Its origin.
+    /// Origin of the request.
     pub origin: Origin,
 }
 
@@ -85,7 +85,7 @@ impl BusHandle {
         self.pass_on(question, false, writes, now)
     }
 
-    /// The same of a broadcast that stops every drive of the bus: it goes before all that waits, stops included.
+    /// Sends a broadcast that stops every drive of the bus: it goes before all that waits, stops included.
     pub(crate) fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, true, writes, now)
     }

@@ -130,7 +130,7 @@ impl DriveHandle {
         });
         let view = queue.gate.hold_view(self.index, None, now);
         drop(queue);
-        // What was started for another one may have to end.
+        // An order of the former holder may have to end, so the bus is woken.
         self.bus.queue.wake();
         acted?;
         if verb != Verb::Release {

@@ -1,5 +1,5 @@
-//! What the name or the unit of a drive meant before a reload: an order belongs to the machine that it named when its first byte
-//! came. Pure: time is an argument.
+//! Earlier meanings of the name or the unit of a drive: an order belongs to the machine that it named when its first byte came.
+//! Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -51,7 +51,7 @@ struct Served {
     place: DriveIndex,
 }
 
-/// What named the drive meant another machine, or none, until then.
+/// An earlier meaning: until `until` the name or unit stood for another machine, or for none.
 #[derive(Debug, Clone)]
 struct Former {
     by: By,
@@ -63,13 +63,13 @@ struct Former {
 /// The machine that an order named, where its name means another one by now.
 #[derive(Debug)]
 pub(super) enum Meant {
-    /// It is served under another name.
+    /// The machine is served under another name.
     There(Box<DriveHandle>),
-    /// It is not served any more, or there was none.
+    /// The machine is no longer served, or there was none.
     Gone,
 }
 
-/// What the names and units of the drives of a bus meant before reloads.
+/// Earlier meanings of the names and units of the drives of a bus.
 #[derive(Debug, Default)]
 pub struct Formerly(Mutex<BTreeMap<DriveIndex, Vec<Former>>>);
 
@@ -78,7 +78,7 @@ impl Formerly {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What an order that came at `asked`, and names the drive so, meant; the first change after that says it.
+    /// The meaning at `asked` of the name or unit of the drive; the first change after that time has it.
     fn at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
         let all = self.lock();
         let mut of_drive = all.get(&drive)?.iter();

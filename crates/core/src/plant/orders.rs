@@ -22,11 +22,11 @@ use crate::process_image::{BusImage, Reading};
 #[derive(Debug, Clone)]
 pub struct OrderRequest {
     order: Order,
-    /// What else was in it and is refused, where only its stop was understood: as text, and why.
+    /// The part of the request that is refused, where only its stop was understood: as text, and why.
     rest: Option<(String, Refusal)>,
     origin: Origin,
     authority: Authority,
-    /// When it came; now where nothing else is said.
+    /// When the request came; now where it is not set.
     arrival: Option<Arrival>,
     expiry: Duration,
     slot: Option<SlotWrite>,
@@ -50,13 +50,13 @@ impl OrderRequest {
         }
     }
 
-    /// It is not sent later than that after it came.
+    /// Limits the time after its arrival within which the order is sent.
     #[must_use]
     pub fn within(self, expiry: Duration) -> OrderRequest {
         OrderRequest { expiry, ..self }
     }
 
-    /// It came so: no stop that came in since is undone by it.
+    /// Sets the arrival, so that the order undoes no stop accepted since.
     #[must_use]
     pub fn arrived(self, arrival: Arrival) -> OrderRequest {
         OrderRequest {
@@ -65,7 +65,7 @@ impl OrderRequest {
         }
     }
 
-    /// Its order is the stop of a command that was understood; the rest, as text, is refused.
+    /// Marks the order as the stop of a command that was understood; the rest, as text, is refused.
     #[must_use]
     pub fn without_rest(self, what: &str, refusal: Refusal) -> OrderRequest {
         OrderRequest {
@@ -74,7 +74,7 @@ impl OrderRequest {
         }
     }
 
-    /// It follows from that write to a slot: both are accepted, or neither is.
+    /// Marks the order as following from this write to a slot: both are accepted, or neither is.
     #[must_use]
     pub fn by_slot(self, write: SlotWrite) -> OrderRequest {
         OrderRequest {
@@ -96,7 +96,7 @@ impl OrderRequest {
     }
 }
 
-/// One part of an order on its way into the queue.
+/// A part of an order on its way into the queue.
 struct Part {
     ticket: Ticket,
     window: Window,
@@ -104,7 +104,7 @@ struct Part {
     at_once: bool,
 }
 
-/// What an order sees of the drives of a bus when it is accepted.
+/// State of the drives of a bus when an order is accepted.
 struct AtAccept<'a> {
     image: &'a BusImage,
     now: Instant,
@@ -188,7 +188,7 @@ pub fn turn_away(
 }
 
 impl BusHandle {
-    /// What an order sees of the drives when it is accepted; samples older than `stale_after` are stale.
+    /// State of the drives when an order is accepted; samples older than `stale_after` are stale.
     pub(super) fn at_accept(&self, stale_after: Duration, now: Instant) -> impl Facts + '_ {
         AtAccept {
             image: &self.image,
@@ -198,8 +198,7 @@ impl BusHandle {
     }
 
     /// Gives the drive of `reading`, at place `drive` on this bus, a command of the gateway itself: a point of the
-    /// model and its value. No client is after it, so it renews no lease, and no newer reference of a client takes its
-    /// place.
+    /// model and its value. No client gives it, so it renews no lease, and no newer reference of a client replaces it.
     ///
     /// # Errors
     /// The refusal; it is neither audited nor counted.
@@ -241,7 +240,7 @@ impl DriveHandle {
     /// all that was placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive
     /// offline. Refused writes are audited and published as an event.
     ///
-    /// Of an order that stops and does more, the stop is carried out whatever becomes of the rest; it is audited as two.
+    /// The stop of an order that also does more is carried out whatever happens to the rest; it is audited as two.
     ///
     /// An order whose first byte came when a reload had not given its name to this machine yet belongs to the machine that it named
     /// then: a stop in it is carried out there, and nothing else of it anywhere.
@@ -467,8 +466,8 @@ impl DriveHandle {
         }
     }
 
-    /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. The
-    /// result of it; a read on a line that another master owns is refused.
+    /// Sends the drive a request of the lowest rank, at `now`; it is not sent later than `expiry` from now. Returns its
+    /// result; a read on a line that another master owns is refused.
     pub async fn read_in_background(
         &self,
         pdu: RequestPdu,

@@ -9,7 +9,7 @@ use tokio::sync::oneshot;
 
 use crate::order::{Answer, Outcome, joined};
 
-/// What reads showed about an acknowledged command; empty for any other.
+/// Effect of an acknowledged command as shown by reads; empty for any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Shown {
     /// Time from acceptance to the read that showed its effect.
@@ -18,13 +18,12 @@ pub struct Shown {
     pub unseen: Option<String>,
 }
 
-/// A command that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task
-/// waits with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing
-/// back.
+/// A command that is in the queue of its bus, or was answered already. No runtime is needed: a task waits with
+/// [`Placed::answered`], other callers poll with [`Placed::answer`]. Dropping it does not cancel the command.
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
-    /// Of a command that stops and does more: of its stop.
+    /// Answer to the command, or to its stop where it also does more.
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
     rest: Option<Box<Rest>>,
@@ -51,7 +50,7 @@ impl Placed {
         }
     }
 
-    /// The same for a command split into stop and rest: the one result covers both parts.
+    /// Adds the rest of a command that was split into stop and rest: the one result covers both parts.
     pub(super) fn with_rest(
         mut self,
         answer: oneshot::Receiver<Answer>,

@@ -9,8 +9,8 @@ use crate::permit::{Mode, Rules, VoidSlot};
 use crate::process_image::{Access, DriveImage};
 
 impl BusHandle {
-    /// Empties the slots of its drives whose client may no longer write, and publishes an event for each: such a slot
-    /// could not be released any more. Without `events` nobody is told: another bus has the drives now. Nothing is written to
+    /// Empties the slots of its drives whose client may no longer write, and publishes an event for each: such a slot could
+    /// not be released any more. Without `events` nothing is published: another bus has the drives now. Nothing is written to
     /// a drive.
     pub fn void_slots(&self, events: Option<&Events>, time: SystemTime) {
         for (index, image) in self.image.drives.enumerate() {
@@ -21,7 +21,7 @@ impl BusHandle {
                 .filter(|rules| rules.mode == Mode::Exclusive)
                 .cloned();
             let stays = |what: Commanded, entry: &Entry| {
-                // Who is no principal may stop, and so release an inactive.
+                // A client that is not a principal may still stop, and so release an inactive.
                 let is_stop = what == Commanded::Run && !entry.value.as_bool();
                 let is_known = |rules: &Rules| rules.claim_of(&entry.origin).is_some();
                 image.spec.access == Access::Control
@@ -37,7 +37,7 @@ impl BusHandle {
                 void.iter()
                     .for_each(|slot| events.publish(self.void_event(image, slot, time)));
             }
-            // Whoever shows the drive shows its slots.
+            // An update of the image makes the interfaces show the slots again.
             image.update(|_| {});
         }
     }
@@ -72,7 +72,7 @@ mod tests {
 
     const NOW: SystemTime = SystemTime::UNIX_EPOCH;
 
-    /// What stands in the slots of a drive after the sweep, and how many events told of what does not.
+    /// The slots of a drive after the sweep, and the number of events about emptied ones.
     fn left(bus: &BusHandle, events: &Events) -> (Vec<(Commanded, u8)>, usize) {
         bus.void_slots(Some(events), NOW);
         let mut queue = bus.queue.lock();
@@ -120,7 +120,7 @@ mod tests {
             (false, true, None, vec![]),
             (true, false, None, vec![]),
             (true, true, Some(rules(Mode::Exclusive, "plc")), all.clone()),
-            // Who is no principal any more may only stop, and so release an inactive.
+            // A client that is no longer a principal may only stop, and so release an inactive.
             (true, true, Some(rules(Mode::Exclusive, "")), vec![(Commanded::Run, 3)]),
             (true, true, Some(rules(Mode::Advisory, "")), all.clone()),
         ];

@@ -32,7 +32,7 @@ impl Reading<'_> {
             .max_by_key(|(seen, _)| *seen);
         match (newest, speed_of(value, *certain)) {
             (Some((_, turns)), Some(turned)) => turns != turned,
-            // So slow that it may be either.
+            // The speed is so low that the motor may turn or stand.
             (Some((_, turns)), None) => !turns,
             (None, _) => false,
         }

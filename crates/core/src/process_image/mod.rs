@@ -95,7 +95,7 @@ impl DriveImage {
         }
     }
 
-    /// The same with the hold of an earlier image of the drive.
+    /// Uses the hold of an earlier image of the drive.
     #[must_use]
     pub fn with_hold(self, hold: Arc<Hold>) -> DriveImage {
         DriveImage { hold, ..self }
@@ -122,7 +122,7 @@ impl DriveImage {
         written.get(&address).copied()
     }
 
-    /// The parameters were read, from `begun` on: what was written before that is in what was read.
+    /// The parameters were read, from `begun` on: values written before that are contained in the reading.
     pub fn forget_written(&self, begun: Instant) {
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         written.retain(|_, (_, at)| *at >= begun);
@@ -286,7 +286,7 @@ impl DriveImage {
 pub struct BusImage {
     /// As configured.
     pub spec: BusSpec,
-    /// Its drives, in the order of the file.
+    /// The drives of the bus, in the order of the file.
     pub drives: PerDrive<Arc<DriveImage>>,
     /// Time of whole transactions, s.
     pub transactions: Histogram,
@@ -329,7 +329,7 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).up
     }
 
-    /// Whether it was tried to open its port, as a reload starts the bus again.
+    /// Whether opening the port was attempted since the bus was last started, as by a reload.
     pub fn is_tried(&self) -> bool {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).tried
     }

@@ -57,7 +57,7 @@ impl<'d> Reading<'d> {
         }
     }
 
-    /// The reading of a drive that accepts only stops while `hold` says so.
+    /// The reading of a drive that accepts only stops while `hold` is set.
     pub fn held(self, hold: &'d Hold) -> Reading<'d> {
         Reading {
             hold: Some(hold),
@@ -107,7 +107,7 @@ impl Reading<'_> {
         }
     }
 
-    /// Whether a cell of that time is stale; asked some twenty times an exchange.
+    /// Whether a cell of this age is stale; evaluated some twenty times in each transaction.
     fn is_old(&self, class: PollClass, cell: &Cell, at: Instant) -> bool {
         if self.snapshot.heard.is_some() {
             let age = self.now.saturating_duration_since(at);
@@ -145,7 +145,7 @@ impl Reading<'_> {
             let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
             let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
             if class == PollClass::Monitor {
-                // Read now and then: what it is now only the drive knows.
+                // A monitor value is read only now and then, so its present value must be read from the drive.
                 return Err(Unavailable::NotPolled);
             }
             let quality = match last {
@@ -195,7 +195,8 @@ impl Reading<'_> {
                 if let Some(band) = self.band(low, high) {
                     return derived.sample(sources(), Some(band));
                 }
-                // What the ends were last makes a value of what the source was last, which is as good as they are.
+                // The last known ends of the band convert the last value of the source; the result is as good as they
+                // are.
                 let Some((band, quality)) = self.last_band(low, high) else {
                     return Sample::NONE;
                 };
@@ -208,12 +209,12 @@ impl Reading<'_> {
         }
     }
 
-    /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. What is no value
-    /// (a float that is no number) is bad.
+    /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. A register content
+    /// that is not a value (a float that is NaN) is bad.
     fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
         let (mut words, mut quality) = ([0; MOST_REGISTERS], Quality::Good);
         let items = usize::from(raw.form.items());
-        // One that was never read comes before all times.
+        // A register that was never read makes the whole value count as never read.
         let mut at = Some(self.now);
         for (offset, word) in (0..).zip(words.iter_mut().take(items)) {
             let address = raw.address.checked_add(offset);
@@ -262,8 +263,8 @@ impl Reading<'_> {
         self.band_of(minimum, maximum, |sample| sample.good())
     }
 
-    /// As [`Reading::band`], for limits and conversions of commands: what the drive said longer than
-    /// [`Reading::parameter_age`] ago is not known.
+    /// As [`Reading::band`], for limits and conversions of commands: a bound that was read longer than
+    /// [`Reading::parameter_age`] ago counts as unknown.
     pub(crate) fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
         self.band_of(minimum, maximum, |sample| {
             let age = self.now.saturating_duration_since(sample.at?);

@@ -9,7 +9,7 @@ use crate::drive::{Plan, PointIndex, PollClass};
 /// Whether a drive answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
-    /// Not asked yet.
+    /// No request was sent yet.
     Untried,
     /// Answers since.
     Online(SystemTime),
@@ -23,7 +23,7 @@ impl Link {
         matches!(self, Link::Online(_))
     }
 
-    /// Whether the drive was asked at least once to an end.
+    /// Whether at least one request to the drive has ended.
     pub fn is_tried(self) -> bool {
         self != Link::Untried
     }
@@ -38,8 +38,8 @@ impl Cadence {
     /// Longest interval that counts as one.
     pub const LONGEST: Duration = Duration::from_secs(600);
 
-    /// Heard again after `interval`. A longer interval than so far is learned at four times the last at most, so that a pause
-    /// of the other master makes no slow cadence; a shorter one by a quarter each time.
+    /// Records that a value was seen again after `interval`. A longer interval than so far is learned at four times the last
+    /// at most, so that a pause of the other master makes no slow cadence; a shorter one by a quarter each time.
     #[must_use]
     pub fn after(self, interval: Duration) -> Cadence {
         let tenths = |time: Duration| u16::try_from(time.as_millis().div_ceil(100)).unwrap_or(u16::MAX);
@@ -54,7 +54,7 @@ impl Cadence {
     }
 }
 
-/// One register (or bit as 0 and 1) of the drive.
+/// A register (or bit as 0 and 1) of the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Cell {
     pub(super) word: u16,
@@ -93,7 +93,7 @@ impl Span {
 /// The state of a drive.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
-    /// Whether it answers.
+    /// Whether the drive answers.
     pub link: Link,
     /// When the process data (fast class) was last read.
     pub fast_at: Option<Instant>,
@@ -109,7 +109,7 @@ pub struct Snapshot {
 /// Why words cannot be served.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unavailable {
-    /// Not part of the plan: only the drive itself knows.
+    /// The register is not part of the plan, so its value must be read from the drive.
     NotPolled,
     /// Too old, never read, or the drive is offline.
     Stale,
@@ -183,7 +183,7 @@ impl Snapshot {
         fast
     }
 
-    /// The machine was suspended for that time, in which its clock stood: all is older by it.
+    /// The machine was suspended for this time, during which its clock did not advance: all times move back by it.
     pub fn slept(&mut self, time: Duration) {
         let earlier = |at: &mut Option<Instant>| *at = at.map(|at| at.checked_sub(time).unwrap_or(at));
         earlier(&mut self.fast_at);
@@ -199,7 +199,7 @@ impl Snapshot {
         });
     }
 
-    /// The drive went away: what is read seldom may be otherwise when it returns, and is stale until it was read again.
+    /// Slow values may have changed while the drive was offline: they are stale until they are read again.
     pub fn outlive(&mut self) {
         let seldom = self.spans.iter_mut().filter(|span| span.class != PollClass::Fast);
         for cell in seldom.flat_map(|span| &mut Arc::make_mut(span).cells) {

@@ -14,11 +14,11 @@ const STANDS: f64 = 0.5;
 /// The state of a motor in readings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Standstill {
-    /// It stands.
+    /// The motor stands.
     Stands,
-    /// It turns, with the evidence.
+    /// The motor turns, with the evidence.
     Turns(String),
-    /// Neither is known; why.
+    /// Standstill is not known; the reason.
     Unknown(String),
 }
 
@@ -29,7 +29,7 @@ impl Reading<'_> {
         self.standstill_read(since).0
     }
 
-    /// The same, with the date of the last sample that it takes to show that.
+    /// The state of the motor, with the date of the last sample needed to prove it.
     pub fn standstill_read(&self, since: Option<Instant>) -> (Standstill, Option<Instant>) {
         if let Some(why) = self.may_turn() {
             return (Standstill::Unknown(why), None);
@@ -69,8 +69,8 @@ impl Reading<'_> {
         reads(ModelPoint::ZeroSpeed) || (reads(ModelPoint::Running) && reads(ModelPoint::OutputFrequency))
     }
 
-    /// Why a motor may turn though the drive stands: the point that says so, or does not say otherwise yet. One that the drive
-    /// refuses, or that is not polled, says nothing.
+    /// Reason why a motor may turn though the drive stands: the point that shows another supply, or does not exclude one yet.
+    /// A point that the drive refuses, or that is not polled, does not count.
     pub fn may_turn(&self) -> Option<String> {
         let points = self.spec.profile.points.enumerate();
         let reasons = points.filter_map(|(index, point)| {

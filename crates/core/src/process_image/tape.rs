@@ -65,15 +65,15 @@ pub struct TapedRead {
 pub struct TapedFrame {
     /// A request: when it was given to the port. Else when the last of it came, or the transaction was given up.
     pub at: Instant,
-    /// Place of the drive that was asked; none for bytes between two transactions.
+    /// Place of the drive of the transaction; none for bytes between two transactions.
     pub drive: Option<DriveIndex>,
-    /// Its verdict.
+    /// Verdict on the frame.
     pub verdict: Verdict,
     /// The bytes; empty if nothing arrived.
     pub bytes: Arc<[u8]>,
 }
 
-/// One entry of the tape.
+/// An entry of the tape.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Taped {
     /// The drive at that place was read.
@@ -116,7 +116,7 @@ struct Waiting {
     lost: u64,
 }
 
-/// What a tape records.
+/// Selects the entries of a tape.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum Taping {

@@ -8,7 +8,7 @@ use tokio::sync::broadcast;
 /// Frames in flight for a listener; one that is further behind loses the oldest.
 const IN_FLIGHT: usize = 1024;
 
-/// Who sent a frame.
+/// Sender of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
@@ -18,7 +18,7 @@ pub enum Direction {
     Reply,
 }
 
-/// One frame, or bytes that are none.
+/// A frame, or bytes that are not a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrameRecord {
     /// A request: when it was given to the port. A reply: when its last byte arrived. Silence instead of a reply: when
@@ -27,9 +27,9 @@ pub struct FrameRecord {
     /// From the end of the frame before (the opening of the port, if there is none) to the beginning of this one; none
     /// where nothing came. Ends of requests and beginnings of replies are calculated from the time on the wire.
     pub gap: Option<Duration>,
-    /// Who sent it.
+    /// Sender of the frame.
     pub direction: Direction,
-    /// The drive that was asked; none for bytes that came between two transactions.
+    /// The drive of the transaction; none for bytes that came between two transactions.
     pub drive: Option<String>,
     /// The bytes on the wire; empty if nothing arrived.
     pub bytes: Vec<u8>,
@@ -58,7 +58,7 @@ impl Trace {
     /// Publishes a frame to the listeners; the record is only built when there are any.
     pub fn publish(&self, record: impl FnOnce() -> FrameRecord) {
         if self.wanted() {
-            // The last listener may have gone meanwhile, which is no error.
+            // The last subscriber may be gone meanwhile, which is not an error.
             let _ = self.0.send(Arc::new(record()));
         }
     }

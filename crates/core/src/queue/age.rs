@@ -19,7 +19,8 @@ impl Pending {
         }
     }
 
-    /// Ends an order that is not sent. Where a pause made it unwanted, its client is heard all the same.
+    /// Ends an order that is not sent. Where a pause of the process was the cause, the order still renews the lease of
+    /// its client.
     pub(super) fn end_unwanted(&mut self, command: Command, outcome: &Outcome, now: Instant) {
         let (arrival, origin) = (&command.intent.window.arrival, command.ticket.origin());
         let waited = self.gate.paused().is_some_and(|pause| arrival.asked < pause.ended);
@@ -41,7 +42,8 @@ impl Pending {
         place.is_some_and(|place| self.renewed.swap_remove(place) == drive)
     }
 
-    /// The machine was suspended for that time, in which its clock stood: what waits is older by it.
+    /// The machine was suspended for this time, during which its clock did not advance: waiting commands are older by
+    /// it.
     pub fn slept(&mut self, time: Duration) {
         let earlier = |at: Instant| at.checked_sub(time).unwrap_or(at);
         for command in &mut self.waiting {

@@ -3,8 +3,7 @@
 //!
 //! Each request is one transaction, answered exactly once: with the drive's reply, or with the reason why there is
 //! none. The bus sends one where the line rests long enough for it, and else within a small share of the line
-//! ([`Pace`]); anyone who waits for a longer work asks again and again, one request behind the other, and so can be
-//! interrupted between any two.
+//! ([`Pace`]); longer work sends its requests one behind the other, and so can be interrupted between any two.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -90,7 +89,7 @@ impl Background {
         self.waiting.iter().any(|request| !request.is_of_gateway())
     }
 
-    /// Those that wait, in order.
+    /// Waiting requests, in order.
     pub fn iter(&self) -> impl Iterator<Item = &BackgroundRequest> {
         self.waiting.iter()
     }

@@ -103,8 +103,8 @@ impl CommandQueue {
         self.lock().has_last_stops()
     }
 
-    /// From now on the stops of that drive are those of another queue, in which it has that place: those that wait, and those
-    /// that are still given to this one. The other queue knows from now on what this one knew of the drive.
+    /// Hands the stops of the drive to another queue, in which it has this place: the stops that wait, and those still given
+    /// to this queue later. The other queue also takes over the gate's state of the drive.
     pub(crate) fn hand_over(&self, drive: DriveIndex, heir: &Arc<CommandQueue>, place: DriveIndex, now: Instant) {
         let mut pending = self.lock();
         let mut of_heir = heir.lock();
@@ -116,7 +116,7 @@ impl CommandQueue {
             stop.move_to(place);
             match stop.client_waits_until() {
                 Some(_) => of_heir.inherit(stop, now),
-                // The lease knows the pending actions of supervision.
+                // Only stops with a waiting client are handed over: supervision repeats its own actions.
                 None => stop.answer(&Outcome::ShuttingDown, now),
             }
         }

@@ -1,5 +1,5 @@
-//! The command queue of a bus: bounded, ordered, with replacing, purging and expiry. Whether a command may go is asked of the
-//! gate ([`crate::permit`]), which is part of the queue.
+//! The command queue of a bus: bounded, ordered, with replacing, purging and expiry. The gate ([`crate::permit`]), which is
+//! part of the queue, decides whether a command may go.
 
 mod age;
 mod background;
@@ -33,7 +33,7 @@ const MOST_DENIED: usize = 256;
 #[derive(Debug, Default)]
 pub struct Pending {
     waiting: VecDeque<Command>,
-    /// What decides whether they may go.
+    /// The gate that decides whether commands may go.
     pub gate: Gate,
     /// Set once the queue is closed: the outcome that every command gets.
     closed: Option<Outcome>,
@@ -47,13 +47,13 @@ pub struct Pending {
     ending: bool,
     /// Drives that no bus sends a stop to after this one: their stops are sent before it ends.
     last: Vec<DriveIndex>,
-    /// Drives with a stop that was taken, until the bus says that it is over.
+    /// Drives with a stop that was taken, until the bus reports that it is over.
     begun_stops: Vec<DriveIndex>,
     /// The drives whose stops another queue took over.
     heirs: BTreeMap<DriveIndex, Heir>,
     /// Where the queues before this one find the drives that it took over from them.
     found_by: BTreeMap<DriveIndex, Heir>,
-    /// The stops that the gateway wants before it ends, until the bus takes note of it.
+    /// The stops that the gateway needs before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
     /// Commands that were refused at their turn, to be reported.
     denied: VecDeque<Denied>,
@@ -74,22 +74,22 @@ pub struct Chosen {
 pub struct Denied {
     /// The drive, or one of those that it was to reach.
     pub drive: DriveIndex,
-    /// Who gave it.
+    /// Origin of the order.
     pub origin: Origin,
-    /// What it was.
+    /// The order, as text.
     pub what: String,
     /// Why.
     pub refusal: Refusal,
 }
 
-/// What the bus says of a command that has not started.
+/// State of the drive of a command that has not started, reported by the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ready {
-    /// Its drive is ready for it.
+    /// The drive is ready for the command.
     Now,
-    /// Its drive is busy with another one.
+    /// The drive is busy with another command.
     No,
-    /// Not before then.
+    /// The drive is not ready before this time.
     At(Instant),
 }
 
@@ -145,7 +145,7 @@ impl Pending {
         None
     }
 
-    /// Takes in a command that is no stop.
+    /// Adds a command that is not a stop.
     fn take_other(&mut self, command: Command, now: Instant) {
         if let Some(index) = self.replaced_by(&command)
             && let Some(older) = self.waiting.remove(index)
@@ -217,7 +217,7 @@ impl Pending {
         (most > held(&own) + 1).then_some(index)
     }
 
-    /// The next command of that rank at `now`; expired and refused ones are removed. `ready` says whether the drive of a
+    /// The next command of this rank at `now`; expired and refused ones are removed. `ready` returns whether the drive of a
     /// command is ready for it: while the oldest for a drive cannot go, later ones for that drive wait. `redundant` decides
     /// whether a stop has no effect on its drive, which gives it the rank of a command.
     pub fn next(
@@ -278,7 +278,7 @@ impl Pending {
         for (index, command) in self.waiting.iter().enumerate() {
             let (drive, urgency) = (command.intent.drive, command.urgency());
             if urgency == Urgency::Stop {
-                // Of the stops of a drive the oldest goes first, anyone who else its client commands.
+                // The oldest stop of a drive goes first, regardless of what else its client commands.
                 if stopped.contains(&drive) {
                     continue;
                 }
@@ -363,7 +363,7 @@ impl Pending {
         }
         let of = (command.ticket.client().to_string(), command.intent.drive);
         self.served.retain(|served| *served != of);
-        // Only clients that wait are counted: there are never more of them than waiting commands.
+        // Clients without waiting commands need no entry, so the list stays as short as the queue.
         if self.served.len() >= SERVED_KEPT {
             self.served.pop_front();
         }

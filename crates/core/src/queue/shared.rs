@@ -46,7 +46,7 @@ impl CommandQueue {
         })
     }
 
-    /// The same with the start guards of its drives.
+    /// Sets the start guards of its drives.
     #[must_use]
     pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
         self.lock().gate.set_starts(guards.clone());
@@ -102,7 +102,7 @@ impl CommandQueue {
     pub fn close(&self, outcome: Outcome, now: Instant) {
         self.background().close(&outcome, now);
         let mut pending = self.lock();
-        // That the port is gone does not matter to stops that another bus sends.
+        // A lost port does not matter to stops that another bus will send.
         let keeps_stops = pending.ending && outcome == Outcome::BusDown;
         pending.remove(now, &outcome, |c| !keeps_stops || !c.is_stop());
         pending.ending = keeps_stops;

@@ -19,7 +19,7 @@ pub struct Stopping {
 /// A drive that did not get, or did not acknowledge, the stop that the gateway wanted before it ends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotStopped {
-    /// Its name.
+    /// Name of the drive.
     pub drive: String,
     /// The result of the stop, in words.
     pub why: String,
@@ -45,7 +45,7 @@ impl Stopping {
 }
 
 impl Pending {
-    /// A stop that `min_run` delays, or that repeats such a one for a cyclic client, waits: that is no second stop.
+    /// Delays a stop within `min_run`, and a stop that a cyclic client only repeats: a repetition is not a second stop.
     pub(super) fn delay(&self, command: &mut Command) {
         let is_usual = matches!(&command.work, Work::Stop(stop) if stop.haste == Haste::Usual);
         let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command)) && !self.is_last(command);
@@ -79,8 +79,8 @@ impl Pending {
         self.begun_stops.retain(|drive| stopping(*drive));
     }
 
-    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for
-    /// the same, and are answered with it; of two that also do different things, the newer one is sent.
+    /// At most one bare stop and one stop that also does more wait for each drive. Later ones join an equal one and are
+    /// answered with it; if they differ, the newer one is sent.
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.intent.drive;
         self.gate.accepted(&stop, now);
@@ -140,7 +140,7 @@ impl Pending {
         });
     }
 
-    /// The stops that the gateway wants before it ends, once.
+    /// Takes the stops that the gateway needs before it ends, once.
     pub fn take_stopping(&mut self) -> Option<Stopping> {
         self.stopping.take()
     }
@@ -160,7 +160,7 @@ impl Command {
         }
     }
 
-    /// A stop is no longer delayed.
+    /// Ends the delay of a stop.
     pub(super) fn hurry(&mut self) {
         if let Work::Stop(stop) = &mut self.work
             && stop.haste == Haste::Delayed

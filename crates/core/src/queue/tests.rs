@@ -197,7 +197,7 @@ fn a_newer_reference_takes_the_place_of_the_older_one() {
         [wanted, points(&[1])],
         "before the run that followed the older one"
     );
-    // A reference of another client does so too: whoever wrote last.
+    // A newer reference of another client replaces an older one, too: the last writer counts.
     let mut old = reference(&mut rig, 10.0);
     let order = Order::Points(vec![(PointIndex::new(7), Value::Number(15.0))]);
     let _new = rig.give((SourceKind::ModbusTcp, "10.0.0.1:1"), 1, Urgency::Command, order, true);
@@ -481,12 +481,12 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
     push(&mut rig, Http, Some("alice#1"), order, true);
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("alice#1"));
     assert_eq!(commander(&rig, DriveIndex::new(2)), None);
-    // What is no command of a client.
+    // Reads and stops of the gateway itself are not commands of a client.
     push(&mut rig, ModbusTcp, None, Read, false);
     push(&mut rig, Supervision, None, Stop, false);
     push(&mut rig, Shutdown, None, Stop, false);
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("alice#1"));
-    // Whether it waits, takes the place of an older one, or joins another one.
+    // A command counts whether it waits, replaces an older one, or joins another one.
     push(&mut rig, Http, Some("bob#2"), order, true);
     push(&mut rig, Http, Some("carol#3"), order, true);
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("carol#3"));
@@ -495,7 +495,7 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("alice#1"));
     push(&mut rig, ModbusTcp, None, Stop, false);
     assert_eq!(commander(&rig, DriveIndex::new(1)), None);
-    // What is not taken in.
+    // A command that is not accepted does not count.
     rig.pending.closed = Some(Outcome::BusDown);
     push(&mut rig, Http, Some("alice#1"), Stop, false);
     assert_eq!(commander(&rig, DriveIndex::new(1)), None);

@@ -25,7 +25,7 @@ pub struct Interlock {
     pub drive: String,
     /// A point of it that is true or false.
     pub point: String,
-    /// Its required value.
+    /// Value that the point must have.
     pub is: bool,
     /// Whether the running motor is stopped where it does not hold.
     pub trip: bool,

@@ -31,7 +31,7 @@ pub enum Access {
 pub enum ParamsAccess {
     #[default]
     Read,
-    /// They are restored, too.
+    /// Parameters may be read and restored.
     Write,
 }
 
@@ -40,7 +40,7 @@ pub enum ParamsAccess {
 pub enum LeaseAction {
     /// Stop the drive.
     Stop,
-    /// Only raise the event.
+    /// An expired lease only raises the event.
     Hold,
     /// Set the speed reference, percent.
     SpeedReference(f64),
@@ -78,7 +78,7 @@ pub struct DriveSpec {
     pub address: u8,
     /// Modbus TCP unit id, 1..=254.
     pub unit: u8,
-    /// Its family.
+    /// Profile of the drive.
     pub profile: Arc<Profile>,
     /// Group of drives that are stopped together, and started one after the other.
     pub group: Option<String>,
@@ -88,7 +88,7 @@ pub struct DriveSpec {
     pub interlocks: Vec<Interlock>,
     /// A drive of its group starts at a distance from the others, so that its own starts count.
     pub staggers: bool,
-    /// Whether it may be commanded.
+    /// Whether the drive may be commanded.
     pub access: Access,
     /// Limits of commands in engineering units, by point name.
     pub limits: BTreeMap<String, RangeInclusive<f64>>,
@@ -168,13 +168,13 @@ pub struct BusSpec {
     pub slow_cycle: Duration,
 }
 
-/// Which machine a drive is, as far as the configuration says: what a lease, a hold or a journal of it belongs to. The name of
-/// a drive, and that of its bus, may come to mean another one.
+/// Identity of a machine, as far as the configuration defines it: leases, holds and journals belong to it. The name of a
+/// drive, and that of its bus, may come to mean another machine.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Machine {
     /// The port of its bus.
     pub port: String,
-    /// Its address there.
+    /// Address of the drive on the bus.
     pub address: u8,
     /// The name of its profile.
     pub profile: String,
@@ -188,8 +188,8 @@ impl std::fmt::Display for Machine {
 }
 
 impl BusSpec {
-    /// Whether a device behind the network speaks Modbus TCP: there is no serial line that the gateway knows of, no baud
-    /// rate and no broadcast.
+    /// Whether the port is a Modbus TCP device on the network: there is no serial line that the gateway knows of, no
+    /// baud rate and no broadcast.
     pub fn is_modbus_tcp(&self) -> bool {
         is_modbus_tcp(&self.port)
     }

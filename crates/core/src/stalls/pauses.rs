@@ -77,7 +77,7 @@ impl Pauses {
         self.0.stops.notified().await;
     }
 
-    /// A thread had this pause. Whether it is news: no other thread had it, too.
+    /// Adds a pause of a thread. Returns whether it is a new one: it does not overlap a pause of another thread.
     pub fn note(&self, pause: Stall) -> bool {
         let mut state = self.state();
         let last = state
@@ -110,7 +110,7 @@ impl Pauses {
         Heartbeat(beat)
     }
 
-    /// Whether a thread that reads orders stands still: nobody's orders or heartbeats are heard over its connections.
+    /// Whether a thread that reads orders does not run now: no orders or heartbeats are received over its connections.
     pub fn is_deaf(&self, now: Instant) -> bool {
         let state = self.state();
         let mut readers = state.readers.iter().filter_map(Weak::upgrade);

@@ -16,7 +16,7 @@ pub(super) struct Around {
     pub(super) stale_after: Duration,
 }
 
-/// One of them.
+/// A drive that interlocks look at.
 #[derive(Debug, Clone)]
 pub(super) struct Watched {
     machine: Machine,
@@ -29,12 +29,12 @@ pub(super) struct Watched {
 pub(super) struct Anew {
     /// When the bus before it had ended.
     pub(super) since: Instant,
-    /// The same machine until then; none if it was not there.
+    /// The machine as it was until then; none if it was not there.
     pub(super) before: Option<Arc<Watched>>,
 }
 
 impl Around {
-    /// The same with these drives.
+    /// The state after a change to these drives.
     pub(super) fn follow(
         &self,
         drives: impl IntoIterator<Item = (Machine, Arc<DriveImage>)>,
@@ -59,7 +59,7 @@ impl Around {
         }
     }
 
-    /// The same while the buses of these drives are started anew.
+    /// The state while the buses of these drives are restarted.
     pub(super) fn expecting(&self, drives: &[Arc<DriveImage>], now: Instant) -> Around {
         let mut next = self.clone();
         let is_meant = |watched: &&mut Watched| drives.iter().any(|image| Arc::ptr_eq(image, &watched.image));
@@ -75,7 +75,7 @@ impl Around {
 }
 
 impl Watched {
-    /// What it leaves to the bus that takes the place of its own.
+    /// The state that is left to the bus that replaces its own.
     fn left(&self, now: Instant) -> Anew {
         let anew = self.anew.clone().filter(|anew| anew.is_recent(now));
         let before = Watched { anew, ..self.clone() };

@@ -75,7 +75,7 @@ impl Saved {
     /// The content of a file.
     ///
     /// # Errors
-    /// It is none of these; why.
+    /// The file is not a list of starts of this version: the reason.
     pub fn from_json(bytes: &[u8]) -> Result<Saved, String> {
         let saved: Saved = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
         let most = MOST_STARTS as usize + 1;

@@ -30,9 +30,9 @@ impl Interlock {
         self.of(around, |watched, index| self.differs(watched, index, around, now))
     }
 
-    /// Returns it if a running motor is to be stopped. A drive whose bus was started anew counts as it counted before until it was
-    /// read.
-    /// After `stood`, until when the bus last stood still, a value that met it and is only too old waits for a first reading.
+    /// Returns the interlock if a running motor is to be stopped. A drive whose bus was restarted counts as it counted before
+    /// until it is read. `stood` is the end of the last pause of the bus: a value that was met and is only too old then waits for
+    /// a first reading.
     pub(super) fn trips(&self, around: &Around, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| {
             let is_only_old = stood.is_some_and(|until| self.met_before(watched, index, around, (until, now)));
@@ -84,11 +84,11 @@ impl Interlock {
             return self.differs(watched, index, around, at);
         };
         let read = watched.image.reading(at, around.stale_after).sample(index).at;
-        // What the bus that ends reads last grows old while the next one starts.
+        // The last value read by a bus that ends may grow old while the next one starts.
         if !watched.is_leaving() && read.is_some_and(|read| read > anew.since) {
             return self.differs(watched, index, around, at);
         }
-        // One that was not there before stops no motor until it was read.
+        // A drive that was not there before stops no motor until it is read.
         let before = anew.before.as_ref()?;
         self.differed(before, index, around, (anew.since, now))
     }

@@ -17,8 +17,8 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Longest file that is read.
 const LONGEST: u64 = 64 << 20;
 
-/// Keeps starts in that directory from now on; those of earlier runs are taken from there. Until they are, which the channel
-/// tells by its end, guarded drives are not started.
+/// Keeps starts in this directory from now on; those of earlier runs are read from there. Until that is done, which the end
+/// of the channel signals, guarded drives are not started.
 ///
 /// # Errors
 /// The system gives no thread.

@@ -32,7 +32,7 @@ pub(super) struct Ledger {
     disk: Disk,
 }
 
-/// One motor in its group.
+/// A motor in its group.
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) motor: Motor,
@@ -102,8 +102,9 @@ impl Guards {
         self.lock().disk = Disk::Unread(path.to_path_buf());
     }
 
-    /// From now on starts are kept in a file: none is written to a drive before [`Guards::wrote`] says that it is there.
-    /// `saved` is what earlier runs left; of a clock that was set back nothing is taken to be older than it can be.
+    /// Keeps starts in a file from now on: no start is written to a drive before [`Guards::wrote`] reports that it is on
+    /// disk. `saved` has the starts of earlier runs; after a clock was set back they are not taken to be older than they
+    /// can be.
     pub fn keep(&self, saved: &Saved, now: Instant, time: SystemTime) {
         let mut ledger = self.lock();
         for (machine, starts) in saved.motors() {
@@ -170,7 +171,7 @@ impl Ledger {
         self.motors.get(machine).map(|entry| &entry.motor)
     }
 
-    /// Does something with a motor that is no start.
+    /// Changes a motor in a way that is not a start.
     pub(super) fn with<T>(&mut self, machine: &Machine, act: impl FnOnce(&mut Motor) -> T) -> Option<T> {
         self.motors.get_mut(machine).map(|entry| act(&mut entry.motor))
     }
@@ -201,7 +202,7 @@ impl Ledger {
             return None;
         }
         let retry_after = match self.awaits_word(name) {
-            // It may be written at any time.
+            // The awaited word may be written at any time, so the full distance counts.
             true => guard.stagger,
             false => {
                 let last = self

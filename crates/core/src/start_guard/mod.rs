@@ -1,10 +1,10 @@
 //! Start guards: how often, how soon and how close together motors may be started, and under which conditions.
 //!
-//! A start is one passage of a motor from standing to running, by whomever. One [`Guards`] for the whole gateway counts
-//! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. Whether an
-//! order may start a motor is asked by the rules of [`crate::permit`]. A start that is cleared ([`BusGuards::clear`])
-//! counts from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except those
-//! that `min_run` delays.
+//! A start is a passage of a motor from standing to running, by any cause. One [`Guards`] for the whole gateway counts
+//! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. The rules
+//! of [`crate::permit`] decide whether an order may start a motor. A start that is cleared ([`BusGuards::clear`]) counts
+//! from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except those that
+//! `min_run` delays.
 //!
 //! - `motor`: what is known of one motor. `passage`: its last start by an order. `ledger`: all motors, and what is to be written.
 //! - `interlock`: whether the points hold that a start needs. `around`: the drives that have these points. `view`: what the

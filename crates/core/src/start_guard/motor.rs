@@ -18,11 +18,11 @@ const UNREAD: Duration = Duration::from_secs(2);
 /// The motor's state in a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Seen {
-    /// It runs, and has no fault.
+    /// Whether the motor runs, without a fault.
     pub running: bool,
-    /// Its run command as the drive has it, and when that was read.
+    /// Run command as the drive has it, and when that was read.
     pub commanded: Option<(bool, Instant)>,
-    /// It stands.
+    /// Whether the motor stands.
     pub stands: bool,
     /// Why it does not run and cannot start, and when that was read.
     pub unable: Option<(Unable, Instant)>,
@@ -36,7 +36,7 @@ pub(super) struct Reserved {
     /// The number of the command.
     pub(super) number: u64,
     pub(super) at: Instant,
-    /// It is not written later.
+    /// The start is not written after this time.
     pub(super) until: Instant,
     /// The generation that must be saved first.
     pub(super) generation: u64,
@@ -50,7 +50,7 @@ struct Started {
     by: Option<Arc<str>>,
 }
 
-/// One motor.
+/// A motor with its starts.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Motor {
     /// The last starts, oldest first.
@@ -58,11 +58,11 @@ pub(super) struct Motor {
     pub(super) reserved: Option<Reserved>,
     /// The last start by an order.
     passage: Option<Passage>,
-    /// Whether it runs, and when that was read; none while it is not known.
+    /// Whether the motor runs, and when that was read; none while it is not known.
     running: Option<(bool, Instant)>,
-    /// The same when it was known last.
+    /// Whether the motor ran when that was known last.
     ran: Option<bool>,
-    /// Its run command as the drive had it last, and when that was read.
+    /// Run command as the drive had it last, and when that was read.
     commanded: Option<(bool, Instant)>,
     /// By the last reading it does not run, and cannot start.
     unable: bool,
@@ -78,13 +78,13 @@ impl Motor {
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// The same for the file: one that is decided may be written as late as its command lives.
+    /// The starts for the file: a reserved one with the latest time at which it may be written.
     pub(super) fn starts_to_keep(&self) -> impl Iterator<Item = Instant> + '_ {
         let reserved = self.reserved.map(|reserved| reserved.until);
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// What a run command is, written now.
+    /// Effect of a run command that is written now.
     pub(super) fn by_run(&self) -> ByRun {
         if self.runs_for_certain() {
             return ByRun::Runs;
@@ -105,7 +105,8 @@ impl Motor {
         self.passage.as_ref().map(|passage| passage.written)
     }
 
-    /// Whether it runs, and goes on. One that slows down after a stop may stand by the time that an order reaches it.
+    /// Whether the motor runs and goes on running. A motor that slows down after a stop may stand by the time that an
+    /// order reaches it.
     fn runs_for_certain(&self) -> bool {
         let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
         let written = self.written();
@@ -113,7 +114,7 @@ impl Motor {
             .stop_written
             .is_some_and(|stop| written.is_none_or(|start| stop > start));
         let told_on = self.commanded.is_some_and(|(on, at)| on && since_stop(at));
-        // It was taken away since, here or elsewhere.
+        // The run command was taken away since the start was written, by the gateway or elsewhere.
         let is_off = |(on, at): (bool, Instant)| !on && written.is_none_or(|start| at > start);
         let slows_down = (stopped_last && !told_on) || self.commanded.is_some_and(is_off);
         let runs = |(running, at): (bool, Instant)| running && since_stop(at) && !slows_down;
@@ -201,7 +202,7 @@ impl Motor {
         let is_next = self.reserved.take_if(|reserved| reserved.number == number).is_some();
         match &mut self.passage {
             _ if is_next => {}
-            // One more word of the same start, or the same word once more.
+            // A further word of a start, or a repetition of its last word, moves the start to now.
             Some(passage) if passage.number == number && passage.progress != Progress::Vain => {
                 let counted = passage.counted;
                 self.discount(counted);
@@ -226,7 +227,7 @@ impl Motor {
             away: false,
             stood: same.map_or(self.stands_since, |same| same.stood),
         });
-        // It is to be seen to stand again, also where it was never seen to run.
+        // Before the next start the motor must be seen to stand again, even if it was never seen to run.
         self.stands_since = None;
         self.started = Some(Started {
             at: now,
@@ -259,7 +260,7 @@ impl Motor {
         }
     }
 
-    /// It was read. Returns whether that changed which starts count, or from when.
+    /// Takes a reading of the motor. Returns whether it changed which starts count, or from when.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
         let Seen {
             running, stands, at, ..
@@ -334,7 +335,7 @@ impl Motor {
         true
     }
 
-    /// It cannot be read: its state meanwhile is unknown.
+    /// The drive cannot be read, so the state of the motor is unknown.
     pub(super) fn unseen(&mut self) {
         (self.running, self.unable) = (None, false);
     }

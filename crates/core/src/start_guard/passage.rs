@@ -1,4 +1,4 @@
-//! One start by an order: the passage of the motor from standing to running, and what further run commands are
+//! A start by an order: the passage of the motor from standing to running, and the meaning of further run commands
 //! meanwhile. Pure: time is an argument.
 
 use std::sync::Arc;
@@ -14,13 +14,13 @@ pub(super) const SETTLES: Duration = Duration::from_secs(1);
 /// Why a drive cannot start its motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unable {
-    /// It has a fault.
+    /// The drive has a fault.
     Fault,
-    /// It says that it is not ready. The words of a start make some families ready.
+    /// The drive reports that it is not ready. The words of a start make some families ready.
     NotReady,
 }
 
-/// What a run command to the motor is, written now.
+/// Effect on the motor of a run command that is written now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ByRun {
     /// Nothing new: the motor runs for certain.
@@ -40,9 +40,9 @@ pub(super) enum Progress {
     Awaited,
     /// The motor turns, and does not count as running yet.
     Turns,
-    /// It was seen to run.
+    /// The motor was seen to run.
     Ran,
-    /// It has ended: the motor stands again, or the drive did not take the command.
+    /// The passage has ended: the motor stands again, or the drive did not take the command.
     Over,
     /// The drive could not start, and did not.
     Vain,
@@ -59,30 +59,30 @@ pub(super) struct Passage {
     pub(super) written: Instant,
     /// When a run command was written last, its own or a repetition.
     pub(super) last: Instant,
-    /// Its date among the starts that count.
+    /// Date under which the start counts.
     pub(super) counted: Instant,
     /// The drive could not start before the word, nor in any reading since.
     pub(super) unable: bool,
     /// The drive was away since.
     pub(super) away: bool,
-    /// Since when the motor had stood before.
+    /// Since when the motor had stood before the start.
     pub(super) stood: Option<Instant>,
 }
 
-/// What a reading of the running motor says of the starts that count.
+/// Effect of a reading of the running motor on the starts that count.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Shown {
     /// Nothing new.
     Nothing,
     /// The awaited start was made.
     Started,
-    /// The same, so late that it counts from now on.
+    /// The awaited start was made, so late that it counts from now on.
     StartedLate,
-    /// A start that does not count yet, and whose it is.
+    /// A start that does not count yet, and its client, where known.
     Another(Option<Arc<str>>),
 }
 
-/// What was written and read besides: the last stop, and the run command as the drive had it last.
+/// Other events of the motor: the last stop, and the run command as the drive had it last.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Besides {
     pub(super) stop: Option<Instant>,
@@ -94,9 +94,9 @@ impl Passage {
         besides.stop.is_some_and(|stop| stop > self.last)
     }
 
-    /// What a run command to a motor is that does not run for certain.
+    /// Effect of a run command on a motor that may not be running.
     pub(super) fn by_run(&self, besides: Besides) -> ByRun {
-        // It was taken away since, at the drive itself or from elsewhere.
+        // The run command was taken away since, at the drive itself or from elsewhere.
         let is_off = besides.commanded.is_some_and(|(on, at)| !on && at > self.last);
         match self.progress {
             _ if self.is_stopped(besides) || self.away => ByRun::Starts,
@@ -122,7 +122,7 @@ impl Passage {
         if may_be_of_others && at > self.last + STARTS_WITHIN {
             return Shown::Another(None);
         }
-        // Its run command stood all the while.
+        // The run command stayed on all the time, so the awaited start was made.
         match at > self.counted + STARTS_WITHIN {
             true => Shown::StartedLate,
             false => Shown::Started,
@@ -151,7 +151,7 @@ impl Passage {
         match seen.unable {
             Some((Unable::Fault, at)) if self.unable => shown(at > self.written),
             Some((Unable::NotReady, at)) if self.unable && seen.stands => shown(at >= self.written + SETTLES),
-            // It may have started, and have tripped at once.
+            // The motor may have started, and the drive have tripped at once.
             Some((Unable::Fault, at)) if at > self.written => Progress::Over,
             _ if !seen.stands => Progress::Turns,
             _ if self.is_stopped(besides) => Progress::Over,

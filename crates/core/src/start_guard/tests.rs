@@ -127,7 +127,7 @@ impl GuardedDrives {
     }
 }
 
-/// What the gate says of a command that starts these drives.
+/// Judges a command that starts these drives.
 fn judged(
     guards: &Arc<BusGuards>,
     stage: Stage,
@@ -229,7 +229,7 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
         Some("starts_per_hour"),
         "what was read before the stop says nothing"
     );
-    // It coasts down: it may stand by the time that the order reaches it.
+    // The motor coasts down: it may stand by the time that the order reaches it.
     rig.read(0, true, 2.1);
     assert_eq!(rig.refused(0, 2.2), Some("starts_per_hour"));
     // The drive did not take the stop, or somebody else started it again.
@@ -252,7 +252,7 @@ fn starts_at_the_panel_count_and_those_of_orders_count_once() {
     rig.read(0, true, 6.0);
     rig.read(0, false, 7.0);
     assert_eq!(rig.refused(0, 8.0), Some("starts_per_hour"), "the panel started it");
-    // One that runs when it is first read was not seen to start.
+    // A motor that runs at its first reading was not seen to start.
     rig.read(1, true, 0.0);
     rig.read(1, false, 1.0);
     rig.start_and_stop(1, 2, 2.0);
@@ -292,7 +292,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     assert_eq!(rig.refused(0, 180.0), Some("min_off"));
     rig.read(0, false, 190.0);
     assert_eq!((rig.refused(0, 219.0), rig.refused(0, 220.0)), (Some("min_off"), None));
-    // One that waits is taken in if it can go in time.
+    // A start that may wait is accepted if it can go in time.
     rig.read(1, false, 200.0);
     let accepted = |until: f64| reason(rig.asked(Stage::Accept, &[1], (0, Some(until)), 220.0));
     assert_eq!((accepted(229.0), accepted(231.0)), ("min_off", "wait"));
@@ -321,7 +321,7 @@ fn drives_of_a_group_start_one_after_the_other() {
     );
     rig.read(0, true, 8.1);
     rig.read(0, false, 9.2);
-    // What was cleared and not written counts from when it was.
+    // A start that was cleared but not written counts from its clearance.
     rig.guards.settle(DriveIndex::new(1), 3);
     assert_eq!((rig.refused(0, 17.9), rig.refused(0, 18.0)), (Some("stagger"), None));
     // A drive without a guard is not held back, and its starts count for the others.
@@ -357,7 +357,7 @@ fn only_a_good_point_holds_an_interlock() {
     assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));
     rig.read(2, true, 4.0);
     assert_eq!(rig.clear(&[0], 1, 4.5), Verdict::Go);
-    // It does not hold any more when the word is to be written.
+    // The interlock no longer holds when the word is to be written.
     assert!(rig.may_write(0, 1, 4.9));
     assert!(!rig.may_write(0, 1, 5.5));
     assert_eq!(
@@ -387,7 +387,7 @@ fn a_start_waits_until_it_is_on_disk() {
     rig.shared.wrote(generation, Ok(()));
     assert_eq!(rig.clear(&[0], 1, 1.2), Verdict::Go);
     assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
-    // Killed before it wrote anything, the next run knows of it.
+    // If the gateway is killed before writing anything, the next run knows of the start.
     let next = GuardedDrives::of(per_hour(1), Vec::new());
     let saved = Saved::from_json(&saved.to_json()).unwrap();
     next.shared.keep(&saved, next.start, time + 60 * SECOND);
@@ -452,7 +452,7 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     assert_eq!(reason(rig.clear(&[0], 2, 2.0)), "wait");
     assert_eq!(reason(rig.clear(&[0], 2, 2.9)), "wait");
     assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "state_file");
-    // It works again.
+    // The disk works again.
     let (generation, _) = rig.shared.to_write(rig.at(4.0), time).unwrap();
     rig.shared.wrote(generation, Ok(()));
     assert_eq!(reason(rig.clear(&[0], 3, 5.0)), "wait");
@@ -514,7 +514,7 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
     );
     assert!(!rig.guards.is_ordinary_stop(DriveIndex::new(0), "another", None));
     assert_eq!((waits(10.0), waits(21.0)), (Some(rig.at(21.0)), None));
-    // It is seen to stand, or not seen at all: nothing is waited for.
+    // The motor is seen to stand, or not seen at all: the stop does not wait.
     rig.read(0, false, 12.0);
     assert_eq!(waits(12.1), None);
     rig.read(1, false, 0.0);
@@ -539,7 +539,7 @@ fn files_of_others_are_refused_with_a_reason() {
     let path = folder.path().join("starts.json");
     std::fs::write(&path, "{").unwrap();
     let (keeper, read) = keep(folder.path(), Arc::new(Guards::default())).unwrap();
-    // The end of the channel tells that the file is read.
+    // The channel closes when the file has been read.
     let _ = read.blocking_recv();
     assert!(folder.path().join("starts.damaged").exists(), "it is kept aside");
     drop(keeper);

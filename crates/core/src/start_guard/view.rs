@@ -30,7 +30,7 @@ struct Guarding {
     group: Arc<str>,
     guard: Guard,
     interlocks: Vec<Interlock>,
-    /// It says whether its motor runs.
+    /// Whether the drive reports that its motor runs.
     tells_running: bool,
 }
 
@@ -39,14 +39,14 @@ struct Guarding {
 pub enum Clearance {
     /// Yes: it is counted, and on disk.
     Go,
-    /// Not before then.
+    /// The start is not cleared before this time.
     Wait(Instant),
     /// No: it cannot be counted.
     Refused(Guarded),
 }
 
 impl BusGuards {
-    /// Those of a bus; none where nothing of it is guarded. They take effect with [`BusGuards::begin`].
+    /// The guards of a bus; none where none of its drives is guarded. They take effect with [`BusGuards::begin`].
     pub fn of<'d>(
         shared: &Arc<Guards>,
         bus: &BusSpec,
@@ -94,7 +94,7 @@ impl BusGuards {
         self.of_drive(drive).is_some()
     }
 
-    /// Those of the guarded drives that an order with these effects does not leave running as they run.
+    /// Guarded drives that an order with these effects may start.
     pub fn started_by(&self, effects: &Effects) -> impl Iterator<Item = DriveIndex> {
         let started = effects
             .iter()
@@ -102,7 +102,7 @@ impl BusGuards {
         started.map(|(drive, _)| drive)
     }
 
-    /// What a run command, written now, does to the motor of that drive; one without guards is not looked after.
+    /// Effect on the motor of a run command written now; a drive without guards counts as running.
     pub fn by_run(&self, drive: DriveIndex) -> ByRun {
         let Some(of) = self.of_drive(drive) else {
             return ByRun::Runs;
@@ -172,14 +172,14 @@ impl BusGuards {
         let interlocked = self.interlocked_of(of, now);
         interlocked.or_else(|| {
             let ledger = self.shared.lock();
-            // One that runs by its order, with a reference of zero, is not kept from a start.
+            // A motor that runs by its order, with a reference of zero, is not hindered.
             let by_run = ledger.motor(&of.machine).map(Motor::by_run);
             let starts = !matches!(by_run, Some(ByRun::Runs | ByRun::Repeats));
             starts.then(|| ledger.hindered(&of.machine, &of.guard, now)).flatten()
         })
     }
 
-    /// The interlocks that do not hold and stop the running motor of that drive; `stood`: until when its bus last stood still.
+    /// The interlocks that do not hold and stop the running motor of the drive; `stood`: until when its bus last did not run.
     pub fn tripped(&self, drive: DriveIndex, stood: Option<Instant>, now: Instant) -> Vec<Unmet> {
         let Some(of) = self.of_drive(drive) else {
             return Vec::new();
@@ -348,7 +348,7 @@ impl BusGuards {
 fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let sample = reading.model(ModelPoint::Running);
     let running = sample.good()?.as_bool();
-    // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
+    // A running bit of a faulted drive may be from before the fault; the motor does not run by its run command then.
     let runs = running && !reading.is_set(ModelPoint::Fault);
     let commanded = reading.model(ModelPoint::Run);
     let turns = || matches!(reading.standstill(None), Standstill::Turns(_));

@@ -3,7 +3,7 @@
 //!
 //! One mechanism for all north sides: [`StopAll::order`] places the stops before it returns, a task of the gateway
 //! calls [`StopAll::look`] while a command is in progress, and [`StopAll::begun`] wakes it. Where every drive of a bus
-//! is concerned and known to obey it, one broadcast goes before their stops. Pure: time is an argument.
+//! is included and known to obey it, one broadcast goes before their stops. Pure: time is an argument.
 
 mod one_stop;
 mod scope;
@@ -24,7 +24,7 @@ use crate::order::Origin;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
 use crate::process_image::{Access, Machine, Standstill};
 
-/// Time after which a command is answered though not every drive stands, unless it says otherwise.
+/// Default time after which a command is answered even if not every drive stands.
 pub const WAIT: Duration = Duration::from_secs(10);
 /// Longest such time.
 pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
@@ -39,18 +39,18 @@ const MOST_ORDERS: usize = 256;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
-    /// It acknowledged its stop, and a read since shows that the motor stands.
+    /// The drive acknowledged its stop, and a read since shows that the motor stands.
     Standing,
-    /// It acknowledged its stop, and the motor still turns.
+    /// The drive acknowledged its stop, and the motor still turns.
     Stopping,
-    /// Neither is known.
+    /// Neither an acknowledgement nor a standstill is known.
     Unproven,
 }
 
-/// One drive in the answer.
+/// A drive in the answer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StoppedDrive {
-    /// Its name.
+    /// Name of the drive.
     pub drive: String,
     /// The result.
     pub outcome: Stopped,
@@ -100,7 +100,7 @@ struct State {
     broadcasts: Vec<(Exchange, Instant)>,
 }
 
-/// One order.
+/// An order in progress.
 #[derive(Debug)]
 struct UnderWay {
     machines: Vec<Machine>,
@@ -114,7 +114,7 @@ impl StopAll {
     /// under way has stopped a drive, and nothing may have started it since, this order joins it; any other drive has a new stop.
     ///
     /// # Errors
-    /// There is no such bus or group, or nothing of it is controlled.
+    /// The bus or group does not exist, or none of its drives is controlled.
     pub fn order(
         &self,
         plant: &Plant,
@@ -210,7 +210,7 @@ impl State {
             let stands = concerned().all(|stop| stop.outcome(plant, now).outcome == Stopped::Standing);
             let over = stands || now >= order.until;
             if let Some(acknowledged) = order.acknowledged.take_if(|_| is_answered || over) {
-                // Its client may have gone.
+                // The client may be gone, so an error is ignored.
                 let _ = acknowledged.send(all);
             }
             match over {
@@ -229,7 +229,7 @@ impl State {
             Some(stop.outcome(plant, now))
         };
         let report = StopReport::new(order.machines.iter().filter_map(of).collect());
-        // Its client may have gone.
+        // The client may be gone, so an error is ignored.
         let _ = order.report.send(report);
     }
 }

@@ -26,7 +26,7 @@ pub(crate) struct OneStop {
     pause: Duration,
     /// A read since its acknowledgement showed that the motor stands, and none since that it turns.
     stood: bool,
-    /// The motor was seen to turn after it had stood.
+    /// Whether the motor was seen to turn after it had stood.
     restarted: bool,
     /// The last command that may start the drive before it was placed.
     last_starter: u64,
@@ -34,13 +34,13 @@ pub(crate) struct OneStop {
 
 #[derive(Debug)]
 enum Step {
-    /// It is in the queue of its bus, or on its way.
+    /// The stop is in the queue of its bus, or being sent.
     Placed(Placed),
-    /// It failed, and is placed again then.
+    /// The stop failed, and is placed again at this time.
     Again(Instant),
     /// The drive acknowledged it then.
     Acknowledged(Instant),
-    /// It cannot be given to the drive.
+    /// The stop cannot be given to the drive.
     Refused,
 }
 
@@ -50,7 +50,7 @@ impl OneStop {
         let mut stop = OneStop {
             machine,
             drive: drive.image.spec.name.clone(),
-            // Once begun it comes to its end, whatever a reload takes away.
+            // A stop in progress is completed, whatever right a reload takes away.
             origin: origin.clone().lasting(),
             step: Step::Refused,
             failed: None,
@@ -70,7 +70,7 @@ impl OneStop {
         self.step = match profile.model_index(ModelPoint::Run) {
             Some(run) => {
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
-                // Whether it may be stopped was checked when the stop all was accepted.
+                // The right to stop was checked when the stop all was accepted.
                 let request = OrderRequest::new(order, self.origin.clone(), Authority::Write).at_once();
                 Step::Placed(drive.place(request, now))
             }
@@ -101,7 +101,7 @@ impl OneStop {
         matches!(self.step, Step::Acknowledged(_))
     }
 
-    /// Whether it cannot be given to the drive.
+    /// Whether the stop cannot be given to the drive.
     pub(crate) fn is_refused(&self) -> bool {
         matches!(self.step, Step::Refused)
     }
@@ -117,7 +117,7 @@ impl OneStop {
         self.outcome(plant, now).outcome == Stopped::Standing
     }
 
-    /// Whether it failed at least once.
+    /// Whether the stop failed at least once.
     pub(crate) fn has_failed(&self) -> bool {
         self.failed.is_some()
     }

@@ -8,18 +8,18 @@ use crate::process_image::Access;
 pub enum Scope {
     /// All of the gateway.
     Gateway,
-    /// Those of the bus of that name.
+    /// All drives of the bus with this name.
     Bus(String),
-    /// Those of these buses.
+    /// All drives of these buses.
     Buses(Vec<String>),
-    /// Those with that `group`.
+    /// All drives with this `group`.
     Group(String),
 }
 
 /// Why a command stops nothing.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NothingToStop {
-    /// There is no such bus or group.
+    /// No bus or group has this name.
     #[error("there is no {kind} `{name}`, so no stop was sent; known: {}", .known.join(", "))]
     Unknown {
         /// `bus` or `group`.

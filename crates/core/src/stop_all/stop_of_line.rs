@@ -1,4 +1,4 @@
-//! One broadcast that stops all drives of a line.
+//! A broadcast that stops all drives of a line.
 
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d Driv
         .into_iter()
         .map(|drive| (drive.access == Access::Control).then(|| drive.profile.broadcast_stop())?);
     let first = stops.next()??;
-    // One drive is stopped as soon by its own stop.
+    // A single drive is stopped just as fast by its own stop.
     let mut others = stops.peekable();
     others.peek()?;
     others.all(|stop| stop.as_ref() == Some(&first)).then_some(first)

@@ -16,11 +16,11 @@ pub enum Sign {
     Tried,
     /// Replies that are damaged anywhere.
     Damaged,
-    /// Of those: longer than the reply could be.
+    /// Damaged replies that are longer than the reply could be.
     Overlong,
     /// Stray bytes directly before the reply.
     Led,
-    /// Of those: zeros.
+    /// Stray bytes before the reply that are zeros.
     LedZero,
     /// Replies without their beginning.
     StartLost,
@@ -36,7 +36,7 @@ pub enum Sign {
     Slow,
     /// Transactions that show whether the adapter receives its own requests.
     EchoShown,
-    /// It does.
+    /// Transactions that show that the adapter receives its own requests.
     Echoed,
 }
 

@@ -1,4 +1,4 @@
-//! What ends a drill before its time: another client, the machine, a reload.
+//! Events that end a drill early: another client, the machine, a reload.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -44,7 +44,7 @@ impl Run {
         if !reading.snapshot.link.is_online() {
             return Some("the drive went offline".to_string());
         }
-        // Its supervision of the fieldbus may have stopped it by a fault.
+        // While a drill cuts off the gateway, the drive's fieldbus supervision may stop the motor with a fault.
         let may_have_fault = matches!(self.step, Step::Clearing(_)) && self.kind() == Some(Kind::Gateway);
         if reading.is_set(ModelPoint::Fault) && !may_have_fault {
             return Some("the drive has a fault".to_string());
@@ -61,7 +61,7 @@ impl Run {
             .map(|speed| format!("the motor turns at {speed:.1} %, more than max_speed of [drill]"))
     }
 
-    /// Who else gave the drive an order.
+    /// Checks whether another client gave the drive an order, and who.
     fn others(&mut self) -> Option<String> {
         let stops = self.drive.stops();
         if stops != self.stops {

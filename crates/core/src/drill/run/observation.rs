@@ -1,6 +1,6 @@
-//! What a drill observes once the motor should stop, and the verdict. The date of a reading is the earliest that it can be from, since
-//! a reply may be a late one to an earlier request: it proves that the motor still turned then. That it stood is proven by the moment
-//! at which the reading is looked at; what was not seen in time is not proven.
+//! The observations of a drill once the motor should stop, and the verdict. A reading is dated as early as it can be, since a reply
+//! may be a late one to an earlier request: it proves that the motor still turned then. Standstill is proven only at the moment at
+//! which the reading is evaluated; a standstill not seen in time is not proven.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -31,7 +31,7 @@ impl Run {
         (now, time): (Instant, SystemTime),
     ) {
         if !matches!(how, Cause::Client { .. }) {
-            // Its supervision is to write no stop meanwhile.
+            // The drill is no silent client here: its heartbeat keeps the lease from writing a stop.
             self.drive.heartbeat(&self.own, now);
         }
         let by_the_gateway = !matches!(how, Cause::Gateway(_));
@@ -137,7 +137,7 @@ impl Run {
         }
         let limit = self.options.limit.as_secs_f64();
         match reading.standstill(Some(until)) {
-            // Whether it was this switch that stopped it is not known.
+            // Whether the switch to local control stopped the motor is not known, so the drill proves nothing.
             Standstill::Stands if is_local(reading) => Seen::Ended(DrillState::Aborted, LOCAL.to_string()),
             Standstill::Stands if now <= until + AT_ONCE => Seen::Stood {
                 took: now.saturating_duration_since(cause),

@@ -1,4 +1,4 @@
-//! Files of recordings: whole or not at all, and what is said of those that are not.
+//! Files of recordings: complete or absent, and the messages about damaged ones.
 
 use std::fs;
 use std::io;
@@ -161,7 +161,7 @@ fn the_directory_keeps_its_limits_over_restarts() {
         .map(|f| f.unwrap().file_name())
         .collect();
     assert_eq!(files.len(), 11, "{files:?}");
-    // The same id again, as after the clock was set back.
+    // An id may come twice after the clock was set back.
     assert_eq!(
         Store::open(&limits)
             .write(&mut recording, SystemTime::now())

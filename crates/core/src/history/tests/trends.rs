@@ -24,7 +24,7 @@ impl Rig {
         self.bus.drives[0].update(|snapshot| snapshot.link = link);
     }
 
-    /// Polls for a time; the motor runs as `runs` says of each poll.
+    /// Polls for a time; `runs` says for each poll whether the motor runs.
     fn run(&mut self, time: Duration, runs: impl Fn(usize) -> bool) {
         self.polls(time, |rig, n| {
             let status = if runs(n) { RUNS } else { 1 };
@@ -79,7 +79,7 @@ fn a_point_made_of_others_needs_all_of_them() {
 fn starts_and_run_time_are_what_the_polls_saw() {
     let mut rig = Rig::new(options(), 1, &[]);
     rig.link(Link::Online(SystemTime::UNIX_EPOCH));
-    // It runs when the gateway starts: no start was seen. Then 10 s on, 10 s off.
+    // The motor already runs when the gateway starts, so no start was seen. Then 10 s on, 10 s off.
     rig.run(MINUTE, |n| n / 1000 % 2 == 0);
     let totals = rig.history().totals();
     assert_eq!(totals.starts, 2);
@@ -130,7 +130,7 @@ fn a_reload_keeps_counters_for_ever_and_trends_of_the_same_drive() {
         "another drive"
     );
     assert_eq!(rig.history().totals(), counted);
-    // It goes, and returns.
+    // The drive is removed by one reload and returns with another.
     rig.recorder.adopt(&[], STALE_AFTER, rig.clock);
     assert!(rig.history.drive("pump-1").is_none());
     assert_eq!(rig.history.totals("pump-1"), counted);
@@ -168,7 +168,7 @@ fn the_last_hour_of_a_line_counts_every_exchange_once() {
     assert_eq!(sums[1], (60, 60));
     assert!(hour.drives[1].iter().flatten().filter(|step| step.failed > 0).count() <= 2);
     assert_eq!(hour.load[30], Some((0.5, 0.5, 0.5)));
-    // A gateway that has just started knows nothing of the time before.
+    // A gateway that has just started has no data for the time before.
     let young = Rig::new(options(), 1, &[]);
     let line = young.history.line("line1").unwrap();
     let hour = line.lock().unwrap().last_hour(young.clock);

@@ -18,7 +18,7 @@ fn clock() -> Clock {
 struct Rig {
     trend: DriveTrend,
     clock: Clock,
-    /// What was fed: time, value, time that it is good.
+    /// Values that were fed in: time, value, time for which it is good.
     fed: Vec<(Instant, f32, Duration)>,
 }
 
@@ -49,7 +49,7 @@ impl Rig {
         self.fed.push((self.clock.now, value, good_for));
     }
 
-    /// The last of a range, as a client asks for it.
+    /// The part at the end of a range, as a client requests it.
     fn part(&self, range: Range, clock: Clock) -> Part {
         let from = clock.now - range.span;
         self.trend
@@ -57,7 +57,7 @@ impl Rig {
             .unwrap()
     }
 
-    /// What a range must show, worked out from all that was ever fed: by the number of the step.
+    /// The expected steps of a range, calculated from all values ever fed in: by the number of the step.
     fn naive(&self, range: Range) -> BTreeMap<u64, (f32, f32, f32)> {
         let number = |at: Instant| at.duration_since(self.trend.epoch).as_secs() / range.step.as_secs();
         let mut steps: BTreeMap<u64, (f32, f32, f32)> = BTreeMap::new();

@@ -24,7 +24,7 @@ impl Hash {
 
 impl From<ring::digest::Digest> for Hash {
     fn from(digest: ring::digest::Digest) -> Hash {
-        // Both have the length of a SHA-256.
+        // The conversion cannot fail: digest and hash both have the length of a SHA-256.
         Hash(digest.as_ref().try_into().unwrap_or_default())
     }
 }
@@ -71,9 +71,9 @@ pub enum Entry<'e> {
         /// When that was noticed.
         #[serde(serialize_with = "crate::event::rfc3339")]
         time: SystemTime,
-        /// Of commands that were sent.
+        /// Records of commands that were sent.
         sent: u64,
-        /// Of others.
+        /// Records of commands that were not sent.
         not_sent: u64,
     },
     /// The bytes between the last entry and this one are the rest of a line that a crash cut.
@@ -93,7 +93,7 @@ pub enum Entry<'e> {
 pub struct Chain {
     /// Number of the last line, from 1; 0 if there is none.
     pub seq: u64,
-    /// Its hash; zero if there is none.
+    /// Hash of the last line; zero if the file is empty.
     pub last: Hash,
 }
 
@@ -160,7 +160,7 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
     let after = window.iter().rposition(|byte| *byte == b'\n').map(|place| place + 1);
     let last = window.get(after.or(is_whole.then_some(0))?..)?;
     if let Some(head) = Head::read(last) {
-        // Only its line end is missing.
+        // A complete line without its line end is taken.
         return Some(Tail {
             chain: of(last, &head),
             fragment: None,
@@ -168,7 +168,8 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
         });
     }
     let mut end = window.len();
-    // What precedes the first line end may be the end of a longer line.
+    // Bytes before the first line end may be the end of a longer line, so they count only if the window is the whole
+    // file.
     while let Some(line_end) = window.get(..end)?.iter().rposition(|byte| *byte == b'\n') {
         let before = window.get(..line_end)?;
         let begin = before.iter().rposition(|byte| *byte == b'\n').map(|place| place + 1);
@@ -221,7 +222,7 @@ impl fmt::Debug for Verifier {
 }
 
 impl Verifier {
-    /// A reader that wants to find a line with the hash `last`.
+    /// A verifier that looks for a line with the hash `last`.
     pub fn new(last: Option<Hash>) -> Verifier {
         Verifier {
             wanted: last,
@@ -316,7 +317,7 @@ mod tests {
     use super::super::tests::record;
     use super::*;
 
-    /// So many lines, joined.
+    /// Joins `count` lines to the chain and returns them.
     fn lines(chain: &mut Chain, count: usize) -> Vec<Vec<u8>> {
         let record = record("a", 1);
         let mut next = || {

@@ -1,6 +1,7 @@
-//! The audit file: a thread that writes records behind two bounded queues, one for commands that were sent. Nobody waits
-//! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost. A reload
-//! that configures another file starts another thread behind the same queues, so that no record is lost in between.
+//! The audit file: a thread that writes records behind two bounded queues, one for commands that were sent. No command
+//! waits for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost. A
+//! reload that configures another file starts another thread behind the same queues, so that no record is lost in
+//! between.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::File;
@@ -153,7 +154,7 @@ impl AuditFile {
         Ok(AuditFile { options, shared, ended })
     }
 
-    /// Its options.
+    /// Options of the file.
     pub fn options(&self) -> &AuditFileOptions {
         &self.options
     }
@@ -183,8 +184,8 @@ impl AuditFile {
         self.shared.queues().lost
     }
 
-    /// Writes what waits, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait
-    /// with a limit.
+    /// Writes waiting records, as far as the disk takes them, and ends the thread. A disk that hangs blocks this
+    /// forever: wait with a limit.
     pub async fn stop(&self) {
         self.shared.queues().end = true;
         self.shared.wake.notify_all();

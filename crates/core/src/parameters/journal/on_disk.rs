@@ -34,7 +34,7 @@ impl JournalFile {
         let mut all = Vec::new();
         for entry in entries {
             let file = JournalFile { dir: entry?.path() };
-            // What cannot be looked at may be one.
+            // A path that cannot be examined may be a journal, so it counts as one.
             if file.path().try_exists().unwrap_or(true) && file.dir.is_dir() {
                 all.push(file);
             }
@@ -76,7 +76,7 @@ impl JournalFile {
     /// whole or replaced. The journal of another machine is left.
     ///
     /// # Errors
-    /// It is not certain to be there.
+    /// The journal is not certain to be on disk.
     pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
         self.is_free(of)?;
         files::replace(&self.path(), text.as_bytes())?;
@@ -98,10 +98,10 @@ impl JournalFile {
         Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
     }
 
-    /// The restore has ended: there is no journal of it any more. That of another machine is left.
+    /// Removes the journal of a restore that has ended. The journal of another machine is left.
     ///
     /// # Errors
-    /// It may still be there.
+    /// The journal may still be there.
     pub fn remove(&self, of: &Owner) -> io::Result<()> {
         if self.is_free(of).is_err() {
             return Ok(());
@@ -116,7 +116,7 @@ impl JournalFile {
     /// Sets the journal aside, with the former values in it; where.
     ///
     /// # Errors
-    /// It is still where it was.
+    /// The journal is still where it was.
     pub fn release(&self) -> io::Result<PathBuf> {
         let aside = self.dir.join(RELEASED);
         fs::rename(self.path(), &aside)?;

@@ -48,7 +48,7 @@ fn same_kind(a: RawValue, b: RawValue) -> bool {
 }
 
 impl<'a> Making<'a> {
-    /// Of files of the family of `profile`.
+    /// Compares files of the family of `profile`.
     pub(super) fn new(
         profile: &'a Profile,
         wanted: &'a ParameterFile,
@@ -92,7 +92,7 @@ impl<'a> Making<'a> {
         self.wishes.only.contains(id)
     }
 
-    /// Whether it is to be restored, unless there is an objection.
+    /// Whether the parameter is to be restored, unless there is an objection.
     fn is_asked_for(&self, id: &Id) -> bool {
         self.wishes.only.is_empty() || self.is_named_singly(id)
     }
@@ -169,7 +169,7 @@ impl<'a> Making<'a> {
                 continue;
             };
             let address = profile.parameters.address(id.name());
-            // One address has one name, and is written once.
+            // An address has one name, and is written once.
             let Some(address) = address.filter(|address| profile.parameters.id(*address).as_deref() == Some(id.name()))
             else {
                 self.leave_out(id, from, to, "the profile does not know it");

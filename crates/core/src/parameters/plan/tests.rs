@@ -129,7 +129,7 @@ fn as_file(profile: &Profile, drive: &str, values: &Values) -> ParameterFile {
     )
 }
 
-/// What `plan` makes of two drives of that family, every risk taken.
+/// The plan for two drives of this family, with every risk accepted.
 fn forced(profile: &Profile, wanted: &Values, present: &Values) -> Plan {
     let (wanted, present) = (as_file(profile, "a", wanted), as_file(profile, "b", present));
     plan(profile, &wanted, &present, &FORCED).unwrap().0
@@ -154,8 +154,8 @@ fn seeds() -> impl Strategy<Value = Vec<u16>> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Of any two legal drives: only what differs is written, once, every step keeps the limits, and in the end only what was left out
-    /// differs; back from anywhere, and on from anywhere, likewise.
+    /// Property for any two legal drives: only differing values are written, once, every step keeps the limits, and in the end only
+    /// values that were left out differ; going back from any step, and on from any step, likewise.
     #[test]
     fn every_step_is_safe_there_and_back(from in seeds(), to in seeds(), share in seeds(), cut in any::<u16>()) {
         for profile in with_parameters() {
@@ -360,7 +360,7 @@ fn drives_that_are_not_alike() {
         (ids_of(&plan_of_own), risks.len(), plan_of_own.notes.len()),
         (vec!["Cn-09"], 0, 1)
     );
-    // One that is named singly is wanted.
+    // A parameter that is named singly is restored although it is usually left out.
     let current = words(&teco, "fan-2", &[("Sn-01", 3), ("Cn-09", 44), ("Bn-01", 30)]);
     assert_eq!(
         ids_of(&plan(&teco, &current, &here, &only(&["Cn-09"])).unwrap().0),
@@ -470,7 +470,7 @@ fn what_is_missing_or_not_legal() {
     assert!(
         plan(&nx, &high, &low, &only(&["101"])).unwrap_err()[0].starts_with("102 would be below 101, which it limits")
     );
-    // One that the drive of the file broke, too.
+    // A limit that the drive of the file already broke may be broken again.
     let broken = words(&nx, "a", &[("101", 60), ("102", 55)]);
     let (odd, _) = plan(&nx, &broken, &low, &ALL).unwrap();
     assert_eq!(

@@ -86,8 +86,7 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
     }
 }
 
-/// On N2 a write goes to one object and sets all of it: an address at which none begins is no address, another length
-/// no value.
+/// On N2 a write sets one whole object: an address within an object is refused, and so is another length.
 fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
     let object = Object::at(table, first)
         .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;

@@ -171,11 +171,11 @@ fn limits_in_hertz_hold_for_the_frequency_at_which_the_motor_turns() {
     for percent in [-0.01, -10.0, -25.0, -30.0] {
         assert_eq!(asked(0.0..=30.0, percent), refused, "{percent} %");
     }
-    // It rounds to 0 %, which is 10 Hz forward.
+    // -0.004 % rounds to 0 %, which is 10 Hz forward.
     assert_eq!(asked(-30.0..=-10.0, -0.004), refused);
 }
 
-/// A drive of that profile between 10 and 50 Hz, as far as it can be told, with one limit; percent is that of the band
+/// A drive of this profile between 10 and 50 Hz, where its range is known, with one limit; percent is that of the band
 /// between `minimum` and 50 Hz.
 fn limited(profile: &Arc<Profile>, name: &str, most: f64) -> DriveImage {
     let spec = DriveSpec {
@@ -197,7 +197,7 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
     for profile in Profiles::built_in().iter() {
         let names = NAMES.iter().filter(|name| profile.point_index(name).is_some());
         let points: Vec<PointIndex> = names.filter_map(|name| profile.point_index(name)).collect();
-        // Of some families only percent is known.
+        // Unverified families may have a reference in percent only, so there is nothing to compare.
         if points.len() < 2 && !profile.verified {
             continue;
         }

@@ -1,4 +1,4 @@
-//! Who holds the drives of the bus, where `[authority]` is on: what accepted and refused orders change about it.
+//! The holders of the drives of the bus, where `[authority]` is on: changes by accepted and refused orders.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ pub(super) struct HoldNews {
 /// A command that advisory mode carried out.
 #[derive(Debug, Clone)]
 pub struct Unheld {
-    /// Who gave it.
+    /// Client that gave the order.
     pub client: Arc<str>,
     /// Why exclusive mode would have refused it.
     pub why: String,
@@ -108,7 +108,7 @@ impl Gate {
         }
     }
 
-    /// Whether a client may begin something that asks so much of a drive, where no order is judged yet.
+    /// Whether a client may start an action that requires `asks` of the hold, where no order is judged yet.
     ///
     /// # Errors
     /// The refusal.
@@ -159,7 +159,7 @@ impl Gate {
 
     /// A command is accepted.
     pub(super) fn hold_accepted(&mut self, command: &Command, now: Instant) {
-        // Of a stop that another bus accepted, it was noted there.
+        // A stop accepted by another bus before a reload was recorded there.
         let Some(rules) = self.rules.clone().filter(|_| !command.is_inherited()) else {
             return;
         };
@@ -247,7 +247,7 @@ impl Gate {
         self.with_hold(drive, |holding, _, _| holding.said_stop(&who));
     }
 
-    /// The client knows which machine it commands.
+    /// Records that the client knows which machine it commands, so it need not take the drive first.
     fn needs_no_stop(&mut self, drive: DriveIndex, origin: &Origin) {
         self.drive(drive)
             .must_stop_first
@@ -273,7 +273,7 @@ impl Gate {
         std::mem::take(&mut self.hold_news.unheld)
     }
 
-    /// Whether that client writes its command word all the time, so that its repeated stop is no new one.
+    /// Whether the client writes its command word continuously, so that its repeated stop is not a new one.
     pub(crate) fn is_cyclic(&self, origin: &Origin) -> bool {
         self.claim(origin).is_some_and(|who| who.cyclic)
     }

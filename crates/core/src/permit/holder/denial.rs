@@ -8,7 +8,7 @@ use crate::order::{Holder, Refusal};
 /// Why a command, or an act upon the hold, is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Denial {
-    /// The client is no principal.
+    /// The client is not a principal.
     Nobody,
     /// Another one holds the drive.
     Held(Claim, Duration),
@@ -18,9 +18,10 @@ pub enum Denial {
     NeedsTake(Claim),
     /// The drive's own local control place has it.
     Local,
-    /// It repeats an acknowledged stop of its own while another one holds the drive, or, with no time left, started the motor.
+    /// The client repeats an acknowledged stop of its own while another client holds the drive, or, with no time left, started
+    /// the motor.
     Repeats(Claim, Duration),
-    /// It renews a hold it does not have.
+    /// The client renews a hold that it does not have.
     NotHeld,
 }
 

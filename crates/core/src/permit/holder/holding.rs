@@ -47,7 +47,7 @@ impl Verb {
     }
 }
 
-/// Who has a drive.
+/// Kind of holder of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HoldState {
     /// No holder.
@@ -56,7 +56,7 @@ pub enum HoldState {
     Held,
     /// A stop reserved it.
     Reserved,
-    /// Its local control place.
+    /// The drive is under local control.
     Local,
 }
 
@@ -75,7 +75,7 @@ impl HoldState {
 /// The published state of a hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HoldView {
-    /// Who has it.
+    /// Kind of holder.
     pub state: HoldState,
     /// The holder, or who stopped it.
     pub holder: Option<Arc<str>>,
@@ -97,9 +97,9 @@ pub struct Told {
 /// A change of a hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum What {
-    /// It began.
+    /// The hold started.
     Held,
-    /// It ended, for that reason.
+    /// The hold ended, for this reason.
     Released(String),
     /// Another one broke it.
     Broken(Claim),
@@ -144,8 +144,8 @@ pub struct Holding {
     stood: Vec<Stood>,
     /// Whose run command was accepted last.
     starter: Option<Claim>,
-    /// One that is not cyclic and ended the hold of another by a stop that repeated its last one, by a way in that programs use
-    /// cyclically.
+    /// A client that is not configured as cyclic but ended the hold of another by repeating its last stop, over an interface
+    /// that programs use cyclically.
     repeater: Option<Arc<str>>,
 }
 
@@ -408,7 +408,7 @@ impl Holding {
         self.local = local;
     }
 
-    /// Whether it is under local control, as last reported.
+    /// Whether the drive is under local control, as last reported.
     pub fn is_local(&self) -> bool {
         self.local
     }
@@ -484,7 +484,7 @@ impl Holding {
         self.held(now).is_some_and(|(by, _)| by.is(who))
     }
 
-    /// Its published state.
+    /// Published state of the hold.
     pub fn view(&self, rules: &Rules, now: Instant) -> HoldView {
         let of = |state: HoldState, (by, left): (&Claim, Duration)| HoldView {
             state,
@@ -530,7 +530,7 @@ impl Holding {
         let Some(who) = who else { return };
         match asks {
             Asks::Stop if !self.has_stood(who) => {
-                // Beside the principals there may be any number of users of the machine.
+                // The table is bounded: besides the principals there may be any number of users.
                 if self.stood.len() >= MOST_STOOD {
                     self.stood.remove(0);
                 }

@@ -1,4 +1,4 @@
-//! What survives the process: the reservation after a stop. Pure: both clocks are arguments.
+//! The reservation after a stop survives the process. Pure: both clocks are arguments.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -13,7 +13,7 @@ pub struct KeptReservation {
     /// The machine.
     #[serde(flatten)]
     pub machine: Machine,
-    /// Who stopped it.
+    /// Name of the client that stopped the drive.
     pub who: String,
     /// The name of its rank then.
     pub rank: String,
@@ -30,7 +30,7 @@ fn milliseconds(time: SystemTime) -> u64 {
 }
 
 impl KeptReservation {
-    /// One of that machine, for a client of that name and rank.
+    /// A reservation of this machine, for a client of this name and rank.
     pub fn new(
         machine: Machine,
         (who, rank): (String, String),
@@ -46,8 +46,9 @@ impl KeptReservation {
         }
     }
 
-    /// Who it is for, and until when it continues after a start at `now`, which is `time` on the calendar; none if it
-    /// has ended, or its rank no longer exists. If the clock is earlier than the stop, all of it is left.
+    /// The client of the reservation, and until when it continues after a start at `now`, which is `time` on the
+    /// calendar; none if it has ended, or its rank no longer exists. If the clock is earlier than the stop, the full
+    /// time is left.
     pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
         let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
         let passed = milliseconds(time).saturating_sub(self.stopped_ms);

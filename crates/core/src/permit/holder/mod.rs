@@ -1,9 +1,9 @@
-//! Who holds a drive: principals and their ranks, the hold of one drive, and what a command asks of it. Pure: time is
-//! an argument.
+//! The holder of a drive: principals and their ranks, the hold of one drive, and the rights that a command needs. Pure:
+//! time is an argument.
 //!
-//! What a connection proves ([`crate::order::Proof`], made by the servers) tells who a client is; [`Rules`] turn that
-//! into a [`Claim`]. A [`Holding`] judges the commands of clients to one drive. The holdings are part of the gate of
-//! the bus, as the priority arrays are, so that they and the commands have one order of acceptance.
+//! The proof of a connection ([`crate::order::Proof`], made by the servers) identifies a client; [`Rules`] turn it into
+//! a [`Claim`]. A [`Holding`] judges the commands of clients to one drive. The holdings are part of the gate of the
+//! bus, as the priority arrays are, so that they and the commands have one order of acceptance.
 
 mod denial;
 mod holding;

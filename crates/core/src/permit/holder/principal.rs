@@ -1,4 +1,4 @@
-//! Who a client is, and what rank it has. Pure.
+//! The identity of a client and its rank. Pure.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -11,40 +11,40 @@ use crate::order::{Origin, Proof};
 /// How commands of non-holders are treated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
-    /// They are counted, reported and executed.
+    /// Violations are counted, reported and executed.
     Advisory,
-    /// They are refused, except stops.
+    /// Violations are refused, except stops.
     Exclusive,
 }
 
 /// A client by the name that it has for all north sides.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Principal {
-    /// Its name.
+    /// Name of the principal.
     pub name: Arc<str>,
     /// Place of its rank; 0 is the highest.
     pub rank: usize,
-    /// It writes its command word all the time: one that repeats its last stop is no new stop. Those over HTTP and the local socket
-    /// are always new ones.
+    /// Whether the client writes its command word continuously: a word that repeats its last stop is not a new stop. Stops over
+    /// HTTP and the local socket are always new ones.
     pub cyclic: bool,
-    /// Its addresses over Modbus TCP and TCP slots.
+    /// Addresses over Modbus TCP and TCP slots.
     pub modbus_tcp: Vec<IpNet>,
     /// The name in its certificate.
     pub certificate: Option<String>,
-    /// Its user over HTTP.
+    /// User name over HTTP.
     pub http_user: Option<String>,
-    /// Its level of the MQTT topics `as/WHO`.
+    /// Level `WHO` of the MQTT topics `as/WHO`.
     pub mqtt: Option<String>,
-    /// Whether it is the Sparkplug host.
+    /// Whether the principal is the Sparkplug host.
     pub sparkplug: bool,
-    /// Its addresses over BACnet.
+    /// Addresses over BACnet.
     pub bacnet: Vec<IpNet>,
-    /// Its user id at the local socket.
+    /// User id at the local socket.
     pub socket: Option<u32>,
 }
 
 impl Principal {
-    /// One that no connection proves to be it.
+    /// A principal without any proof, so that no connection matches it.
     pub fn new(name: impl Into<Arc<str>>, rank: usize) -> Principal {
         Principal {
             name: name.into(),
@@ -61,23 +61,23 @@ impl Principal {
     }
 }
 
-/// Who a client is when it commands.
+/// The identity under which a client commands.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Claim {
-    /// Its name: two claims of one name are one principal.
+    /// Name of the principal: two claims of one name are one principal.
     pub name: Arc<str>,
     /// Place of its rank; 0 is the highest.
     pub rank: usize,
     /// See [`Principal::cyclic`]; never where it may not repeat itself.
     pub cyclic: bool,
-    /// It commands by a way in that programs use cyclically, so that a stop of it may be a repetition.
+    /// Whether the client uses an interface that programs use cyclically, so that a stop may be a repetition.
     pub may_repeat: bool,
-    /// Its commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
+    /// Whether commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
     pub breaks: bool,
 }
 
 impl Claim {
-    /// A client that is no principal.
+    /// The claim of a client that is not a principal.
     pub(super) fn nobody() -> Claim {
         Claim {
             name: "nobody".into(),
@@ -88,17 +88,17 @@ impl Claim {
         }
     }
 
-    /// Whether it is the same principal.
+    /// Whether both claims are of one principal.
     pub fn is(&self, other: &Claim) -> bool {
         self.name == other.name
     }
 
-    /// Whether it ranks below another.
+    /// Whether this claim ranks below the other.
     pub fn is_below(&self, other: &Claim) -> bool {
         self.rank > other.rank
     }
 
-    /// The same, whose stops are all new ones.
+    /// A claim whose stops are all new ones.
     fn never_repeating(self) -> Claim {
         Claim {
             cyclic: false,
@@ -119,7 +119,7 @@ pub struct Rules {
     pub lease: Duration,
     /// Whether a stop is written when a drive with its run command set is switched to local control.
     pub stop_at_local: bool,
-    /// Those who are known by name.
+    /// The configured principals.
     pub principals: Vec<Principal>,
 }
 

@@ -292,7 +292,8 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
     }
     assert_eq!(drive.order("plc", Asks::Run), "needs_take");
     assert_eq!(drive.order("cloud", Asks::Run), "ok", "another client was not refused");
-    // Its own stop, a take, the stopper's release, and ten leases without a run.
+    // A stop of the client itself, a take, the release by the stopper, or ten leases without a run make a new run
+    // possible.
     let mut drive = stopped();
     drive.order("plc", Asks::Stop);
     drive.wait(31);
@@ -353,7 +354,7 @@ fn a_cyclic_client_stops_once() {
     assert_eq!(drive.order("cycle", Asks::Run), "held_by_other");
     assert_eq!(drive.order("cycle", Asks::Stop), "ok", "the change to stop is one");
     assert_eq!(drive.state(), "reserved cycle 30");
-    // One that is not said to be cyclic is found out.
+    // A client that is not configured as cyclic is detected.
     let mut drive = Drive::new();
     drive.order("plc", Asks::Stop);
     drive.act("op", Verb::Take);
@@ -361,7 +362,7 @@ fn a_cyclic_client_stops_once() {
     drive.order("plc", Asks::Stop);
     assert_eq!(drive.state(), "reserved plc 30");
     assert_eq!(drive.holding.repeater().map(|name| &**name), Some("plc"));
-    // Whoever insists, stops.
+    // An insisting stop of a cyclic client is always a new stop.
     let mut drive = Drive::new();
     let cycle = drive.who("cycle").unwrap();
     drive.order("cycle", Asks::Stop);
@@ -374,7 +375,8 @@ fn a_cyclic_client_stops_once() {
     );
 }
 
-/// Each row: what happened after the cyclic client said stop, whether the drive acknowledged that, and the repetition of it.
+/// Each row: events after the stop of the cyclic client, whether the drive acknowledged the stop, and the result of
+/// repeating it.
 #[test]
 fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
     type Then = fn(&mut Drive);
@@ -483,7 +485,7 @@ fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
     );
 }
 
-/// Of whom a stop may be a repetition, and who may be advised to say so: no person.
+/// Stops of programs may be repetitions; stops of persons never are, so a person is never reported as cyclic.
 #[test]
 fn a_stop_over_http_or_the_socket_is_never_a_repetition() {
     let address = "10.0.0.5".parse().unwrap();
@@ -537,7 +539,7 @@ fn a_stop_over_http_or_the_socket_is_never_a_repetition() {
         drive.act("op", Verb::Break);
         drive.act("op", Verb::Take);
         assert_eq!(stop(&mut drive, &claim), !repeats, "{proof:?}");
-        // One that is not said to be cyclic is found out where it may repeat itself.
+        // A client that is not configured as cyclic is detected where its interface allows repetitions.
         let plain = Claim { cyclic: false, ..claim };
         drive.act("op", Verb::Break);
         drive.act("op", Verb::Take);
@@ -689,7 +691,7 @@ fn in_bacnet_the_priority_is_the_act() {
     assert_eq!(holding.judge(high.as_ref(), Asks::Run, &drive.rules, drive.now), Ok(()));
     holding.accepted(high.as_ref(), Asks::Run, &drive.rules, drive.now, &mut drive.told);
     assert_eq!(drive.told(), ["plc held", "plc broken by op"]);
-    // One that goes on behind a stop is judged like any run: it breaks no hold.
+    // A run behind a stop of another client is judged like any run: it does not break the hold.
     let mut holding = Holding::default();
     let site = drive.who("site");
     holding.accepted(site.as_ref(), Asks::Stop, &drive.rules, drive.now, &mut drive.told);

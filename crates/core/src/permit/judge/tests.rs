@@ -18,7 +18,7 @@ use crate::testkit::{bus_spec, controlled, image, nx, read};
 const SECOND: Duration = Duration::from_secs(1);
 const DRIVE: usize = 0;
 
-/// What keeps orders from the drive.
+/// Reason that keeps orders from the drive.
 #[derive(Debug, Clone, Copy)]
 enum Why {
     Nothing,
@@ -33,7 +33,7 @@ enum Why {
     Guard,
 }
 
-/// What is ordered.
+/// The orders that are tried.
 const ORDERS: [&str; 5] = ["start", "reference", "reset", "stop", "read"];
 
 struct Rig {
@@ -108,7 +108,7 @@ impl Rig {
             asked,
             now: asked + Duration::from_millis(10),
         };
-        // It stands, and is not ready.
+        // The motor stands, and the drive is not ready.
         read(&rig.image, 2100, &[0x40, 0, 0, 0], asked);
         let shared = Arc::new(Guards::default());
         if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {
@@ -212,12 +212,12 @@ impl Rig {
     }
 }
 
-/// What becomes of each order of Alice, by moment: its code where it is refused.
+/// The result of each order of Alice at each moment: the code where it is refused.
 fn refused(why: Why) -> Vec<String> {
     let stages = [Stage::Accept, Stage::Turn, Stage::Write];
     let row = |what: &&str| {
         let told = stages.map(|stage| {
-            // Each moment is asked of a gate that has judged nothing.
+            // Each moment gets a new gate that has judged nothing yet.
             let mut rig = Rig::new(why);
             let command = rig.command(what, "alice", rig.asked);
             let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);

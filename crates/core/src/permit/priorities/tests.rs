@@ -22,7 +22,7 @@ fn write(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: 
     write.0
 }
 
-/// The same, not settled.
+/// Writes a slot without settling the result.
 fn asked(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: Option<f64>) -> (String, SlotWrite) {
     let value = value.map(|number| match what {
         Run | Reverse => Value::Bool(number != 0.0),
@@ -195,7 +195,7 @@ fn what_protects_people_stays_also_behind_an_active_that_governs() {
                 vec![(1, 1.0)]
             };
             assert_eq!(standing(&all, Run), left, "{kind:?} at {priority}");
-            // What stays governs as soon as the active is given back, and refuses starts then.
+            // An inactive that stays governs as soon as the active is given back, and then refuses starts.
             write(&mut all, Run, "a", 1, NULL);
             assert_eq!(elsewhere(&mut all, kind, effect(Some(true), false)), !stays);
         }

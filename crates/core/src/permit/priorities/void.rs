@@ -1,4 +1,4 @@
-//! Slots whose client has lost its right to write: nobody could release them any more. Pure.
+//! Slots whose client has lost its right to write: no client could release them any more. Pure.
 
 use super::{Commanded, Entry, Priorities, Slot};
 
@@ -9,7 +9,7 @@ pub struct VoidSlot {
     pub what: Commanded,
     /// 1..=16.
     pub priority: u8,
-    /// What was in it.
+    /// Entry of the slot.
     pub entry: Entry,
 }
 

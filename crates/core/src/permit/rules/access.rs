@@ -1,13 +1,13 @@
-//! Whether the client of a command may write at all. Judged by the configuration of now: what a reload has taken away
-//! since the first byte of a request no longer counts when the request is complete, and a command that waits, or a
-//! sequence that has begun, goes no further.
+//! Whether the client of a command may write at all. The present configuration decides: a right that a reload has taken
+//! away since the first byte of a request no longer counts when the request is complete, and a command that waits, or a
+//! sequence in progress, goes no further.
 //!
-//! A stop needs the right when it is accepted. Once accepted it is sent: the motor that it is to stop may run by nobody
-//! else's will.
+//! A stop needs the right when it is accepted. Once accepted it is sent: without it the motor might go on running
+//! against the client's will.
 //!
-//! What the profile, the access of the drive and that of the point let through, [`crate::permit::admit`] answers before this is asked,
-//! since what an order does is only known then. That is not asked again: a reload that changes the access of a drive or a point
-//! starts the bus anew, and what waits there ends.
+//! Refusals by the profile, the access of the drive and that of the point come from [`crate::permit::admit`] before this rule, since
+//! the effects of an order are only known then. They are not checked again: a reload that changes the access of a drive or a point
+//! restarts the bus, and orders that wait there end.
 
 use crate::order::{Interruption, Order, Origin, Outcome, Refusal};
 use crate::permit::gate::{DriveGate, Gate};

@@ -1,7 +1,7 @@
 //! Whether an order is still wanted: its age, what stopped its machine since, and whether its client is still there.
 //!
-//! What lay in a buffer while the reading thread stood still is as old as the stall, and came in no known order. Pure:
-//! time is an argument.
+//! An order that was buffered while the reading thread did not run is as old as the stall, and its sequence is not
+//! known. Pure: time is an argument.
 
 use std::time::Instant;
 
@@ -16,27 +16,27 @@ pub(in crate::permit) const RULE: Rule = Rule {
     judge,
 };
 
-/// What an order does to a machine, as far as its age matters.
+/// Effect of an order on a machine, as far as its age matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Does {
-    /// It takes the run command away.
+    /// The order takes the run command away.
     Stop,
-    /// It can make a standing motor turn.
+    /// The order can make a standing motor turn.
     Start,
     /// Anything else, such as setting a reference.
     Other,
-    /// It only reads.
+    /// The order only reads.
     Read,
 }
 
-/// What is looked at.
+/// The facts that decide about the age of an order.
 #[derive(Debug, Clone, Copy)]
 struct Age<'a> {
     /// How it came.
     arrival: &'a Arrival,
-    /// What it does.
+    /// Effect of the order.
     does: Does,
-    /// It is not sent later.
+    /// The order is not sent after this time.
     expires: Option<Instant>,
     /// The last stops of its machine.
     stops: &'a LastStops,
@@ -55,7 +55,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     let age = Age {
         arrival: &window.arrival,
         does,
-        // A started order ends by its own clock: it still clears a reset bit that it has set.
+        // An order that has started keeps its own time limit: it still clears a reset bit that it has set.
         expires: (ask.stage != Stage::Write).then_some(window.expires),
         stops: &drive.last_stops,
         waited: gate.paused,
@@ -71,7 +71,7 @@ fn verdict(age: Age<'_>, now: Instant) -> Verdict {
     if age.expires.is_some_and(|expires| expires <= now) {
         return Verdict::Refuse(Outcome::Expired);
     }
-    // One that waited while the bus stood still is of before, too.
+    // An order that waited while the bus did not run counts as given before the pause.
     let waited = age.waited.filter(|pause| arrival.asked < pause.ended);
     if arrival.connection.is_gone() && (arrival.stall.is_some() || waited.is_some()) {
         return Verdict::Refuse(Outcome::Expired);
@@ -106,8 +106,8 @@ mod tests {
         start + Duration::from_millis(ms)
     }
 
-    /// Asked and expires; the stall that it came in; the last pause of its reader, and of the bus; when the connection
-    /// was opened, and whether it is gone; a stop by its own connection, and by another one; now.
+    /// Times in ms: order received and expires; the stall during which it came; the last pause of its reader, and of
+    /// the bus; connection opened, and whether it is closed; a stop over this connection, and over another one; now.
     #[derive(Clone, Copy)]
     struct Case {
         asked: u64,
@@ -136,14 +136,14 @@ mod tests {
         now: 20_100,
     };
 
-    /// The same, read after a stall of 200 ms.
+    /// [`PLAIN`], read after a stall of 200 ms.
     const HICCUP: Case = Case {
         stall: Some((20_000, 20_200)),
         now: 20_201,
         ..PLAIN
     };
 
-    /// The same, read after a pause of 1.5 s.
+    /// [`PLAIN`], read after a pause of 1.5 s.
     const PAUSED: Case = Case {
         stall: Some((20_000, 21_500)),
         pause: Some((20_000, 21_500)),

@@ -1,4 +1,5 @@
-//! Whether the guard of the drive lets its motor start now: how often, how long after it stood, how close to others.
+//! Whether the guard of the drive permits a start of its motor now: starts per hour, time since it stood, distance to
+//! other starts.
 
 use crate::order::Refusal;
 use crate::permit::gate::{DriveGate, Gate};
@@ -16,7 +17,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
         return Verdict::Go;
     };
     match (ask.stage, starts.by_run(ask.drive)) {
-        // A run command that stands is no new start until the motor was seen to stand again.
+        // A repeated run command is not a new start until the motor was seen to stand again.
         (_, ByRun::Runs | ByRun::Repeats) => Verdict::Go,
         // The order before this one starts the motor, if it does.
         (Stage::Accept, _) if starts.has_cleared(ask.drive) => Verdict::Go,

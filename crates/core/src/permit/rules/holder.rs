@@ -1,6 +1,7 @@
-//! Who holds the drive, for whom a stop reserved it, and who has to take it before a start.
+//! The holder of the drive, the client for which a stop reserved it, and the clients that must take it before a start.
 //!
-//! A stop is asked only when it is accepted, since a word that a cyclic client repeats is no stop; an accepted stop is sent.
+//! A stop is judged only when it is accepted, since a word that a cyclic client repeats is not a stop; an accepted stop is
+//! sent.
 
 use crate::order::{Asks, Holder, Refusal};
 use crate::permit::gate::{DriveGate, Gate};

@@ -1,7 +1,8 @@
 //! Whether the values of the order still keep the limits, and what they rest on still holds.
 //!
-//! At accept the same is asked while the order is converted ([`crate::permit::admit`]), since its values are made of what it rests
-//! on. At write nothing can have changed: between the turn of an order and its last frame no other order to that drive is sent.
+//! At accept the limits are checked while the order is converted ([`crate::permit::admit`]), since its values come from the range
+//! on which they depend. At write nothing can have changed: between the turn of an order and its last frame no other order to that
+//! drive is sent.
 
 use crate::order::{FrequencyRange, Refusal};
 use crate::permit::gate::{DriveGate, Gate};

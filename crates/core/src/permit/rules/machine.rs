@@ -1,12 +1,12 @@
 //! Whether an order still means the machine that it named when its first byte came.
 //!
-//! The door asks this before an order takes its place ([`crate::plant::DriveHandle::place`]), since all other rules look at the
-//! machine that the order reaches. It is not asked again: a bus serves the same machines as long as it runs, and a reload ends or
-//! hands over what waits in the queue of a bus that it replaces, by machine.
+//! This rule is checked before an order takes its place ([`crate::plant::DriveHandle::place`]), since all other rules look at the
+//! machine that the order reaches. It is not checked again: a bus serves the same machines as long as it runs, and a reload ends
+//! or hands over the waiting orders of a bus that it replaces, by machine.
 
 use crate::order::Refusal;
 
-/// The refusal of all that is no stop.
+/// The refusal of all orders except stops.
 pub(crate) fn refusal() -> Refusal {
     Refusal::UnknownDrive(
         "the name meant another machine when this request began; nothing was written; send it again".to_string(),

@@ -1,5 +1,5 @@
-//! The rules, each a pure function that answers one question about an order and one drive. A rule says in its file why it is not
-//! asked at a moment at which it is not.
+//! The rules, each a pure function that judges one aspect of an order to one drive. Each rule's file explains why the rule is
+//! not evaluated at the other moments.
 
 pub(super) mod access;
 pub(super) mod age;

@@ -7,7 +7,7 @@ use crate::drive::Profile;
 use crate::process_image::{Cadence, Link};
 use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
 
-/// What rests on the drive's frequency range is no worse than the figures that it rests on.
+/// A value that depends on the drive's frequency range is no worse than the values of that range.
 #[test]
 fn a_value_within_a_band_is_as_good_as_the_band() {
     let profile = nx();
@@ -103,7 +103,7 @@ fn parameters_from_before_a_drive_went_away_are_not_believed() {
     assert_eq!(seen(), (Quality::Good, Quality::Stale, Some((0.0, 100.0))));
 }
 
-/// A family without a bit is not asked for it.
+/// A family without a bit decides without it.
 #[test]
 fn what_a_family_lacks_decides_nothing() {
     let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
@@ -148,7 +148,7 @@ fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     assert!(!is_stale(now + Duration::from_secs(10)) && is_stale(now + Duration::from_secs(16)));
 }
 
-/// A scale of another register: no value without it, none with a power that is no scale, and never a better quality.
+/// A scale in another register: no value without it, none with an invalid power, and never a better quality.
 #[test]
 fn a_scale_in_another_register() {
     let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\

@@ -1,4 +1,4 @@
-//! What came while the threads that read stood still: of several clients, in whatever sequence it is read.
+//! Orders that came while the reading threads did not run: of several clients, read in any sequence.
 
 use super::*;
 use crate::order::{Arrival, Connection, Effect, Effects};
@@ -6,7 +6,7 @@ use crate::stalls::Stall;
 
 const MS: Duration = Duration::from_millis(1);
 
-/// What a client orders of drive 1.
+/// Order of a client to drive 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Gives {
     Run,
@@ -23,7 +23,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// The reader of two connections stood still for that time, until now.
+    /// A bench whose reader of two connections did not run for this time, until now.
     fn after(stood: Duration) -> Bench {
         let mut rig = Clients::new();
         let began = rig.now;
@@ -37,7 +37,7 @@ impl Bench {
         }
     }
 
-    /// That order is read, which came during the stall over that connection.
+    /// The reader reads an order that came during the stall over this connection.
     fn reads(&mut self, connection: usize, gives: Gives) -> Receiver<Answer> {
         let arrival = Arrival {
             asked: self.began,
@@ -71,7 +71,7 @@ impl Bench {
         receiver
     }
 
-    /// What is sent until so long after the stall, in order.
+    /// Orders sent up to this time after the stall, in sequence.
     fn sent(&mut self, after: Duration) -> Vec<Urgency> {
         self.rig.now = self.stall.ended + after;
         std::iter::from_fn(|| self.rig.pop())

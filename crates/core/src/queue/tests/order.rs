@@ -1,4 +1,4 @@
-//! One order for each drive: what is passed on to several of them among the others, and what was asked for before a stop.
+//! One order for each drive: requests passed on to several drives among the others, and orders given before a stop.
 
 use super::*;
 use crate::codec::{Reply, RequestPdu};
@@ -83,7 +83,7 @@ fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
     // Behind that order the newest takes the place of the one before.
     let _third = give(&mut rig, reference(40.0), true);
     assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
-    // What does not touch it changes nothing.
+    // An order for other points changes nothing.
     let _other = give(&mut rig, points(&[8]), false);
     let _fourth = give(&mut rig, reference(50.0), true);
     let sent: Vec<Order> = std::iter::from_fn(|| rig.take()).map(|c| c.intent.order).collect();
@@ -218,7 +218,8 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     }
 }
 
-/// A client that asks nothing keeps the first queue: the last one gets its stop, and those between are gone.
+/// A client whose handle is idle keeps only the first queue: the last queue gets its stop, and the queues between are
+/// freed.
 #[test]
 fn a_stop_finds_the_last_of_many_buses_and_keeps_none_between() {
     let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());

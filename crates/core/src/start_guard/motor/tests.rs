@@ -1,6 +1,6 @@
 use super::*;
 
-/// One motor, and the time.
+/// A motor, and the time.
 struct Play {
     motor: Motor,
     began: Instant,

@@ -1,4 +1,4 @@
-//! What a reload changes of the guards, and what it does not.
+//! Changes of the guards by a reload, and their limits.
 
 use super::*;
 
@@ -19,7 +19,7 @@ fn trip(drive: &str) -> Interlock {
 }
 
 impl GuardedDrives {
-    /// The same drives as a bus that is prepared for a reload has them.
+    /// The drives as on a bus that is prepared for a reload.
     fn prepared(&self, change: impl Fn(&mut DriveSpec)) -> Arc<BusGuards> {
         let mut specs: Vec<DriveSpec> = self.images.iter().map(|image| image.spec.clone()).collect();
         specs.iter_mut().for_each(change);
@@ -56,7 +56,7 @@ fn a_prepared_bus_changes_nothing_until_it_begins() {
         matches!(verdict, Verdict::Refuse(_)).then_some(verdict)
     };
     assert_eq!(refused(2.0), None, "another group");
-    // And back: what was started meanwhile counts in the group that it is in.
+    // Back in the old groups, a start made meanwhile counts in the group of its drive.
     rig.guards.begin();
     assert_eq!((rig.refused(1, 5.9), rig.refused(1, 6.0)), (Some("stagger"), None));
 }
@@ -69,7 +69,7 @@ fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
     assert!(rig.tripped(0, 10.0).is_some_and(|why| why.contains("is unknown")));
     rig.read(2, true, 20.0);
     assert_eq!(rig.tripped(0, 20.9), None);
-    // Its bus takes longer to end than its values are fresh, and reads once more meanwhile.
+    // The bus takes longer to end than its values are fresh, and reads once more meanwhile.
     let leaving = vec![rig.images[2].clone()];
     rig.shared.expect(&leaving, rig.at(20.5));
     rig.read(2, true, 20.6);

@@ -93,12 +93,12 @@ async fn a_reload_loses_no_record() {
         for round in 1..=50 {
             (0..20).for_each(|n| file.push(Arc::new(record("operator", n)), true));
             let next = file.succeed(at(round)).unwrap();
-            // Whoever has the former one still uses it.
+            // Holders of the former handle still use it.
             file.push(Arc::new(record("operator", 20)), true);
             file = next;
         }
         file.stop().await;
-        // One that writes the other file may still be at it.
+        // The thread that writes the other file may still be running.
         while Arc::strong_count(&file.shared) > 1 {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
@@ -115,7 +115,7 @@ fn a_reload_back_to_a_file_that_is_still_written_waits_for_it() {
     let a = AuditFile::start(options(dirs[0].path())).unwrap();
     let first_writer = a.shared.file(&a.options.path);
     let busy = loop {
-        // It has its file.
+        // The first writer has locked its file.
         match first_writer.try_lock() {
             Ok(_) => std::thread::sleep(Duration::from_millis(1)),
             Err(_) => break first_writer.clone(),
