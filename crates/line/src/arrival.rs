@@ -130,7 +130,7 @@ mod tests {
         let root = folder.path();
         let port = root.join("serial/by-id/usb-1");
         let of = || Arrival::of(port.to_str().unwrap()).unwrap();
-        // What the system does when an adapter is plugged in.
+        // The steps of the system when an adapter is plugged in.
         let arrival = of();
         fs::write(root.join("ttyUSB7"), "").unwrap();
         assert!(!arrival.take(), "another device");

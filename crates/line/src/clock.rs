@@ -13,7 +13,7 @@ use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
 /// Precedence of a thread that serves a line, in real time (1 to 99). Interrupt threads of the kernel stand at 50.
 const REAL_TIME: u8 = 10;
-/// The same on the scale of `nice`, where real time is not allowed.
+/// Priority on the scale of `nice`, where real time is not allowed.
 const NICE: i32 = -10;
 
 /// Time since the machine was started, also that for which it was suspended: then the clock of [`Instant`] stands.
@@ -24,11 +24,11 @@ pub fn since_boot() -> Duration {
     Duration::new(seconds.unwrap_or_default(), nanoseconds.unwrap_or_default())
 }
 
-/// Asks the kernel to wake this thread at the time it named: by default it may be 50 microseconds late, to save power.
-/// And to let it go before all ordinary ones that want the processor, since a thread of a line needs little time, but
-/// needs it at once: in real time, which the kernel allows to root, with CAP_SYS_NICE and within RLIMIT_RTPRIO; else by
-/// `nice` (RLIMIT_NICE). Among ordinary threads even the first may wait for the next tick, 4 ms later, while the machine
-/// is busy. Where everything is refused, waits are later and nothing else changes.
+/// Asks the kernel to wake this thread exactly at the requested time: by default it may be 50 microseconds late, to save
+/// power. The thread also goes before all ordinary ones that want the processor, since a thread of a line needs little
+/// time, but needs it at once: in real time, which the kernel allows to root, with CAP_SYS_NICE and within
+/// RLIMIT_RTPRIO; else by `nice` (RLIMIT_NICE). Among ordinary threads even the first may wait for the next tick, 4 ms
+/// later, while the machine is busy. Where everything is refused, waits are later and nothing else changes.
 pub fn sharpen_timers() {
     if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
         tracing::debug!(target: "drivegate::line::clock", "timer slack stays as it is: {error}");
@@ -97,8 +97,8 @@ pub fn wait_until(at: Instant, spin: Duration) {
     }
 }
 
-/// How late the kernel wakes a thread, and so how much earlier it has to be asked to: some microseconds on bare metal,
-/// 50 to 80 on a virtual machine. What is left of the wait is spun.
+/// How late the kernel wakes a thread, and so how much earlier the wake-up is requested: some microseconds on bare
+/// metal, 50 to 80 on a virtual machine. The rest of the wait is spun.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct WakeUps {
     mean: Duration,
@@ -138,7 +138,7 @@ impl WakeUps {
 mod tests {
     use super::*;
 
-    /// Whether the system lets a thread of this process run in real time, asked by other means.
+    /// Whether the system lets a thread of this process run in real time, checked with another program.
     fn allowed() -> bool {
         let ask = format!("import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param({REAL_TIME}))");
         let output = std::process::Command::new("python3").args(["-c", &ask]).output();

@@ -1,7 +1,7 @@
 //! A device that takes one frame of the line in each datagram (`udp://`).
 //!
 //! Each request is sent from a socket, and so a port, of its own: a datagram that comes late or twice answers a port that
-//! nobody has any more, and is never taken for the reply to another request.
+//! is no longer open, and is never mistaken for the reply to another request.
 
 use std::cell::{Ref, RefCell};
 use std::io;
@@ -13,7 +13,7 @@ use super::{Lost, Names, OpenError};
 #[derive(Debug)]
 pub(super) struct Datagrams {
     device: SocketAddr,
-    /// That of the last request.
+    /// Socket of the last request.
     socket: RefCell<UdpSocket>,
 }
 
@@ -68,7 +68,7 @@ impl Datagrams {
     }
 }
 
-/// Whether the error says of the device or of the way to it that it is not there now.
+/// Whether the error means that the device or the way to it is not there now.
 fn is_of_network(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionRefused, HostUnreachable, Interrupted, NetworkDown, NetworkUnreachable};
     [
@@ -88,7 +88,7 @@ fn socket_to(device: SocketAddr) -> io::Result<UdpSocket> {
     };
     let socket = UdpSocket::bind(any)?;
     socket.set_nonblocking(true)?;
-    // Only what the device sends is received.
+    // A connected socket receives only datagrams of the device.
     match socket.connect(device) {
         Err(error) if !is_of_network(&error) => Err(error),
         _ => Ok(socket),

@@ -1,8 +1,8 @@
 //! Devices that dial in (`tcp-listen://`): modems and converters that connect to the gateway and say a text first.
 //!
 //! One thread for each address accepts connections and finds by that text for which bus one is. A bus whose port has no
-//! text gets whoever connects. A device that dials in again replaces its connection, which may be dead without a word;
-//! nobody without the text gets the line.
+//! text gets any connection. A device that dials in again replaces its connection, which may be dead without a notice;
+//! a connection without the text never gets the line.
 
 use std::io::{self, Read};
 use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -25,7 +25,7 @@ pub const LONGEST_ID: usize = 64;
 const WAIT: Duration = Duration::from_secs(2);
 /// Waiting threads look again after that time.
 const STEP: Duration = Duration::from_millis(100);
-/// An address that no bus wants is listened at for so long: a reload leaves the connections as they are.
+/// Time for which an address that no bus uses stays open: a reload leaves the connections as they are.
 const KEPT: Duration = Duration::from_secs(5);
 
 /// The addresses at which devices dial in.
@@ -122,7 +122,7 @@ impl Place {
         Ok(Place { shared, id })
     }
 
-    /// Waits for the device; none where it does not come in time, or is no longer wanted.
+    /// Waits for the device; none where it does not come in time, or the port is no longer used.
     fn wait(&self, go_on: &dyn Fn() -> bool) -> Option<TcpStream> {
         let until = Instant::now() + WAIT;
         let mut state = self.shared.state();
@@ -272,7 +272,7 @@ struct Pending {
     since: Instant,
 }
 
-/// Accepts connections until no bus wants them any more.
+/// Accepts connections until no bus uses the address any more.
 fn accept_all(listener: &TcpListener, shared: &Shared) {
     let mut pending: Vec<Pending> = Vec::new();
     loop {
@@ -321,12 +321,12 @@ fn is_unwanted(shared: &Shared, now: Instant) -> bool {
 fn set_up(stream: &TcpStream) -> io::Result<()> {
     stream.set_nonblocking(true)?;
     stream.set_nodelay(true)?;
-    // A modem that lost its network says nothing; the system would keep trying for a quarter of an hour.
+    // A modem that lost its network sends nothing; the system would keep trying for a quarter of an hour.
     rustix::net::sockopt::set_tcp_user_timeout(stream, UNACKNOWLEDGED.as_millis() as u32)?;
     Ok(())
 }
 
-/// What becomes of a connection: it goes to its line, is hung up on, or still owes its text.
+/// Decides about a connection: it goes to its line, is closed, or still owes its text.
 fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending> {
     let from = one.from.ip().to_canonical();
     let mut allowed = state
@@ -378,7 +378,7 @@ enum Said {
     Gone,
 }
 
-/// Reads what a device says first, no byte further than its text: what follows is of the line.
+/// Reads the text that a device sends first, and no byte further: the bytes behind the text belong to the line.
 fn said(one: &mut Pending) -> Said {
     let mut byte = [0];
     match one.stream.read(&mut byte) {
@@ -399,12 +399,12 @@ fn said(one: &mut Pending) -> Said {
 enum Belongs {
     To(Vec<u8>),
     ToNobody,
-    /// What was said is the beginning of a text.
+    /// The received bytes are the beginning of a text.
     Unknown,
 }
 
-/// The line of a device by what it has said. Line ends before the text are ignored; those behind it are left on the line,
-/// which takes them for bytes between transactions.
+/// Finds the line of a device by the text it has sent. Line ends before the text are ignored; those behind it are left on
+/// the line, which counts them as bytes between transactions.
 fn belongs_to<'i>(said: &[u8], ids: impl Iterator<Item = &'i Vec<u8>>) -> Belongs {
     let said = said.trim_ascii_start();
     let mut may = said.is_empty();
@@ -445,7 +445,7 @@ mod tests {
         Line::open_by(names, &text, &format, &LineOptions::default(), &|| true).map(|(line, _)| line)
     }
 
-    /// A device that dials in and says that.
+    /// A device that dials in and sends this text.
     fn dials(port: u16, says: &str) -> TcpStream {
         let mut stream = loop {
             match TcpStream::connect(("127.0.0.1", port)) {
@@ -479,7 +479,7 @@ mod tests {
         let mut buffer = [0; 3];
         of_first.read_exact(&mut buffer).unwrap();
         assert_eq!(&buffer, b"ask");
-        // The modem restarted, and nothing said that the connection is gone.
+        // The modem restarted without closing its first connection.
         let mut again = dials(port, "USR-0001");
         assert_eq!(of_first.read(&mut buffer).unwrap(), 0, "hung up on");
         let lost = loop {

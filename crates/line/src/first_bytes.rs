@@ -11,11 +11,11 @@ const ASKED: usize = 32;
 /// The kind of server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Server {
-    /// A serial port, or nothing that is known.
+    /// A serial port, or a server that is not recognised.
     Raw,
-    /// It would take a byte 255 in a request for a command and double it in a reply.
+    /// A telnet server would take a byte 255 in a request for a command and double it in a reply.
     Telnet,
-    /// It takes the beginning of each request for a transaction id.
+    /// A Modbus TCP server takes the beginning of each request for a transaction id.
     ModbusTcp,
 }
 
@@ -58,7 +58,7 @@ impl FirstBytes {
         self.came.first().copied().unwrap_or_default()
     }
 
-    /// The drive that was asked first.
+    /// The drive of the first request.
     pub(super) fn first_unit(&self) -> Option<u8> {
         self.asked.first().map(|[unit, _]| *unit)
     }
@@ -80,9 +80,9 @@ impl FirstBytes {
         }
     }
 
-    /// Whether that is a reply of Modbus TCP to a request of RTU: the first two bytes of the request as its transaction id, the
-    /// protocol id 0, a length, a unit and a function. In RTU it would be the reply to a write to register 0, whose check code
-    /// tells it, or one without data.
+    /// Whether the bytes are a reply of Modbus TCP to a request of RTU: the first two bytes of the request as its transaction
+    /// id, the protocol id 0, a length, a unit and a function. In RTU they would be the reply to a write to register 0, which
+    /// the check code shows, or one without data.
     fn is_modbus_tcp(&self) -> Option<bool> {
         let begins = |from: usize, with: &[u8]| {
             let seen = self.came.get(from..).unwrap_or_default();
@@ -120,7 +120,7 @@ mod tests {
         out
     }
 
-    /// What is recognised when these bytes come one by one after that request.
+    /// The server recognised when these bytes come one by one after the request.
     fn seen(request: &[u8], bytes: &[u8]) -> Option<Server> {
         let mut first = FirstBytes::default();
         first.asked(request);
@@ -172,7 +172,7 @@ mod tests {
             }
         }
 
-        /// Whatever a drive answers to whatever is read or written, it is no other server.
+        /// No reply of a drive to any read or write is recognised as another server.
         #[test]
         fn any_reply_of_a_drive(address in 1u8..=247, start: u16, count in 1u16..=125, data in prop::collection::vec(any::<u8>(), 250)) {
             let [[high, low], [more, few]] = [start, count].map(u16::to_be_bytes);

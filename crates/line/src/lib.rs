@@ -58,7 +58,7 @@ const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 /// The port cannot be opened: the bus tries again with back-off.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// The path does not exist, is busy, is no serial port, or may not be used.
+    /// The path does not exist, is busy, is not a serial port, or may not be used.
     #[error("cannot open {port}: {reason}")]
     Serial {
         /// Path.
@@ -109,7 +109,7 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// Whether nobody took the connection, as for a moment at a server that still lets go of the one before.
+    /// Whether the connection was not accepted, as for a moment at a server that still closes the one before.
     pub fn is_refused(&self) -> bool {
         use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
         let refused = [ConnectionAborted, ConnectionRefused, ConnectionReset];
@@ -128,7 +128,7 @@ pub struct Lost {
 }
 
 impl Lost {
-    /// Of a serial port: an adapter that is unplugged reads end of file.
+    /// The loss of a serial port: an adapter that is unplugged reads end of file.
     fn of_adapter(self) -> Lost {
         Lost { closed: false, ..self }
     }
@@ -147,7 +147,7 @@ impl Lost {
     }
 }
 
-/// What ended a wait.
+/// Event that ended a wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Woken {
     /// Bytes can be read (or the port is gone, which reading shows).
@@ -213,8 +213,8 @@ impl Line {
         Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }
 
-    /// As [`Line::open`], for anyone who opens the same port again and again: `names` remembers the addresses of a
-    /// device server, and `go_on`, called at least once a second, says whether it is still wanted.
+    /// As [`Line::open`], for callers that open one port repeatedly: `names` remembers the addresses of a device
+    /// server, and `go_on`, called at least once a second, returns whether the port is still needed.
     ///
     /// # Errors
     /// As [`Line::open`].
@@ -513,7 +513,7 @@ impl Line {
     }
 }
 
-/// The format that the port says it has.
+/// The format that the port reports.
 fn read_back(fd: &Exclusive) -> Option<String> {
     let modes = tcgetattr(fd).ok()?;
     let data = if modes.control_modes.contains(ControlModes::CS8) {

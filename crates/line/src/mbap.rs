@@ -1,4 +1,4 @@
-//! A device that speaks Modbus TCP (`modbus-tcp://`): the frames of a line in those of the network, and back.
+//! A device on Modbus TCP (`modbus-tcp://`): the frames of a line in those of the network, and back.
 //!
 //! The bus gives and takes RTU frames. On the network each request has a transaction id of its own, and a reply with
 //! another one than that of the last request belongs to a request that was given up: it is dropped, so that no late or
@@ -45,7 +45,7 @@ impl Mbap {
     /// Reads the reply to the last request, as an RTU frame; 0 if there is none.
     ///
     /// # Errors
-    /// When the port is gone, or what comes is no Modbus TCP.
+    /// When the port is gone, or the bytes are not Modbus TCP.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         let mut raw = [0; 512];
         let count = read(self.stream.as_fd(), &mut raw)?;

@@ -1,5 +1,5 @@
-//! Names of device servers. The system may take ten seconds and more to say that no name server answers, and a bus that
-//! stands still so long looks as if it hung: a thread of its own asks, and the bus waits for it in short steps.
+//! Names of device servers. The system may take ten seconds and more to report that no name server answers, and a bus
+//! that waits so long looks as if it hung: a thread of its own asks, and the bus waits for it in short steps.
 
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs};
@@ -15,26 +15,26 @@ use super::other_server::OtherServer;
 
 /// Longest wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Waiting callers are asked this often whether to continue.
+/// Interval at which `go_on` of waiting callers is called.
 const STEP: Duration = Duration::from_millis(100);
 
 type Found = io::Result<Vec<SocketAddr>>;
 
-/// The addresses of one device server: at most one thread asks for them, and the last good ones are kept.
+/// The addresses of one device server: at most one thread looks them up, and the last good ones are kept.
 pub struct Names {
     ask: Arc<dyn Fn(&str) -> Found + Send + Sync>,
     patience: Duration,
     known: Vec<SocketAddr>,
     /// The result of a lookup still in progress.
     asked: Option<Receiver<Found>>,
-    /// What the system said last instead of an address: repeated while it says nothing, so that the reason why a bus
-    /// is down changes only when there is news.
+    /// The last error of the system instead of an address: repeated until there is another result, so that the reason
+    /// why a bus is down changes only when the cause does.
     failure: Option<String>,
     /// The last lookup found nothing.
     doubtful: bool,
-    /// What the server turned out to be.
+    /// The kind of server, once recognised.
     pub(super) other: OtherServer,
-    /// Who may dial in.
+    /// Networks from which devices may dial in.
     pub(super) allow: Vec<IpNet>,
     /// Where devices dial in.
     pub(super) dial_in: Option<Place>,
@@ -77,11 +77,11 @@ impl Names {
         }
     }
 
-    /// The addresses of `host:port`, at least one: those that the system says, else the last that it said. `go_on` is
+    /// The addresses of `host:port`, at least one: those that the system returns, else the last known ones. `go_on` is
     /// called several times a second while the answer is awaited; false ends the wait.
     ///
     /// # Errors
-    /// When there is no address, no answer within two seconds, or the wait was ended.
+    /// When there is no address, no answer within two seconds, or `go_on` returned false.
     pub fn addresses(&mut self, address: &str, go_on: &dyn Fn() -> bool) -> Found {
         if let Ok(literal) = address.parse() {
             return Ok(vec![literal]);
@@ -116,13 +116,13 @@ impl Names {
         Ok(self.known.clone())
     }
 
-    /// Asks in a thread. It cannot be cancelled: it ends when the system gives up.
+    /// Looks the name up in a thread, which cannot be cancelled: it ends when the system gives up.
     fn ask(&self, address: &str) -> io::Result<Receiver<Found>> {
         let (answer, asked) = sync_channel(1);
         let (ask, address) = (self.ask.clone(), address.to_string());
         std::thread::Builder::new().name("names".to_string()).spawn(move || {
             clock::be_ordinary();
-            // Nobody waits any more when the bus has ended.
+            // The receiver is gone when the bus has ended.
             let _ = answer.send(ask(&address));
         })?;
         Ok(asked)
@@ -165,7 +165,7 @@ mod tests {
 
     const NAME: &str = "device-server:4001";
 
-    /// A name server that answers when the test says so, and how often it was asked.
+    /// A name server that answers when the test commands it, and the number of lookups.
     fn names() -> (Names, Sender<Found>, Arc<AtomicUsize>) {
         let (say, said) = channel();
         let (said, asked) = (Mutex::new(said), Arc::new(AtomicUsize::new(0)));

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// Who switches the direction of an RS-485 line.
+/// Which part switches the direction of an RS-485 line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Rs485 {
     /// The adapter itself.
@@ -22,7 +22,7 @@ pub enum Level {
     Driver,
     /// Asserted.
     On,
-    /// Not asserted.
+    /// The signal is not asserted.
     Off,
 }
 
@@ -54,7 +54,7 @@ impl Spin {
 /// [`Rs485::KernelInverted`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineOptions {
-    /// Who switches the direction.
+    /// Which part switches the direction.
     pub rs485: Rs485,
     /// Time between switching to sending and the first bit, whole milliseconds up to [`MOST_RTS_DELAY`].
     pub rts_before_send: Duration,

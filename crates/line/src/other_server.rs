@@ -1,9 +1,9 @@
 //! Whether a Modbus TCP server is at the other end of a raw connection on which nothing ever came. Most of these servers drop
 //! the frames of a serial line without a word, and a line whose drives are switched off looks the same.
 //!
-//! So it is asked, on a connection of its own that is closed at once, by a thread: for a register, as a Modbus TCP client does.
-//! On a line behind a raw port the question means nothing: it begins with an address that no drive may have and has no check
-//! code. It is asked only after long silence, and not again within an hour; once there was an answer, before each connection.
+//! The check uses a connection of its own, closed at once, in a thread: it requests a register, as a Modbus TCP client does. On
+//! a line behind a raw port the request means nothing: it begins with an address that no drive may have and has no check code.
+//! The check is made only after long silence, and not again within an hour; once there was an answer, before each connection.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
@@ -20,15 +20,15 @@ const PATIENCE: Duration = Duration::from_millis(500);
 /// Transaction id, whose first byte is an address that Modbus reserves.
 const TRANSACTION: [u8; 2] = [0xF8, 0x01];
 
-/// What is known of the server behind a port, kept while the port is opened again and again.
+/// Knowledge of the server behind a port, kept while the port is opened repeatedly.
 #[derive(Debug, Clone, Default)]
 pub(super) struct OtherServer(Arc<Known>);
 
 #[derive(Debug, Default)]
 struct Known {
-    /// It responds to Modbus TCP.
+    /// Whether the server responds to Modbus TCP.
     found: AtomicBool,
-    /// The drive in whose name it was asked: servers do not answer for all.
+    /// Unit id used in the check: servers do not answer for all.
     unit: AtomicU8,
     asked: Mutex<Option<Instant>>,
 }
@@ -75,7 +75,7 @@ impl OtherServer {
         self.ask(server, unit, None, Instant::now());
     }
 
-    /// Asks in a thread; a connection that waits in vain is ended where the server responds.
+    /// Checks the server in a thread; a connection that waits without success is ended where the server responds.
     fn ask(&self, server: SocketAddr, unit: u8, silent: Option<TcpStream>, now: Instant) {
         let mut asked = self.0.asked.lock().unwrap_or_else(PoisonError::into_inner);
         if asked.is_some_and(|asked| now.saturating_duration_since(asked) < AGAIN) {
@@ -118,7 +118,7 @@ fn answers(server: SocketAddr, unit: u8) -> bool {
 
 fn is_answer(head: &[u8; 9], unit: u8) -> bool {
     let [high, low] = TRANSACTION;
-    // One register, or an exception.
+    // The answer is a register, or an exception.
     matches!(*head, [a, b, 0, 0, 0, length, c, function, next]
         if (a, b, c) == (high, low, unit)
             && matches!((length, function, next), (5, 3, 2) | (3, 0x83, 1..=11)))

@@ -73,7 +73,7 @@ impl Pty {
     /// Writes as much as there is room for, without waiting.
     ///
     /// # Errors
-    /// There is no room, or the system reports something else.
+    /// There is no room, or the system reports another error.
     pub fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         Ok(rustix::io::write(&self.master, bytes)?)
     }
@@ -138,7 +138,7 @@ fn point(link: &Path, target: &Path) -> io::Result<()> {
     let mut aside = link.as_os_str().to_owned();
     aside.push(format!(".{}", std::process::id()));
     let aside = PathBuf::from(aside);
-    // What a process of this number left behind when it was killed in between.
+    // Removes the link of a killed process that had the number of this one.
     let _ = fs::remove_file(&aside);
     symlink(target, &aside).map_err(explain)?;
     fs::rename(&aside, link).map_err(|error| {

@@ -15,7 +15,7 @@ use super::{Lost, OpenError, poll_port, read, write_all};
 
 /// Time for the server to agree and to set up its port.
 const NEGOTIATION: Duration = Duration::from_secs(3);
-/// Waiting callers are asked this often whether to continue.
+/// Interval at which `go_on` of waiting callers is called.
 const STEP: Duration = Duration::from_millis(100);
 
 /// A raw connection.
@@ -24,7 +24,7 @@ pub(super) struct Raw {
     stream: TcpStream,
     opened: Instant,
     server: Option<SocketAddr>,
-    /// What came first; `None` once it is known to be of a line.
+    /// The first bytes; `None` once they are known to come from a line.
     first: RefCell<Option<FirstBytes>>,
     other: OtherServer,
 }
@@ -33,7 +33,7 @@ impl Raw {
     /// `other` is what is known of the server by connections before.
     ///
     /// # Errors
-    /// It is a Modbus TCP server.
+    /// The server speaks Modbus TCP.
     pub(super) fn open(stream: TcpStream, port: &str, other: &OtherServer) -> Result<Raw, OpenError> {
         if other.is_found() && !other.is_gone(&stream) {
             return Err(OpenError::Remote {
@@ -86,7 +86,8 @@ impl Raw {
 }
 
 impl Raw {
-    /// Why the connection ended, where the server is known to be another one; it is asked where it hung up at a request.
+    /// The reason for the loss, where another kind of server is known; a server that closed the connection at a request
+    /// is checked.
     fn explained(&self, lost: Lost) -> Lost {
         if self.other.is_found() {
             return Lost::new(Server::ModbusTcp.words());
@@ -120,7 +121,7 @@ impl Remote {
     /// Has the server set up its port; the texts are warnings.
     ///
     /// # Errors
-    /// When the server cannot, does not within three seconds, or is no longer wanted.
+    /// When the server cannot be set up, does not answer within three seconds, or `go_on` returned false.
     pub(super) fn open(
         stream: TcpStream,
         port: &str,
@@ -175,7 +176,7 @@ impl Remote {
         write_all(self.stream.as_fd(), &escape(frame))
     }
 
-    /// Reads the data that is there, answering what the server asks; 0 is nothing.
+    /// Reads the available data and answers the server's requests; 0 means no data.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         let count = read(self.stream.as_fd(), buffer)?;
         let mut data = Vec::with_capacity(count);

@@ -1,5 +1,6 @@
-//! RS-485 by the kernel: what is asked of the driver, and what the driver made of it. A driver that cannot do a part of it
-//! leaves that out, often without a word (`uart_sanitize_serial_rs485` of `serial_core.c`), and returns what it settled on.
+//! RS-485 by the kernel: the settings requested from the driver, and those it accepted. A driver that cannot do a part
+//! leaves it out, often without an error (`uart_sanitize_serial_rs485` of `serial_core.c`), and returns the settings it
+//! accepted.
 
 use std::io;
 use std::time::Duration;
@@ -7,10 +8,11 @@ use std::time::Duration;
 use super::options::{LineOptions, Rs485};
 use super::sys::{ENABLED, RTS_AFTER_SEND, RTS_ON_SEND, RX_DURING_TX, SerialRs485, TERMINATE_BUS};
 
-/// Has `driver` switch the direction (it replaces its argument by what it settled on); what it does not do as asked.
+/// Has `driver` switch the direction (it replaces its argument by the accepted settings); returns the settings that it
+/// did not accept.
 ///
 /// # Errors
-/// What the driver says, such as ENOTTY; `Unsupported` where it accepts the request and leaves the mode off.
+/// The error of the driver, such as ENOTTY; `Unsupported` where it accepts the request and leaves the mode off.
 pub(super) fn enable(
     options: &LineOptions,
     driver: impl FnOnce(&mut SerialRs485) -> io::Result<()>,

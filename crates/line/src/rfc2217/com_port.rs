@@ -25,7 +25,7 @@ const DTR: (u8, u8) = (8, 9);
 const RTS: (u8, u8) = (11, 12);
 const BOTH_BUFFERS: u8 = 3;
 
-/// What the port behind the server is to be.
+/// The settings for the port behind the server.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Settings {
     pub(crate) format: LineFormat,
@@ -42,11 +42,11 @@ pub(crate) enum State {
     Setting,
     /// All is set; from now on what comes from the line is data.
     Ready,
-    /// It cannot be: why, and what to do.
+    /// The port cannot be used: the reason and the remedy.
     Refused(&'static str),
 }
 
-/// One connection.
+/// A connection.
 #[derive(Debug)]
 pub(crate) struct Session {
     settings: Settings,
@@ -54,7 +54,7 @@ pub(crate) struct Session {
     state: State,
     /// Settings without an answer: the command, and the name of what it sets.
     missing: Vec<(u8, &'static str)>,
-    /// What the server settled on: baud rate, data bits, parity, stop bits, as in the answers.
+    /// Settings that the server confirmed: baud rate, data bits, parity, stop bits, as in the answers.
     took: [u32; 4],
 }
 
@@ -85,13 +85,13 @@ impl Session {
         &self.state
     }
 
-    /// What the server has not answered.
+    /// Names of the settings that the server has not answered.
     pub(crate) fn missing(&self) -> String {
         let names: Vec<&str> = self.missing.iter().map(|(_, name)| *name).collect();
         names.join(", ")
     }
 
-    /// The format that the server says the port has.
+    /// The format that the server confirmed for the port.
     pub(crate) fn took(&self) -> String {
         let [baud, data_bits, parity, stop_bits] = self.took;
         let parity = match parity {
@@ -170,7 +170,8 @@ impl Session {
         for value in [level(dtr, DTR), level(rts, RTS)].into_iter().flatten() {
             set(replies, SET_CONTROL, &[value]);
         }
-        // Nothing but data and answers is wanted, and nothing that the port received before.
+        // Notifications are switched off, and the bytes that the port received before are discarded: only data and
+        // answers are needed.
         set(replies, SET_LINE_STATE_MASK, &[0]);
         set(replies, SET_MODEM_STATE_MASK, &[0]);
         set(replies, PURGE, &[BOTH_BUFFERS]);

@@ -1,6 +1,6 @@
 //! The other side of the COM port option of telnet (RFC 2217): a program opens a port that is served here.
 //!
-//! What the program sets is confirmed and has no effect: baud rate and format of the line are not the program's.
+//! Settings of the program are confirmed and have no effect: baud rate and format of the line are not the program's.
 
 use super::com_port::{
     ANSWER, BINARY, COM_PORT, PURGE, SET_BAUD, SET_CONTROL, SET_DATA_BITS, SET_LINE_STATE_MASK, SET_MODEM_STATE_MASK,
@@ -13,7 +13,7 @@ const SIGNATURE: u8 = 0;
 const NOTIFY_MODEM_STATE: u8 = 107;
 /// Carrier, data set ready and clear to send: some programs send nothing without them.
 const MODEM_STATE: u8 = 0xB0;
-/// Who serves the port, for programs that ask.
+/// Name of the server, for programs that request it.
 const NAME: &[u8] = b"drivegate";
 /// The negotiation of each option, sent once.
 const OPTIONS: [(Verb, u8); 5] = [
@@ -24,12 +24,12 @@ const OPTIONS: [(Verb, u8); 5] = [
     (Verb::Do, SUPPRESS_GO_AHEAD),
 ];
 
-/// One connection of a program.
+/// A connection of a program.
 #[derive(Debug)]
 pub struct ServedPort {
     format: LineFormat,
     decoder: Decoder,
-    /// Whether the program was told that the server has the COM port option, too.
+    /// Whether the program already knows that the server has the COM port option.
     has_com_port: bool,
 }
 
@@ -105,7 +105,7 @@ impl ServedPort {
     }
 }
 
-/// What a question about flow control, break, DTR or RTS is answered with; anything else is confirmed.
+/// The answer to a request for the state of flow control, break, DTR or RTS; anything else is confirmed.
 fn control(asked: u8) -> u8 {
     match asked {
         // No flow control; no break; DTR on; RTS on; no inbound flow control.

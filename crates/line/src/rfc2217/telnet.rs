@@ -8,7 +8,7 @@ pub(super) const SB: u8 = 250;
 /// Longest content of a subnegotiation that is kept: those of RFC 2217 have five bytes, except the signature.
 const MOST_SUB: usize = 64;
 
-/// What one end says of an option.
+/// Answer of one end about an option.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verb {
     Will,
@@ -38,7 +38,7 @@ impl Verb {
     }
 }
 
-/// What the other end sends apart from data.
+/// Anything that the other end sends apart from data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Command {
     /// About an option.
@@ -127,8 +127,8 @@ pub fn escape(data: &[u8]) -> Vec<u8> {
     escaped
 }
 
-/// Whether the first bytes of a connection are those of a telnet server: an option that it offers or asks for. No frame of any
-/// protocol begins with 255. `None` while that is open.
+/// Whether the first bytes of a connection are those of a telnet server: an option that it offers or requests. No frame of any
+/// protocol begins with 255. `None` while that is not decided.
 pub(crate) fn is_greeting(first: &[u8]) -> Option<bool> {
     match first {
         [] | [IAC] => None,
