@@ -85,7 +85,7 @@ pub struct Daemon {
     settings: Settings,
     plant: SharedPlant,
     buses: Vec<(BusSettings, BusTask)>,
-    /// What drives had that reloads have left out.
+    /// State of drives that reloads have left out.
     parted: Parted,
     events: Events,
     writes: Arc<WriteStats>,
@@ -107,7 +107,7 @@ pub struct Daemon {
     starts: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
-    /// Watches the threads that serve, and tells of their pauses.
+    /// Watches the serving threads, and reports their pauses.
     watcher: tokio::task::JoinHandle<()>,
     stopper: tokio::task::JoinHandle<()>,
     driller: tokio::task::JoinHandle<()>,
@@ -116,7 +116,7 @@ pub struct Daemon {
     /// Keeps reservations on disk.
     reserver: tokio::task::JoinHandle<()>,
     pulse: Pulse,
-    /// Who is asked to reload, and the file that the gateway runs with.
+    /// Receiver of reload requests, and the file that the gateway runs with.
     control: Option<Control>,
 }
 
@@ -175,10 +175,10 @@ impl Daemon {
             pulse: Pulse::default(),
             control,
         };
-        // Before anything happens: it knows what happened earlier.
+        // The keeper starts before anything happens: it has the earlier events.
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
-        // So that MQTT misses no event, though it comes after the buses: its first messages tell of them.
+        // MQTT starts after the buses; subscribing it now lets its first messages include their events.
         daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
         // Before the first start is counted.
         daemon.apply_guards(&settings).await;
@@ -237,7 +237,7 @@ impl Daemon {
     /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
-        // Everything that can fail comes before anything that runs is stopped for good, or counts otherwise.
+        // All steps that can fail come before a running part is stopped, or its counts change.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
         if let Err(error) = self.apply_recorder(&settings).await {
@@ -359,7 +359,7 @@ impl Daemon {
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
         self.show(settings, &kept);
-        // Last: whoever is notified of a bus finds it in the plant.
+        // The buses begin last: a client that is notified of a bus finds it in the plant.
         for (bus, task) in &mut kept {
             if let Some(before) = handovers.remove(&bus.spec.name) {
                 tracing::info!(target: "drivegate::daemon", bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
@@ -455,7 +455,7 @@ impl Daemon {
         if let Some(reader) = &self.reader {
             reader.abort();
         }
-        // What is held back, whenever it would be due.
+        // Refusals that are held back are reported now, even those that are due later.
         self.plant
             .load()
             .report_refusals(Instant::now() + Duration::from_secs(60));

@@ -96,7 +96,7 @@ fn read_one(reader: &Reader<'_>, ranks: &[String]) -> Option<Principal> {
     (name.is_some() && place.is_some() && uid.is_none_or(|uid| uid.is_some())).then_some(principal)
 }
 
-/// Whether it has a way in by which a client may repeat its stop.
+/// Whether the principal has an interface over which a client may repeat its stop.
 fn repeats(principal: &Principal) -> bool {
     let by_address = !principal.modbus_tcp.is_empty() || !principal.bacnet.is_empty();
     by_address || principal.certificate.is_some() || principal.mqtt.is_some() || principal.sparkplug

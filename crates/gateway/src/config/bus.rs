@@ -158,7 +158,8 @@ fn read_options(
     options
 }
 
-/// What others send on a line of N2 is understood by the numbers of the maps, which such drives do not have.
+/// Requests of another master on an N2 line are read by the numbers of the maps, which drives that count from 0 do not
+/// have.
 fn check_numbers(reader: &Reader<'_>, drives: &[drive::Found], mode: Mode) {
     let from_zero = |drive: &&drive::Found| {
         drive

@@ -11,7 +11,7 @@ use crate::document::{Reader, format_duration};
 /// A duration of the range; a longer one, up to what was allowed before, counts as the longest of the range.
 pub(super) struct Capped {
     pub(super) range: RangeInclusive<Duration>,
-    /// What was allowed before.
+    /// Value that was allowed before.
     pub(super) before: Duration,
     /// Why no longer, after the value.
     pub(super) why: &'static str,

@@ -44,7 +44,7 @@ pub(super) struct Found {
     pub(super) spec: Option<DriveSpec>,
 }
 
-/// What a drive inherits from its bus and gateway.
+/// Settings that a drive inherits from its bus and gateway.
 pub(super) struct Surroundings<'a> {
     pub(super) bus: &'a str,
     pub(super) protocol: Protocol,
@@ -132,7 +132,8 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     }
 }
 
-/// How often what was ordered is written again: as written, or as the profile says for a drive with a lease of its own.
+/// Interval at which an order is written again: as configured, or as the profile requires for a drive with a lease of
+/// its own.
 fn read_refresh(
     reader: &Reader<'_>,
     profile: Option<&Profile>,
@@ -169,7 +170,7 @@ fn read_refresh(
     Some(every)
 }
 
-/// What the drive does when the gateway stops: it cannot be stopped where its profile does not write `run`.
+/// Action when the gateway stops: the drive cannot be stopped where its profile does not write `run`.
 fn read_on_shutdown(reader: &Reader<'_>, profile: Option<&Profile>) -> OnShutdown {
     let on_shutdown = DRIVE.on_shutdown.get(reader);
     let stops = |profile: &Profile| profile.model_point(ModelPoint::Run).is_some_and(|run| run.write);

@@ -34,7 +34,7 @@ pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> Http {
     }
     let users_are_told = users.is_some() || reader.has(HTTP.users_file.name);
     let may_command = !commands || is_safe_to_command(reader, listen, users_are_told);
-    // Both are reported if they are there and cannot be used.
+    // A file that is configured and cannot be used is reported, and the server is then left out.
     let usable = (tokens.is_some() || !reader.has(HTTP.tokens_file.name))
         && (users.is_some() || !reader.has(HTTP.users_file.name))
         && (identity.is_some() || !reader.has(HTTP.certificate.name))
@@ -72,7 +72,7 @@ fn read_users(reader: &Reader<'_>, base: &Path) -> Option<Users> {
     Some(users)
 }
 
-/// What a file of tokens or users says; `without` it, something is so.
+/// Reads a file of tokens or users; `without` describes the effect of an unusable file.
 fn credentials<C: Credential>(
     reader: &Reader<'_>,
     key: &'static str,

@@ -41,10 +41,10 @@ pub(super) trait Form<T> {
     /// The value of `key`, which is present; an invalid one is reported.
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<T>;
 
-    /// Its JSON Schema, without description and default.
+    /// JSON Schema of the value, without description and default.
     fn schema(&self) -> Value;
 
-    /// What to write, for messages and the documentation.
+    /// Values that may be written, for messages and the documentation.
     fn range(&self) -> String;
 }
 
@@ -82,7 +82,7 @@ impl<T> Key<T> {
         }
     }
 
-    /// The same, the default standing in for an invalid value.
+    /// The value, or the default in place of an invalid one.
     pub(super) fn get_on(&self, reader: &Reader<'_>, protocol: Protocol) -> T
     where
         T: Default,
@@ -276,8 +276,7 @@ impl<T> Form<T> for Parsed<T> {
     }
 }
 
-/// The value of a key whose type says less than its range: that is what is to be written instead of one of another
-/// type.
+/// The value of a key whose range says more than its type, so that the message for a wrong type shows the range.
 fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T> {
     let value = T::from_node(reader.raw(key)?);
     reader.accept(
@@ -417,7 +416,7 @@ impl Form<u64> for Size {
     }
 }
 
-/// One of several words, each with what it means.
+/// One of several words, each with its value.
 pub(super) struct Words<T: 'static>(pub(super) &'static [(&'static str, T)]);
 
 impl<T: Clone> Words<T> {

@@ -54,7 +54,7 @@ fn first_below(dir: &Path, path: &Path) -> Option<String> {
     let real = |path: &Path| path.canonicalize().or_else(|_| std::path::absolute(path)).ok();
     let path = match path.canonicalize() {
         Ok(path) => path,
-        // There is no such file yet.
+        // The file does not exist yet.
         Err(_) => real(path.parent()?)?.join(path.file_name()?),
     };
     let first = path.strip_prefix(real(dir)?).ok()?.components().next()?;

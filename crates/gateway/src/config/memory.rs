@@ -15,7 +15,8 @@ const DRIVE: usize = 42 << 10;
 /// BACnet: subscriptions, writes, answers that wait; and what it shows of a drive, bytes.
 const BACNET: (usize, usize) = (7 << 20, 24 << 10);
 
-/// What comparing the passwords of users takes, bytes; measured. 12 MiB of it are what `drivegate user add` makes a hash cost.
+/// Memory for comparing the passwords of users, bytes; measured. 12 MiB of it are the cost of a hash made by `drivegate user
+/// add`.
 const LOGINS: usize = 14 << 20;
 
 /// Memory of a gateway at most.
@@ -32,14 +33,14 @@ pub struct Memory {
 pub struct BusMemory {
     /// Trends of its drives and the last hour of the line, bytes.
     pub trends: usize,
-    /// Those of the drive with most points, bytes.
+    /// Trends of the drive with the most points, bytes.
     pub drive_trends: usize,
     /// The recorder.
     pub recorder: Budget,
 }
 
 impl Memory {
-    /// Of a gateway with these settings.
+    /// Memory of a gateway with these settings.
     pub fn of(settings: &Settings) -> Memory {
         let buses = &settings.buses;
         let drives = buses.iter().flat_map(|bus| &bus.drives);

@@ -112,7 +112,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     }
 }
 
-/// What a listener takes from `[modbus_tcp]` unless it has its own, and the names of the buses.
+/// Settings that a listener takes from `[modbus_tcp]` unless it has its own, and the names of the buses.
 struct Inherited<'a> {
     allow: &'a [IpNet],
     write: &'a [IpNet],

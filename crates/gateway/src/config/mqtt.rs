@@ -184,7 +184,7 @@ pub(super) fn secret(path: &Path) -> Result<String, Finding> {
     })
 }
 
-/// What others on the way to the broker could read or send.
+/// Warns of passwords and commands that others on the way to the broker could read or alter.
 fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands: bool) {
     let remedy = "write mqtts:// for TLS";
     if password {
@@ -215,7 +215,7 @@ fn check_certificates(reader: &Reader<'_>, host: &str, ca: Option<&Path>, identi
     }
 }
 
-/// What cannot be read was reported by [`read_pem`].
+/// Whether the file can be read; [`read_pem`] has reported a file that cannot.
 fn is_readable(path: &Path) -> bool {
     path.is_file() && File::open(path).is_ok()
 }

@@ -29,7 +29,7 @@ pub struct NamedFile {
     pub key: String,
     /// The file.
     pub path: PathBuf,
-    /// Its kind.
+    /// Kind of the file.
     pub kind: FileKind,
 }
 

@@ -18,7 +18,7 @@ use crate::process_image::Machine;
 pub struct ParamsSettings {
     /// Where readings are kept.
     pub dir: PathBuf,
-    /// How often all parameters are read; none: when asked only.
+    /// Interval at which all parameters are read; none: only on request.
     pub every: Option<Duration>,
     /// Names that go before those of the profiles, by profile.
     pub names: BTreeMap<String, Arc<Names>>,

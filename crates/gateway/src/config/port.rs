@@ -11,7 +11,7 @@ use crate::document::{Finding, Reader};
 use crate::line::{LONGEST_ID, split_dial_in};
 use crate::process_image::Access;
 
-/// What can be written.
+/// Remedy with all kinds of ports.
 const KINDS: &str = "write the path of a serial device, or \"tcp://host:port\" (raw serial over TCP), \"rfc2217://host:port\", \
                      \"modbus-tcp://host:port\", \"udp://host:port\", \"tcp-listen://address:port\"";
 
@@ -49,7 +49,7 @@ pub fn check(text: &str, base: &Path) -> Result<String, Finding> {
     }
 }
 
-/// `address:port`, with the text that the device says first.
+/// Checks `address:port`, with the text that the device sends first.
 fn check_place(text: &str, place: &str) -> Result<(), Finding> {
     let (address, id) = split_dial_in(place);
     if address

@@ -1,4 +1,4 @@
-//! What the loader makes of a configuration.
+//! The settings that the loader reads from a configuration.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -44,7 +44,7 @@ pub struct Settings {
     pub profiles: Profiles,
     /// Age from which a sample of process data is stale.
     pub stale_after: Duration,
-    /// `stale_after` is written, so it applies to slow lines too.
+    /// Whether `stale_after` is configured, so that it applies to slow lines too.
     pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
@@ -58,7 +58,7 @@ pub struct Settings {
     pub http: Option<http_server::Options>,
     /// Absent: not started.
     pub bacnet: Option<bacnet_server::Options>,
-    /// Who holds drives; absent: off.
+    /// Rules for the holders of drives; absent: off.
     pub authority: Option<Arc<Rules>>,
     /// How stops are proven; absent: off.
     pub drill: Option<DrillOptions>,
@@ -76,7 +76,7 @@ impl Settings {
     }
 }
 
-/// One bus with its drives.
+/// A bus with its drives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {
     /// The part used by other crates.
@@ -114,6 +114,6 @@ impl BusSettings {
     }
 }
 
-/// What cannot be used, which is reported.
+/// A value cannot be used, which has been reported.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unusable;

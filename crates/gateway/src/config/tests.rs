@@ -1,4 +1,4 @@
-//! The loader: what a file says, defaults, reload, the environment; listeners and the schema are beside.
+//! The loader: values of a file, defaults, reload, the environment; listeners and the schema have files of their own.
 
 use std::path::Path;
 use std::sync::{Arc, LazyLock};

@@ -77,7 +77,7 @@ fn check_ports(document: &Document, buses: &[Found]) {
     }
 }
 
-/// Devices that dial in at one address are told apart by their texts: none may be the beginning of another.
+/// Devices that dial in at one address are distinguished by their texts: none may be the beginning of another.
 fn check_dial_in(document: &Document, buses: &[Found]) {
     let mut seen: Vec<(&str, &str)> = Vec::new();
     for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
@@ -101,7 +101,7 @@ fn check_dial_in(document: &Document, buses: &[Found]) {
     }
 }
 
-/// A slot makes the serial port of its tool: it is no other slot's, and not that of a line.
+/// A slot creates the serial port of its tool: the path may not be that of another slot, or of a line.
 fn check_ptys(document: &Document, buses: &[Found]) {
     let mut seen: Vec<(&Path, String)> = Vec::new();
     for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
@@ -189,7 +189,7 @@ pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Op
                 continue;
             }
             let first = owner(other);
-            // What two listeners show alike is reported once.
+            // A conflict that two listeners share is reported once.
             if place.line.is_some() && reported.contains(&(place.line, *unit)) {
                 continue;
             }

@@ -50,10 +50,10 @@ pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patienc
     }
 }
 
-/// What a file has; none where there is none.
+/// State of drills in a file; none where there is no file.
 ///
 /// # Errors
-/// It cannot be read, or is none of these.
+/// The file cannot be read, or is not one of drills.
 pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
     let bytes = files::read(path, LONGEST)?;
     bytes.map(|bytes| SavedDrills::from_json(&bytes)).transpose()
@@ -64,7 +64,7 @@ pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -
     tokio::spawn(async move {
         let mut writer = Writer::default();
         loop {
-            // Either is a reason to look.
+            // The end of the wait by time or by a signal is a reason to look.
             let _ = tokio::time::timeout(IDLE, drills.begun()).await;
             loop {
                 let goes_on = drills.look(&plant.load(), Instant::now(), SystemTime::now());
@@ -80,7 +80,7 @@ pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -
 
 type Writing = tokio::task::JoinHandle<(u64, Result<(), String>)>;
 
-/// Writes the file beside the drill that is under way: a slow disk delays no stop.
+/// Writes the file in parallel to the drill: a slow disk delays no stop.
 #[derive(Default)]
 struct Writer {
     writing: Option<Writing>,
@@ -145,7 +145,7 @@ pub(super) async fn end(
     let running = running.find(|report| of_bus(&report.bus));
     let Some(report) = running else { return };
     let who = Origin::new(SourceKind::Shutdown, by);
-    // It may have ended meanwhile.
+    // The drill may have ended meanwhile, so an error is ignored.
     let _ = drills.abort(&report.id, &who, Instant::now(), SystemTime::now());
     let until = Instant::now() + LAST_STOP;
     while Instant::now() < until && drills.look(&plant.load(), Instant::now(), SystemTime::now()) {

@@ -56,7 +56,7 @@ fn raise(wanted: usize) -> usize {
 #[derive(Debug, Clone)]
 struct Wanted {
     buses: usize,
-    /// Of the tool slots and BACnet.
+    /// Connections of the tool slots and BACnet.
     slots: usize,
     modbus_tcp: Option<modbus_tcp::Options>,
     http: Option<http::Options>,
@@ -84,7 +84,7 @@ impl Wanted {
         modbus_tcp + self.http.as_ref().map_or(0, |options| options.max_connections)
     }
 
-    /// The same with so few connections that `limit` files are enough; each server keeps [`LEAST_CONNECTIONS`].
+    /// Reduces the connections until `limit` files are enough; each server keeps [`LEAST_CONNECTIONS`].
     fn within(&self, limit: usize) -> Wanted {
         let (mut fewest, mut most) = (0, 1000);
         while fewest + 1 < most {

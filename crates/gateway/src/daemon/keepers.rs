@@ -1,4 +1,4 @@
-//! What is kept on disk, and read for it.
+//! Writers and readers of the files on disk.
 
 use std::sync::Arc;
 
@@ -66,7 +66,8 @@ impl Daemon {
         .await;
     }
 
-    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
+    /// Keeps events and counters in the configured directory. If no thread can be started for it, the gateway runs without
+    /// it.
     pub(super) async fn apply_keeper(&mut self, settings: &Settings) {
         let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
         if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
@@ -167,7 +168,7 @@ impl Daemon {
         drills.set_options(settings.drill);
     }
 
-    /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.
+    /// Writes the audit to the configured file. If no thread can be started for it, the gateway runs without it.
     pub(super) async fn apply_audit(&self, settings: &Settings) {
         let audit = self.writes.audit();
         let before = audit.file();

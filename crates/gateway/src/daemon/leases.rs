@@ -1,6 +1,6 @@
-//! The leases of drives over a reload. A lease belongs to a machine: it goes where that is, whatever it is called then, and where
-//! the new configuration has it no more, an event says that it ended. A reload that brings the machine back soon, as one that puts a
-//! former file back does, goes on with what was left. Pure.
+//! The leases of drives over a reload. A lease belongs to a machine and stays with it under any name; where the new configuration no
+//! longer has the machine, an event reports the end. A reload that brings the machine back soon, such as one that restores a former
+//! file, continues the lease. Pure.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -35,7 +35,7 @@ struct Left {
     drive: String,
 }
 
-/// What drives had that reloads have left out. Clones are the same.
+/// State of drives that reloads have left out. Clones share it.
 #[derive(Debug, Default, Clone)]
 pub(super) struct Parted(Arc<Mutex<Kept>>);
 
@@ -117,8 +117,8 @@ impl Leases {
         }
     }
 
-    /// Those with which the drives of a new bus go on at `now`, in their order. One that is commanded no more has none. The time of one
-    /// stood while its drive was left out, as while a drive is offline.
+    /// Leases with which the drives of a new bus continue at `now`, in their order. A drive that is no longer commanded has none. The
+    /// time of a lease does not run while its drive is left out, as while a drive is offline.
     pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Carried> {
         let mut lease = |drive: &DriveSpec| {
             let machine = bus.spec.machine(drive);
@@ -128,7 +128,7 @@ impl Leases {
             let left = self.left.remove(&machine);
             if drive.supervision.is_none() {
                 let stops = left.as_ref().map(|left| left.carried.stops);
-                // Its time stands until a configuration supervises the drive again.
+                // The time of the lease does not run until a configuration supervises the drive again.
                 self.parted
                     .extend(left.map(|left| (machine, (now, left.carried.alone()))));
                 return stops.map(|stops| Carried {
@@ -136,7 +136,7 @@ impl Leases {
                     ..Carried::default()
                 });
             }
-            // What is refreshed goes on only where the drive is commanded as before.
+            // A refresh continues only where the drive is commanded as before.
             let left = left.map(|left| match left.control == drive.profile.control {
                 true => left.carried,
                 false => left.carried.alone(),
@@ -150,7 +150,7 @@ impl Leases {
             .collect()
     }
 
-    /// What happened to the others.
+    /// Events for the leases that no drive continues.
     pub(super) fn ended(self, time: SystemTime) -> impl Iterator<Item = Event> {
         self.left.into_iter().filter_map(move |(machine, left)| {
             let ends = left.carried.lease.ends()?;

@@ -17,7 +17,7 @@ const LONGEST: u64 = 1 << 20;
 /// The file of the reservations; none while nothing is kept.
 pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
 
-/// What is kept, as far as it changes the file.
+/// The kept reservations, as far as a change of them changes the file.
 type Seen = Vec<(Instant, String, u8)>;
 
 /// From now on they are in that state directory.

@@ -1,4 +1,4 @@
-//! What ends with a right that a reload takes away.
+//! Actions that end with a right that a reload takes away.
 
 use std::time::SystemTime;
 

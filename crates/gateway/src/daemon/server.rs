@@ -11,17 +11,17 @@ use crate::plant::SharedPlant;
 /// Time for what the clients of a server have started that a reload takes away, longer than any order waits for its
 /// bus; and how often it is looked whether that has ended.
 const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_millis(20));
-/// What [`ServerSlot::prepare`] has prepared.
+/// Result of [`ServerSlot::prepare`].
 #[derive(Default)]
 pub(super) enum Prepared<S: Reconfigure> {
     /// The server stays as it is.
     #[default]
     Same,
-    /// It stops.
+    /// The server stops.
     Stop,
-    /// It was started.
+    /// The server was started.
     Started(Running<S>),
-    /// It runs on with other options.
+    /// The server runs on with other options.
     Changed(S::Options, S::Change),
 }
 
@@ -51,7 +51,7 @@ impl<S: Server> ServerSlot<S> {
     /// Makes the server run as configured: unchanged options keep it running, others restart it.
     ///
     /// # Errors
-    /// It does not start, and does not run afterwards.
+    /// The server does not start, and does not run afterwards.
     pub(super) async fn apply(
         &mut self,
         configured: Option<&S::Options>,
@@ -61,7 +61,7 @@ impl<S: Server> ServerSlot<S> {
         if self.0.as_ref().map(|running| &running.options) == configured {
             return Ok(());
         }
-        // Its client id and files are free before its successor uses them.
+        // The server stops first: its client id and files must be free before the next one uses them.
         self.stop().await;
         if let Some(options) = configured {
             self.0 = Some(Running::start(options, plant, stats).await?);
@@ -132,7 +132,7 @@ where
     /// Prepares the server to run as configured. [`ServerSlot::commit`] cannot fail after that.
     ///
     /// # Errors
-    /// It cannot run so; it runs as before.
+    /// The server cannot run with these options; it runs as before.
     pub(super) async fn prepare(
         &mut self,
         configured: Option<&S::Options>,
@@ -193,7 +193,7 @@ mod tests {
     use super::*;
 
     thread_local! {
-        /// What the test server did.
+        /// Actions of the test server.
         static LOG: RefCell<Vec<String>> = const { RefCell::new(Vec::new()) };
     }
 

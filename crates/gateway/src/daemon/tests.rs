@@ -76,7 +76,7 @@ fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_first_birth_of_the_node_names_its_buses() {
-    // Whether it comes before the buses is a matter of milliseconds.
+    // The birth may come before or after the buses by milliseconds, so several tries are made.
     for _ in 0..6 {
         let (state, listener) = (
             tempfile::tempdir().unwrap(),

@@ -1,4 +1,4 @@
-//! What the tables of all sections are written with: types of values, kinds of forms, and the forms that several keys share.
+//! Building blocks of the tables of all sections: types of values, kinds of forms, and the forms that several keys share.
 
 pub(super) use std::net::SocketAddr;
 pub(super) use std::path::PathBuf;

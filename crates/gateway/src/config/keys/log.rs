@@ -4,7 +4,7 @@ use super::forms::*;
 
 /// Words of a level.
 const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
-/// What [`parse_level`] accepts, as a regular expression.
+/// The levels that [`parse_level`] accepts, as a regular expression.
 const PATTERN: &str = concat!(
     r"^\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*",
     r"(,\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*)*$"
@@ -20,7 +20,7 @@ pub enum LogFormat {
     Journal,
     /// Lines as text, coloured on a terminal.
     Text,
-    /// One JSON object per line.
+    /// Each line is a JSON object.
     Json,
 }
 

@@ -149,7 +149,7 @@ keys! {
     }
 }
 
-/// What telemetry is published as.
+/// The form in which telemetry is published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::config) enum TelemetryTopic {
     State,
@@ -172,7 +172,7 @@ pub(in crate::config) struct ProxyAddress {
 }
 
 impl Broker {
-    /// Whether it is on this machine.
+    /// Whether the broker is on this machine.
     pub(in crate::config) fn is_here(&self) -> bool {
         let address: Option<IpAddr> = self.host.parse().ok();
         address.map_or(self.host.eq_ignore_ascii_case("localhost"), |address| {

@@ -1,4 +1,5 @@
-//! What `check` says of files of certificates and keys that cannot be used, or that peers will refuse. All are made by openssl.
+//! Messages of `check` about files of certificates and keys that cannot be used, or that peers will refuse. All are made by
+//! openssl.
 
 use std::path::Path;
 use std::process::Command;
@@ -40,7 +41,7 @@ fn made() -> tempfile::TempDir {
     dir
 }
 
-/// What is said of a certificate and a key, by each that uses such: HTTP, Modbus TCP, MQTT.
+/// Messages about a certificate and a key, by each section that uses them: HTTP, Modbus TCP, MQTT.
 fn said(dir: &Path, certificate: &str, key: &str) -> [Vec<String>; 3] {
     let at = |name: &str| dir.join(name).display().to_string();
     let pair = format!("certificate = {:?}\nkey = {:?}\n", at(certificate), at(key));
@@ -63,7 +64,7 @@ fn messages(sections: &str) -> Vec<String> {
     all.filter(of_files).collect()
 }
 
-/// Certificate, key, what is said of them, and the remedy.
+/// Certificate, key, message about them, and the remedy.
 const UNUSABLE: &str = "\
 good.crt    | encrypted.key     | it is encrypted, and there is nobody                | openssl pkey -in
 good.crt    | encrypted-old.key | it is encrypted, and there is nobody                | openssl pkey -in
@@ -101,7 +102,7 @@ fn a_file_that_holds_something_else_is_told_with_what_it_holds() {
             assert!(!text.contains("OtherError"), "{text}");
         }
     }
-    // Both swapped: each file is told.
+    // Swapped files: each is reported.
     for found in said(dir, "good.key", "good.crt") {
         assert_eq!(found.len(), 2, "{found:#?}");
         assert!(

@@ -8,7 +8,7 @@ use std::process::Command;
 use super::listeners::{certificate, certificates};
 use super::{FULL, load};
 
-/// What the gateway keeps in its state directory and in that of the buffer is not overwritten by commands, under whatever name.
+/// Commands never overwrite files of the gateway in its state directory or that of the buffer, under any name.
 #[test]
 fn the_audit_has_a_file_of_its_own() {
     let folder = tempfile::tempdir().unwrap();
@@ -53,7 +53,7 @@ fn the_audit_has_a_file_of_its_own() {
 
 /// The configuration of openssl for revocation lists.
 const BOOK: &str = "[ca]\ndefault_ca=a\n[a]\ndatabase=index\ndefault_md=sha256\n";
-/// What makes them version 2.
+/// Extensions that make the lists version 2.
 const EXTENSIONS: &str = "crl_extensions=e\n[e]\nauthorityKeyIdentifier=keyid\n";
 
 /// An empty list of the CA in [`certificates`], with these options of openssl, in `dir`.
@@ -75,7 +75,7 @@ fn openssl(dir: &Path, arguments: &str) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// What is said of this file as `client_crl`.
+/// Messages about this file as `client_crl`.
 fn said_of(file: &Path) -> String {
     let usual = certificates().join("ca.crl").display().to_string();
     let (loaded, _) = load(&FULL.replace(&usual, &file.display().to_string()));
@@ -94,7 +94,7 @@ fn revocations_are_checked_before_they_refuse_everybody() {
     assert_eq!(said_of(&dir.join("der.crl")), "");
     let bytes = std::fs::read(dir.join("der.crl")).unwrap();
     std::fs::write(dir.join("cut.crl"), &bytes[..bytes.len() - 1]).unwrap();
-    // Of a CA with the same name, and of one with another.
+    // Revocation lists of a CA with an equal name, and of one with another name.
     certificate(&dir.join("same"), &["ca"], "30");
     certificate(&dir.join("same"), &["crl"], "30");
     let renamed = "req -x509 -newkey rsa:2048 -nodes -keyout other/ca.key -out other/ca.crt -days 30 -subj /CN=other";
@@ -152,7 +152,7 @@ fn secrets_that_everybody_can_read() {
         );
         assert_eq!(found.contains(&wanted), warned, "{mode:o}: {found:#?}");
     }
-    // What else can be read on the way.
+    // Other data that can be read on the way to the broker.
     for (url, warned) in [
         ("mqtt://localhost", 0),
         ("mqtt://127.0.0.2", 0),

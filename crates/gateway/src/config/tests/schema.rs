@@ -114,7 +114,7 @@ fn any_value() -> impl Strategy<Value = String> {
 }
 
 proptest! {
-    /// Whatever stands behind any key: no panic, and settings exactly when there is no error.
+    /// With any value of any key there is no panic, and there are settings exactly when there is no error.
     #[test]
     fn any_value_of_any_key_is_judged(which in 0usize..100, value in any_value(), lines in 0usize..40) {
         let mut document: toml::Table = FULL.parse().unwrap();

@@ -14,7 +14,7 @@ fn held(since: Instant) -> Carried {
 
 const LEASE: &str = "supervision = { timeout = \"5s\" }\n";
 
-/// One bus at that port with these drives: name, address and access.
+/// A bus at this port with these drives: name, address and access.
 fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
     let drive = |(name, address, access): &(&str, u8, &str)| {
         format!(
@@ -32,7 +32,7 @@ fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
         .remove(0)
 }
 
-/// The leases with which `after` goes on when the first drive of `before` had one and the second had none, and what is told.
+/// The leases with which `after` continues when the first drive of `before` had one and the second had none, and the events.
 fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String>) {
     let mut leases = Leases::default();
     leases.left(before, vec![held(Instant::now()), Carried::default()]);
@@ -117,7 +117,7 @@ fn a_lease_goes_on_when_a_reload_brings_its_drive_back() {
         bus("/dev/ttyUSB0", &[("pump-2", 2, "control")]),
         unsupervised,
     ] {
-        // It ran for a pause before the first reload; between the two its time stood.
+        // The lease ran for a pause before the first reload; its time did not run between the two.
         let second = Duration::from_secs(1);
         assert_eq!(over(&[&all, &without, &all], 7 * second), Some(7 * second));
         assert_eq!(over(&[&all, &without, &without, &all], 7 * second), Some(7 * second));
