@@ -1,4 +1,4 @@
-//! What ships: every configuration, the documents, what is packaged around the program.
+//! Everything that ships: every configuration, the documents, the files of the packages.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

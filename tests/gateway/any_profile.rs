@@ -53,7 +53,7 @@ fn examples() -> Vec<(String, String)> {
     blocks.map(|(text, _)| (name(text), text.to_string())).collect()
 }
 
-/// What a drive of an example is sent, in the order of the comment below.
+/// Words sent to a drive of an example, in the order of the comment below.
 type Words = (u16, u16, u16, &'static [u16], u16, f64);
 
 /// The meter of the page whose values depend on other registers, with the registers of its example.
@@ -144,7 +144,7 @@ fn the_examples_of_the_page_are_simulated() {
     }
 }
 
-/// What `profiles import` makes of a list is simulated, and what the gateway reads is what the registers hold.
+/// A list read by `profiles import` is simulated, and the gateway reads the values that the registers hold.
 #[test]
 fn a_register_list_becomes_a_device_that_is_read() {
     let site = Site::new();

@@ -1,4 +1,4 @@
-//! The audit beside a client that may not write, on disk, and text from outside in the log.
+//! The audit: of a client that may not write, on disk, and with text from outside in the log.
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};

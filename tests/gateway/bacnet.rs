@@ -75,7 +75,7 @@ impl Plant {
         asked(&mut command, orders)
     }
 
-    /// Those of node-bacnet. It sends to its own port, so the gateway must have the same.
+    /// Runs the orders with node-bacnet, which sends to its own port, so the gateway must have the same one.
     fn node(&self, host: u8, orders: &[Json]) -> Vec<Json> {
         let script = root().join("tests/peers/bacnet_node.js").display().to_string();
         let mut command = Command::new(tool("node"));
@@ -186,7 +186,7 @@ fn other_families(first: usize) -> (String, Vec<String>, Vec<Running>) {
     (text, names, drives)
 }
 
-/// Compares what BACnet shows of a drive with what HTTP tells: how many objects, or what differs.
+/// Compares the objects of a drive in BACnet with its points over HTTP: the number of objects, or the difference.
 fn compared(shown: &Json, told: &Json) -> Result<usize, String> {
     const STATES: [&str; 5] = ["offline", "not_ready", "ready", "running", "fault"];
     let mut count = 0;
@@ -262,7 +262,7 @@ fn every_family_shows_what_http_tells() {
         .collect();
     let lists = plant.bacpypes(20, &orders);
     let lists: Vec<Vec<Json>> = lists.iter().map(|list| list.as_array().unwrap().clone()).collect();
-    // What a motor that stands shows does not move; a value may be read between two looks all the same.
+    // The values of a motor that stands do not change; still, a value may be read between two comparisons.
     let mut left: Vec<usize> = units.clone().collect();
     let mut objects = 0;
     until("all is as HTTP tells", || {
@@ -410,7 +410,7 @@ fn slots_and_other_sides_see_each_other() {
     plant.site.until_state("pump-1", "ready");
     start();
     assert_eq!(slots(&plant), [], "a start withdraws the inactives that protect nobody");
-    // Those that protect people stay, also behind an active that governs.
+    // Inactives that protect people stay, even behind an active that governs.
     let orders = [run_at(1, true), run_at(4, false), run_at(12, false)];
     assert_eq!(
         plant.bacpypes(20, &orders),
@@ -429,7 +429,7 @@ fn a_drive_that_is_away_is_silent_or_shows_its_fault() {
     let mut plant = pumps("");
     let present = |plant: &Plant| plant.bacpypes(20, &[json!(["who_is", 101, 102, "global"])]).remove(0);
     assert_eq!(present(&plant), json!([101, 102]));
-    // It takes its link away; another test might get the same pseudo-terminal.
+    // The simulator removes its link; otherwise another test might get the same pseudo-terminal.
     plant.drives.signal("TERM");
     plant.drives.ended();
     plant.site.until_state("pump-1", "offline");
@@ -616,7 +616,7 @@ fn tshark_finds_nothing_wrong_with_any_frame() {
     );
 }
 
-/// What `check` predicts for the round of `line1`.
+/// The round of `line1` that `check` predicts.
 fn predicted_round(site: &Site) -> Duration {
     let output = drivegate(&["check", &site.config()]).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -667,6 +667,6 @@ fn a_change_is_told_within_a_round() {
         at(99),
         at(100)
     );
-    // One in ten may be late because this machine is busy.
+    // Up to one in ten may be late because this machine is busy.
     assert!(at(90) <= round + Duration::from_millis(20), "{took:?}");
 }

@@ -209,8 +209,8 @@ fn the_report_of_a_sound_configuration() {
         (&first["function"], &first["address"], &first["count"]),
         (&3.into(), &2100.into(), &11.into())
     );
-    // Request of 8 characters, 3.5 by which the drive knows its end, turnaround, reply of 27, silence of 3.5;
-    // 10 bits a character.
+    // Request of 8 characters, 3.5 of silence that mark its end, turnaround, reply of 27, silence of 3.5; 10 bits a
+    // character.
     let wire = (8.0 + 3.5 + 27.0 + 3.5) * 10.0 / 38.4 + 0.5;
     assert!((first["wire_ms"].as_f64().unwrap() - wire).abs() < 1e-4, "{first}");
     let share = |class: &str, cycle: f64| {
@@ -460,7 +460,7 @@ fn the_schema_is_json() {
     );
 }
 
-/// What `check --json` says of the file, without the name of the file.
+/// Output of `check --json` for the file, without the name of the file.
 fn checked(path: &Path) -> String {
     let path = path.display().to_string();
     run(&["check", "--json", "--config", &path]).out.replace(&path, "FILE")

@@ -68,7 +68,7 @@ fn a_stop_under_a_full_queue_comes_first() {
         frames.extend([high, low, 0, 0, 0, 6, 2, 6, 0x07, 0xD1, 0, low]);
     }
     flood.write_all(&frames).unwrap();
-    // It gets a place and goes out; that it is the very next on the line is proved in `tests/world`.
+    // The stop gets a place and is sent; `tests/world` proves that it is the very next request on the line.
     until("the stop", || {
         let reported = mbpoll_write(site.modbus, 1, 33_024, &[0]);
         assert!(
@@ -125,7 +125,7 @@ fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
     ]);
     site.until_point("pump-1", "speed_reference", 20.0);
     assert_eq!(site.point("pump-1", "run"), false);
-    // One that is too old when its turn comes: a transaction takes longer than it lives.
+    // A transaction takes longer than this command lives, so it is too old when its turn comes.
     until("an expired command", || {
         site.publish(&["-t", SET, "-m", "{\"speed_reference\": 30, \"expires_ms\": 1}"]);
         site.audit().into_iter().find(|r| r["result"] == "expired")
@@ -177,12 +177,12 @@ fn confirmed_repeated_refused_and_audited() {
     }
     let starts = site.audit().iter().filter(|r| r["result"] == "confirmed").count();
     assert_eq!(starts, 1, "{:?}", site.audit());
-    // The same by Modbus TCP: both references in one write, bits that mean nothing.
+    // Modbus TCP refuses a write of both references, and of bits without a meaning.
     let both = mbpoll_write(site.modbus, 1, 33_025, &[5000, 3000]).unwrap_err();
     assert!(both.contains("Illegal data value"), "{both}");
     let bits = mbpoll_write(site.modbus, 1, 33_024, &[0x0100]).unwrap_err();
     assert!(bits.contains("Illegal data value"), "{bits}");
-    // The second is of the same kind, so it may be counted first.
+    // The second write is of the same kind, so it may be counted first.
     let modbus = until("both in the audit", || {
         let mut modbus = site.audit();
         modbus.retain(|r| r["source"] == "modbus_tcp");

@@ -54,7 +54,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
         (point(http, "pump-1", "output_frequency") == 25.0).then_some(())
     });
 
-    // The same words for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run, read, stop.
+    // The words of the common model work for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run, read, stop.
     for (unit, name, half) in [(7, "conveyor-1", 3000), (8, "ahu-1", 2500)] {
         write_registers(modbus, unit, 33_025, &[5000]);
         write_registers(modbus, unit, 33_024, &[1]);
@@ -185,7 +185,7 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
     demo.signal("INT");
     assert!(demo.ended().success());
     assert!(!dir.join("line1").exists(), "the ports end with the demo");
-    // A configuration that is no demo's is left as it is.
+    // A configuration that no demo has written is left as it is.
     std::fs::write(&config, "[gateway]\n").unwrap();
     let refused = drivegate(&["demo", "--write-config", dir.to_str().unwrap()])
         .output()

@@ -88,13 +88,13 @@ fn every_command_with_a_list_or_a_result_prints_it_as_json() {
         code != Some(0) && !said.is_empty() && mistaken["error"].is_string(),
         "{mistaken}"
     );
-    // One drive does not answer, so not all are proven to stand.
+    // One of the drives does not answer, so not all are proven to stand.
     let (code, stopped, _) = with(&commands["stop-all"]);
     assert_eq!((code, &stopped["ok"]), (Some(1), &json!(false)), "{stopped}");
     assert_eq!(stopped["drives"].as_array().map(Vec::len), Some(2));
     let (code, once, _) = with(&commands["watch"]);
     assert_eq!((code, &once["drives"][0]["name"]), (Some(0), &json!("pump-1")));
-    // Without --once a line again and again, until nobody reads.
+    // Without --once a line is printed again and again, until the reader closes.
     let mut live = drivegate(&["watch", "--json", "--config", &config])
         .stdout(Stdio::piped())
         .spawn()

@@ -120,7 +120,7 @@ fn a_drill_proves_stops_and_is_kept() {
         page.starts_with("<!doctype html>") && page.contains("Drill of drive pump-1"),
         "{page}"
     );
-    // A restart knows it still; the audit has it.
+    // The drill is known after a restart, and is in the audit.
     let of_drill = |record: &Json| {
         record["command"]
             .as_str()
@@ -148,7 +148,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
         );
         assert_eq!((status, &armed["state"]), (201, &json!("armed")), "{armed}");
         let id = armed["id"].as_str().unwrap().to_string();
-        // It is whose armed it.
+        // Only the user who armed the drill may start it.
         let (status, refused) = plant.curl("bob", "POST", &format!("/{id}/start"), &json!({}));
         assert_eq!(status, 409, "{refused}");
         let (status, started) = plant.curl("alice", "POST", &format!("/{id}/start"), &json!({}));
@@ -172,7 +172,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
     let refused = crate::support::process::mbpoll_write(site.modbus, 1, 0x8101, &[1500]);
     assert!(refused.is_err());
     stands(&id, "aborted", "sent a command: speed_reference=15");
-    // Who may ends it.
+    // Any user who may command can end the drill.
     let id = begin(json!(["order", "gateway"]));
     assert_eq!(plant.curl("bob", "DELETE", &format!("/{id}"), &Json::Null).0, 200);
     stands(&id, "aborted", "http bob 127.0.0.1 ended it");

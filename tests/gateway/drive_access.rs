@@ -141,7 +141,7 @@ impl Line {
         assert_eq!(json["not_told"], serde_json::json!(["interlock", "enable input"]));
     }
 
-    /// Start, look, refuse, stop: the same whoever has the port.
+    /// Starts, reads, refusals and a stop give equal results whether the gateway or the command has the port.
     fn operate(&self) {
         let all = self.command("read", &["pump-1"]);
         assert_eq!(all.code, 0, "{}{}", all.out, all.err);
@@ -172,7 +172,7 @@ impl Line {
             assert_eq!(ran.code, code, "{arguments:?}: {}", ran.err);
             assert!(ran.err.contains(wanted), "{arguments:?}: {}", ran.err);
         }
-        // What contradicts itself, in the same words whichever way it would have gone.
+        // Contradictory values are refused in equal words, directly and through the gateway.
         for (values, twice) in [
             (&["run=false", "run=true"][..], "run"),
             (&["run=true", "run=true"], "run"),
@@ -218,7 +218,7 @@ fn directly_and_through_the_gateway() {
     let stop = line.command("write", &["pump-1", "run=false"]);
     assert!(stop.out.ends_with(", through the gateway\n"), "{}", stop.out);
     line.operate();
-    // Where the gateway is not to be found, the port is taken, and the message says so.
+    // Where the gateway is not found, its port is taken, and the message says so.
     let text = std::fs::read_to_string(line.config()).unwrap();
     let elsewhere = line.directory.path().join("elsewhere.toml");
     for (socket, wanted) in [
@@ -234,7 +234,7 @@ fn directly_and_through_the_gateway() {
         let taken = ran.err.contains("another program has it; ");
         assert!(taken && ran.err.contains(&wanted), "{}", ran.err);
     }
-    // So does a search.
+    // A scan fails at a taken port, too.
     let ran = drivegate(&["scan", "--port", &line.port(), "--addresses", "1"]);
     assert_eq!(ran.code, 1);
     assert!(ran.err.contains("another program has it"), "{}", ran.err);
@@ -282,7 +282,7 @@ fn a_refusal_has_the_same_words_whichever_way() {
     drop(gateway);
 }
 
-/// A gateway that has the port and runs with another configuration is neither asked nor passed by.
+/// A gateway that has the port and runs with another configuration gets no request, and is not bypassed.
 #[test]
 fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     let line = Line::start();
@@ -338,7 +338,7 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     std::fs::write(line.config(), &text).unwrap();
     gateway.signal("HUP");
     sound();
-    // A profile of the same name that was edited since: the gateway answers by its own, so nothing is misread.
+    // A profile of that name was edited since: the gateway answers with its own, so nothing is misread.
     assert_eq!(
         line.command("write", &["pump-1", "run=true", "speed_reference=50"])
             .code,
@@ -349,7 +349,7 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     assert_eq!(line.value("output_frequency"), 25.0);
 }
 
-/// What is known of a drive that is away is stale, what never was is bad: by `read` as over HTTP.
+/// Last values of an absent drive are stale, values never read are bad: with `read` as over HTTP.
 #[test]
 fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     let folder = TempDir::new().unwrap();
@@ -393,11 +393,11 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
         }
         assert!(others.is_empty(), "{others:#?}");
     }
-    // One reason for all of its points is reported once.
+    // A reason that all of its points have in common is reported once.
     let ran = drivegate(&["read", "--config", &config, "pump-2"]);
     let wanted = "error: no point of `pump-2` has a value: the drive does not reply\n";
     assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));
-    // Nobody ever asked for this one, so nothing of it can be old.
+    // This point was never requested, so it has no old value.
     let ran = drivegate(&["read", "--json", "--config", &config, "pump-1", "fault_code_id99"]);
     assert!(ran.out.contains("\"bad\""), "{}{}", ran.out, ran.err);
 }
@@ -515,7 +515,7 @@ fn every_family_is_found_by_reading() {
     }
 }
 
-/// N2 has addresses that Modbus lacks; 255 is no unit, so the snippet gives such a drive another.
+/// N2 has addresses that Modbus lacks; 255 is not a unit id, so the snippet gives such a drive another.
 #[test]
 fn drives_at_the_last_addresses_of_n2_are_found() {
     let directory = TempDir::new().unwrap();

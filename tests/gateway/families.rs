@@ -30,7 +30,7 @@ struct Rig {
     site: Site,
     /// The tool slot, by which addresses are reached that are the common model's over Modbus TCP.
     slot: u16,
-    /// One that also passes broadcasts on.
+    /// The slot that also passes broadcasts on.
     raw_slot: u16,
     drive: Running,
     _gateway: Running,
@@ -73,7 +73,7 @@ impl Rig {
     fn order(&self, orders: &[Order]) {
         for order in orders {
             let before = self.drive.output().len();
-            // A gateway that stood still on a busy machine may take an order to be older than the stop before it, and answers 06.
+            // On a busy machine the gateway may take an order for older than the stop before it, and answer 06.
             let answer = until("an answer", || {
                 Some(self.exchange(order)).filter(|answer| *answer != Answer::Exception(6))
             });
@@ -220,7 +220,7 @@ fn obeys(case: &Case) {
     }
 }
 
-/// A drive that is not prepared does not run, and is not said to.
+/// A drive that is not prepared does not run, and is not reported as running.
 fn stays(case: &Case) {
     let rig = Rig::new(case, true);
     rig.order(&case.reference);
@@ -236,7 +236,7 @@ fn command(run: bool, reverse: bool, reset: bool) -> Order {
     Order::Model(u16::from(run) | u16::from(reverse) << 1 | u16::from(reset) << 2, 0, 0)
 }
 
-/// The same by the common model: the words are the gateway's, and the drive must do as ordered.
+/// Orders of the common model: the gateway makes the words, and the drive must do as ordered.
 fn obeys_the_common_model(case: &Case) {
     let rig = Rig::new(case, false);
     let name = case.profile;

@@ -1,4 +1,4 @@
-//! What a gateway remembers: trends in memory; run hours, starts and events over a kill.
+//! History of a gateway: trends in memory; run hours, starts and events that survive a kill.
 
 use std::fs;
 

@@ -1,4 +1,4 @@
-//! Who sees and may what of a drive that one client holds: mbpoll, mosquitto, curl.
+//! Rights and views of clients while one of them holds a drive: mbpoll, mosquitto, curl.
 
 use serde_json::{Value as Json, json};
 
@@ -78,7 +78,7 @@ fn who_sees_and_may_what() {
     assert_eq!(plant.seen(), (1, 1, json!("held"), json!("plc")));
     let left = until("the time", || mbpoll_read(plant.site.modbus, 1, 0x8014, 1).ok())[0];
     assert!((1..=30).contains(&left), "{left}");
-    // Nobody else commands it, whatever rank; each refusal names the holder.
+    // No other client commands the drive, whatever its rank; each refusal names the holder.
     let (status, answer) = plant.curl("commands", r#"{"run": true, "speed_reference": 10}"#);
     assert_eq!((status, &answer["result"]), (409, &json!("held_by_other")), "{answer}");
     assert_eq!(
@@ -91,7 +91,7 @@ fn who_sees_and_may_what() {
         (&json!("held_by_other"), &json!("plc")),
         "{answer}"
     );
-    // Nobody is nobody, also with a drive's name right.
+    // A client without a principal is refused, even with the right drive name.
     for topic in ["set", "as/stranger/set"] {
         let answer = plant.site.ask(&format!("pump-1/{topic}"), r#"{"speed_reference": 10}"#);
         assert_eq!(answer["result"], "not_allowed", "{answer}");
@@ -124,7 +124,7 @@ fn who_sees_and_may_what() {
         (2, 0, json!("held"), json!("alice")),
         "a release by another has no effect"
     );
-    // A stop of anybody passes and ends the hold; that of nobody reserves nothing.
+    // A stop of any client passes and ends the hold; a stop of a client without a principal reserves nothing.
     let answer = plant.site.ask("pump-1/set", r#"{"run": false}"#);
     assert_eq!(answer["result"], "confirmed", "{answer}");
     assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));

@@ -1,4 +1,4 @@
-//! Files of the state directory that cannot be opened, as on a disk that hangs: named pipes that nobody writes to.
+//! Files of the state directory that cannot be opened, as on a disk that hangs: named pipes without a writer.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, USERS, controlle
 const REST: &str = "[mqtt.sparkplug]\ngroup = \"plant\"\n[audit]\nfile = \"audit.jsonl\"\n[drill]\n\
      [authority]\nmode = \"exclusive\"\nlease = \"30s\"\n[[authority.principal]]\nname = \"alice\"\nrank = \"operator\"\nhttp_user = \"alice\"\n";
 
-/// What is read of the state directory at a start.
+/// Files of the state directory that are read at a start.
 const FILES: [&str; 11] = [
     "events.jsonl",
     "counters.json",

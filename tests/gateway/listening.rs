@@ -125,7 +125,7 @@ fn libmodbus(site: &Site, port: &str) -> Vec<Block> {
     printed(&run_well(Path::new(&program), &[port, "115200", &exchanges("600")]))
 }
 
-/// What the two programs above do, by tokio-modbus.
+/// Requests of the two programs above, sent with tokio-modbus.
 #[tokio::main(flavor = "current_thread")]
 async fn tokio_modbus(port: &str) -> Vec<Block> {
     let stream = tokio_serial::SerialStream::open(&tokio_serial::new(port, 115_200)).unwrap();
@@ -153,7 +153,7 @@ async fn tokio_modbus(port: &str) -> Vec<Block> {
     blocks.collect()
 }
 
-/// What a program reads and commands on the line is what the gateway shows.
+/// The gateway shows the values that a program reads and commands on the line.
 fn polled(protocol: Protocol, master: impl FnOnce(&Site, &str) -> Vec<Block>) {
     let shared = Shared::start(protocol, 115_200, "vacon-nx", 2);
     let gateway = shared.gateway(protocol, 115_200, "vacon-nx", 2);
@@ -161,7 +161,7 @@ fn polled(protocol: Protocol, master: impl FnOnce(&Site, &str) -> Vec<Block>) {
     assert_eq!(said.len(), 6, "{said:?}");
     let port = shared.site.modbus.to_string();
     for (address, first, words) in &said {
-        // What SCADA reads of the gateway is what the master read of the drive.
+        // A SCADA client reads from the gateway the values that the master read from the drive.
         let count = words.len().to_string();
         let first = first.to_string();
         let mbpoll = [

@@ -1,4 +1,4 @@
-//! A gateway in service: the watchdog beside a silent line, reloads that are asked for and refused, health, backups.
+//! A gateway in service: the watchdog while a line is silent, reloads that are requested and refused, health, backups.
 
 use std::fs;
 

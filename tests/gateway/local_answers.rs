@@ -48,7 +48,7 @@ fn a_reload_that_moves_the_socket_loses_no_answer() {
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
     let answer = answer(waiting);
-    // Whoever may open the new socket is another one: what was not sent yet is refused.
+    // The new socket may be open to other users: a request that was not sent yet is refused.
     let is_told = ["HTTP/1.1 504", "HTTP/1.1 403"]
         .iter()
         .any(|begin| answer.starts_with(begin));

@@ -1,4 +1,4 @@
-//! The local socket of a gateway: whose it is, what becomes of its file, and what commands through it do beside others.
+//! The local socket of a gateway: its owner, its file, and commands through it while others command too.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
@@ -127,7 +127,7 @@ fn a_socket_that_cannot_be_bound_is_a_warning() {
         warning.contains("WARN") && warning.contains("nowhere/own.sock"),
         "{warning}"
     );
-    // The gateway serves everybody else, and there is no second master beside it.
+    // The gateway serves all other clients, and the command does not become a second master.
     until("pump-1 by Modbus TCP", || mbpoll_read(line.modbus, 1, 32_768, 1).ok());
     let read = line.command("read", &["pump-1", "run"]);
     assert!(
@@ -135,7 +135,7 @@ fn a_socket_that_cannot_be_bound_is_a_warning() {
         "{}",
         read.err
     );
-    // What is no socket is not removed.
+    // A file that is not a socket is not removed.
     let file = line.directory.path().join("file");
     std::fs::write(&file, "precious").unwrap();
     line.reconfigure(|text| text.replace("nowhere/own.sock", "file"));
@@ -157,7 +157,7 @@ fn gateways_of_one_user_are_told_apart() {
     };
     let write = |line: &Line| -> Ran { ran(&mut command(line, &["write", "pump-1", "run=false"])) };
     for line in &lines {
-        // The same name, too: as it is after two searches.
+        // Both gateways get one name, as after two searches.
         line.reconfigure(|text| text.replace("socket = \"own.sock\"\n", ""));
     }
     lines[2].reconfigure(|text| text.replace("\"plant\"", "\"works\""));
@@ -177,7 +177,7 @@ fn gateways_of_one_user_are_told_apart() {
     }
     // The third has another name and a line of its own, which is free.
     let direct = write(&lines[2]);
-    // Another gateway of this machine may be told of, too.
+    // The notes may also mention another gateway of this machine.
     let notes = [
         "the gateway is `plant`, the file has `works`",
         "; the command opens the port itself",
@@ -209,7 +209,7 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
         (line.command("read", &["pump-1", "run"]).code == 0).then_some(())
     });
     let points = "/api/v1/drives/pump-1/points";
-    // One that never reads what it asks for: meanwhile others are served.
+    // A client that never reads its answers does not hinder others.
     let mut deaf = Client::connect(&line.socket());
     deaf.0
         .get_ref()
@@ -217,7 +217,7 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
         .unwrap();
     while deaf.0.get_mut().write_all(get(points).as_bytes()).is_ok() {}
     assert_eq!(line.command("read", &["pump-1", "run"]).code, 0);
-    // What is not HTTP is told so.
+    // A client that does not send HTTP gets a hint.
     for rubbish in ["{\"v\":1,\"read\":{\"drive\":\"pump-1\"}}\n", "run\n", "\0"] {
         let mut client = Client::connect(&line.socket());
         client.send(rubbish);
@@ -246,7 +246,7 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
     cut.send(command.strip_suffix('}').unwrap());
     cut.0.get_ref().shutdown(std::net::Shutdown::Write).unwrap();
     assert!(cut.next().is_none_or(|(status, _)| status != 200));
-    // Clients that say nothing are in nobody's way: the one that is silent longest is told so and closed.
+    // Silent clients hinder no other client: the one that is silent longest gets a message and is closed.
     let mut silent: Vec<Client> = (0..40).map(|_| Client::connect(&line.socket())).collect();
     let (status, busy) = silent[0].next().unwrap();
     assert!(status == 503 && busy["error"].is_string(), "{busy}");
@@ -256,7 +256,7 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
     drop(silent);
 }
 
-/// What is audited: the user of the client's process.
+/// The audit has the user of the client's process.
 #[test]
 fn a_command_is_audited_with_its_user() {
     let line = Line::start();
@@ -285,7 +285,7 @@ fn a_command_is_audited_with_its_user() {
 /// Baud rate and other keys of a Metasys N2 line.
 const N2: (&str, &str) = ("9600", "protocol = \"n2\"\ncycle = \"500ms\"\nslow_cycle = \"2s\"\n");
 
-/// One simulated drive of each family with its gateway.
+/// A simulated drive of each family with its gateway.
 struct Family {
     directory: TempDir,
     _drive: Running,
@@ -368,7 +368,7 @@ impl Family {
         });
     }
 
-    /// A command that does not name run leaves it as it is, whoever stopped the motor.
+    /// A command without `run` leaves `run` unchanged, whichever client stopped the motor.
     fn only_run_runs(&self) {
         self.write(&["run=true", "speed_reference=40"]);
         self.until_running(true);
@@ -386,7 +386,7 @@ impl Family {
         }
         self.write(&["fault_reset=true"]);
         assert_eq!((self.value("run"), self.value("running")), (false.into(), false.into()));
-        // Nor does such a command stop a motor that a SCADA client has started.
+        // A command without `run` does not stop a motor that a SCADA client has started, either.
         scada(1);
         self.until_running(true);
         if self.has_reverse {
@@ -504,7 +504,7 @@ fn it_serves_the_http_api_to_whoever_may_open_it() {
         405,
         "nobody logs in here"
     );
-    // It reads its configuration again, or says why not.
+    // The gateway reloads its configuration, or reports why not.
     let (status, outcome) = http(&line, &["-d", "{}"], "/api/v1/reload");
     assert_eq!((status, &outcome["changes"]), (200, &json!([])), "{outcome}");
     line.reconfigure(|text| text.replace("address = 1", "address = 999"));

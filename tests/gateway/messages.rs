@@ -1,4 +1,4 @@
-//! What the program says when something is meant that is nearly there.
+//! Messages of the program for input that is nearly right.
 
 use std::io::{Read, Write};
 use std::net::TcpListener;
@@ -67,7 +67,7 @@ fn a_file_is_checked_with_and_without_its_option() {
     assert_eq!(command(&["check", &config, "--config", &config]).code, 2);
 }
 
-/// One that speaks MQTT 3.1.1 only answers in that version and hangs up; a newer one says it in the words of version 5.
+/// A broker with MQTT 3.1.1 only answers in that version and closes; a newer one refuses in the format of version 5.
 #[test]
 fn a_broker_without_mqtt_5_is_named_as_such() {
     for (answer, wanted) in [

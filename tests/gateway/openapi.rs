@@ -51,7 +51,7 @@ fn every_answer_is_as_the_description_says() {
     let checked: Value = serde_json::from_slice(&checked.stdout).unwrap();
     let answered = checked["answered"].as_object().unwrap();
     let others: Vec<_> = answered.iter().filter(|(_, status)| **status != 200).collect();
-    // `[authority]` is off, no restore was made, and nobody logs in at the socket.
+    // 404 and 409: `[authority]` is off, no restore was made, and the socket has no logins.
     let expected = [
         ("/api/v1/drills/{id}", 404),
         ("/api/v1/drives/{name}/hold", 409),
@@ -76,7 +76,7 @@ fn every_answer_is_as_the_description_says() {
         assert!(described.contains(&path), "{path}: {described:?}");
     }
     read_by_a_generated_client(&site, &names);
-    // Whoever may read may read that, too.
+    // The description can be read with the right to read.
     let (status, text) = get(site.http, "/api/v1/openapi.json").unwrap();
     assert!(status == 200 && text.contains("\"openapi\":\"3.1"), "{text}");
 }
@@ -103,7 +103,7 @@ fn read_by_a_generated_client(site: &Site, names: &Value) {
     }
     assert_eq!(answers["get_api_v1_recordings_id"], json!([200, "RecordingObject"]));
     assert_eq!(answers["get_api_v1_drives_name_why"], json!([200, "Why"]));
-    // An unknown drive, point and value, a stop, and an order where nobody may command.
+    // An unknown drive, point and value, a stop, and an order without the right to command.
     let result = |status: u16| json!([status, "CommandResult"]);
     let expected = [
         result(404),

@@ -1,5 +1,5 @@
-//! Reloads that give names and units to other machines, or take a machine away: what a client had begun, holds or waits for
-//! belongs to the machine that it named. What drives were told is read from the line.
+//! Reloads that give names and units to other machines, or take a machine away: an action in progress, a hold and a waiting
+//! order belong to the machine that the client named. Words sent to the drives are read from the line.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -89,7 +89,7 @@ fn pair(one: &str, other: &str) -> String {
     controlled(one, 1, "unit = 11") + &controlled(other, 2, "unit = 12")
 }
 
-/// The same names; the units are swapped.
+/// Unchanged names with swapped units.
 fn swapped_units() -> String {
     controlled("pump-1", 1, "unit = 12") + &controlled("pump-2", 2, "unit = 11")
 }

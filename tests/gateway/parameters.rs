@@ -1,4 +1,4 @@
-//! Parameters read through a running gateway: what changed by itself is told, what the gateway wrote is not.
+//! Parameters read through a running gateway: changes at the drive are reported, writes of the gateway are not.
 
 use std::fs;
 
@@ -13,7 +13,7 @@ use crate::support::tools::root;
 /// PDU addresses of parameters of the profile.
 const MAXIMUM_FREQUENCY: u16 = 101;
 
-/// The Vacon NX profile as `few`, whose drives are asked for the parameters with a name only.
+/// The Vacon NX profile as `few`, which reads only the parameters with a name.
 pub(super) fn few() -> String {
     let text = fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
     let changed = text
@@ -104,7 +104,7 @@ fn only_what_the_gateway_did_not_write_is_told_as_a_change() {
     listed_from_elsewhere(&site);
 }
 
-/// The readings that are stored, as the gateway tells them where the configuration is not.
+/// The stored readings as a gateway lists them for a command without its configuration.
 fn listed_from_elsewhere(site: &Site) {
     let url = format!("http://127.0.0.1:{}", site.http);
     let told = |arguments: &[&str]| {
@@ -116,7 +116,7 @@ fn listed_from_elsewhere(site: &Site) {
     let mut here = list(&ran(site, &["params", "list", "--json"]).1);
     assert_eq!(here.len(), 3);
     for reading in &mut here {
-        // The gateway tells the name of the file only.
+        // The gateway reports only the name of the file.
         let name = std::path::Path::new(reading["file"].as_str().unwrap()).file_name();
         reading["file"] = name.unwrap().to_str().unwrap().into();
         assert_eq!((&reading["family"], &reading["missing"]), (&"few".into(), &0.into()));
@@ -128,7 +128,7 @@ fn listed_from_elsewhere(site: &Site) {
     assert_eq!(told(&["params", "show", "pump-1"]), (Some(0), shown, String::new()));
     let (code, _, why) = told(&["params", "show", "pump-9"]);
     assert!(code == Some(1) && why.contains("pump-9"), "{why}");
-    // One that cannot be read is named beside the others.
+    // A reading that cannot be parsed is listed with the others.
     std::fs::write(site.file("state/params/pump-1/19700101T000000Z.params"), "no reading").unwrap();
     for (code, text, why) in [told(&["params", "list"]), ran(site, &["params", "list"])] {
         assert_eq!((code, text.matches("few").count()), (Some(0), 3), "{why}");

@@ -1,5 +1,5 @@
-//! The gateway stands still (SIGSTOP), and goes on: what clients sent meanwhile, and what is told of the drives. The clients are
-//! bytes on sockets, so that they can give up.
+//! The gateway is stopped (SIGSTOP) and continues: requests that clients sent meanwhile, and values of the drives. The clients
+//! are bytes on sockets, so that they can give up.
 
 use std::io::{Read, Write};
 use std::net::{TcpStream, UdpSocket};
@@ -88,7 +88,7 @@ impl Plant {
         });
     }
 
-    /// A client of Modbus TCP that has asked something before.
+    /// A client of Modbus TCP that has already sent a request.
     fn modbus(&self) -> Client {
         let stream = TcpStream::connect(("127.0.0.1", self.site.modbus)).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -212,7 +212,7 @@ impl Client {
         self.answer().is_ok()
     }
 
-    /// The same; the answer of one that was not.
+    /// Reads an answer; an error where the order was not carried out.
     fn answer(&mut self) -> Result<(), String> {
         let mut answer = vec![0; 4096];
         let count = self.stream.read(&mut answer).unwrap_or(0);
@@ -247,7 +247,7 @@ fn a_client_that_gave_up_starts_nothing() {
         ];
         for (name, client) in by {
             let client = client.map(|client| client(&plant));
-            // Whoever is connected through a broker, or not at all, is not known to have gone.
+            // Whether a client behind a broker, or without a connection, has gone is not known.
             if client.is_none() && pause < Duration::from_secs(1) {
                 continue;
             }
@@ -258,7 +258,7 @@ fn a_client_that_gave_up_starts_nothing() {
             });
             assert!(!plant.runs(), "{name}, {pause:?}");
         }
-        // Nor does what connects in the pause and is gone.
+        // A client that connects during the pause and leaves starts nothing, either.
         plant.stands(pause, || {
             let mut stream = TcpStream::connect(("127.0.0.1", plant.site.modbus)).unwrap();
             stream.write_all(&[0, 1, 0, 0, 0, 6, 1, 6, 0x81, 0, 0, 1]).unwrap();
@@ -276,7 +276,7 @@ fn a_client_that_gave_up_starts_nothing() {
     assert_eq!(events.matches("\"paused\"").count(), 18, "{events}");
 }
 
-/// An order that is begun before a pause and completed in it starts no motor.
+/// An order that starts before a pause and is completed during it starts no motor.
 #[test]
 fn what_is_completed_in_a_pause_starts_nothing() {
     let plant = Plant::new();
@@ -288,7 +288,7 @@ fn what_is_completed_in_a_pause_starts_nothing() {
     for (name, open) in by {
         let mut client = open(&plant);
         let bytes = client.command(1);
-        // Of HTTP the head is complete.
+        // The head of the HTTP request is complete; only the body is cut.
         let (begin, rest) = bytes.split_at(bytes.len() - 3);
         client.stream.write_all(begin).unwrap();
         std::thread::sleep(100 * MS);
@@ -389,8 +389,8 @@ fn a_new_connection_starts_a_motor_behind_a_pause_and_an_old_one_later() {
     assert!(plant.runs());
 }
 
-/// While the gateway stands still its drives do, too: what it tells then is not younger than that, but for the time in which the
-/// last reply can have left its drive.
+/// While the gateway is stopped its drives send nothing, either: values are reported no younger than that, except for the time
+/// in which the last reply can have left its drive.
 #[test]
 fn nothing_is_told_as_younger_than_it_is() {
     let plant = Plant::new();
@@ -418,7 +418,7 @@ fn nothing_is_told_as_younger_than_it_is() {
     assert_eq!(events.matches("\"paused\"").count(), TIMES, "{events}");
 }
 
-/// A drive that answers is not told as offline by a pause, and reads go on.
+/// A drive that answers is not reported as offline after a pause, and reads continue.
 #[test]
 fn a_pause_takes_no_drive_away() {
     let plant = Plant::new();

@@ -90,7 +90,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     let told = String::from_utf8(unknown.stderr).unwrap();
     assert_eq!(unknown.status.code(), Some(1));
     assert!(told.contains("there is no recording `x`"), "{told}");
-    // The same files over HTTP, with a name.
+    // HTTP serves equal files, with a name.
     assert_eq!(
         get(site.http, &format!("/api/v1/recordings/{id}?format=csv")).unwrap(),
         (200, csv)
@@ -142,7 +142,7 @@ fn a_fault_makes_a_recording_and_a_directory_that_cannot_be_written_costs_that_o
     assert_eq!(entry["trigger"], "fault");
     let summary = entry["summary"].as_str().unwrap();
     assert!(summary.starts_with("fault 2: "), "{summary}");
-    // The fault told its cause already.
+    // The event of the fault already has the cause.
     let made = format!("recording {}", entry["id"].as_str().unwrap());
     let log = until("the event", || {
         let (_, events) = get(site.http, "/api/v1/events/log?kind=recording").expect("an answer");

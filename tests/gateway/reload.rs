@@ -1,4 +1,4 @@
-//! Signals and reloads: clients stay connected, and nothing that hangs holds up a stop.
+//! Signals and reloads: clients stay connected, and no hanging file delays a stop.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -72,7 +72,7 @@ fn clients_stay_connected_over_a_reload() {
     assert_eq!(client.ask(&WRITE), MAY_NOT_WRITE);
     assert_eq!(client.ask(&READ).len(), 11);
 
-    // Who is no longer allowed is disconnected.
+    // A client that is no longer allowed is disconnected.
     site.change("write = []", "write = []\nallow = [\"127.0.0.2/32\"]");
     gateway.signal("HUP");
     assert!(client.is_closed());
@@ -143,7 +143,7 @@ fn a_file_that_cannot_be_read_holds_up_neither_the_watchdog_nor_a_stop() {
     assert!(gateway.ended().success());
     gateway.until_printed("drivegate has stopped");
 
-    // The same when it starts.
+    // A start with such a file can be ended as well.
     let mut gateway = run();
     let reads = || {
         let tasks = std::fs::read_dir(format!("/proc/{}/task", gateway.pid())).ok()?;

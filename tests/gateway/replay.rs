@@ -32,7 +32,7 @@ fn replay(capture: &Path, config: &Path) -> (Option<i32>, String, String) {
     (output.status.code(), text(output.stdout), text(output.stderr))
 }
 
-/// What a replay shows in a row of its table: value and quality of a point.
+/// Value and quality of a point in the table of a replay.
 fn shown(printed: &str, point: &str) -> Option<(String, String)> {
     let rows = printed.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
     rows.filter_map(|row| match row.as_slice() {
@@ -121,7 +121,7 @@ fn what_is_no_capture_is_refused_with_its_place() {
         assert_eq!((exit, printed.as_str()), (Some(code), ""), "{name}: {complaints}");
         assert!(complaints.contains(wanted), "{name}: {complaints}");
     }
-    // One that was cut off is read up to there.
+    // A capture that was cut off is read up to the cut.
     let path = folder.path().join("cut");
     fs::write(&path, &whole[..whole.len() - 10]).unwrap();
     let (exit, printed, complaints) = replay(&path, &config);

@@ -1,4 +1,4 @@
-//! What is on the line when the gateway starts, dies and starts again; and a port that is not there.
+//! Requests on the line when the gateway starts, dies and starts again; and a port that is not there.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -204,7 +204,7 @@ fn a_reload_does_not_end_supervision() {
     site.until_point("pump-1", "run", false);
 }
 
-/// Leaves a process room for that many open files more, for good.
+/// Permanently limits a process to `more` open files beyond the present ones.
 fn leave_room_for(pid: u32, more: usize) {
     let open = || -> BTreeSet<u32> {
         let files = std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap();

@@ -1,5 +1,5 @@
-//! Parameters restored by a real gateway: what is asked before, who may command meanwhile, and what a gateway that was killed
-//! in the middle finds.
+//! Parameters restored by a real gateway: the questions before, commands meanwhile, and a gateway that was killed in the
+//! middle.
 
 use std::fs;
 use std::io::{Read as _, Write as _};
@@ -62,7 +62,7 @@ impl Plant {
         path
     }
 
-    /// What differs, but for what is never restored unless it is named.
+    /// Differences of two files, except for parameters that are only restored by name.
     fn differences(&self, before: &str, after: &str) -> Vec<String> {
         let (_, printed, said) = self.ran(&["diff", before, after]);
         assert!(!said.contains("error"), "{said}");
@@ -136,7 +136,7 @@ fn nothing_is_restored_without_leave_and_nothing_is_left_to_differ_with_it() {
     let (_, said) = plant.well(&["restore", &wanted, "pump-1", "--force", "--yes"]);
     assert!(said.contains("nothing to restore"), "{said}");
 
-    // The motor runs: nothing is written, and nobody is kept from anything.
+    // The motor runs: nothing is written, and no client is locked out.
     write_registers(plant.site.modbus, 1, 33_024, &[1]);
     plant.site.until_state("pump-1", "running");
     let (code, _, said) = plant.ran(&["restore", &before, "pump-1", "--force", "--yes"]);
@@ -216,7 +216,7 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     let writes = plant.line.with_drive(1, |drive, _| drive.parameter_writes()).unwrap();
     assert!(writes.values().all(|writes| writes.while_fed == 0), "{writes:?}");
 
-    // A journal that nobody understands holds the drive, and is not lost when it is set aside.
+    // A journal that cannot be read locks the drive, and is kept when it is set aside.
     gateway.signal("TERM");
     gateway.ended();
     fs::write(&journal, "# drivegate restore 7\n").unwrap();
@@ -300,7 +300,7 @@ fn without_a_gateway_the_command_restores_by_itself() {
         "{told}{said}"
     );
     assert_eq!(plant.differences(&wanted, "pump-1"), Vec::<String>::new());
-    // One that was cut off holds the drive for whoever commands it without a gateway, too.
+    // An interrupted restore also locks the drive for commands without a gateway.
     let command = [
         "params",
         "restore",

@@ -1,5 +1,5 @@
-//! Rights that a reload takes away: they serve no request that had begun before, by whatever way it comes in, and start no
-//! motor by an order that waits.
+//! Rights that a reload takes away: they serve no request in progress, over any interface, and no waiting order starts a
+//! motor.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -28,7 +28,7 @@ struct Begun {
 impl Begun {
     /// Sends the rest; the reply, or nothing where the connection is closed.
     fn finish(mut self) -> Vec<u8> {
-        // It may be closed already.
+        // The connection may be closed already, so an error is ignored.
         let _ = self.stream.write_all(&self.rest);
         let mut reply = vec![0; 4096];
         let count = self.stream.read(&mut reply).unwrap_or(0);
@@ -88,7 +88,7 @@ fn socket(site: &Site) -> Begun {
 fn modbus(site: &Site) -> Begun {
     let mut stream = tcp(site.modbus);
     stream.write_all(&[0, 1, 0, 0, 0, 6, 1]).unwrap();
-    // It has arrived.
+    // Waits until the first part has arrived.
     std::thread::sleep(Duration::from_millis(50));
     Begun {
         stream: Box::new(stream),
@@ -96,14 +96,14 @@ fn modbus(site: &Site) -> Begun {
     }
 }
 
-/// What a request gets.
+/// Answer to a request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Gets {
-    /// This status.
+    /// The answer has this status.
     Status(&'static str),
     /// Exception 01.
     Exception,
-    /// Its connection is closed.
+    /// The connection is closed without an answer.
     Nothing,
 }
 
@@ -209,7 +209,7 @@ fn a_right_that_a_reload_took_away_serves_no_request_that_had_begun() {
         ("not in `allow`", modbus, &no_client, &users, gone),
         ("no [modbus_tcp]", modbus, &no_modbus, &users, gone),
         ("no socket", socket, &no_socket, &users, refused),
-        // What leaves the right.
+        // Changes that leave the right unaffected.
         ("another user is removed", http, &same, &only_alice, Gets::Status("200")),
         ("no Modbus TCP for HTTP", http, &no_writes, &users, Gets::Status("200")),
         (

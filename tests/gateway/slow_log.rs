@@ -1,4 +1,4 @@
-//! Nobody reads the log any more: a pipe that is full must not hold up a client.
+//! The log is not read any more: a full pipe must not block a client.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -37,7 +37,7 @@ fn a_log_that_nobody_reads_holds_nobody_up() {
     gateway.args(["run", "--config", &site.config()]).stderr(writer);
     let mut gateway = Unread(gateway.spawn().unwrap());
     until("the metrics", || get(site.http, "/metrics"));
-    // A pipe holds 64 KiB: this blocks until nobody can read any more.
+    // A pipe holds 64 KiB: this blocks until the reader closes.
     let filling = std::thread::spawn(move || other.write_all(&vec![b'x'; 1 << 20]));
     let mut client = TcpStream::connect(("127.0.0.1", site.modbus)).unwrap();
     client.set_read_timeout(Some(PATIENCE)).unwrap();

@@ -154,7 +154,7 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
         message.contains("its start cannot be counted") && message.contains("starts.json"),
         "{message}"
     );
-    // What was refused did not count.
+    // A refused start did not count.
     std::fs::remove_dir(site.file("state/starts.partial")).unwrap();
     starts(&site, "pump-1");
     stop(&site);

@@ -100,7 +100,7 @@ fn from_every_side() {
     assert_eq!((code, text.as_str()), (0, "pump-1: standing\nfan-1: standing\n"));
     plant.all_stand();
 
-    // One group alone.
+    // A group can be stopped alone.
     plant.start();
     let (status, answer) = plant.curl("{\"group\": \"fans\"}");
     assert_eq!(
@@ -111,7 +111,7 @@ fn from_every_side() {
     assert_eq!(plant.not_standing(), 1);
     assert_eq!(plant.site.point("pump-1", "running"), true);
 
-    // What is not understood stops nothing and says so.
+    // A request that is not understood stops nothing and is refused.
     let refused = mbpoll_write(plant.site.modbus, 255, STOP_ALL, &[2]).unwrap_err();
     assert!(refused.contains("Illegal data value"), "{refused}");
     assert_eq!(plant.curl("{\"bus\": \"line9\"}").0, 404);
@@ -121,14 +121,14 @@ fn from_every_side() {
     assert!(code == 1 && text.contains("known: line1"), "{code} {text}");
     assert_eq!(plant.site.point("pump-1", "running"), true);
 
-    // Not without a login.
+    // A login is required.
     let url = format!("http://127.0.0.1:{}/api/v1/stop", plant.site.http);
     let nobody = run(
         &tool("curl"),
         &["-s", "-o", "/dev/null", "-d", "{}", "-w", "%{http_code}", &url],
     );
     assert_eq!(nobody.stdout, b"401");
-    // The command line over the network, as a user or as nobody.
+    // The command line over the network, with and without a user.
     let (url, login) = (
         format!("http://127.0.0.1:{}", plant.site.http),
         plant.site.path("login"),
@@ -172,7 +172,7 @@ fn a_retained_stop_of_all_stops_nothing_and_is_told() {
     plant.start();
     let heard = |topic| Running::spawn(client("mosquitto_sub", plant.site.mqtt).args(["-t", topic, "-F", "%p"]));
     let results = heard("drivegate/test/result");
-    // It has subscribed when a stop that is not understood is answered.
+    // An answer to an invalid stop shows that the subscription is active.
     until("the subscription", || {
         plant.site.publish(&["-t", "drivegate/test/set/stop", "-m", "[]"]);
         results.output().contains("no stop was sent").then_some(())

@@ -128,7 +128,7 @@ fn plant(authority: &str) -> Plant {
     }
 }
 
-/// What is sent to a drive, and what its client reads.
+/// A write to a drive, and the answer that its client reads.
 enum Way {
     /// Function 16 by pymodbus: unit, first register, values, exception.
     Registers(u8, u16, Vec<u16>, u8),
@@ -266,7 +266,7 @@ impl Plant {
         self.site.until_point(drive, "running", true);
     }
 
-    /// What the client is told.
+    /// Answer to the client.
     fn ask(&self, drive: &str, way: &Way) -> String {
         match way {
             Way::Registers(unit, start, values, _) => {
@@ -290,7 +290,7 @@ impl Plant {
                 format!("exception {}", answer[8])
             }
             Way::Mqtt(topic, payload, _) => {
-                // Nobody is named where nobody holds drives.
+                // Without principals the topic names no client.
                 let topic = if self.has_principals {
                     *topic
                 } else {
@@ -350,7 +350,7 @@ impl Plant {
         }
     }
 
-    /// What the audit says of the rest of a host's command.
+    /// The audit's record about the rest of a host's command.
     fn dcmd(&self, drive: &str, metrics: &[(&str, f64)]) -> String {
         let metric = |(name, value): &(&str, f64)| match *name {
             "run" => json!({"name": name, "type": "Boolean", "value": *value != 0.0}),
@@ -401,7 +401,7 @@ impl Plant {
     }
 }
 
-/// So many bytes of the answer, or what came of them.
+/// Reads at most this many bytes of the answer.
 fn exchange(port: u16, request: &[u8], most: usize) -> Vec<u8> {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
     stream

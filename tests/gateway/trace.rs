@@ -124,12 +124,12 @@ fn frames_their_times_and_their_meaning() {
             assert!(frame.meaning.starts_with("read "), "{frame:?}");
             reads += usize::from(frame.meaning == "read holding 2100..2110");
         } else {
-            // A drive knows the end of a request by 3.5 characters of silence, 911 µs, and then turns around.
+            // A drive detects the end of a request by 3.5 characters of silence, 911 µs, and then turns around.
             assert!((900..5_000_000).contains(&gap), "{frame:?}");
             assert!(frame.meaning.ends_with(" ok"), "{frame:?}");
             let registers = (frame.bytes.len() - 5) / 2;
             assert!(frame.meaning.starts_with(&format!("{registers} register")), "{frame:?}");
-            // Its last byte was there when the line had carried it, not before.
+            // The last byte cannot arrive before the line has carried it.
             let request = frames[..place].last();
             if let Some(request) = request.filter(|frame| frame.request) {
                 let took = frame.micros.saturating_sub(request.micros);
@@ -207,7 +207,7 @@ fn silence_of_a_drive_is_shown() {
     assert_eq!(fields[1..], ["-", "line1", "<", "pump-2", "timeout"]);
 }
 
-/// What goes wrong on the line is shown as such, and what follows is right again.
+/// Faults on the line are reported as such, and the next transaction is sound again.
 #[test]
 fn faults_are_told_apart() {
     let plant = Plant::with("200ms");
@@ -330,7 +330,7 @@ fn it_ends_as_it_is_told_and_says_why() {
 
 #[test]
 fn one_that_is_no_gateway_is_told_from_one() {
-    // A listener that says nothing of HTTP.
+    // A listener that does not speak HTTP.
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
     let answer = std::thread::spawn(move || {

@@ -52,7 +52,7 @@ impl OnTerminal {
         let shown = screen.clone();
         std::thread::spawn(move || {
             let mut bytes = [0; 4096];
-            // A terminal that nobody has open any more cannot be read.
+            // A terminal whose other end is closed cannot be read.
             while let Some(count) = output.read(&mut bytes).ok().filter(|count| *count > 0) {
                 shown
                     .lock()
@@ -88,7 +88,7 @@ impl OnTerminal {
 
 impl Drop for OnTerminal {
     fn drop(&mut self) {
-        // What runs on the terminal ends with it; `setsid` waits for that.
+        // Ctrl-C ends the program on the terminal; `setsid` waits for that.
         let _ = self.keyboard.write_all(b"\x03");
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -170,7 +170,7 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
         shown.contains("found modbus-rtu 38400 8N1, address 7: vacon-nx"),
         "{shown}"
     );
-    // On a busy machine the drives may be asked again first.
+    // On a busy machine the drives may need a second request first.
     assert!(shown.contains(" state "), "values before the question: {shown}");
     let http = page(&shown);
     for drive in ["drive-1", "drive-2"] {
@@ -226,7 +226,7 @@ fn a_script_has_an_option_for_the_question() {
     let again = ran(&mut drivegate(&words(&rig.arguments(&["--write", &written]))));
     assert_eq!(again.code, 2, "{}", again.err);
     assert!(again.err.contains("exists already"), "{}", again.err);
-    // Nobody to ask, and nothing said.
+    // Without a terminal and an option nothing is written.
     let mut silent = Running::drivegate(&words(&rig.arguments(&[])));
     silent.until_printed("no configuration was written; --write FILE writes one");
     silent.signal("INT");

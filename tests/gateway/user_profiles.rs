@@ -6,7 +6,7 @@ use crate::support::process::{Running, api, free_port, get, mbpoll_write, read_r
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 use crate::support::tools::{python, root, run, run_well};
 
-/// A profile over the example, with a float that is no number.
+/// A profile based on the example, with a float that may be NaN.
 const OURS: &str = r#"
 name = "our-meter"
 base = "energy-meter"
@@ -131,7 +131,7 @@ fn the_energy_meter_of_the_page_is_served() {
     assert_eq!(points["tariff"]["text"], "weekend");
     assert_eq!(points["mode"]["text"], "3 phases, 3 wires");
     assert_eq!(points["power_factor"].get("text"), None);
-    // What is no number is never served as one.
+    // NaN is never served as a value.
     assert_eq!(
         (
             &points["neutral_current"]["value"],
@@ -149,7 +149,8 @@ fn the_energy_meter_of_the_page_is_served() {
         assert!(metrics.contains(&line), "{line} is missing in\n{metrics}");
     }
     assert!(!metrics.contains("neutral_current"), "{metrics}");
-    // Not available: bad on every side. A helper is on none. What a metric would round is not one.
+    // An unavailable value is bad in every interface. A helper point appears in none. A value that a metric would round
+    // is not a metric.
     assert_eq!(
         (&points["motor_current"]["value"], &points["motor_current"]["quality"]),
         (&().into(), &"bad".into())
@@ -166,7 +167,7 @@ fn the_energy_meter_of_the_page_is_served() {
     assert!(metrics.contains("point=\"decimals\",unit=\"\"} 1234"), "{metrics}");
     assert_eq!(points.get("power_of_ten"), None);
     assert_eq!(points["season"]["text"], "winter");
-    // An enumeration is set by its text, and to nothing that it does not list.
+    // An enumeration is set by its text, and refuses any text that it does not list.
     let program = Path::new(env!("CARGO_BIN_EXE_drivegate"));
     let config = site.config();
     let write = |set: &str| run(program, &["write", "--config", &config, "meter", set]);

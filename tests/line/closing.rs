@@ -53,7 +53,7 @@ fn device_server(to: &str, rule: Rule) -> String {
     address
 }
 
-/// Whether the client says nothing for the time of the rule.
+/// Whether the client is silent for the time of the rule.
 fn pauses(near: &TcpStream, rule: Rule) -> bool {
     let Rule::Pause(pause) = rule else { return false };
     let until = Instant::now() + pause;
@@ -68,7 +68,7 @@ fn pauses(near: &TcpStream, rule: Rule) -> bool {
     false
 }
 
-/// One frame of Modbus RTU with functions 3, 6 and 16.
+/// Reads a frame of Modbus RTU with functions 3, 6 and 16.
 fn frame(from: &mut TcpStream, is_reply: bool) -> std::io::Result<Vec<u8>> {
     let mut frame = vec![0; 3];
     from.read_exact(&mut frame)?;

@@ -60,7 +60,7 @@ async fn is_good(rig: &Rig, point: ModelPoint, value: Value) {
 async fn an_n2_slave_in_python() {
     for form in ["plain", "byte"] {
         let script = root().join("tests/peers/n2_slave.py");
-        // It prints its port, then each frame that it hears.
+        // The peer prints its port, then each frame that it receives.
         let peer = Running::start(&tool("python3"), &[&script.display().to_string(), form]);
         let lines = || peer.output().lines().map(str::to_string).collect::<Vec<_>>();
         let port = until("its port", || lines().into_iter().next());
@@ -77,8 +77,8 @@ async fn an_n2_slave_in_python() {
         is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
         assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
         is_good(&rig, ModelPoint::SpeedReference, Value::Number(50.0)).await;
-        // The slave answers sooner than a line could: an answer that is not believed is asked for again, so that nothing is
-        // counted here. That nothing is written twice is proved in virtual time.
+        // The slave answers faster than a line could, so a doubtful answer is requested again and requests are not counted
+        // here. A test in virtual time proves that nothing is written twice.
         let frames = ["0111020388", "0112020288", "017203014248000020", "017303018F"];
         let heard = || lines().split_off(1);
         until("all frames", || {

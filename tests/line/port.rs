@@ -25,7 +25,7 @@ fn loopback() -> EndpointOptions {
     }
 }
 
-/// That each is read once more, and not more often, is proved in virtual time.
+/// A test in virtual time proves that each drive is read exactly once more.
 #[tokio::test]
 async fn after_a_replug_everything_is_read_and_nothing_written() {
     let rig = Rig::of(Setup {
@@ -62,7 +62,7 @@ async fn after_a_replug_everything_is_read_and_nothing_written() {
 
 #[tokio::test]
 async fn a_command_that_loses_its_port_is_answered_once() {
-    // Nothing that is on the line ends by time before the port goes.
+    // The long time limit keeps the request open until the port goes.
     let rig = Rig::of(Setup {
         response_timeout: Duration::from_secs(60),
         ..Setup::default()
@@ -317,7 +317,8 @@ fn a_format_that_the_port_does_not_take_is_warned_about() {
     assert!(opened(&pty.1, &plain).1.is_empty());
 }
 
-/// The port, once nobody else has it: a process that another test starts has what was open until it is another program.
+/// Opens the port once it is free: a process started by another test has inherited the open files until it executes its
+/// program.
 fn opened(path: &str, format: &LineFormat) -> (Line, Vec<String>) {
     until("the port", || Line::open(path, format, &LineOptions::default()).ok())
 }

@@ -1,4 +1,4 @@
-//! A device server that is set up over the network, against the one of pyserial; and what is no such server.
+//! A device server that is set up over the network, against the one of pyserial; and servers of other kinds.
 
 use std::net::TcpListener;
 use std::time::Duration;

@@ -44,7 +44,7 @@ pub(crate) struct Setup {
     pub(crate) drives: u8,
     pub(crate) protocol: Protocol,
     pub(crate) profile: Arc<Profile>,
-    /// Where the simulated line is; the bus opens that, unless `port` says otherwise.
+    /// Endpoint of the simulated line; the bus opens it unless `port` is set.
     pub(crate) endpoint: Option<EndpointOptions>,
     pub(crate) port: Option<String>,
     pub(crate) options: LineOptions,
@@ -137,7 +137,7 @@ impl Rig {
         self.plant.drive(&drive(address)).unwrap()
     }
 
-    /// One that is not known yet counts as offline.
+    /// State of a drive; offline as long as it is not known.
     pub(crate) fn state(&self, address: u8) -> State {
         let state = self.handle(address).reading(Instant::now()).state();
         state.unwrap_or(State::Offline)

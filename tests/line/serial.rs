@@ -9,7 +9,7 @@ use crate::support::process::{self, Running, get, mbpoll_read, read_registers, u
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, nx_in_ascii};
 use crate::support::tools::{python, root, tool};
 
-/// What `drivegate` printed on stdout and stderr.
+/// Output of `drivegate` on stdout and stderr.
 fn drivegate(arguments: &[&str]) -> String {
     let ran = process::drivegate(arguments).output().unwrap();
     let (out, err) = (
@@ -168,7 +168,7 @@ fn simulated_drives_in_ascii_run_and_meet_faults() {
     until("half the speed", || {
         (value("actual_speed").as_f64() == Some(50.0)).then_some(())
     });
-    // That a sound line has no failures is proved in virtual time.
+    // A test in virtual time proves that a sound line has no failures.
     assert!(counted(site.http, "ok") > 10.0);
 
     let url = format!("http://127.0.0.1:{}", site.http);

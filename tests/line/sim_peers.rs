@@ -36,13 +36,13 @@ fn line_of(protocol: Protocol, format: &str) -> SimulatedBus {
     SimulatedBus::start(options).unwrap()
 }
 
-/// What a program printed, stdout first, whether it ended well or not.
+/// Output of a program, stdout first, whatever its exit code.
 fn printed(program: &Path, arguments: &[&str]) -> String {
     let output = run(program, arguments);
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
 }
 
-/// What mbpoll printed; values to write stand behind `--`.
+/// Output of mbpoll; values to write follow `--`.
 fn mbpoll(line: &SimulatedBus, arguments: &str) -> String {
     let (options, values) = arguments.split_once(" -- ").unwrap_or((arguments, ""));
     let line = line.address();

@@ -159,7 +159,7 @@ fn tools_that_misbehave_harm_nobody() {
         |answer: &[u8]| rtu::open_frame(answer).is_some_and(|(address, pdu)| address == 1 && pdu[..2] == [3, 6]);
     let mut sound = rig.connect();
     assert!(answered(&ask(&mut sound, &request)));
-    // One floods and never reads, one sends half a frame and falls silent.
+    // One tool floods and never reads, another sends half a frame and goes silent.
     let mut flood = rig.connect();
     flood.set_nonblocking(true).unwrap();
     let all = request.repeat(4000);
@@ -210,7 +210,7 @@ fn a_reload_changes_slots_and_leaves_the_bus_alone() {
     rig.site.change("access = \"read\"", "access = \"write\"");
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
-    // Who was connected connects again.
+    // Connected tools must connect again.
     let mut rest = [0; 16];
     until("the connection of the old slot ends", || {
         matches!(stream.read(&mut rest), Ok(0)).then_some(())

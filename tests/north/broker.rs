@@ -113,7 +113,7 @@ impl Reader {
     }
 }
 
-/// A connection that sends exactly what a test wants.
+/// A connection that sends exactly the bytes of a test.
 struct Raw(TcpStream);
 
 impl Raw {
@@ -438,6 +438,6 @@ fn a_client_that_does_not_read_stops_nobody_else() {
         publisher.send(&publish);
         reader.expect(&publish);
     }
-    // It lost its connection, with what was sent until then.
+    // The stuck client lost its connection, after the bytes sent until then.
     assert!(stuck.until_closed().len() < 200 * publish.len());
 }

@@ -157,7 +157,7 @@ fn ends_with(path: &Path, extension: &str) -> bool {
     path.extension().is_some_and(|e| e == extension)
 }
 
-/// What a document shows in fences as TOML.
+/// The TOML blocks of a document.
 fn fenced(text: &str) -> Vec<String> {
     let mut blocks = Vec::new();
     let mut block: Option<String> = None;
@@ -172,8 +172,8 @@ fn fenced(text: &str) -> Vec<String> {
     blocks
 }
 
-/// What must be mended in a configuration that ships. Secrets, certificates and profile directories lie on the
-/// machine it is made for.
+/// Errors to fix in a configuration that ships. Secrets, certificates and profile directories exist only on the machine
+/// it is made for.
 fn faults(path: &Path, source: &str) -> Vec<String> {
     let elsewhere = [
         ".password_file",

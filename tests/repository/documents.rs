@@ -1,4 +1,4 @@
-//! What the documents say is true: commands, links, and every configuration they show.
+//! The documents are true: commands, links, and every configuration in them.
 
 mod cabinet;
 mod commands;
@@ -55,7 +55,7 @@ fn every_configuration_that_ships_is_valid() {
     let mut configurations = files(&root().join("deploy"), "toml");
     assert!(configurations.len() >= 2);
     let dir = TempDir::new().unwrap();
-    // The certificates that the documentation makes beside its configuration.
+    // The certificates that the documentation creates for its configuration.
     let (script, tls) = (
         root().join("docs/modbus-tls-ca.sh"),
         dir.path().join("tls").display().to_string(),
@@ -337,7 +337,7 @@ fn examples() -> Vec<(PathBuf, String)> {
     examples
 }
 
-/// What is pasted whole must be a command: a description stands behind `#` or on a line of its own.
+/// Every example that is pasted whole must be a command: a description stands behind `#` or on a line of its own.
 #[test]
 fn examples_can_be_pasted_whole() {
     let examples = examples();
@@ -433,7 +433,7 @@ fn examples_in_comments(crate_root: &Path) -> Vec<String> {
     sources.iter().flat_map(of).collect()
 }
 
-/// A manifest says `doctest = false` only where no comment holds an example that could be compiled.
+/// A manifest sets `doctest = false` only where no comment has an example that could be compiled.
 #[test]
 fn examples_in_comments_are_compiled() {
     let crates = fs::read_dir(root().join("crates")).unwrap();

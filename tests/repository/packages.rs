@@ -175,7 +175,7 @@ const MAJORS: [(&str, u32); 14] = [
     ("ttymxc", 207),
     ("ttyXRUSB", 266),
 ];
-/// Those that are given a number when they are loaded.
+/// Drivers whose major number is assigned when they are loaded.
 const WITHOUT_MAJOR: [&str; 9] = [
     "ttyLP", "ttySTM", "ttyO", "ttyPS", "ttyAML", "ttyTHS", "ttyMSM", "ttyMUE", "ttyMXUSB",
 ];

@@ -1,4 +1,4 @@
-//! What ships around the binary: service unit, image, compose file, dashboard, alert rules.
+//! Files that ship with the binary: service unit, image, compose file, dashboard, alert rules.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -68,7 +68,7 @@ const METRICS: [&str; 53] = [
     "drivegate_write_seconds_bucket",
 ];
 
-/// What the dashboard has to show.
+/// Metrics that the dashboard must show.
 const SHOWN: [&str; 15] = [
     "drivegate_drive_up",
     "drivegate_drive_state",
@@ -388,7 +388,7 @@ fn the_image_is_small_and_not_root() {
     let user = last.lines().find_map(|line| line.strip_prefix("USER ")).unwrap();
     assert_ne!(user.split(':').next().unwrap().parse(), Ok(0), "a number, and not root");
     assert!(last.contains("CMD [\"run\", \"--config\", \"/etc/drivegate/drivegate.toml\"]"));
-    // What the build needs is let in.
+    // Files that the build needs are not ignored.
     let ignored = read(".dockerignore");
     for needed in [
         "Cargo.toml",

@@ -1,4 +1,4 @@
-//! One gate: what refuses an order for the state of its drive is built in `core/permit` alone.
+//! The gate is the only place: refusals of an order for the state of its drive are built in `core/permit` alone.
 
 use std::path::Path;
 

@@ -32,7 +32,7 @@ fn no_modules_of_core_need_each_other() {
     for (module, needed) in &mut needs {
         needed.retain(|other| other != module && modules.contains(other));
     }
-    // Whatever needs nothing that is left goes; what remains needs itself by way of others.
+    // Modules that need none of the remaining ones are removed; the rest is part of a cycle.
     loop {
         let done: Vec<String> = needs
             .iter()

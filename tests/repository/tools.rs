@@ -1,4 +1,4 @@
-//! What the scripts around the tests and packages install and leave.
+//! Files that the scripts of the tests and packages install and leave.
 
 use std::fs;
 use std::process::{Command, Stdio};
@@ -62,7 +62,7 @@ fn temporary_files_of_the_tests_go_with_their_run() {
         "removed, and the result is that of the command"
     );
 
-    // One that is killed leaves its directory to the next.
+    // A run that is killed leaves its directory to the next one.
     let mut killed = with("touch \"$TMPDIR/file\"; exec cat")
         .stdin(Stdio::piped())
         .stdout(Stdio::null())

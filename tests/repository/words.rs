@@ -6,7 +6,7 @@ use std::process::Command;
 
 use crate::support::tools::root;
 
-/// What no page and no message says, and what to say instead.
+/// Words that no page and no message has, and what to write instead.
 const INSTEAD: [(&str, &str); 31] = [
     ("told", "reported, shown"),
     ("tells", "reports, shows, says"),
@@ -41,10 +41,10 @@ const INSTEAD: [(&str, &str); 31] = [
     ("lately", "recently"),
 ];
 
-/// Of README and docs, without decisions.
+/// Limit for README and docs, without decisions.
 const MOST_WORDS: usize = 50_000;
 
-/// What is right although a part of it is not.
+/// Phrases that are right although a part of them is refused.
 const RIGHT: [&str; 9] = [
     "there is no",
     "there are no",
@@ -53,7 +53,7 @@ const RIGHT: [&str; 9] = [
     "is no better",
     "are no better",
     "key exchange",
-    // Of a file format.
+    // "data . exchange" is part of a file format.
     "data . exchange",
     "begun . by",
 ];
@@ -142,7 +142,7 @@ fn said(literal: &str) -> String {
         .join("`")
 }
 
-/// All Rust code that is no test.
+/// All Rust files except tests.
 fn code_files(folder: &std::path::Path, found: &mut Vec<PathBuf>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();

@@ -1,4 +1,4 @@
-//! What tests of several targets share: outside programs and processes, a gateway's site, plants made by hand.
+//! Helpers for tests of several targets: outside programs and processes, a gateway's site, plants made by hand.
 #![allow(dead_code, reason = "each target takes what it needs")]
 
 pub(crate) mod mqtt;

@@ -17,7 +17,7 @@ pub(crate) fn client(name: &str, port: u16) -> Command {
     client_of("5", name, port)
 }
 
-/// What `mosquitto_sub` prints of the next message of a topic, or nothing when none comes within 10 s.
+/// Output of `mosquitto_sub` for the next message of a topic; empty when none comes within 10 s.
 pub(crate) fn next_message(port: u16, topic: &str, more: &[&str]) -> Output {
     let mut command = client("mosquitto_sub", port);
     command.args(["-t", topic, "-C", "1", "-W", "10"]).args(more);

@@ -1,4 +1,4 @@
-//! Processes that end with their test, and what is asked of them.
+//! Processes that end with their test, and helpers for their output and signals.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -46,12 +46,12 @@ impl Running {
         Running::spawn(&mut drivegate(arguments))
     }
 
-    /// Whether it runs still.
+    /// Whether the process is still running.
     pub(crate) fn runs(&mut self) -> bool {
         self.child.try_wait().unwrap().is_none()
     }
 
-    /// What it has printed.
+    /// Output of the process so far.
     pub(crate) fn output(&self) -> String {
         self.output.lock().unwrap().clone()
     }
@@ -63,7 +63,7 @@ impl Running {
         })
     }
 
-    /// Its process id.
+    /// Process id.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
     }
@@ -115,10 +115,10 @@ pub(crate) fn drivegate(arguments: &[&str]) -> Command {
     static STARTED: AtomicU32 = AtomicU32::new(0);
     let number = STARTED.fetch_add(1, Ordering::Relaxed);
     let own = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{}/{number}", env!("CARGO_CRATE_NAME")));
-    // Of an earlier run of the tests.
+    // The directory may be left from an earlier run of the tests.
     let _ = std::fs::remove_dir_all(&own);
     let (state, temporary) = (own.join("state"), own.join("tmp"));
-    // What a demo that is killed leaves stays out of the machine's own.
+    // Files of a demo that is killed stay out of the machine's temporary directory.
     std::fs::create_dir_all(&temporary).expect("a directory in that of the tests");
     let mut command = Command::new(env!("CARGO_BIN_EXE_drivegate"));
     command
@@ -181,9 +181,9 @@ pub(crate) fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A TCP port that is free now, and that no other test is given, of this process or of another, as long as this process runs:
-/// a socket that is closed to be bound anew would find the other's try there. It is none of those that the kernel gives to
-/// whoever asks for any, so that nobody has it by chance before it is bound.
+/// A TCP port that is free now, and that no other test gets, of this process or of another, as long as this process runs:
+/// without this a socket that is closed to be bound again could collide with another test. The port is outside the range that
+/// the kernel assigns, so that no other program gets it by chance.
 pub(crate) fn free_port() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     static CLAIMED: Mutex<Vec<UnixListener>> = Mutex::new(Vec::new());
@@ -216,7 +216,7 @@ pub(crate) fn get(port: u16, path: &str) -> Option<(u16, String)> {
     Some((status, text.split_once("\r\n\r\n")?.1.to_string()))
 }
 
-/// Waits until the gateway says that it is ready.
+/// Waits until the gateway reports that it is ready.
 pub(crate) fn until_ready(http: u16) {
     until("200 from /readyz", || {
         get(http, "/readyz").filter(|(status, _)| *status == 200)

@@ -25,7 +25,7 @@ pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncomman
 pub(crate) const HTTP: &str = "[http]\nlisten = \"127.0.0.1:{http}\"\n";
 /// Commands over HTTP, by users in the file `users`.
 pub(crate) const USERS: &str = "commands = true\nusers_file = \"users\"\n";
-/// Of every user.
+/// Password of every user.
 pub(crate) const PASSWORD: &str = "correct horse battery";
 
 /// The section of a Vacon NX; `keys` are further lines of it.
@@ -33,12 +33,12 @@ pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
     format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{keys}\n")
 }
 
-/// One that takes commands.
+/// A drive that takes commands.
 pub(crate) fn controlled(name: &str, address: u8, keys: &str) -> String {
     drive(name, address, &format!("access = \"control\"\n{keys}"))
 }
 
-/// The Vacon NX profile under another name, said to speak Modbus ASCII.
+/// The Vacon NX profile under another name, changed to Modbus ASCII.
 pub(crate) fn nx_in_ascii(name: &str) -> String {
     let text = std::fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
     let changed = text
@@ -56,7 +56,7 @@ pub(crate) struct Site {
 }
 
 impl Site {
-    /// One without a configuration.
+    /// A site without a configuration.
     pub(crate) fn new() -> Site {
         Site {
             folder: tempfile::tempdir().unwrap(),
@@ -66,7 +66,7 @@ impl Site {
         }
     }
 
-    /// One with the configuration that the parts make.
+    /// A site whose configuration is made of these parts.
     pub(crate) fn of(parts: &[&str]) -> Site {
         let site = Site::new();
         site.configure(parts);
@@ -114,8 +114,8 @@ impl Site {
         assert!(added.status.success(), "{added:?}");
     }
 
-    /// Status and reply of a request of a user to the HTTP API, by curl; `more` has the method or the body. It is
-    /// asked again where an order expired: after a pause of the machine of more than a second, starts are refused.
+    /// Status and reply of a user's request to the HTTP API, by curl; `more` has the method or the body. The request is
+    /// repeated where an order expired: after a pause of the machine of more than a second, starts are refused.
     pub(crate) fn curl(&self, user: &str, path: &str, more: &[&str]) -> (u16, serde_json::Value) {
         let url = format!("http://127.0.0.1:{}/api/v1/{path}", self.http);
         let login = format!("{user}:{PASSWORD}");
@@ -130,7 +130,7 @@ impl Site {
         line_of(&self.file("line1"), addresses)
     }
 
-    /// The same as a process of its own.
+    /// Simulates the line in a process of its own.
     pub(crate) fn simulate(&self, arguments: &[&str]) -> Running {
         let line = self.path("line1");
         let running = Running::drivegate(&[&["simulate", "--link", &line], arguments].concat());
@@ -212,7 +212,7 @@ impl Site {
         serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{topic} {payload}: {error}: {output:?}"))
     }
 
-    /// Asks again until the command is carried out: on a busy machine its time may run out.
+    /// Repeats the command until it is carried out: on a busy machine its time may expire.
     pub(crate) fn order(&self, topic: &str, payload: &str) -> serde_json::Value {
         until(payload, || {
             Some(self.ask(topic, payload)).filter(|result| result["ok"] == true)

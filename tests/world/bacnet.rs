@@ -2,7 +2,7 @@
 //! that are away, through the real server, its datagrams, the real core and a simulated line.
 //!
 //! `one_by_one` compares every answer, the arrays and the drive itself with the rules as they are written in `docs/bacnet.md`;
-//! `all_at_once` looks at what must hold whatever happens: nothing starts behind a stop, and nobody is answered twice.
+//! `all_at_once` checks what must always hold: nothing starts behind a stop, and no request is answered twice.
 
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
@@ -44,7 +44,7 @@ struct Client {
     invoke: u8,
     waits: bool,
     last: Vec<u8>,
-    /// The drive was there when it was asked.
+    /// Whether the drive was online when the request was sent.
     taken: bool,
     answers: Vec<Vec<u8>>,
 }
@@ -55,7 +55,7 @@ struct BacnetWorld {
     dice: Random,
     clients: [Client; 3],
     next_poll: Instant,
-    /// When a stop from elsewhere was accepted, and nothing was asked to run since.
+    /// When a stop from elsewhere was accepted, as long as no run was requested since.
     stopped: Option<Instant>,
     elsewhere: Vec<Placed>,
 }
@@ -179,7 +179,7 @@ impl BacnetWorld {
         }
     }
 
-    /// A client asks the drive; a write takes the next number, and one that is sent again its own.
+    /// A client sends a request; a write takes the next invoke id, a repetition keeps its id.
     fn ask(&mut self, client: usize, service: u8, content: &[u8], again: bool) {
         let there = self.rig.is_online(0);
         let asking = &mut self.clients[client];
@@ -198,7 +198,7 @@ impl BacnetWorld {
         self.hear();
     }
 
-    /// The answer to what a client asked; none comes from a drive that is away.
+    /// The answer to a client's request; none comes from an absent drive.
     fn answer(&mut self, client: usize) -> Option<Vec<u8>> {
         let until = self.rig.now + Duration::from_secs(10);
         while self.clients[client].waits && self.step(until) {}
@@ -257,7 +257,7 @@ impl BacnetWorld {
         }
     }
 
-    /// Whether the drive is told to run.
+    /// Whether the drive has a run command.
     fn runs(&mut self) -> bool {
         let profile = self.rig.bus.profile.clone();
         let place = profile.run_place().unwrap();
@@ -279,7 +279,7 @@ impl BacnetWorld {
         self.rig.place_as("cloud", DRIVE, order)
     }
 
-    /// The same, with its answer.
+    /// Gives an order from elsewhere and waits for its outcome.
     fn elsewhere(&mut self, points: &[(&str, f64)]) -> Outcome {
         let mut placed = self.order_elsewhere(points);
         let until = self.rig.now + Duration::from_secs(10);
@@ -315,7 +315,7 @@ fn values(array: &Array) -> Vec<Option<f64>> {
 }
 
 impl Rules {
-    /// What keeps an order from elsewhere.
+    /// Whether the slots refuse an order from elsewhere.
     fn protects(&self, starts: bool, sets: bool) -> bool {
         let run = governs(&self.run).is_some_and(|(priority, value, _)| priority <= 5 && value == 0.0);
         let speed = governs(&self.speed).is_some_and(|(priority, ..)| priority <= 5);
@@ -325,7 +325,7 @@ impl Rules {
     fn elsewhere(&mut self, run: Option<bool>, sets: bool) {
         if let Some(run) = run {
             let other = |slot: &(f64, usize)| (slot.0 != 0.0) != run;
-            // What protects people outlives a start, also behind an active that governs.
+            // An inactive that protects people outlives a start, even behind an active that governs.
             let protects = |place: usize| run && place < 5;
             for (place, slot) in self.run.iter_mut().enumerate() {
                 *slot = slot.filter(|slot| !other(slot) || protects(place));
@@ -349,7 +349,7 @@ impl Rules {
 
 const PRIORITIES: [u8; 9] = [1, 3, 5, 6, 7, 8, 10, 12, 16];
 
-/// One seed in which everybody waits for everybody.
+/// A seed in which each client waits for its answer.
 fn one_by_one(seed: u64) {
     let mut world = BacnetWorld::new(seed, "");
     let mut rules = Rules::default();
@@ -414,7 +414,7 @@ fn one_by_one(seed: u64) {
                 }
             }
             _ => {
-                // Nobody but one whose slot does not govern says anything.
+                // Only a client whose slot does not govern acts now.
                 let own = governs(&rules.run).map(|(.., client)| client);
                 let other = usize::from(own == Some(0));
                 for _ in 0..10 {
@@ -449,7 +449,7 @@ fn slots_answers_and_the_drive_are_as_the_rules_say() {
     }
 }
 
-/// One seed in which nobody waits, frames are lost and the drive goes away.
+/// A seed in which clients do not wait, frames are lost and the drive goes away.
 fn all_at_once(seed: u64) -> (usize, usize) {
     let faults = ["", "drop=0.05", "deaf=0.05,corrupt=0.05"][seed as usize % 3];
     let mut world = BacnetWorld::new(seed, faults);
@@ -460,7 +460,8 @@ fn all_at_once(seed: u64) -> (usize, usize) {
         let pause = Duration::from_millis(world.dice.within(0..=200));
         match world.dice.within(0..=15) {
             0..=9 if world.clients[client].waits => {
-                // The answer is late: the same once more. It is no new order, unless the drive was away before.
+                // The answer is late, so the client repeats its request. The repetition is not a new order, unless the
+                // drive was away before.
                 let content = world.clients[client].last.clone();
                 if !world.clients[client].taken {
                     world.stopped = None;
@@ -506,7 +507,7 @@ fn all_at_once(seed: u64) -> (usize, usize) {
     for client in &mut world.clients {
         client.waits = false;
     }
-    // It works as it did: a stop is done, nothing stands, and it can be started again.
+    // The world works as at the start: a stop is done, no slot is active, and the motor can be started again.
     assert!(matches!(world.elsewhere(&[("run", 0.0)]), Outcome::Acknowledged(_)));
     assert!(!world.runs() && world.array(RUN).iter().all(|slot| *slot != Some(1.0)));
     for priority in PRIORITIES.into_iter().filter(|priority| *priority != 6) {

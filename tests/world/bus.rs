@@ -1,4 +1,4 @@
-//! One bus of a world: the real core, and a simulated line where the port would be.
+//! A bus of a world: the real core, and a simulated line in place of the port.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -27,18 +27,18 @@ use drivegate_world::start_guard::{BusGuards, Guards};
 
 use super::scenario::Line;
 
-/// What went over the line last.
+/// Last request on the line.
 #[derive(Debug, Clone)]
 pub struct Asked {
     pub drive: usize,
     pub pdu: RequestPdu,
     pub at: Instant,
     pub is_poll: bool,
-    /// What was ordered is written again.
+    /// Whether the request is a refresh: an order written again.
     pub is_refresh: bool,
     /// When the image had the first word of a read from, before.
     pub last_read: Option<Instant>,
-    /// What the drive answered, if it acted upon the request.
+    /// Reply of the drive, if it acted upon the request.
     pub reply: Option<Reply>,
     /// The frame of that.
     pub frame: Vec<u8>,
@@ -68,7 +68,7 @@ pub struct WorldBus {
     pub guards: Arc<Guards>,
     pub profile: Arc<Profile>,
     pub open: bool,
-    /// It was asked to stop its drives: its polls cease.
+    /// Whether the bus is about to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
     /// Replies may come when they are not expected any more, or twice.
@@ -77,7 +77,7 @@ pub struct WorldBus {
     pub round: Duration,
     /// The slow cycle of the line, as predicted.
     pub slow_round: Duration,
-    /// The same while drives come online, whose process data is compared with its monitoring registers.
+    /// The slow round while drives come online, whose process data is compared with its monitoring registers.
     pub first_slow_round: Duration,
     /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
     pub flips: f64,
@@ -92,7 +92,7 @@ pub struct WorldBus {
     ended: Option<Asked>,
 }
 
-/// What a line has that is not in its description.
+/// Properties of a line that its description does not have.
 pub struct Parts {
     pub profile: Arc<Profile>,
     pub drives: Vec<DriveOptions>,
@@ -100,7 +100,7 @@ pub struct Parts {
     pub flips: f64,
     pub delivery: Delivery,
     pub silence: Silence,
-    /// How many times as fast the line is as its baud rate says.
+    /// Factor by which the line is faster than its baud rate.
     pub wire_speed: u32,
 }
 
@@ -283,7 +283,7 @@ impl WorldBus {
         now - self.began
     }
 
-    /// When the bus wants to be looked at next.
+    /// When the bus needs its next step.
     pub fn wake_at(&self) -> Instant {
         let wire = self.wire.wake().map(|wake| self.began + wake.at);
         let core = self.open.then_some(self.until);
@@ -358,7 +358,7 @@ impl WorldBus {
         self.note_acts(seen);
     }
 
-    /// Its thread sleeps until then, or until an order comes.
+    /// The thread of the bus sleeps until this time, or until an order comes.
     pub fn waits(&mut self, until: Instant, commands: bool, seen: &mut Vec<Seen>) {
         self.note_over(seen);
         (self.until, self.commands) = (until, commands);
@@ -395,8 +395,7 @@ impl WorldBus {
         self.note_acts(seen);
     }
 
-    /// What is due on the wire reaches the drives, and the gateway, which reads it even if there is nothing when it `stood`
-    /// still.
+    /// Delivers the due bytes to the drives and to the gateway, which also reads without bytes after it `stood` still.
     pub fn deliver(&mut self, now: Instant, stood: bool, seen: &mut Vec<Seen>) {
         let sim = self.sim(now);
         self.wire.on_time(sim);
@@ -428,7 +427,7 @@ impl WorldBus {
                 .get(DriveIndex::new(asked.drive))
                 .is_none_or(|image| image.spec.address == act.address);
             if let Some(broadcast) = self.broadcast.as_mut().filter(|_| !is_asked) {
-                // A drive may carry a broadcast out when another one is asked already.
+                // A drive may carry a broadcast out after the request to another drive was sent.
                 broadcast.acted = act.address;
                 seen.push(Seen::Acted(broadcast.clone()));
                 continue;

@@ -48,7 +48,7 @@ pub struct Waiting {
 pub struct Broker {
     /// The gateway is not connected until then.
     pub away_until: Option<Instant>,
-    /// What it delivered last, with the time and the number of the order: it repeats what was not acknowledged.
+    /// The last messages delivered, with the time and the number of the order: the broker repeats unacknowledged ones.
     pub delivered: VecDeque<(Instant, usize, Incoming)>,
     /// Messages that wait for the gateway to be back.
     pub waiting: u64,

@@ -1,4 +1,4 @@
-//! Orders that stop a drive and ask for more: the stop goes out whatever is wrong with the rest, and one answer tells both.
+//! Orders that stop a drive and do more: the stop is sent whatever is wrong with the rest, and one answer reports both.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use super::scenario::Line;
 const CONTROL_WORD: u16 = 2000;
 const REFERENCE: u16 = 2002;
 
-/// One drive that runs at 50 %.
+/// A drive that runs at 50 %.
 fn running(protocol: Protocol, family: &'static str) -> Rig {
     let line = Line {
         spec: |spec| {
@@ -99,7 +99,7 @@ fn a_value_outside_the_limits_does_not_keep_the_stop_back() {
     assert!(!outcome.is_ok() && outcome.exception() == Some(Exception::VALUE));
     assert_eq!(writes(&rig, before), [(6, CONTROL_WORD)]);
     rig.until_state(1, State::Ready);
-    // Of a raw block the control word goes alone.
+    // The control word of a raw block is sent alone.
     let mut rig = nx();
     let before = rig.requests().len();
     let outcome = rig.ordered(1, block(0, 9_000));
@@ -133,7 +133,7 @@ fn a_held_drive_takes_the_stop_and_nothing_else() {
         assert_eq!(writes(&rig, before), [(6, CONTROL_WORD)]);
     }
     assert_eq!(rig.word(1, REFERENCE), 5_000);
-    // What only stops is done and told so.
+    // A command that only stops is done and acknowledged.
     assert!(rig.set(1, &[("run", 0.0), ("reverse", 0.0)]).is_ok());
     assert!(rig.ordered(1, write(CONTROL_WORD, 0)).is_ok());
     rig.until_state(1, State::Ready);

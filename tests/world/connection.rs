@@ -1,4 +1,4 @@
-//! A device server that closes its connection: after replies, in mid-exchange, for good.
+//! A device server that closes its connection: after replies, in mid-transaction, permanently.
 
 use std::time::Duration;
 
@@ -25,7 +25,7 @@ fn usual() -> [Rig; 3] {
         for address in 1..=line.drives {
             rig.until_state(address, State::Ready);
         }
-        // What commands rest on is read, too.
+        // The points on which commands depend are read, too.
         rig.run(3 * SECOND);
         rig
     })
@@ -95,7 +95,7 @@ fn values_and_drives_stay_as_they_are_whenever_the_server_closes() {
     }
 }
 
-/// What is asked within 5 ms of a reply goes into a connection that nobody reads.
+/// A request within 5 ms of a reply goes into a connection that the server no longer reads.
 #[test]
 fn a_server_that_closes_soon_after_each_reply_costs_no_time_of_a_reply() {
     for mut rig in usual() {
@@ -184,7 +184,7 @@ fn a_write_upon_which_the_server_closes_is_unknown_and_the_line_goes_on() {
 fn a_server_that_answers_nothing_any_more_is_lost() {
     for mut rig in usual() {
         assert_eq!(close_on(&mut rig, is_over, false), Closed::Reconnect);
-        // Idle: there is time until something is to be asked.
+        // The line is idle: there is time until the next request.
         assert_eq!(rig.bus.core.closed(rig.now), Closed::ReconnectToAsk);
         rig.bus.core.reconnected();
         assert_eq!(rig.bus.core.closed(rig.now), Closed::Lost, "it takes no request at all");
@@ -234,8 +234,8 @@ fn a_server_that_closes_all_the_time_is_told_and_nothing_else() {
     }
 }
 
-/// What was learned of a line that is faster than its baud rate holds for the next connection and for the next bus, so that
-/// no reply is doubted.
+/// The measured speed of a line that is faster than its baud rate holds for the next connection and for the next bus, so
+/// that no reply is doubted.
 #[test]
 fn a_line_that_is_faster_than_its_baud_rate_is_known_after_an_outage() {
     for usual in [

@@ -27,10 +27,10 @@ fn works(family: &'static str, faults: &str) -> Line {
     }
 }
 
-/// What the orders so far allow the motor.
+/// State that the orders so far allow the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Allowed {
-    /// A stop was acknowledged, and nothing that starts was given since.
+    /// A stop was acknowledged, and no start was given since.
     Stands,
     /// A run command was given, whatever became of it.
     MayRun,
@@ -70,7 +70,8 @@ impl World {
         (self.reference, f64::from(self.dice.within(0..=39) as u32) + 10.0)
     }
 
-    /// One order and its outcome; what it allows counts from when it was given, a stop from its acknowledgement.
+    /// Gives an order and waits for its outcome; a permission counts from when the order was given, a stop from its
+    /// acknowledgement.
     fn order(&mut self, points: &[(&str, f64)]) -> Outcome {
         let run = points.iter().find(|(name, _)| *name == "run").map(|(_, value)| *value);
         if run == Some(1.0) {

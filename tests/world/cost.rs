@@ -1,4 +1,4 @@
-//! What a silent drive, garbled frames and stops that nobody answers cost the other drives of a line.
+//! Costs of a silent drive, damaged frames and unanswered stops for the other drives of a line.
 
 use std::time::Duration;
 

@@ -14,13 +14,13 @@ use super::rig::{Rig, line};
 use super::scenario::Line;
 
 const SECOND: Duration = Duration::from_secs(1);
-/// Within this time each cause must be told.
+/// Time within which each cause must be reported.
 const TOLD: Duration = Duration::from_secs(60);
 
 /// When the drive is started whose line is to be disturbed by it.
 const RUNS_FROM: Duration = Duration::from_secs(20);
 
-/// What is told: causes, and the addresses of drives they are about (0: none).
+/// Reported causes, each with the address of its drive (0: none).
 type Told = BTreeSet<(Cause, u8)>;
 
 /// The usual lines.
@@ -32,7 +32,7 @@ fn lines() -> [Line; 3] {
     ]
 }
 
-/// A cause, and what is to be told of it on a line with so many drives.
+/// A cause, and the expected report on a line with a number of drives.
 struct Case {
     name: &'static str,
     faults: fn(u8, u64) -> FaultPlan,
@@ -273,7 +273,7 @@ fn each_cause_is_told_within_a_minute() {
     assert!(wrong.is_empty(), "{} of all: {}", wrong.len(), wrong.join("\n"));
 }
 
-/// A line without a fault, and what befalls it that is none of the line's.
+/// A line without a fault, and incidents that are not faults of the line.
 struct Sound {
     name: String,
     line: Line,
@@ -382,7 +382,7 @@ fn nothing_is_told_of_a_sound_line() {
         let mut parts = Parts::of(0, &sound.line, 5);
         (sound.parts)(&mut parts);
         let mut rig = Rig::new(&sound.line, parts);
-        // A drive that was never there is no fault of the line, and is told as what it is.
+        // A drive that was never there is not a fault of the line, and is reported as such.
         let never: Told = sound
             .line
             .dead
@@ -424,13 +424,13 @@ fn a_drive_that_never_answered_is_told_until_it_answers() {
             "{verdict:?}"
         );
         assert!(verdict.remedy.contains("drivegate scan"), "{verdict:?}");
-        // What to look at is that of this family.
+        // The steps to check are those of this family.
         let lamp = match line.family {
             "teco-7300pa" => "teco-7300pa: LED 3 dark: line, terminals, or no master (inference)",
             family => &format!("{family}: green LED (FS) steady: the board is active and has seen no message yet"),
         };
         assert!(verdict.steps.iter().any(|step| step.starts_with(lamp)), "{verdict:?}");
-        // It is switched on, and off again: it has answered.
+        // The drive is switched on, and off again: it has answered by then.
         rig.with_drive(2, |drive, now| drive.power_on(now));
         rig.run(2 * TOLD);
         assert_eq!(told(&rig), Told::new(), "{}", line.family);
@@ -440,7 +440,8 @@ fn a_drive_that_never_answered_is_told_until_it_answers() {
     }
 }
 
-/// A Vacon CX counts what it receives damaged (function 08): with that the verdict tells which direction is bad.
+/// A Vacon CX counts the damaged messages it receives (function 08): with that the verdict shows which direction is
+/// bad.
 #[test]
 fn a_drive_that_counts_tells_which_direction_is_bad() {
     let evidence = |rates: &str| {
@@ -462,7 +463,7 @@ fn a_drive_that_counts_tells_which_direction_is_bad() {
             .find(|verdict| verdict.verdict == Cause::OneDrive);
         let counted = diagnosis.drives[1].by_drive;
         assert!(counted.is_some_and(|counted| counted.own > 100), "{counted:?}");
-        // Nobody asks a drive whose line is sound.
+        // The counters of a drive with a sound line are not read.
         assert_eq!(diagnosis.drives[0].by_drive, None);
         of_it.map(|verdict| verdict.evidence.clone()).unwrap_or_default()
     };

@@ -22,7 +22,7 @@ const LIMIT: Duration = Duration::from_secs(25);
 /// PDU address of a parameter of a Vacon NX: what it does when its master was silent for 20 s; 2 is a fault with the stop function,
 /// 0 nothing.
 const FIELDBUS_FAULT_RESPONSE: u16 = 732;
-/// That of its deceleration time, 0.1 s.
+/// Register of the deceleration time, 0.1 s.
 const DECELERATION: u16 = 103;
 const OPTIONS: DrillOptions = DrillOptions {
     max_speed: 20.0,
@@ -88,7 +88,7 @@ impl Play {
         id
     }
 
-    /// Runs a drill to its end; `meanwhile` is called at each look with what is said of it.
+    /// Runs a drill to its end; `meanwhile` is called at each step with its report.
     fn drill(&mut self, kinds: &[Kind], mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> DrillReport {
         let id = self.begin(kinds, 10.0);
         let drills = self.drills.clone();
@@ -132,7 +132,7 @@ fn drives_that_stop_pass() {
         let mut play = Play::of(&works(family, protocol), 5);
         let report = play.drill(&[Kind::Order, Kind::Client], |_, _| {});
         if family == "siemens-g120" {
-            // It says nothing by which standstill could be seen.
+            // The Siemens G120 has no point that shows standstill.
             assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
             play.healed();
             continue;
@@ -225,7 +225,7 @@ fn what_does_not_stop_is_named() {
         DrillState::Failed,
         "after a silence of 25 s the motor still turns",
     );
-    // It ignores stops: another master keeps it running.
+    // The drive ignores stops: another master keeps it running.
     let mut play = of();
     let report = play.drill(&[Kind::Order], |rig, report| {
         if is_at(report, "a stop command was sent") && !turns(rig) {
@@ -239,13 +239,13 @@ fn what_does_not_stop_is_named() {
         }
     });
     ends(&mut play, &report, DrillState::Failed, "the motor still turns");
-    // It takes too long to stand.
+    // The drive takes too long to stand.
     let mut play = of();
     play.rig.at_the_drive(1, DECELERATION, 6000);
     let report = play.drill(&[Kind::Order], |_, _| {});
     play.rig.at_the_drive(1, DECELERATION, 30);
     ends(&mut play, &report, DrillState::Failed, "the motor still turns");
-    // It is switched to local, gets a fault, is stopped, or ordered by another client.
+    // The drive is switched to local, gets a fault, is stopped, or gets an order of another client.
     let mut play = of();
     let report = play.drill(&[Kind::Client], |rig, report| {
         if is_at(report, "the client is silent") {
@@ -280,7 +280,7 @@ fn what_does_not_stop_is_named() {
         });
         ends(&mut play, &report, DrillState::Aborted, text);
     }
-    // It never starts to turn.
+    // The motor never starts to turn.
     let mut play = of();
     let report = play.drill(&[Kind::Order], |rig, _| {
         rig.with_drive(1, |drive, _| drive.set_alive(false))
@@ -293,12 +293,12 @@ fn what_does_not_stop_is_named() {
     play.healed();
 }
 
-/// What goes wrong in a drill.
+/// Trouble during a drill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Trouble {
     /// Another master keeps it running.
     IgnoresStops,
-    /// The same for three seconds, which is in time.
+    /// Another master keeps the drive running for three seconds, which is in time.
     StopsLate,
     Local,
     Fault,
@@ -331,7 +331,7 @@ impl Trouble {
         }
     }
 
-    /// Makes it happen at the look at which `report` is said.
+    /// Causes the trouble at the step whose `report` calls for it.
     fn look(self, rig: &mut Rig, report: &DrillReport, happened: &mut Option<Instant>) {
         let steady = is_at(report, "the motor turns at");
         let stopping = is_at(report, "a stop command was sent");
@@ -382,7 +382,7 @@ impl Trouble {
         }
     }
 
-    /// What the drill has to say.
+    /// Expected result of the drill.
     fn expected(self) -> (DrillState, &'static str) {
         match self {
             Trouble::IgnoresStops => (DrillState::Failed, "the motor still turns"),
@@ -410,7 +410,7 @@ fn whatever_goes_wrong_is_named_with_every_family() {
             let mut play = Play::of(&works, number as u64);
             let has_remote = play.rig.good(1, ModelPoint::Remote).is_some();
             if trouble == Trouble::Local && !has_remote {
-                // It does not say who commands it, and stops or not.
+                // The drive does not report its control place, so the trouble cannot be seen.
                 continue;
             }
             let (mut happened, mut turned) = (None, false);
@@ -508,7 +508,7 @@ fn one_at_a_time_by_who_armed_it_and_within_a_minute() {
     );
 }
 
-/// What a file keeps of drills, written `looks` looks after it was due: a disk that is slow.
+/// The file of drills on a slow disk, written `looks` steps after it was due.
 struct Disk {
     on_disk: Option<SavedDrills>,
     writing: Option<(u32, u64, SavedDrills)>,
@@ -567,7 +567,7 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
             );
         }
         let turned = turns(&mut play.rig);
-        // What the process that was killed knew is gone, but for its file.
+        // The killed process leaves only its file.
         let drive = play.rig.drive(1);
         drive.bus.queue.set_drill(drive.index, None);
         play.drills = Arc::default();

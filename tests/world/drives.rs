@@ -1,4 +1,4 @@
-//! What is true of a drive, as seen on its line and inside it, and what must follow from that.
+//! The true state of a drive, as seen on its line and inside it, and what must follow from that.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use super::orders::{Unique, sets};
 /// Acts of a drive that are remembered.
 const KEPT: usize = 400;
 
-/// One drive of a world.
+/// A drive of a world.
 #[derive(Debug)]
 pub struct Truth {
     /// The run command, as the drive has it.
@@ -24,9 +24,9 @@ pub struct Truth {
     pub last_place: usize,
     /// The last order with these words: they come again after some thousands.
     pub uniques: HashMap<Unique, usize>,
-    /// What the drive did, with the words that it answered.
+    /// Requests that the drive carried out, with the words that it answered.
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
-    /// What orders set last, as the drive took it.
+    /// Values that orders set last, as the drive took them.
     pub ordered: HashMap<(Table, u16), u16>,
     /// The run command was written last, by an order or again.
     pub fed: Option<Instant>,
@@ -34,7 +34,7 @@ pub struct Truth {
     pub ran_by_order: Option<Instant>,
     /// An order to it waited last.
     pub waited_until: Option<Instant>,
-    /// The latest time at which a client was heard of for certain, and the latest at which it may have been.
+    /// The latest time at which a client was certainly alive, and the latest at which it may have been.
     pub heard: (Option<Instant>, Option<Instant>),
     /// The motor runs since.
     pub running_since: Option<Instant>,
@@ -47,7 +47,7 @@ pub struct Truth {
     pub supervised: Option<Instant>,
     /// Something befell it: until then that excuses much.
     pub troubled_until: Option<Instant>,
-    /// Its bus was started anew: until then that excuses some of it.
+    /// The bus was restarted: until this time that excuses some deviations.
     pub found_anew_until: Option<Instant>,
     /// The word of the control register was changed by something else than the line.
     pub lost_word: Option<Instant>,
@@ -65,7 +65,7 @@ pub struct Truth {
     pub offline_since: Option<Instant>,
     /// The bus was started anew while it ran, its lease being of then.
     pub carried: Option<Instant>,
-    /// Its maximum frequency in Hz, and since when it has that.
+    /// Maximum frequency in Hz, with the time from which it applies.
     pub maxima: Vec<(Instant, f64)>,
 }
 

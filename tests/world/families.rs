@@ -1,5 +1,5 @@
-//! Every family of the reference, over every protocol it speaks, commanded through the same sequence and read by the
-//! same names: what differs is in the profiles, nobody who commands a drive has to know.
+//! Every family of the reference, over every protocol it speaks, commanded through one sequence and read by one set of
+//! names: the differences are in the profiles, and clients need not know them.
 
 use drivegate_world::codec::Protocol;
 use drivegate_world::drive::profile::Profiles;

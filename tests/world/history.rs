@@ -1,4 +1,4 @@
-//! What happened in a world, of which the end is printed when a check fails.
+//! Events of a world; the last ones are printed when a check fails.
 
 use std::collections::VecDeque;
 use std::time::Duration;

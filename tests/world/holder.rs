@@ -22,7 +22,7 @@ use drivegate_world::drive::DriveIndex;
 const SECOND: Duration = Duration::from_secs(1);
 const LEASE: Duration = Duration::from_secs(3);
 const DRIVES: u8 = 2;
-/// Each client on a north side of its own. The reference that it sets tells whose a frame is: 10 % and as many more as its place.
+/// Each client on a north side of its own. Its reference identifies its frames: 10 % plus its place.
 const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
 /// Their ranks; the last one has none.
 const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
@@ -151,7 +151,7 @@ impl Play {
         }
     }
 
-    /// Whose frame may be on the wire: that of the holder, or, while nobody holds the drive, of one whose order was accepted before.
+    /// Checks the sender of a frame: only the holder, or, while the drive is free, a client whose order was accepted before.
     fn note(&mut self, seen: Seen) {
         let Seen::Sent(asked) = seen else { return };
         let Some((Table::Holding, items)) = written(&asked.pdu) else {
@@ -183,7 +183,7 @@ impl Play {
                 let mut orders = self.orders.iter();
                 orders.any(|(drive, of, _)| (*drive, *of) == (asked.drive, client))
             };
-            // What the word itself says of whose it is.
+            // A reference in the word identifies its client.
             let wrote = |client: usize| runs || usize::from(word) == 1000 + 100 * client;
             let whose = (0..CLIENTS.len()).find(|client| may(*client) && ordered(*client) && wrote(*client));
             assert!(whose.is_some(), "{:?} while {state:?} for {holder}", asked.pdu);
@@ -198,7 +198,7 @@ impl Play {
         placed
     }
 
-    /// An order that needs the drive: whoever has to be refused is refused at once.
+    /// An order that needs the drive: a client that must be refused is refused at once.
     fn steer(&mut self, client: usize, drive: usize, points: &[(&str, f64)]) {
         let (state, holder) = self.holder(drive);
         let other = CLIENTS
@@ -296,7 +296,7 @@ impl Play {
     }
 }
 
-/// Number of worlds, each of about a thousand actions: 12, or what `make world` says.
+/// Number of worlds, each of about a thousand actions: 12, or set by `make world`.
 fn worlds() -> u64 {
     super::number("HOLDER_SEEDS").unwrap_or(12)
 }
@@ -426,7 +426,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
                 play.act();
             }
             if round % 67 == 66 && !play.faulty {
-                // What is on its way when a bus starts anew may end in any way.
+                // Orders in progress when a bus restarts may end in any way.
                 play.run(DEFAULT_EXPIRY + SECOND);
                 play.look();
                 let killed = play.dice.chance(0.5);

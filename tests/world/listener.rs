@@ -1,5 +1,5 @@
-//! The decoder of a line that another master owns, without drives: what it believes of frames whose order, damage and delay a seed
-//! decides is what was said to the request that it names.
+//! The decoder of a line that another master owns, without drives: every reply it accepts was sent to the request that it names,
+//! with frames whose order, damage and delay a seed decides.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use drivegate_world::bus::listener::{Decoder, Heard};
 use drivegate_world::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Table, ascii, n2, rtu};
 
-/// What a decoder believes of frames that follow one another, each with a pause in ms before it: address, first register, words.
+/// Replies that a decoder accepts from successive frames, each with a pause in ms before it: address, first register, words.
 fn believed(protocol: Protocol, frames: &[(&[u8], u64)]) -> Vec<(u8, u16, Vec<u16>)> {
     let format = LineFormat::new(19_200, "8N1").unwrap();
     let mut decoder = Decoder::new(protocol, format, BTreeMap::new());
@@ -58,7 +58,7 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     assert_eq!(all(&later), [(1, 20, vec![5])]);
     // A late reply of one drive is none of another.
     assert_eq!(all(&[(&one, 5), (&other, 200), (&said_by_2, 5)]), [(2, 20, vec![6])]);
-    // A glitch before the reply matters to nobody; more may have been another request.
+    // A glitch before the reply does not matter; more bytes may have been another request.
     let behind = |count: usize| [vec![0xFE; count], said.clone()].concat();
     assert_eq!(all(&[(&one, 5), (&behind(2), 5)]), std::slice::from_ref(&first));
     let mut mangled = two.clone();
@@ -79,7 +79,7 @@ fn a_reply_of_bits_that_could_be_a_request_is_not_believed() {
     let ask = framed(1, &[1, 0, 0, 0, 24]);
     let reply = framed(1, &[1, 3, 0x12, 0x00, 0x10]);
     assert_eq!(believed(Protocol::ModbusRtu, &[(&ask, 5), (&reply, 5)]), []);
-    // One that cannot be a request: 0xF012 bits are too many.
+    // This reply cannot be a request: 0xF012 bits are too many.
     let reply = framed(1, &[1, 3, 0x12, 0xF0, 0x12]);
     assert_eq!(believed(Protocol::ModbusRtu, &[(&ask, 5), (&reply, 5)]).len(), 1);
     let line = |pdu: &[u8]| {
@@ -127,7 +127,7 @@ impl Dice {
     }
 }
 
-/// What befalls the line: shares of bytes, and shares of replies.
+/// Faults of the line: shares of bytes, and shares of replies.
 #[derive(Debug, Clone, Copy, Default)]
 struct Fate {
     garbled: f64,
@@ -137,7 +137,7 @@ struct Fate {
     late: f64,
 }
 
-/// A master, drives whose every word is different, and the decoder beside them.
+/// A master, drives whose every word is different, and the decoder that listens to them.
 struct Talk {
     protocol: Protocol,
     format: LineFormat,
@@ -243,7 +243,7 @@ impl Talk {
         frame
     }
 
-    /// One request; drives answer what they hear, sometimes late or never.
+    /// Sends a request; drives answer the requests they receive, sometimes late or never.
     fn ask(&mut self, address: u8, start: u16, count: u16) {
         let pdu = RequestPdu::Read {
             table: Table::Holding,
@@ -253,7 +253,7 @@ impl Talk {
         let request = Request::new(address, pdu);
         let mut frame = Vec::new();
         self.protocol.encode(&request, &mut frame);
-        // What still comes of earlier requests comes before, or into the request: then neither is heard.
+        // Late replies to earlier requests come before this request, or collide with it: then neither is received.
         let end = self.now + self.format.chars(frame.len());
         let (before, rest): (Vec<_>, Vec<_>) = std::mem::take(&mut self.coming)
             .into_iter()

@@ -1,5 +1,5 @@
-//! The gateway listens while another master polls simulated drives: what enters the image is what the drive said, whatever
-//! befalls the line on its way to the gateway, and nothing goes out.
+//! The gateway listens while another master polls simulated drives: only values sent by the drive enter the image,
+//! whatever happens on the line to the gateway, and nothing is sent.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -30,7 +30,7 @@ use super::scenario::Line;
 /// Time limit of the other master for the first byte of a reply.
 const PATIENCE: Duration = Duration::from_millis(100);
 
-/// What befalls the bytes between the line and the gateway: shares of bytes.
+/// Faults of the bytes between the line and the gateway: shares of bytes.
 #[derive(Debug, Clone, Copy, Default)]
 struct Noise {
     garbled: f64,
@@ -40,7 +40,7 @@ struct Noise {
     lumps: usize,
 }
 
-/// Another master, its drives, and the gateway beside them.
+/// Another master, its drives, and the gateway that listens.
 struct Scene {
     line: Line,
     wire: HalfDuplex,
@@ -122,7 +122,7 @@ impl Scene {
         self.began + self.now
     }
 
-    /// What the wire carries reaches the gateway, the last byte now.
+    /// Carries bytes from the wire to the gateway, the last byte now.
     fn carry(&mut self, bytes: &[u8]) {
         let mut heard = Vec::with_capacity(bytes.len() + 2);
         for byte in bytes {
@@ -147,7 +147,7 @@ impl Scene {
         }
     }
 
-    /// One exchange of the other master, with tries after the first; the reply that it took.
+    /// A transaction of the other master, with `tries`; returns the reply that it accepted.
     fn ask(&mut self, address: u8, pdu: &RequestPdu, tries: u32) -> Option<Reply> {
         (0..tries).find_map(|_| self.try_once(address, pdu))
     }
@@ -195,7 +195,7 @@ impl Scene {
         taken
     }
 
-    /// What the drives answered since.
+    /// Records the answers of the drives since the last call.
     fn note(&mut self, request: &Request) {
         for act in self.wire.take_acts() {
             let RequestPdu::Read { table, start, count } = request.pdu else {
@@ -226,7 +226,7 @@ impl Scene {
         drives.flat_map(of).collect()
     }
 
-    /// What changed in the image is what the drive said to this very request.
+    /// Every change in the image is a value that the drive sent in answer to this request.
     fn check(&mut self, address: u8, pdu: &RequestPdu, before: &[Option<Instant>]) {
         let after = self.times();
         let drives = self.handle.image.drives.iter();
@@ -455,7 +455,7 @@ fn values_are_good_while_the_other_master_reads_them() {
     let quality = |scene: &Scene| drive.reading(scene.instant(), stale_after).overall();
     assert_eq!(quality(&scene), Quality::Good);
     assert!(drive.snapshot().link.is_online());
-    // It stops.
+    // The other master stops.
     scene.now += Duration::from_secs(40);
     scene.core.on_time(scene.instant());
     assert_eq!(quality(&scene), Quality::Stale);
@@ -471,7 +471,7 @@ fn commands_of_the_other_master_are_told_when_they_change() {
         start: 2000,
         values: vec![word, 0, reference],
     };
-    // The same words a hundred times, then a stop.
+    // The other master repeats its words a hundred times, then stops the drive.
     for _ in 0..100 {
         scene.ask(1, &run(1, 5000), 1);
     }

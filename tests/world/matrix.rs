@@ -26,7 +26,7 @@ use super::rig::{Counts, Rig, line, write};
 const DRIVES: u8 = 3;
 /// How long faults come at a high rate.
 const STORM: Duration = Duration::from_secs(30);
-/// The same on N2, which is slow.
+/// The storm on N2, which is slow.
 const N2_STORM: Duration = Duration::from_secs(150);
 /// Time between the answer to a write and the next one.
 const PAUSE: Duration = Duration::from_millis(7);
@@ -84,7 +84,7 @@ fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
     rig
 }
 
-/// What the counters must show of a fault.
+/// Effect of a fault on the counters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shows {
     /// Nothing: the exchange goes well.
@@ -209,7 +209,7 @@ impl Watched {
         watched
     }
 
-    /// What the image has of the process data of a drive.
+    /// Process data of a drive in the image.
     fn stored(&self, drive: usize) -> Vec<((usize, Table, u16), u16)> {
         let image = &self.rig.bus.handle.image.drives[drive];
         let snapshot = image.snapshot();
@@ -325,7 +325,7 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
     // An echo that ceases takes the acknowledgement of a write with it.
     watched.run(Duration::from_secs(1), false);
     let ok = watched.rig.counts().since(before).ok;
-    // What the last fault brings is waited for, and the drives that were taken for dead.
+    // Waits for the effects of the last fault, and for drives that were taken for dead.
     watched.rig.set_faults(FaultPlan::default());
     watched.run(BACK / 10, false);
     let counts = watched.rig.counts().since(before);
@@ -370,12 +370,12 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
         s.silence_violations == 0,
         format!("{} silence violations", s.silence_violations),
     );
-    // A late reply to a request that was repeated is believed, rightly; the drive's second reply then meets the next
-    // request. Nobody who does not know the future can avoid that.
+    // A late reply to a repeated request is accepted, correctly; the drive's second reply then meets the next request.
+    // That cannot be avoided without knowing the future.
     let late = row.rates.contains("late");
     must(late || s.collisions == 0, format!("{} collisions", s.collisions));
     must(s.bad_crc == 0, format!("{} broken requests", s.bad_crc));
-    // So it is with a frame that is seen at its end only, after the line seemed silent.
+    // A frame that is seen only at its end, after the line seemed silent, meets the next request as well.
     let unseen = late || (row.rates.contains("double") && row.delivery != Delivery::Chunks(1));
     let met = s.provoked_overlaps;
     must(unseen || met == 0, format!("{met} requests met noise"));
@@ -519,7 +519,7 @@ fn modbus_ascii() {
         row("stray-length", Foreign, 0.8),
         named("echo", "echo=1", Nothing, 0.99),
         named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.03),
-        // Before a colon it is no matter at all.
+        // Noise before a colon has no effect.
         row("noise-before", Nothing, 0.95),
         row("noise-after", Foreign, 0.95),
         by(1, row("noise-after", Foreign, 0.95)),

@@ -1,4 +1,4 @@
-//! One bus with N2 boards: sessions, overrides, what the boards say of themselves.
+//! A bus with N2 boards: sessions, overrides, attributes of the boards.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -125,7 +125,7 @@ fn a_drive_that_starts_anew_in_mid_run() {
     rig.until_good(1, ModelPoint::OutputFrequency, Value::Number(25.0));
     assert!(rig.set(1, &[("run", 0.0)]).is_ok());
     assert!(rig.is_online(0));
-    // Its supply fails for less time than it takes to be missed.
+    // The supply fails for less time than it takes to be noticed.
     let identified = count(&rig, ">01F");
     rig.with_drive(1, |drive, now| {
         drive.power_off();
@@ -184,7 +184,7 @@ fn both_forms_of_replies_and_what_is_no_number() {
         current(rig).quality == Quality::Good
     });
     for no_number in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        // The bus overrides the AI with what is no number.
+        // The bus overrides the AI with NaN or infinity.
         let (region, number) = (n2::Region::Ai, 6);
         let command = n2::Command::Override {
             object: n2::Object { region, number },
@@ -209,7 +209,7 @@ fn a_dead_drive_is_probed_by_identify_and_comes_back() {
     rig.bus.wire.record(10_000);
     rig.until("it is probed", PATIENCE, |rig| count(rig, ">02F") >= 1);
     assert_eq!(count(&rig, ">02"), count(&rig, ">02F"));
-    // Its reads look like those that the dead one did not answer: they wait until no late reply can come.
+    // Reads of this drive look like unanswered reads of the dead one: they wait until no late reply can come.
     rig.until_state(1, State::Ready);
     rig.set_alive(2, true);
     rig.until_state(2, State::Ready);
@@ -224,7 +224,7 @@ fn what_means_no_object_and_what_the_drive_refuses() {
     assert!(rig.read(1, 0, 2).is_ok());
 }
 
-/// The longest time in which a drive said nothing of its state, from now on.
+/// The longest time without a good state of a drive, from now on.
 fn longest_without_state(rig: &mut Rig, address: u8, time: Duration) -> Duration {
     let until = rig.now + time;
     let (mut known, mut longest) = (rig.now, Duration::ZERO);

@@ -1,4 +1,4 @@
-//! One bus and what its clients see of it: frames, commands, faults, leases, parameters, a port that comes and goes.
+//! A bus and its clients: frames, commands, faults, leases, parameters, a port that comes and goes.
 
 use std::time::Duration;
 
@@ -198,7 +198,7 @@ fn a_lease_that_runs_out_stops_the_drive_once() {
     assert_eq!(events.filter(|event| event.kind == EventKind::Supervision).count(), 1);
 }
 
-/// Whatever comes in place of the answer whether it runs: the lease acts, and what came of it is told.
+/// Whatever the drive answers to the read of its running state, the lease acts, and the result is reported.
 #[test]
 fn a_lease_acts_whatever_the_drive_answers_when_it_is_asked_whether_it_runs() {
     for fault in ["busy=1", "exception:4=1", "exception:5=1", "exception:8=1"] {
@@ -215,7 +215,7 @@ fn a_lease_acts_whatever_the_drive_answers_when_it_is_asked_whether_it_runs() {
             .map(|event| event.kind)
             .collect();
         let count = |kind: EventKind| told.iter().filter(|told| **told == kind).count();
-        // One that the drive does not say whether it runs, one that the lease ran out.
+        // One event reports that the running state is unknown, the other that the lease expired.
         assert!((1..=2).contains(&count(EventKind::Supervision)), "{fault}: {told:?}");
         assert!(
             (1..=3).contains(&count(EventKind::SupervisionFailed)),
@@ -313,8 +313,9 @@ fn a_minimum_frequency_is_that_of_either_direction() {
     }
 }
 
-/// A reference in Hz, or one within a limit in Hz, rests on the frequency range as the drive has it when it gets the command:
-/// neither one that the command itself changes, nor one that an earlier command changed and nobody has read since.
+/// A reference in Hz, or one within a limit in Hz, depends on the frequency range that the drive has when it gets the
+/// command: neither on one that the command itself changes, nor on one that an earlier command changed and that has not been
+/// read since.
 #[test]
 fn no_command_rests_on_a_frequency_range_that_was_changed() {
     let of = |profile: &'static str| Line {
@@ -363,8 +364,8 @@ fn no_command_rests_on_a_frequency_range_that_was_changed() {
     }
 }
 
-/// 80 % of 50 Hz are within a limit of 40 Hz; of 100 Hz they are not. Whatever is asked for, in whatever order, the drive is never told
-/// to turn faster than the limit.
+/// 80 % of 50 Hz are within a limit of 40 Hz; of 100 Hz they are not. Whatever is ordered, in whatever sequence, the drive never gets a
+/// reference above the limit.
 #[test]
 fn the_reference_that_stands_keeps_its_limit_when_the_frequency_range_changes() {
     let of = |profile: &'static str| Line {
@@ -378,7 +379,8 @@ fn the_reference_that_stands_keeps_its_limit_when_the_frequency_range_changes() 
         let known = |hertz: f64| move |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(hertz));
         rig.until("the maximum frequency", PATIENCE, known(50.0));
         rig.until_good(1, ModelPoint::SpeedReference, Value::Number(0.0));
-        // Both in the queue: when the range has its turn, the reference that was read is not the one that stands.
+        // Both orders are in the queue: when the range has its turn, the reference that was read is no longer the one
+        // in force.
         let reference = rig.points(1, &[("speed_reference", 80.0)]);
         let mut reference = rig.place(1, reference);
         let range = rig.points(1, &[("maximum_frequency", 100.0)]);
@@ -446,7 +448,7 @@ fn a_drive_that_nothing_stops_is_told_once() {
         let mut rig = Rig::recorded(&line, parts);
         let known = |rig: &Rig| rig.value(1, "fieldbus_fault_response").is_some();
         rig.until("the parameter is read", PATIENCE, known);
-        // It goes and comes, which is no news.
+        // The drive goes and comes back, which must not be reported again.
         rig.set_alive(1, false);
         rig.until_state(1, State::Offline);
         rig.set_alive(1, true);
@@ -485,7 +487,7 @@ fn a_stop_that_waits_while_a_reload_starts_the_bus_anew_is_sent() {
         rig.restart_now();
         let outcome = rig.answered(&mut stop);
         assert!(outcome.is_ok(), "{steps} {asked:?}: {outcome:?}");
-        // What more it sets is not handed over.
+        // Only the stop is handed over, not the rest of its order.
         let outcome = rig.answered(&mut also);
         let stopped = outcome.is_ok() || matches!(outcome, Outcome::StopOnly(_));
         assert!(stopped, "{steps} {asked:?}: {outcome:?}");
@@ -508,7 +510,7 @@ fn a_stop_is_taken_while_the_bus_ends_and_before_its_port_is_open_again() {
     );
     assert_eq!(while_it_ends.answer(), None);
     rig.restart_now();
-    // Whoever still has the drive as it was.
+    // The client still has the handle of the old bus.
     let mut behind = before.place(
         OrderRequest::new(order, Origin::new(SourceKind::Mqtt, "test"), Authority::Write),
         rig.now,

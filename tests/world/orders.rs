@@ -1,4 +1,4 @@
-//! The orders of a world: what each asks for, how far it got, and what became of it.
+//! The orders of a world: their content, progress and outcome.
 
 use std::time::Instant;
 
@@ -7,7 +7,7 @@ use drivegate_world::drive::{ModelPoint, Point, PointIndex, Profile, Value};
 use drivegate_world::order::{Order, written};
 use drivegate_world::sim::random::Random;
 
-/// What an order wants.
+/// Kind of an order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wish {
     Reference,
@@ -26,7 +26,7 @@ pub enum Wish {
     RawRead,
     /// By function 5, 6 or 16, registers of which the last is of no point, or of one that is not writable.
     RawOther,
-    /// A speed in the unit that is not the drive's own: Hz of one that knows percent, percent of one that knows Hz.
+    /// A speed in the unit that the drive does not use: Hz for one with percent, percent for one with Hz.
     Converted,
 }
 
@@ -45,14 +45,14 @@ impl Wish {
         )
     }
 
-    /// Whether it takes the place of an older one that waits: a reference, or the same parameter.
+    /// Whether the order replaces an older waiting one: a reference, or an equal parameter.
     pub fn replaces(self, older: Wish) -> bool {
         let is_reference = |wish| matches!(wish, Wish::Reference | Wish::Converted);
         (is_reference(self) && (is_reference(older) || older == Wish::StopAtReference))
             || (self == Wish::Parameter && older == self)
     }
 
-    /// One that the dice choose.
+    /// A random order.
     pub fn of(dice: &mut Random) -> Wish {
         match dice.within(0..=99) {
             0..=29 => Wish::Reference,
@@ -75,7 +75,7 @@ impl Wish {
 /// Words that only one order writes.
 pub type Unique = (Table, u16, Vec<u16>);
 
-/// One order.
+/// An order with its progress.
 #[derive(Debug, Clone)]
 pub struct Record {
     pub client: usize,
@@ -132,7 +132,7 @@ pub fn converts_hertz(profile: &Profile) -> bool {
     reference_point(profile).1.unit == "%"
 }
 
-/// What the order of that number that is converted writes to a drive with that maximum frequency: half a count may be
+/// Words that the converted order of this number writes to a drive with this maximum frequency: half a count may be
 /// rounded either way.
 pub fn converted(profile: &Profile, number: usize, maximum: f64) -> impl Iterator<Item = Unique> {
     const ROUNDING: f64 = 1e-6;
@@ -148,8 +148,8 @@ pub fn converted(profile: &Profile, number: usize, maximum: f64) -> impl Iterato
         .filter_map(move |percent| percent_reference(profile, percent, maximum))
 }
 
-/// What a speed reference in percent of a drive with that maximum frequency is in its own register; none where it is not
-/// shown in a register of one word.
+/// A speed reference in percent of a drive with this maximum frequency, in the units of its register; none where it does
+/// not fit a single word.
 pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Option<Unique> {
     let (_, point) = reference_point(profile);
     let raw = point.raw()?;
@@ -242,8 +242,8 @@ pub fn is_of_writable_point(profile: &Profile, table: Table, address: u16) -> bo
     points.any(|point| point.raw().is_some_and(|raw| raw.covers(table, address)))
 }
 
-/// A write of what no writable point has and the family lets write: near the end of a range, where a simulated drive
-/// has nothing that decides about its motor, or the general control word; alone, or behind a writable register.
+/// A permitted write outside the writable points: near the end of a range, where a simulated drive has nothing that
+/// decides about its motor, or the general control word; alone, or behind a writable register.
 fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
     let ranges = profile.ranges.iter().filter(|range| range.write > 0);
     let last = ranges.flat_map(|range| {
@@ -285,7 +285,7 @@ pub fn sets(pdu: &RequestPdu, (table, address, words): &Unique) -> bool {
     })
 }
 
-/// What a write does to the run command: sets it, takes it away, or nothing.
+/// Effect of a write on the run command: sets it, takes it away, or none.
 pub fn run_command(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
     let place = profile.run_place()?;
     let (table, items) = written(pdu)?;

@@ -17,7 +17,7 @@ use super::scenario::Line;
 const DRIVE: u8 = 1;
 
 impl Rig {
-    /// One background exchange.
+    /// A background transaction.
     fn in_background(&mut self, pdu: RequestPdu) -> Outcome {
         if !self.is_online(0) {
             return Outcome::Offline;
@@ -66,7 +66,7 @@ impl Rig {
         let profile = self.drive(DRIVE).image.spec.profile.clone();
         for id in file.values.keys() {
             let address = profile.parameters.address(id.name()).unwrap();
-            // What the drive refuses stays as it is.
+            // Values that the drive refuses stay unchanged.
             let write = RequestPdu::WriteRegister {
                 address,
                 value: random.within(0..=600) as u16,
@@ -94,7 +94,7 @@ fn families() -> [Line; 6] {
         line("vacon-nx-n2", Protocol::N2, 9600, 1),
         line("teco-7300pa-n2", Protocol::N2, 9600, 1),
     ];
-    // With time left over: a drive that is asked for everything would otherwise be read for hours.
+    // Slow cycles leave time on the line: otherwise reading a whole drive would take hours.
     families.map(|family| Line {
         cycle: Duration::from_secs(1),
         slow_cycle: Duration::from_secs(10),
@@ -121,7 +121,7 @@ fn what_is_read_is_what_the_drive_has() {
             rig.scramble(&first, &mut random);
         }
         let profile = rig.drive(DRIVE).image.spec.profile.clone();
-        // Only what is known to be there is asked the second time, and the file loses nothing on its way.
+        // The second reading requests only known addresses, and the file loses nothing when written and parsed.
         let file = ParameterFile::parse(&first.text()).unwrap();
         let before = rig.now;
         let second = rig.read_parameters(Reading::addresses_of(&profile, &file), |_| ());

@@ -1,4 +1,4 @@
-//! What `predict` says of a bus, against the bus itself.
+//! The prediction of `predict` for a bus, against the bus itself.
 
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ fn a_saturated_line_has_the_cycle_that_was_predicted() {
     let line = line("vacon-nx", Protocol::ModbusRtu, 19_200, 3);
     let mut rig = Rig::new(&line, Parts::of(0, &line, 1));
     rig.until("all drives are read", Duration::from_secs(5), Rig::is_whole);
-    // The class `once` is read first; it is no part of the prediction.
+    // The class `once` is read first; the prediction does not include it.
     rig.run(Duration::from_secs(2));
     rig.bus.wire.record(100_000);
     rig.run(Duration::from_secs(60));

@@ -1,4 +1,4 @@
-//! The recorder beside a bus in virtual time: what a storm of faults costs the line, and that a recording has what was on it.
+//! The recorder on a bus in virtual time: the cost of a storm of faults for the line, and the completeness of recordings.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -12,7 +12,7 @@ use super::rig::{Rig, line};
 
 const SECOND: Duration = Duration::from_secs(1);
 const TICK: Duration = Duration::from_millis(100);
-/// Register of the fault code that a drive with a fault is asked for (ID 99).
+/// Register of the fault code (ID 99), which is read when a drive has a fault.
 const ON_FAULT: u16 = 98;
 const PROCESS_DATA: u16 = 2100;
 
@@ -48,7 +48,7 @@ fn run(rig: &mut Rig, recorder: Option<&mut Recorder>, time: Duration) -> Vec<Re
     made
 }
 
-/// Reads on the line since it was looked at last: process data, what a fault asks for, all others.
+/// Reads on the line since frame `from`: process data, reads on a fault, all others.
 fn reads(rig: &Rig, from: usize) -> [usize; 3] {
     let mut counts = [0; 3];
     for frame in &rig.requests()[from..] {
@@ -64,7 +64,7 @@ fn reads(rig: &Rig, from: usize) -> [usize; 3] {
 
 #[test]
 fn thirty_two_drives_that_trip_at_once_cost_the_line_the_reads_of_their_faults_only() {
-    // The same line with and without a recorder.
+    // A line with and without a recorder.
     let storm = |recorded: bool| {
         let mut rig = Rig::of(&line("vacon-nx", Protocol::ModbusRtu, 38_400, 32));
         let mut recorder = recorded.then(|| Recorder::new(options(), Arc::default()));
@@ -119,7 +119,7 @@ fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
     let now = clock(&rig);
     recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), SECOND, now);
     run(&mut rig, Some(&mut recorder), 5 * SECOND);
-    // It accelerates, which takes ever more current, and trips on the way.
+    // The drive accelerates, which takes increasing current, and trips on the way.
     rig.set(1, &[("speed_reference", 100.0), ("run", 1.0)]);
     run(&mut rig, Some(&mut recorder), 2 * SECOND);
     rig.with_drive(1, |drive, _| drive.trip(1));
@@ -127,7 +127,7 @@ fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
     let [recording] = &made[..] else {
         panic!("{}", made.len())
     };
-    // What the drive said on the line, by the reply frames of the process data.
+    // Values that the drive sent, from the reply frames of the process data.
     let frames = rig.bus.wire.transcript().frames();
     let replies = frames.windows(2).filter_map(|pair| {
         let asked = pair[0].direction == Direction::ToDrives && pair[0].bytes[2..4] == PROCESS_DATA.to_be_bytes();

@@ -1,6 +1,6 @@
-//! Restores of parameters in virtual time, on drives full of random ones, whatever happens on the line, at the drive and to the gateway: no
-//! parameter is written while the motor is fed, nobody else commands the drive meanwhile but by stops, and wherever a restore
-//! is cut off the drive comes to hold all new values or all former ones.
+//! Restores of parameters in virtual time, on drives with random values, with incidents on the line, at the drive and in the gateway: no
+//! parameter is written while the motor is fed, no other client commands the drive meanwhile except by stops, and wherever a restore is
+//! interrupted the drive ends up with all new values or all former ones.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -36,7 +36,7 @@ const FAMILIES: [(&str, Protocol, u32); 4] = [
     ("teco-7300pa", Protocol::ModbusAscii, 19_200),
 ];
 
-/// What is wrong with the line. Every reply that comes is the drive's own.
+/// Faults of the line. Every reply that arrives is the drive's own.
 const FAULTS: [&str; 5] = [
     "",
     "drop=0.05",
@@ -64,7 +64,7 @@ struct RestoreWorld {
     started: Option<Instant>,
     /// Somebody stops it, or puts the drive back on the line, then.
     mended: Option<Instant>,
-    /// What the drive answered last on the line, if it was the last exchange: that its motor stands.
+    /// When the drive answered that its motor stands, if that was the last transaction on the line.
     stands: Option<Instant>,
     stops: Vec<Placed>,
     refused: usize,
@@ -168,7 +168,7 @@ impl RestoreWorld {
         self.rig.drive(DRIVE).image.hold.set(why);
     }
 
-    /// What the line shows: a parameter is written only right behind the answer that the motor stands, and with the journal on disk.
+    /// Checks the line: a parameter is written only directly after the answer that the motor stands, and with the journal on disk.
     fn look(&mut self, seen: Vec<Seen>) {
         let profile = self.rig.drive(DRIVE).image.spec.profile.clone();
         let running = profile
@@ -262,7 +262,7 @@ impl RestoreWorld {
             drive.set_reset(run);
             drive.command(command);
             if !run && drive.state().running {
-                // Its ramp may take an hour.
+                // The ramp may take an hour, so a trip stops the motor.
                 drive.trip(1);
             }
             drive.advance(now);
@@ -376,7 +376,7 @@ impl RestoreWorld {
         }
     }
 
-    /// Does what a restore wants until it is over, or cut off.
+    /// Carries out the steps of a restore until it is over or interrupted.
     fn carry_out(&mut self, mut restoration: Restoration) -> Result<End, Cut> {
         let profile = self.rig.drive(DRIVE).image.spec.profile.clone();
         let disk_takes = |dice: &mut Random| Duration::from_millis(dice.within(0..=60));
@@ -434,7 +434,7 @@ impl RestoreWorld {
             let now = self.rig.now;
             let (restoration, back) = match parsed {
                 None => {
-                    // What was ordered before is carried out before, or refused.
+                    // An earlier order is carried out before, or refused.
                     let order = self.rig.points(DRIVE, &[("frequency_reference", 11.0)]);
                     drop(self.rig.place(DRIVE, order));
                     self.hold(true);
@@ -445,7 +445,7 @@ impl RestoreWorld {
             };
             match self.carry_out(restoration) {
                 Err(Cut) => {
-                    // It may have been over all but the journal.
+                    // The restore may have been complete except for the journal.
                     self.start_anew();
                 }
                 Ok(End::Done) => {

@@ -1,4 +1,4 @@
-//! One bus in virtual time, with nobody around it but the test.
+//! A bus in virtual time, used only by the test.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -81,7 +81,7 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
 }
 
 impl Rig {
-    /// One with the usual drives, whose frames are written down.
+    /// A rig with the usual drives, whose frames are recorded.
     pub fn of(line: &Line) -> Rig {
         Rig::recorded(line, Parts::of(0, line, 5))
     }
@@ -142,7 +142,7 @@ impl Rig {
         self.place_as("test", address, order)
     }
 
-    /// The same for that client.
+    /// Places an order for this client.
     pub fn place_as(&mut self, client: &str, address: u8, order: Order) -> Placed {
         let origin = Origin::new(SourceKind::Mqtt, client);
         let placed = self
@@ -160,7 +160,7 @@ impl Rig {
         self.restart_now();
     }
 
-    /// The same, whatever is on the line.
+    /// Restarts the bus at once, even during a transaction.
     pub fn restart_now(&mut self) {
         if self.bus.core.asked().is_some() {
             self.bus.wire.cut();
@@ -230,7 +230,7 @@ impl Rig {
         drive.reading(self.now).sample(index).good()
     }
 
-    /// One that is not known yet counts as offline.
+    /// State of a drive; offline as long as it is not known.
     pub fn state(&self, address: u8) -> State {
         self.drive(address).reading(self.now).state().unwrap_or(State::Offline)
     }

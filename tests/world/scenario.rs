@@ -1,4 +1,4 @@
-//! What a seed decides beforehand: lines, drives, faults, clients.
+//! The choices of a seed: lines, drives, faults, clients.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use drivegate_world::drive::RawWrites;
 use drivegate_world::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate_world::sim::random::Random;
 
-/// One world.
+/// The description of a world.
 #[derive(Debug, Clone)]
 pub struct Scenario {
     pub seed: u64,
@@ -23,7 +23,7 @@ pub struct Scenario {
     pub floods: bool,
 }
 
-/// One line with its drives.
+/// A line with its drives.
 #[derive(Debug, Clone)]
 pub struct Line {
     pub family: &'static str,
@@ -36,7 +36,7 @@ pub struct Line {
     pub retries: u32,
     pub cycle: Duration,
     pub slow_cycle: Duration,
-    /// Of the wire, as `simulate --faults` takes them; empty for a sound one.
+    /// Faults of the wire, as `simulate --faults` takes them; empty for a sound one.
     pub faults: String,
     /// Share of what comes to the gateway in which one bit is wrong besides.
     pub flips: f64,
@@ -44,17 +44,17 @@ pub struct Line {
     /// How often what was ordered is written again.
     pub refresh: Option<Duration>,
     pub on_shutdown: OnShutdown,
-    /// Addresses where nobody answers.
+    /// Addresses without a drive that answers.
     pub dead: Vec<u8>,
     /// The names and units of its drives stand in the opposite order.
     pub swapped: bool,
     /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
-    /// What else is different about its drives.
+    /// Further changes of its drives.
     pub spec: fn(&mut DriveSpec),
 }
 
-/// What a client is like.
+/// Habits of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Habit {
     /// By MQTT: single points and whole objects, often two at once.
@@ -73,9 +73,10 @@ pub enum Habit {
     Duels,
     /// Commands one drive for a moment, is silent for about as long as its lease or for much longer, and is back.
     Operates,
-    /// One of many connections of a client, by Modbus TCP: each commands the drives of the last line, all but the last.
+    /// A connection of a client with many connections, by Modbus TCP: each commands the drives of the last line, all
+    /// but the last.
     Shares,
-    /// One reference every half second to its own drive; it must always be served.
+    /// A reference every half second to a drive of its own; it must always be served.
     Steady,
 }
 

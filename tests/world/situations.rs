@@ -59,7 +59,7 @@ fn supervised(family: &'static str, protocol: Protocol, baud: u32) -> Line {
     }
 }
 
-/// Runs the first drive for a client that is never heard of again.
+/// Runs the first drive for a client that is then silent forever.
 fn leave_running(rig: &mut Rig) {
     let placed = rig.place(1, run(rig, true));
     let outcome = answer(rig, placed, 3 * SECOND);
@@ -80,7 +80,7 @@ fn an_action_that_the_drive_does_not_hear_is_written_again() {
     for seed in 0..16 {
         let mut rig = rig(&supervised("vacon-nx", Protocol::ModbusRtu, 19_200));
         leave_running(&mut rig);
-        // Every other request is not heard: of one action in four none of the two tries.
+        // Half of the requests are lost: of one action in four both tries.
         rig.set_faults(faults("deaf=0.5", seed));
         // Most of the time it is away, and probed every 10 s.
         rig.run(120 * SECOND);
@@ -137,7 +137,7 @@ fn a_lease_goes_on_across_a_reload() {
     }
 }
 
-/// Two clients: one fills the queue for two drives, the other wants one thing of the third.
+/// Two clients: one fills the queue for two drives, the other gives a single order to the third.
 #[test]
 fn who_has_much_waiting_does_not_keep_another_waiting() {
     for (family, protocol) in [("vacon-nx", Protocol::ModbusRtu), ("vacon-nx-n2", Protocol::N2)] {
@@ -153,14 +153,14 @@ fn who_has_much_waiting_does_not_keep_another_waiting() {
     }
 }
 
-/// The same by Modbus TCP, where the many orders come by as many connections of one client.
+/// By Modbus TCP, the many orders come over as many connections of one client.
 #[test]
 fn connections_of_one_client_share_its_turns() {
     let mut rig = rig(&line("vacon-nx-n2", Protocol::N2, 9600, 3));
     let servers = Servers::new(rig.shared_plant());
     let mut kept = Vec::new();
     for connection in (0..96).step_by(2).chain((1..96).step_by(2)) {
-        // Those of even numbers are one client by its certificate, the others one by its address.
+        // Connections with even numbers are one client by its certificate, the others one by its address.
         let mut client = servers.connection(Habit::Shares, connection);
         let unit = 1 + (connection / 2 % 2) as u8;
         client.receive(&write_frame(1, unit, 0x8100, 1), rig.now);
@@ -219,7 +219,7 @@ struct Duel {
     rig: Rig,
     /// Orders without an answer: to run or to stop, and when they were accepted.
     open: Vec<(bool, Instant, Placed)>,
-    /// What the drive was sent and accepted.
+    /// Commands that the drive got and accepted.
     reported: Vec<(Instant, bool)>,
 }
 
@@ -245,7 +245,7 @@ impl Duel {
         stops
     }
 
-    /// An acknowledged stop was heard by the drive.
+    /// An acknowledged stop has reached the drive.
     fn collect(&mut self) -> u32 {
         let (reported, mut stops) = (&self.reported, 0);
         self.open.retain_mut(|(on, accepted, placed)| {

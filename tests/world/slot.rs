@@ -25,21 +25,21 @@ use super::scenario::Line;
 const REQUESTS: u64 = 400;
 /// A tool gives its request up after this time.
 const TIMEOUT: Duration = Duration::from_millis(1100);
-/// So long after its request the gateway answers, or not at all.
+/// Time within which the gateway answers a tool, or not at all.
 const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 
 fn requests() -> u64 {
     std::env::var("WORLD_TOOL").map_or(REQUESTS, |text| text.parse().expect("a number"))
 }
 
-/// What a tool asked and waits for.
+/// A request of a tool that waits for its answer.
 #[derive(Debug, Clone)]
 struct Question {
     address: u8,
     pdu: RequestPdu,
     at: Instant,
     patience: Duration,
-    /// What the drive answered to it, each time that it was on the line since.
+    /// Answers of the drive to the request, one for each time that it was on the line.
     said: Vec<Vec<u8>>,
 }
 
@@ -51,7 +51,7 @@ struct Figures {
     given_up: u64,
 }
 
-/// A tool as a program behaves: it asks, waits, thinks, and asks the next.
+/// A tool that behaves like a program: it sends a request, waits, thinks, and sends the next.
 struct ToolRig {
     rig: Rig,
     slot: Offline,
@@ -59,13 +59,13 @@ struct ToolRig {
     dice: Random,
     question: Option<Question>,
     next: Instant,
-    /// What it asks for: address and PDU.
+    /// Chooses the next request: address and PDU.
     asks: fn(&mut Random, &Line) -> (u8, RequestPdu),
     /// Share of requests that it gives up after a few ms.
     impatient: f64,
     heard: Vec<u8>,
     figures: Figures,
-    /// Nothing is to be on the line that was not asked for.
+    /// The line, on which every request must have a cause.
     line: Line,
 }
 
@@ -475,7 +475,7 @@ fn a_tool_that_says_nothing_changes_no_frame() {
 
 #[test]
 fn what_a_tool_reads_fills_the_image() {
-    // So slowly polled that it is not the gateway that reads it.
+    // The slow cycle ensures that the gateway does not read the value itself.
     let mut slow = line("vacon-nx", Protocol::ModbusRtu, 38_400, 1);
     slow.slow_cycle = Duration::from_secs(600);
     let mut tool = ToolRig::new(slow, SlotAccess::Read, 1);
@@ -526,7 +526,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
             .map(|value| value.as_bool()),
         Some(false)
     );
-    // Its own stop is not held, whatever it wrote before.
+    // A stop of the tool is not held back, whatever it wrote before.
     tool.pass(&frame(&set(1)));
     tool.rig.run(Duration::from_millis(200));
     assert_eq!(tool.rig.word(1, 2000), 1);
@@ -551,7 +551,7 @@ fn what_cannot_be_checked_needs_raw_and_a_drive_that_may_be_commanded() {
         assert_eq!(tool.count(SlotOutcome::Refused), 3);
     }
     let mut tool = ToolRig::new(base.clone(), SlotAccess::Raw, 1);
-    // The simulated drive does not know the function either, and says so itself.
+    // The simulated drive does not know the function either, and answers with its own exception.
     assert_eq!(tool.exchange(&unknown(1)), refusal(&unknown(1)));
     assert_eq!(tool.count(SlotOutcome::Exception), 1);
     assert_eq!(tool.exchange(&broadcast), None);
@@ -592,7 +592,7 @@ fn an_address_without_a_configured_drive_is_read_and_confused_with_nobody() {
         );
         assert_eq!(tool.rig.word(address, 101), 5_000);
     }
-    // Nobody at all: silence, and the drives keep their cadence.
+    // An address without a drive: silence, and the drives keep their cadence.
     let before = tool.rounds();
     let from = tool.rig.now;
     assert_eq!(tool.exchange(&frame_of(77, &[3, 0, 1, 0, 1])), None);
@@ -601,7 +601,7 @@ fn an_address_without_a_configured_drive_is_read_and_confused_with_nobody() {
 }
 
 impl ToolRig {
-    /// One request and what comes of it within two seconds.
+    /// A request, and the answer within two seconds.
     fn exchange(&mut self, frame: &[u8]) -> Option<Vec<u8>> {
         let until = self.rig.now + Duration::from_secs(2);
         let mut answer = self.pass(frame);

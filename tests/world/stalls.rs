@@ -1,8 +1,8 @@
 //! Worlds in which threads stand still, names and units move to other machines, and drives restart between two polls.
 //!
-//! The clients are bytes on connections that somebody has to read: what they send while the reading thread stands still waits,
-//! and they may close the connection before it is read. A shadow model (`promised`) knows what each of them wanted of which
-//! machine, and when. Every run that a drive is told, and every motor that starts, must rest on an order that its client
+//! The clients are bytes on connections that a thread must read: bytes sent while the reading thread does not run wait, and a
+//! client may close the connection before they are read. A shadow model (`promised`) records what each of them wanted of which
+//! machine, and when. Every run command to a drive, and every motor that starts, must result from an order that its client
 //! still wanted.
 
 mod befall;
@@ -52,7 +52,7 @@ struct Connection {
     offline: Offline,
     /// The gateway has accepted it.
     open: bool,
-    /// Bytes that nobody has read yet, each with the order whose first or last byte is among them.
+    /// Unread bytes, each with the order whose first or last byte is among them.
     inbox: VecDeque<(Instant, Vec<u8>, Option<usize>)>,
     /// The client has closed it.
     closed: Option<Instant>,
@@ -62,7 +62,7 @@ struct Connection {
     next: Instant,
 }
 
-/// Whoever stands still, and until when.
+/// Which threads do not run, and until when.
 #[derive(Debug, Clone, Copy, Default)]
 struct Standing {
     readers: Option<Instant>,
@@ -74,7 +74,7 @@ struct World {
     dice: Random,
     began: Instant,
     now: Instant,
-    /// One client, and nothing but hiccups: then no order may be lost.
+    /// Whether there is one client and nothing but hiccups: then no order may be lost.
     healthy: bool,
     bus: WorldBus,
     plant: SharedPlant,
@@ -129,7 +129,7 @@ impl World {
                     .is_none()
                     .then_some(0.0..=60.0)
             },
-            // Not all of its time, so that slow polls come in time, too.
+            // A cycle below the full load, so that slow polls come in time, too.
             cycle: Duration::from_millis(200),
             ..line(family, Protocol::ModbusRtu, baud, drives)
         };
@@ -264,7 +264,7 @@ impl World {
         for what in seen {
             self.check_line(&what);
         }
-        // Which of two threads runs first behind a pause of both, nobody knows.
+        // After a pause of both threads either may run first.
         let bus_first = self.chance(0.5);
         if bus_first {
             self.run_bus();
@@ -299,7 +299,7 @@ impl World {
             .connections
             .iter()
             .filter_map(|connection| connection.rest.as_ref().map(|(at, ..)| *at));
-        // What is there already waits for the bus.
+        // Bytes that have already arrived wait for the bus.
         let wire = self.bus.wire_wakes().filter(|at| *at > self.now);
         clients
             .chain(rests)
@@ -321,7 +321,7 @@ impl World {
         self.bus.deliver(now, stood, &mut seen);
         while self.bus.open {
             match self.bus.core.poll(now) {
-                // It may stand still just before it sends.
+                // The thread may pause just before it sends.
                 Action::Send if !self.calm && !self.healthy && self.dice.chance(0.000_5) => {
                     stands = true;
                     break;

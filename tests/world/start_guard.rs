@@ -59,7 +59,7 @@ struct Disk {
     fails: bool,
 }
 
-/// What the drives themselves did.
+/// True actions of the drives.
 #[derive(Default)]
 struct Truth {
     running: BTreeMap<u8, bool>,
@@ -121,7 +121,7 @@ impl Play {
         }
     }
 
-    /// A word that starts goes out only where the interlock holds, as far as the gateway knows.
+    /// Checks that a start is sent only where the interlock holds, as far as the gateway knows.
     fn note(&mut self, seen: Seen) {
         let (asked, acted) = match seen {
             Seen::Sent(asked) => (asked, false),
@@ -336,7 +336,7 @@ fn no_start_of_an_order_breaks_a_guard() {
     assert!(count("guarded") > 200 && count("interlocked") > 20, "{results:?}");
 }
 
-/// The same clients, line and time, with guards and without: the longest way of a stop is the same.
+/// Equal clients, line and time, with guards and without: the longest delay of a stop is equal.
 #[test]
 fn stops_come_as_soon_as_without_guards() {
     let longest = |guarded: bool| {
@@ -350,7 +350,7 @@ fn stops_come_as_soon_as_without_guards() {
             play.rig = Rig::new(&unguarded, super::bus::Parts::of(0, &unguarded, 77));
             play.began = play.rig.now;
         }
-        // The disk hangs for good: it holds up starts only.
+        // The disk hangs permanently: it delays starts only.
         play.disk.writing = Some((0, Saved::default(), play.rig.now + HOUR));
         play.run(5 * SECOND);
         for _ in 0..300 {
@@ -465,7 +465,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
         if let Some(first) = &mut first {
             assert!(rig.answered(first).is_ok(), "it joins");
         }
-        // Its ramp takes a while.
+        // The ramp takes a while.
         rig.run(8 * SECOND);
         assert!(!turns(&mut rig), "{who}");
     }
@@ -541,7 +541,7 @@ fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
     }
 }
 
-/// One drive with that guard, ready.
+/// A drive with this guard, ready.
 fn ready(spec: fn(&mut DriveSpec)) -> Rig {
     let mut rig = Rig::of(&Line {
         spec,

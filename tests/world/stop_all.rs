@@ -1,5 +1,5 @@
-//! Stop all on a line that loses and damages frames, with a drive that is away and a reload in between: what the answer says of a
-//! drive is so, every drive that answers stands in the end, and afterwards all is as good as before.
+//! Stop all on a line that loses and damages frames, with an absent drive and a reload in between: the answer is true for each
+//! drive, every drive that answers stands in the end, and afterwards the line works as before.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ fn works() -> Line {
     line("vacon-nx", Protocol::ModbusRtu, 19_200, DRIVES)
 }
 
-/// What happens while the order is under way.
+/// Incident while the order is in progress.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meanwhile {
     Nothing,
@@ -34,7 +34,7 @@ fn turns(rig: &mut Rig, address: u8) -> bool {
     rig.with_drive(address, |drive, _| drive.state().running)
 }
 
-/// Gives the order, lets time pass until its answer, and checks what that says against the drives themselves.
+/// Gives the order, waits for its answer, and compares it with the drives themselves.
 fn stop_all(rig: &mut Rig, meanwhile: Meanwhile) -> StopReport {
     let origin = Origin::new(SourceKind::Http, "alice");
     let orders = StopAll::default();

@@ -1,7 +1,7 @@
 //! The whole gateway in a seeded world in virtual time: the real core of every bus, the real command queue, the real
-//! dialogues of Modbus TCP and the real intake of MQTT, simulated drives of all families on simulated half-duplex
-//! wires. A seed decides who sends what when, what the wire does to it, and what befalls drives and ports. Every step is
-//! checked against what must always hold (see `checks`); a seed that fails prints itself and the end of its history.
+//! dialogues of Modbus TCP and the real intake of MQTT, simulated drives of all families on simulated half-duplex wires.
+//! A seed decides the sender and time of each order, faults of the wire, and incidents of drives and ports. Every step
+//! is checked against what must always hold (see `checks`); a seed that fails prints itself and the end of its history.
 //!
 //! `make check` runs fixed seeds. `make world SEEDS=n` runs n new ones, `WORLD_SEED=n` one again with its history. With
 //! `WORLD_FLOOD=1` clients that flood a drive do so without pauses.
@@ -61,7 +61,7 @@ const FIXED: u64 = 400;
 /// Seeds of every test run in which clients flood without a pause.
 const FLOODED: Range<u64> = 0..16;
 
-/// One world from its beginning to the end of its gateway.
+/// Runs a world from its start to the end of its gateway.
 fn run(seed: u64) -> Figures {
     run_with(seed, std::env::var_os("WORLD_FLOOD").is_some())
 }

@@ -50,7 +50,7 @@ const REPEATED: Duration = Duration::from_secs(8);
 /// How often what must hold at any time is looked at.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What a world was.
+/// Figures of a world.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Figures {
     pub worlds: u64,

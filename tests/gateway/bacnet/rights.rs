@@ -70,7 +70,8 @@ fn a_slot_is_void_with_the_right_of_its_client_and_does_not_come_back_with_it() 
     plant.reload(&config);
     assert!(plant.is_locked());
     for (round, (what, without)) in without_right(&config).into_iter().enumerate() {
-        // One that governs, and an active behind it of another client, which keeps its right where that has one.
+        // The slot that governs has another client behind it with an active, which keeps its right where that client
+        // has one.
         assert_eq!(plant.bacpypes(20, &[run_at(3, false)]), [json!("done")], "{what}");
         assert!(plant.is_locked(), "{what}");
         plant.reload(&without);
@@ -119,14 +120,14 @@ fn kept_slots_are_void_at_a_start_that_gives_no_right() {
     }
 }
 
-/// Of several writes in one request the first waits for a drive that is slow; then a reload takes the right of its client away.
+/// The first of several writes in one request waits for a slow drive; then a reload takes the right of its client away.
 #[test]
 fn a_write_behind_another_one_needs_the_right_that_its_client_has_then() {
     let plant = pumps("");
     let config = std::fs::read_to_string(plant.site.config()).unwrap();
     for (what, without) in without_right(&config) {
         if matches!(what, "access" | "[bacnet]") {
-            // Its bus, or its server, is another one.
+            // The reload replaces the bus, or the server, so nothing waits any longer.
             continue;
         }
         plant.drives.signal("STOP");

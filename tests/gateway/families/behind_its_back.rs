@@ -15,7 +15,7 @@ const HAPPENS: [(&str, &str); 3] = [
     ("USR1", "tripped"),
 ];
 
-/// One after another, the first before the next poll.
+/// Pairs of orders, the second sent before the next poll.
 const ORDERS: [&[&str]; 4] = [
     &["{\"reverse\": true}", "{\"reverse\": false}"],
     &[
@@ -60,7 +60,7 @@ fn stays_as_it_is(case: &Case) {
                     .as_str()
                     .unwrap_or_default()
                     .contains("takes effect with the next start");
-                // Its word says that it runs, and its status that it does not.
+                // The control word says that the drive runs, and its status that it does not.
                 let is_kept = signal == "USR2" && place == 0 && values.starts_with("{\"reverse\"");
                 assert!(waits || !is_kept, "{name}: {printed}, {values}: {result}");
                 assert!(result["ok"] == true, "{name}: {printed}, {values}: {result}");
@@ -85,7 +85,7 @@ fn stays_as_it_is(case: &Case) {
     }
 }
 
-/// What was ordered while the motor stood counts for the start that follows.
+/// Orders given while the motor stood take effect with the next start.
 #[test]
 fn a_direction_that_waits_is_that_of_the_next_start() {
     for name in [

@@ -1,4 +1,4 @@
-//! What the gateway passes on and refuses of each family, by hand from the figures of its manual.
+//! Words that the gateway passes on and refuses for each family, by hand from the figures of its manual.
 
 use drivegate_testkit::{families, orders, rows};
 
@@ -50,7 +50,7 @@ pub(super) struct Case {
     pub(super) reverse: Vec<Order>,
     /// Empty where the family's reset is not known.
     pub(super) reset: Vec<Order>,
-    /// Not passed on: neither a stop nor clearly a run command.
+    /// Orders that are refused: neither a stop nor clearly a run command.
     pub(super) refused: Vec<Order>,
     pub(super) shows_frequency: bool,
     pub(super) shows_reversed: bool,

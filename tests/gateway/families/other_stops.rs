@@ -1,5 +1,5 @@
-//! Words by which a drive stops by another of its own means, written by a client at every way in: the motor stops, and nothing that
-//! is ordered later without a run command starts it.
+//! Words by which a drive stops in a way of its own, written by a client over every interface: the motor stops, and no later order
+//! without a run command starts it.
 
 use std::io::Write;
 use std::net::TcpStream;
@@ -56,7 +56,7 @@ impl Rig {
             (Way::Broadcast, _) => {
                 let mut stream = TcpStream::connect(("127.0.0.1", self.raw_slot)).unwrap();
                 stream.write_all(&rtu(0, &pdu)).unwrap();
-                // Nobody answers.
+                // A broadcast is not answered.
                 std::thread::sleep(Duration::from_millis(500));
                 Answer::Done
             }

@@ -1,4 +1,4 @@
-//! What every word does, by hand from the figures of the manuals, against what the profiles take it for.
+//! The effect of every word, by hand from the figures of the manuals, compared with the profiles.
 
 use drivegate::codec::Table;
 use drivegate::drive::control::ControlItem;
@@ -67,7 +67,7 @@ fn cia402(word: u16) -> Does {
     }
 }
 
-/// One of two bits, none of those that press inputs or trip; the reset counts for nothing.
+/// Exactly one of the two bits runs the motor; the reset bit is ignored, and any other bit belongs to another function.
 fn pair(word: u16, forward: u16, reverse: u16, reset: u16) -> Does {
     match word & !reset {
         word if word == forward || word == reverse => Runs,
@@ -152,8 +152,8 @@ fn vacon(word: u16) -> Does {
     if is(word, 1) { Runs } else { Stops }
 }
 
-/// What a profile takes for a stop stops the motor, whatever else is in the word; what it lets pass as a run command runs it.
-/// Of each, there is the word that the gateway itself sends.
+/// A word that a profile takes for a stop stops the motor, whatever else is in it; a word that it passes as a run command
+/// runs the motor. The gateway itself sends a word of each kind.
 #[test]
 fn every_word_is_taken_for_what_it_does() {
     type Word = fn(u16) -> Does;

@@ -39,7 +39,7 @@ rank = "automation"
 sparkplug = true
 "#;
 
-/// The clients with their ranks, as Modbus TCP numbers them; the last one is no principal.
+/// The clients with their ranks, as Modbus TCP numbers them; the last one is not a principal.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Client {
     Plc,
@@ -66,7 +66,7 @@ struct Plant {
     site: Site,
     _others: [Running; 3],
     heard: Running,
-    /// So many commands the Sparkplug host gave.
+    /// Number of commands that the Sparkplug host gave.
     commands: Cell<u64>,
 }
 
@@ -195,7 +195,7 @@ impl Plant {
         let expected = match (state, rank) {
             ("free", _) => 0,
             ("reserved", _) => 4,
-            // 1: the client that asks, 2: another one.
+            // 1: the client itself holds the drive, 2: another client.
             (_, _) if holder == "plc" => 1,
             (_, _) => 2,
         };
@@ -218,7 +218,7 @@ impl Plant {
         });
     }
 
-    /// The operator takes the drive, whoever has it, and gives it back.
+    /// The operator takes the drive from any holder, and releases it.
     fn free(&self) {
         self.curl("hold", &json!({"action": "break"}));
         let freed = self.curl("hold", &json!({"action": "release"}));
@@ -262,7 +262,7 @@ fn each_client_sees_and_may_what_the_table_says() {
                 (&json!(state), &left),
                 "{stopper:?} stops {holder:?}: {seen}"
             );
-            // Who ranks below the stopper does not take the drive.
+            // A client that ranks below the stopper does not take the drive.
             for next in ALL.into_iter().filter(|next| *next != Client::Nobody) {
                 if state == "reserved" && next.rank() > stopper.rank() {
                     assert_eq!(plant.reference(next), "held_by_other", "{next:?} behind {stopper:?}");

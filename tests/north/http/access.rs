@@ -215,7 +215,7 @@ async fn a_removed_token_ends_its_streams() {
     let stream = EventStream::open(server.address, "/api/v1/trace", &header(&one)).await;
     let mut stream = stream.opened().await;
     server.reload(options(left)).await;
-    // Its comments go on as long as it does.
+    // The comments that keep the stream alive end with it.
     let end = timeout(PATIENCE, stream.next()).await.expect("the stream ends");
     assert_eq!(end, None);
     for (secret, status) in [(one, 401), (two, 200)] {
@@ -345,7 +345,7 @@ fn a_gateway_with_tokens_and_tls() {
     assert_eq!(scrape(&prometheus), "200 True\n");
     assert_eq!(scrape(&operator), "403 False\n");
 
-    // What lists the tokens shows no secret.
+    // The list of tokens shows no secret.
     let listed = drivegate(&["token", "list", "--file", &at("tokens")]);
     let listed = String::from_utf8(listed.stdout).unwrap();
     assert!(

@@ -97,7 +97,7 @@ pub(crate) struct EventStream {
     pub(crate) head: String,
 }
 
-/// One server-sent event.
+/// A server-sent event.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Message {
     pub(crate) event: String,

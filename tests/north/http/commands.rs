@@ -306,7 +306,7 @@ async fn pages_of_others_command_nothing() {
     }
     let out = post(rig.address(), "/api/v1/logout", &format!("{cookie}\r\n"), "").await;
     assert_eq!(out.status, 403, "nobody is logged out by a page of others");
-    // What a form of another page can send.
+    // Content types that a form of another page can send.
     for kind in [
         "text/plain",
         "application/x-www-form-urlencoded",
@@ -328,7 +328,7 @@ async fn pages_of_others_command_nothing() {
             .status,
         403
     );
-    // Its own name, or a preflight for it: the host is checked before everything.
+    // The page's own host name, or a preflight for it: the host is checked before everything else.
     let rebound = format!(
         "POST {PUMP} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n{alice}Content-Length: 14\r\n\r\n{STOP}"
     );
@@ -402,7 +402,7 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
         let second = post(address, PUMP, &headers, body);
         tokio::join!(first, second)
     });
-    // Both wait for the one in the queue; a client that gives up changes nothing about it.
+    // Both requests wait for the one command in the queue; a client that gives up changes nothing about it.
     let mut gone = TcpStream::connect(rig.address()).await.unwrap();
     let text = format!(
         "POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{alice}Content-Length: {}\r\n\r\n{body}",
@@ -425,7 +425,7 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     assert_eq!(first.body, second.body);
     assert_eq!(rig.command(&alice, body).await.body, first.body, "later, too");
     assert_eq!(rig.bus.orders().len(), 1);
-    // Another user may use the same id; after a stop a repetition is no command any more.
+    // Another user may use an equal id; after a stop a repetition no longer commands.
     let bob = rig.log_in("bob").await;
     assert_eq!(rig.command(&bob, body).await.status, 200);
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
@@ -454,7 +454,7 @@ async fn only_who_commanded_last_renews_the_lease() {
     assert_eq!(renew(&alice).await, (204, true));
     assert_eq!(renew(&bob).await, (409, false));
     assert_eq!(renew(&again).await, (409, false), "another login of the same user");
-    // What is refused commands nothing.
+    // A refused command does not change the commander.
     assert_eq!(rig.command(&bob, "{\"speed_reference\": 500}").await.status, 422);
     assert_eq!(renew(&alice).await, (204, true));
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
@@ -537,7 +537,7 @@ async fn a_flood_of_logins_holds_up_no_stop() {
                      Content-Type: application/json\r\nContent-Length: {}\r\n\r\n{body}",
                     body.len()
                 );
-                // It may be displaced.
+                // The connection may be displaced, so an error is ignored.
                 let _ = stream.write_all(head.as_bytes()).await;
                 let _ = timeout(PATIENCE, stream.read_to_end(&mut Vec::new())).await;
             })

@@ -1,5 +1,5 @@
-//! Every query of the dashboards and alerts, asked of a real Prometheus that scrapes two gateways alike; and the way of
-//! an alert to whom it is for.
+//! Every query of the dashboards and alerts, run in a real Prometheus that scrapes two equal gateways; and the route of
+//! an alert to its receiver.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;

@@ -460,7 +460,7 @@ async fn it_stops_whatever_clients_do() {
         .await;
     let address: SocketAddr = server.address;
     server.cancel.cancel();
-    // A client that says nothing more would have its place for 30 s.
+    // A silent client would keep its place for 30 s.
     timeout(Duration::from_secs(20), server.http.stopped())
         .await
         .expect("nobody is waited for");

@@ -95,13 +95,13 @@ async fn health_has_places_of_its_own() {
         let refused = get(server.address, "/api/v1/buses").await;
         assert_eq!((refused.status, refused.header("retry-after")), (503, Some("5")));
         assert_eq!(status_from([127, 0, 0, 2], server.address, "/api/v1/buses").await, 200);
-        // Nor can these places be taken by silence.
+        // Silent connections cannot take these places, either.
         silent.push(TcpStream::connect(server.address).await.unwrap());
     }
     assert!(turned_away(&server, ConnectionRefusal::AddressFull) > 0);
     drop(open.pop());
     let again = async {
-        // A stream that nobody reads ends when the server next writes to it.
+        // A stream without a reader ends when the server next writes to it.
         while get(server.address, "/api/v1/buses").await.status != 200 {
             tokio::task::yield_now().await;
         }

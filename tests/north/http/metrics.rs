@@ -81,7 +81,7 @@ const FROZEN: [&str; 64] = [
     "process_virtual_memory_bytes gauge ",
 ];
 
-/// One series: name, labels in alphabetical order, value.
+/// A series: name, labels in alphabetical order, value.
 #[derive(Debug, Clone, PartialEq)]
 struct Series {
     name: String,
@@ -153,7 +153,7 @@ fn value(text: &str, name: &str, labels: &str) -> Option<f64> {
     found.first().copied()
 }
 
-/// A plant with a drive that has every point there is, and one that was never asked.
+/// A plant with a drive that has every point, and one that was never read.
 pub(super) async fn everything() -> Server {
     let image = plant::supervised("line1", "all", 1, &plant::everything());
     plant::answer(&image, Instant::now(), |address| if address == 41 { 50 } else { 1 });
@@ -300,7 +300,7 @@ async fn what_is_not_good_has_no_sample() {
         "drivegate_drive_up",
         "drivegate_drive_state",
         "drivegate_drive_transactions_total",
-        // What was counted stays, as counters do.
+        // Counts stay, as counters do.
         "drivegate_drive_starts_total",
         "drivegate_drive_running_seconds_total",
         // Offline is a cause.

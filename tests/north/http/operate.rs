@@ -129,7 +129,7 @@ fn a_removed_user_stops_nothing_and_the_lease_does() {
     assert!(audit.contains("\"supervision\""), "{audit}");
 }
 
-/// What `check` says of commands that cannot be.
+/// Messages of `check` about commands that cannot work.
 #[test]
 fn commands_need_users_and_a_private_way() {
     let site = site();

@@ -78,7 +78,7 @@ pub(crate) fn nx_running(address: u16) -> u16 {
     }
 }
 
-/// The same with fault 7.
+/// A running NX drive with fault 7.
 pub(crate) fn nx_faulted(address: u16) -> u16 {
     match address {
         2100 => 0b1001_1000,
@@ -182,7 +182,7 @@ pub(crate) fn secretive() -> Arc<DriveImage> {
     image
 }
 
-/// One command that was answered.
+/// Adds a command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
     let (ticket, _answer) = ticket(&plant.writes, Instant::now());
     ticket.answer(order::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));

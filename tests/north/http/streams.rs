@@ -241,7 +241,7 @@ async fn listeners_are_bounded_and_places_come_back() {
     assert_eq!(get(server.address, "/healthz").await.status, 200);
     drop(open);
     let again = async {
-        // A stream that nobody reads ends when the server next writes to it.
+        // A stream without a reader ends when the server next writes to it.
         while EventStream::open(server.address, "/api/v1/events", "")
             .await
             .head

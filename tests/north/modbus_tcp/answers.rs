@@ -1,4 +1,4 @@
-//! What is answered to what: every kind of request in every state of plant and client, and single requests byte by byte.
+//! Every kind of request with its answer in every state of plant and client, and single requests byte by byte.
 //! `docs/modbus-tcp.md` shows the table of the former; `BLESS=1 cargo test --test north answers` writes it.
 
 use std::fmt::Write as _;

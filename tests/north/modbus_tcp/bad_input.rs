@@ -1,4 +1,4 @@
-//! Bytes that no sound client sends: the right exception or a closed connection, and nobody else notices.
+//! Bytes that no sound client sends: the right exception or a closed connection, without an effect on other clients.
 
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;

@@ -178,7 +178,7 @@ async fn pipelined_writes_reach_the_bus_in_their_order() {
 async fn back_pressure_and_a_full_queue() {
     let rig = Rig::new().await;
     rig.buses[0].pause(true);
-    // One connection has at most 16 on the way; the rest of its batch stays unread.
+    // A connection has at most 16 requests in progress; the rest of its batch stays unread.
     let mut clients = Vec::new();
     for n in 1..=4 {
         let mut client = rig.client().await;

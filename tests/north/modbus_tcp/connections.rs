@@ -1,4 +1,4 @@
-//! Who may connect, how many, and the end of it all.
+//! Connections: which clients may connect, how many, and their end.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -50,7 +50,7 @@ async fn no_more_than_max_connections() {
     rig.end().await;
 }
 
-/// A client that vanished without a word is found out: the kernel asks for it once it is silent for a minute.
+/// A client that vanished is detected: the kernel probes a connection that is silent for a minute.
 #[tokio::test]
 async fn connections_are_kept_alive() {
     let rig = Rig::new().await;
@@ -219,7 +219,8 @@ async fn an_operator_gets_in_whoever_else_is_connected() {
     let rig = Rig::with(options).await;
     let mut open = Vec::new();
     for n in 0..1000u16 {
-        // Some are silent, some have asked, some are in the middle of a frame; from one address, then from many.
+        // Some clients are silent, some have sent a request, some are in the middle of a frame; from one address, then
+        // from many.
         let from = if n < 500 { 1 } else { 3 + (n % 200) as u8 };
         let mut client = Client::connect_from([127, 0, 0, from], rig.address()).await;
         match n % 3 {
@@ -307,7 +308,7 @@ async fn a_reload_that_cannot_bind_changes_nothing() {
     rig.end().await;
 }
 
-/// A listener that a reload takes away answers what was asked, however long that takes.
+/// A listener that a reload removes still answers open requests, however long that takes.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_write_under_way_is_answered_after_its_listener_was_closed() {
     let mut rig = Rig::new().await;

@@ -31,7 +31,7 @@ mod rand_free {
     }
 }
 
-/// This process holds both ends of every connection.
+/// Raises the limit of open files: this process holds both ends of every connection.
 fn allow_files(count: u64) {
     let limit = getrlimit(Resource::Nofile);
     let current = limit.maximum.map_or(count, |most| most.min(count));
@@ -65,7 +65,7 @@ async fn a_thousand_connections() {
     let mut idle = Vec::new();
     for n in 0..999 {
         let mut client = rig.client().await;
-        // One in three has asked.
+        // Every third client has sent a request.
         if n % 3 == 1 {
             assert_eq!(client.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
         }
@@ -77,7 +77,7 @@ async fn a_thousand_connections() {
         assert_eq!(worker.ask(1, &words(6, &[2003, value])).await, words(6, &[2003, value]));
     }
     until("all are in", || rig.stats.modbus_tcp.connections() == 1000).await;
-    // One in three is in the middle of a frame, for the ten seconds that it has for the rest.
+    // Every third client is in the middle of a frame, for the ten seconds that it has for the rest.
     for client in idle.iter_mut().skip(2).step_by(3) {
         client.send(&[0, 1, 0]).await;
     }
@@ -271,7 +271,7 @@ fn vandal(address: SocketAddr, mut dice: Dice) {
     }
 }
 
-/// The real daemon with few files: it serves fewer clients, says so, and has files left for everything else.
+/// The real daemon with few files: it serves fewer clients, reports that, and has files left for everything else.
 #[test]
 fn few_files_mean_few_connections() {
     let dir = tempfile::tempdir().unwrap();

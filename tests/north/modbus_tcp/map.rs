@@ -1,5 +1,5 @@
-//! The map is true: every register that `drivegate map` lists is answered under its unit, in every table that it names, and
-//! a write is taken where it says so.
+//! The map is true: every register listed by `drivegate map` is answered under its unit, in every table that it names, and
+//! a write is accepted where the map says so.
 
 use std::fmt::Write as _;
 use std::sync::Arc;

@@ -19,10 +19,10 @@ struct Step {
     unit: u8,
     function: u8,
     address: u16,
-    /// What a read gives; its length is the count.
+    /// Expected result of a read; its length is the count.
     #[serde(default)]
     expect: Vec<u16>,
-    /// What a write sets.
+    /// Values of a write.
     #[serde(default)]
     values: Vec<u16>,
     exception: Option<u8>,

@@ -1,4 +1,4 @@
-//! One request, one answer: the table of answers and exceptions.
+//! Each request with its answer: the table of answers and exceptions.
 
 use std::time::SystemTime;
 
@@ -148,7 +148,7 @@ async fn what_the_drive_refuses() {
         (Outcome::QueueFull, 6),
         (Outcome::Replaced, 6),
         (Outcome::Purged, 6),
-        // Not an answer to what was asked.
+        // The reply does not answer the request.
         (
             Outcome::Acknowledged(drivegate::codec::Reply::Registers(vec![1, 2, 3])),
             4,
@@ -199,7 +199,7 @@ async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
     let rig = Rig::of(n2_plant(), options()).await;
     let mut client = rig.client().await;
     let read = |table, start, count| Order::Read(RequestPdu::read(table, start, count));
-    // BI 6 and 7 are polled, BI 8 to 10 never; the simulated bus says that every third bit is set.
+    // BI 6 and 7 are polled, BI 8 to 10 never; in the simulated bus every third bit is set.
     assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [2, 1, 0b1_0011]);
     let asked: Vec<Order> = (7..10).map(|at| read(Table::DiscreteInput, at, 1)).collect();
     assert_eq!(rig.buses[0].orders(), asked);
@@ -223,7 +223,7 @@ async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
     rig.buses[0].answers(|_| Some(Outcome::TimedOut));
     assert_eq!(client.ask(1, &words(2, &[7, 8])).await, [0x82, 0x0B]);
     assert_eq!(rig.buses[0].orders().len(), 1);
-    // Nothing is asked when part of it is stale.
+    // No request is sent when part of the range is stale.
     rig.drive("fan-1").update(|s| s.link = Link::Offline(SystemTime::now()));
     assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [0x82, 0x0B]);
     assert_eq!(rig.buses[0].orders(), []);

@@ -14,7 +14,7 @@ use super::tls::{TlsClient, WORKS, make, refused, tls_options};
 use crate::support::process::Running;
 use crate::support::tools;
 
-/// An answer of pump-1, by which a client knows that it is served.
+/// Whether the client gets an answer of pump-1, and so is served.
 async fn is_served(client: &mut TlsClient) -> bool {
     match client.ask(1, &words(3, &[2102, 1])).await {
         Ok(answer) => answer == registers(3, &[5000]),

@@ -74,7 +74,7 @@ at = "input 5"
 class = "fast"
 "#;
 
-/// What a simulated bus does with a command; `None` keeps it for good.
+/// Action of a simulated bus on a command; `None` keeps it forever.
 pub(crate) type Script = Box<dyn FnMut(&Command) -> Option<Outcome> + Send>;
 
 /// The other end of a command queue.
@@ -182,7 +182,7 @@ pub(crate) fn options() -> Options {
     }
 }
 
-/// One that all of this machine may use and 127.0.0.1 may write by.
+/// A listener that all clients of this machine may use and 127.0.0.1 may write to.
 pub(crate) fn listener() -> Listener {
     Listener {
         section: "[modbus_tcp]".to_string(),
@@ -217,7 +217,7 @@ fn bus(name: &str, protocol: Protocol, drives: Vec<DriveSpec>) -> BusHandle {
     bus
 }
 
-/// What a running NX drive at half speed answers.
+/// Fills in the values of a running NX drive at half speed.
 pub(crate) fn fill(image: &DriveImage) {
     let now = Instant::now();
     image.update(|s| {
@@ -242,7 +242,7 @@ pub(crate) fn plant() -> Plant {
     plant_where(|_| {})
 }
 
-/// The same with other drives.
+/// The plant with changed drives.
 pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
     let bus = |name: &str, mut drives: Vec<DriveSpec>| {
         drives.iter_mut().for_each(&change);

@@ -61,7 +61,7 @@ fn encoded(request: Request<'static>) -> Vec<u8> {
     })
 }
 
-/// What it means, in the words of this house.
+/// Translates the request of the other library to the types of this program.
 fn meant(request: &Request<'static>) -> Option<RequestPdu> {
     let read = |table: Table, start: u16, count: u16| {
         let fits = (1..=table.max_read()).contains(&count) && u32::from(start) + u32::from(count) <= 65_536;
@@ -110,7 +110,7 @@ fn meant(request: &Request<'static>) -> Option<RequestPdu> {
 fn understood(pdu: &[u8]) -> bool {
     match Response::try_from(bytes::Bytes::copy_from_slice(pdu)) {
         Ok(response) => response.function_code().value() == pdu[0],
-        // An exception is no response to it.
+        // An exception is not decoded as a response by the library.
         Err(_) => pdu.len() == 2 && pdu[0] & 0x80 != 0,
     }
 }
@@ -156,7 +156,8 @@ proptest! {
         if let Ok(own) = RequestPdu::decode(&pdu)
             && !matches!(own, RequestPdu::Diagnostics { .. } | RequestPdu::DeviceIdentification { .. })
         {
-            // tokio-modbus panics on some that are refused here (its issue 298), so it is asked second.
+            // tokio-modbus panics on some requests that are refused here (its issue 298), so it decodes only accepted
+            // ones.
             let other = Request::try_from(bytes::Bytes::from(pdu.clone()));
             prop_assert_eq!(other.ok().and_then(|other| meant(&other)), Some(own));
         }

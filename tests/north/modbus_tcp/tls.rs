@@ -146,7 +146,7 @@ pub(super) fn tls_options() -> Options {
 pub(super) struct TlsClient(tokio_rustls::client::TlsStream<TcpStream>);
 
 impl TlsClient {
-    /// A client whose handshake is through; with TLS 1.3 that says nothing about its certificate yet.
+    /// A client after its handshake; with TLS 1.3 that does not prove its certificate yet.
     pub(super) async fn connect(address: SocketAddr, config: Arc<ClientConfig>) -> std::io::Result<TlsClient> {
         let stream = TcpStream::connect(address).await?;
         let name = ServerName::try_from("127.0.0.1").unwrap();
@@ -282,7 +282,7 @@ async fn who_is_not_known_is_refused() {
         count += 1;
         until("it is counted", || refused(&rig) == count).await;
     }
-    // Who is silent has a place but holds nobody up.
+    // A silent client has a place but blocks no other.
     let silent = Client::connect(address).await;
     let mut client = TlsClient::connect(address, WORKS.client(Some("own/hmi"), &TLS13))
         .await

@@ -1,5 +1,5 @@
-//! What else a listener can show: a drive at units 0 and 255, the common model at 0, the drive's registers alone; and
-//! function 23, by which a client writes and reads.
+//! Other views of a listener: a drive at units 0 and 255, the common model at 0, the drive's registers alone; and
+//! function 23, which writes and reads.
 
 use drivegate::codec::RequestPdu;
 use drivegate::drive::Value;
@@ -190,7 +190,7 @@ async fn function_23_writes_and_reads_behind_the_answer() {
     assert_eq!(answer, registers(23, &[300, 301]));
     let orders = rig.buses[0].orders();
     assert!(matches!(orders[..], [Order::Points(_), Order::Read(_)]), "{orders:?}");
-    // Neither is done where the read makes no sense, nor the read where the write failed.
+    // Neither part is done where the read is invalid, nor the read where the write failed.
     assert_eq!(
         client.ask(1, &write_and_read((0x8101, &[2000]), (0x8300, 2))).await,
         [0x97, 2]
@@ -210,7 +210,7 @@ async fn function_23_writes_and_reads_behind_the_answer() {
     );
     let both = vec![stop()[0].clone(), ("reverse".to_string(), Value::Bool(false))];
     assert_eq!(points(&rig), [both]);
-    // A heartbeat is no command, and is answered with what is read.
+    // A heartbeat is not a command, and is answered with the values that are read.
     assert_eq!(
         client.ask(1, &write_and_read((0x8103, &[1]), (0x8000, 2))).await,
         expected

@@ -64,7 +64,7 @@ fn keep_log() {
     // All but the first call fail: the log is kept already.
     let _ = tracing_subscriber::fmt()
         .with_ansi(false)
-        // Of the other servers in this process nothing is asked.
+        // Only messages of the MQTT server are needed, not those of other servers in this process.
         .with_env_filter("drivegate::north::mqtt=info")
         .with_writer(|| LogWriter)
         .try_init();
@@ -279,7 +279,7 @@ impl Watcher {
     }
 }
 
-/// Of the further arguments of a watcher, those that a publisher needs too.
+/// The arguments of a watcher that a publisher needs too.
 fn more_login<'a>(more: &'a [&'a str]) -> &'a [&'a str] {
     if more.first().is_some_and(|first| ["-u", "--cafile"].contains(first)) {
         more
@@ -473,7 +473,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
                 let name = |index: PointIndex| drive.spec.profile.points.get(index).unwrap().name.clone();
                 if let Order::Points(points) = &command.intent.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
-                    // It may have come after `now`.
+                    // The command may have come after `now`.
                     let life = command.intent.window.expires.saturating_duration_since(Instant::now());
                     orders
                         .lock()

@@ -1,5 +1,5 @@
-//! Which certificates of a broker are accepted, and what is said of the others. All are made by openssl; those that the gateway
-//! accepts or that `mosquitto_pub` accepts are tried with `mosquitto_pub`, too.
+//! Certificates of a broker that are accepted, and messages about the others. All are made by openssl; those that the gateway
+//! or `mosquitto_pub` accepts are tried with `mosquitto_pub`, too.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -124,7 +124,7 @@ fn a_certificate_that_is_itself_named_is_accepted() {
     gateway.stop();
 }
 
-/// Certificate of the broker, certificate that is trusted, what `mosquitto_pub` does, and what the gateway says.
+/// Certificate of the broker, trusted certificate, result of `mosquitto_pub`, message of the gateway.
 const REFUSED: &str = "\
 first     | ca        | accept | X.509 version 1, which has no names and usages; have it reissued as version 3
 nameless  | ca        | accept | does not name the host `127.0.0.1` (it has no subjectAltName); have it reissued with subjectAltName = IP:127.0.0.1

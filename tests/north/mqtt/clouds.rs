@@ -1,5 +1,5 @@
-//! What brokers of the clouds and plants with a single way out need: WebSocket, a proxy, a token that another program
-//! renews, a limit of messages.
+//! Needs of cloud brokers and of plants with a single way out: WebSocket, a proxy, a token that another program renews,
+//! a limit of messages.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -31,7 +31,7 @@ fn a_broker_behind_websocket_has_values_and_commands() {
     });
 }
 
-/// An HTTP proxy that knows CONNECT alone: what it was asked for.
+/// An HTTP proxy that knows only CONNECT, and the requests it received.
 fn proxy() -> (u16, Arc<Mutex<Vec<String>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();

@@ -252,7 +252,7 @@ fn retained_messages_are_never_commands() {
     wait_for("both to be refused again", || {
         (watcher.payloads(EVENT).len() == 2).then_some(())
     });
-    // Clearing them is no command either; and a real command still works.
+    // Clearing a retained message is not a command, either; a real command still works.
     watcher.clear();
     let cleared = broker.run("mosquitto_pub", &["-q", "1", "-t", SET, "-r", "-n"]);
     assert!(cleared.status.success());

@@ -1,4 +1,4 @@
-//! Several brokers: the next one when one is gone, and what an old one says that comes back.
+//! Several brokers: the next one when one is gone, and messages of an old one that comes back.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -66,7 +66,7 @@ fn the_next_broker_follows_and_a_working_one_is_kept() {
     let gateway = Gateway::start(of_ports(&ports, state.path(), ""), plant(&["p1"]));
     wait_both(&watcher, "the first is dead", from);
 
-    // It comes to life: nobody asks for it while the second one works.
+    // The first broker is back: the gateway does not return to it while the second one works.
     first.up();
     let on_first = all_of(&first);
     for round in 0..20 {
@@ -107,7 +107,7 @@ fn a_silent_broker_is_left() {
     let from = Instant::now();
     first.signal("STOP");
     wait_both(&on_second, "the first is silent", from);
-    // It finds the connections closed when it goes on, and publishes the last wills.
+    // The broker finds the connections closed when it continues, and publishes the last wills.
     first.signal("CONT");
     on_first.wait_payload(STATUS, &hex("offline"));
     on_first.wait("the death", |m| m.topic == DEATH);
@@ -115,7 +115,7 @@ fn a_silent_broker_is_left() {
     gateway.stop();
 }
 
-/// What a broker says of the gateway that comes back from its disk `later` while the gateway is at another one.
+/// Retained messages of a broker that comes back from its disk `later` while the gateway uses another one.
 fn after_return(message_expiry: Option<Duration>, later: Duration) -> [Option<String>; 2] {
     let state = TempDir::new().unwrap();
     let mut first = Broker::prepared(
@@ -157,7 +157,7 @@ fn a_broker_that_comes_back_does_not_say_that_a_gateway_elsewhere_is_online() {
         after_return(Some(expiry), expiry + Duration::from_secs(1)),
         [None, None]
     );
-    // So it is without.
+    // Without an expiry the old messages are still there.
     let [status, state] = after_return(None, Duration::ZERO);
     assert_eq!((status.as_deref(), state.is_some()), (Some("online"), true));
 }
@@ -183,7 +183,7 @@ fn what_expires_is_renewed_before() {
         assert!(broker.retained(topic).is_some(), "{topic}");
     }
     gateway.stop();
-    // It stays offline until somebody says otherwise.
+    // The status stays offline until a new one is published.
     let offline = wait_for("offline", || {
         broker.retained(STATUS).filter(|status| status == "offline")
     });
@@ -202,7 +202,7 @@ fn the_edge_node_looks_for_its_primary_host() {
     let gateway = Gateway::start(of_ports(&ports, state.path(), "scada"), plant(&["p1"]));
     on_first.wait_payload(STATUS, &hex("online"));
     on_second.wait("the birth", |m| m.topic == BIRTH);
-    // It is offline there and online at the first one: the plain client stays where it is.
+    // The edge node is offline at the second broker and online at the first; the plain client stays where it is.
     second.publish(HOST, &host(false, 2_000), &["-r"]);
     on_second.wait("the death", |m| m.topic == DEATH);
     first.publish(HOST, &host(true, 2_000), &["-r"]);

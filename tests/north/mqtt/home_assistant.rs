@@ -152,7 +152,7 @@ fn a_drive_that_a_reload_removes_is_cleared() {
     gateway.stop();
 }
 
-/// Without a buffer the gateway asks the broker what it has of an earlier run.
+/// Without a buffer the gateway reads the messages of an earlier run from the broker.
 #[test]
 fn a_drive_that_was_removed_while_the_gateway_was_stopped_is_cleared() {
     let broker = Broker::start();

@@ -13,26 +13,26 @@ use super::bench::*;
 const EVENT: &str = "drivegate/hall/drive/p1/event";
 const STATE: &str = "drivegate/hall/drive/p1/state";
 
-/// What the broker does.
+/// Behaviour of the broker.
 #[derive(Clone, Default)]
 struct Manners {
     /// Properties of its CONNACK.
     properties: Vec<u8>,
     /// Topics below this get this reason code, so many times.
     refused: Option<(&'static str, u8, usize)>,
-    /// It writes each byte on its own.
+    /// Whether the broker sends each byte separately.
     piecemeal: bool,
-    /// It acknowledges two events at a time, the later one first.
+    /// Whether the broker acknowledges two events at a time, the later one first.
     backwards: bool,
     /// The first connection ends with this DISCONNECT after the first event.
     farewell: Option<Vec<u8>>,
-    /// It does not answer subscriptions.
+    /// Whether the broker leaves subscriptions unanswered.
     deaf: bool,
     /// From the first ping on it answers nothing.
     mute: bool,
-    /// It refuses a last will with QoS 1, and one that is retained.
+    /// Whether the broker refuses a last will with QoS 1, and one that is retained.
     no_will: bool,
-    /// It refuses filters with wildcards.
+    /// Whether the broker refuses filters with wildcards.
     no_wildcards: bool,
 }
 
@@ -54,7 +54,7 @@ struct Seen {
     by_alias: usize,
     refusals: usize,
     filters: Vec<String>,
-    /// What the gateway says when it leaves.
+    /// Last messages of the gateway when it leaves.
     farewells: Vec<Vec<u8>>,
 }
 
@@ -69,7 +69,7 @@ impl Hostile {
         let port = listener.local_addr().unwrap().port();
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let shared = seen.clone();
-        // It ends with the process.
+        // The thread ends with the process.
         std::thread::spawn(move || {
             for stream in listener.incoming().map_while(Result::ok) {
                 let first = {
@@ -353,7 +353,7 @@ fn odd_brokers_are_served() {
     }
 }
 
-/// A broker that falls silent is told that the connection ends, so that it does not take the gateway for lost by an accident.
+/// The gateway ends the connection to a silent broker with a message, so that the broker can tell this from a failure.
 #[test]
 fn a_broker_that_falls_silent_is_told_goodbye() {
     let keep_alive = with(vec![0x13, 0, 2]);
@@ -365,7 +365,7 @@ fn a_broker_that_falls_silent_is_told_goodbye() {
     wait_for("the farewell", || {
         (!broker.seen.lock().unwrap().farewells.is_empty()).then_some(())
     });
-    // "Disconnect with Will Message": until it is back, whoever reads at this broker is to know that it is away.
+    // "Disconnect with Will Message": clients of this broker must learn that the gateway is away until it is back.
     assert_eq!(
         broker.seen.lock().unwrap().farewells.first().unwrap().first(),
         Some(&0x04)
@@ -515,7 +515,7 @@ fn a_broker_that_refuses_the_last_will_gets_a_lesser_one() {
 
 #[test]
 fn without_wildcards_the_gateway_subscribes_drive_by_drive() {
-    // It says so, or refuses the subscription.
+    // The broker announces that it has no wildcards, or refuses the subscription.
     for (properties, no_wildcards) in [(vec![0x28, 0], false), (vec![], true)] {
         let broker = Hostile::start(Manners {
             properties,

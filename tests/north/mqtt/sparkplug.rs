@@ -52,7 +52,7 @@ fn peer(arguments: &[&str], input: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What was published so far, and the rules it keeps.
+/// Messages published so far, checked against the rules.
 struct Seen(Json);
 
 impl Seen {
@@ -274,7 +274,7 @@ fn a_device_command_is_an_order_like_any_other() {
         (&"sparkplug".into(), &P1.into())
     );
 
-    // Refused: outside the limits, only monitored, retained. The drive's own values are told again.
+    // Refused: outside the limits, only monitored, retained. The drive's own values are published again.
     let references = seen.values("p1", "speed_reference", false).len();
     command(
         &broker,
@@ -332,7 +332,7 @@ fn without_commands_nothing_is_commanded() {
         json!([{ "name": "run", "type": "Boolean", "value": true }]),
         &[],
     );
-    // A birth that is asked for afterwards: what came before was received.
+    // A rebirth requested afterwards shows that the messages before it were received.
     let asks = json!([{ "name": "Node Control/Rebirth", "type": "Boolean", "value": true }]);
     command(&broker, NODE, asks, &[]);
     watcher.wait_count("spBv1.0/plant/DBIRTH/pump-house/p1", 2);

@@ -1,4 +1,4 @@
-//! What is published, and how.
+//! Published telemetry: topics, payloads and times.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};

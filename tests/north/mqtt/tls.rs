@@ -124,7 +124,7 @@ fn users_passwords_and_rights() {
     let gateway = Gateway::start(right, plant(&["p1"]));
     watcher.wait_payload("drivegate/hall/status", "online");
     watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
-    // What the broker refuses for good is dropped; the rest goes on.
+    // A message that the broker refuses permanently is dropped; the rest continues.
     gateway.publish_event("p1", EventKind::Fault, "not allowed");
     broker.publish("drivegate/hall/drive/p1/set", r#"{"run": true}"#, &login);
     watcher.wait("the result", |m| m.topic == "drivegate/hall/drive/p1/result");

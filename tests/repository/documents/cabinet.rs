@@ -1,4 +1,4 @@
-//! What docs/commissioning.md says of each family at the cabinet, generated from the built-in profiles.
+//! The texts of docs/commissioning.md for each family at the cabinet, generated from the built-in profiles.
 
 use std::fmt::Write;
 

@@ -44,7 +44,7 @@ pub(crate) fn tables() -> String {
     text
 }
 
-/// The families that nobody has confirmed on hardware, and how many they are.
+/// The families that are not confirmed on hardware, and their number.
 fn unverified(profiles: &Profiles) -> (String, usize) {
     let mut text = String::from(
         "\n## Families not verified on hardware\n\nMade from manuals and reports, not confirmed ([how to](verifying.md)); \

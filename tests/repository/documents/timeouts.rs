@@ -1,11 +1,11 @@
-//! What docs/safety.md says of the own timeout of each family, generated from the built-in profiles.
+//! The texts of docs/safety.md about the timeout of each family, generated from the built-in profiles.
 
 use std::fmt::Write;
 
 use drivegate::drive::Step;
 use drivegate::drive::profile::Profiles;
 
-/// What a profile says where nobody knows what the timeout counts; the page says it once.
+/// Text of a profile whose timeout counts unknown requests; the page has it once.
 const UNKNOWN: &str = "; which requests count is not known";
 
 /// A row for each timeout, with the families that have it and are not based on another.

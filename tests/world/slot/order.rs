@@ -1,4 +1,4 @@
-//! What a tool broadcasts is an order to every drive of the bus, with its place among their others.
+//! A broadcast of a tool is an order to every drive of the bus, with its place among their other orders.
 
 use drivegate_world::drive::RawWrites;
 use drivegate_world::event::{Event, EventKind};
@@ -88,7 +88,7 @@ fn half_a_frame_before_a_stop_is_no_start_behind_it() {
         tool.pass(&frame[3..]);
         tool.pass_time(2 * SECOND);
         assert!(!tool.runs(1), "the tool began to ask before the stop");
-        // It asks again.
+        // The tool repeats its request.
         tool.pass(&frame);
         tool.pass_time(2 * SECOND);
         assert!(tool.runs(1));

@@ -1,4 +1,4 @@
-//! What befalls threads, drives and names.
+//! Incidents of threads, drives and names.
 
 use super::*;
 
@@ -19,7 +19,7 @@ impl World {
         }
     }
 
-    /// What befalls threads, drives and names.
+    /// Incidents of threads, drives and names.
     pub(super) fn incidents(&mut self) {
         let now = self.now;
         if self.calm {
@@ -35,7 +35,7 @@ impl World {
                 self.incident();
             }
         }
-        // What is read late by a hiccup that nobody notices means what its name means then.
+        // An order read late after an unnoticed hiccup has the meaning of its name at the reading.
         let unnoticed = self.standing.readers.is_some() && self.stalled_for <= promised::UNNOTICED;
         if self.wants_reload && !unnoticed && self.standing.bus.is_none() && self.bus.core.asked().is_none() {
             self.wants_reload = false;

@@ -1,4 +1,4 @@
-//! What the clients do.
+//! The actions of the clients.
 
 use super::*;
 
@@ -18,7 +18,7 @@ impl World {
         });
     }
 
-    /// What a client does.
+    /// The next action of a client.
     pub(super) fn act(&mut self, index: usize) {
         let now = self.now;
         if let Some((_, bytes, id)) = self.connections[index].rest.take_if(|(at, ..)| *at <= now) {
@@ -40,7 +40,7 @@ impl World {
         if busy || waits {
             return;
         }
-        // Who gets no answer gives up.
+        // A client without an answer gives up.
         let gives_up = if self.standing.readers.is_some() { 0.2 } else { 0.03 };
         if !self.healthy && self.chance(gives_up) {
             return self.hang_up(index);

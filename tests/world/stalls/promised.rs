@@ -1,11 +1,12 @@
-//! What the clients of a world wanted of which machine, and what must follow from that.
+//! Orders that the clients of a world wanted for each machine, and what must follow from that.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// An order is not begun later than this after it was sent (2 s), and what it does may take several exchanges.
+/// An order is started at most 2 s after it was sent, and its effect may take several transactions.
 const WANTED: Duration = Duration::from_millis(3_500);
-/// A client that closed its connection this long before it was read has given up; sooner, nobody can know.
+/// A client that closed its connection this long before the order was read has given up; a shorter time cannot be
+/// noticed.
 pub const UNNOTICED: Duration = Duration::from_millis(160);
 /// A longer stall is a pause: what was sent before its end starts nothing.
 const PAUSE: Duration = Duration::from_millis(1_010);
@@ -16,12 +17,12 @@ const FOLLOWS: Duration = Duration::from_millis(400);
 /// Between the reading that a write rests on and the write there is one exchange.
 const LOOKED: Duration = Duration::from_millis(60);
 
-/// What an order does to a motor.
+/// Effect of an order on a motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Does {
     Run,
     Stop,
-    /// It starts nothing.
+    /// The order starts nothing.
     Other,
 }
 
@@ -30,19 +31,19 @@ pub struct Order {
     pub connection: usize,
     pub machine: u8,
     pub does: Does,
-    /// Its first byte was sent.
+    /// When the first byte was sent.
     pub sent: Instant,
-    /// Its last byte was sent.
+    /// When the last byte was sent.
     pub complete: Instant,
-    /// Its last byte was read.
+    /// When the last byte was read.
     pub read: Option<Instant>,
-    /// Its client closed the connection before that.
+    /// When the client closed the connection, if before that.
     pub closed: Option<Instant>,
     /// With the exception, if it was one.
     pub answer: Option<(Instant, Option<u8>)>,
 }
 
-/// What all clients wanted, and what the drives did.
+/// Orders of all clients, and actions of the drives.
 pub struct Promised {
     pub orders: Vec<Order>,
     /// When each drive was sent the writes that it carried out.
@@ -87,7 +88,7 @@ impl Promised {
         self.orders[id].read = Some(now);
     }
 
-    /// Its client has closed the connection.
+    /// Records that the client has closed the connection.
     pub fn closed(&mut self, id: usize, now: Instant) {
         self.orders[id].closed.get_or_insert(now);
     }
@@ -126,7 +127,7 @@ impl Promised {
             return;
         }
         let at = told.first().copied().unwrap_or(now);
-        // What was read just before says that it runs: the word that keeps its run bit is on its way.
+        // A reading just before said that the motor runs, so a word that keeps the run bit is already being sent.
         if self
             .befell
             .get(&machine)

@@ -1,4 +1,4 @@
-//! What the clients do.
+//! The actions of the clients.
 
 use super::*;
 use drivegate_world::drive::PointIndex;
@@ -25,7 +25,7 @@ impl World {
             return;
         }
         let falls_silent = match habit {
-            // It comes back so often that it would be silent most of the time.
+            // A client that acts this often would otherwise be silent most of the time.
             Habit::StopsInALoop => 0.000_3,
             Habit::Floods if self.scenario.floods => 0.000_3,
             _ => 0.01,
@@ -131,7 +131,7 @@ impl World {
                     Wish::RawRead if self.records.len().is_multiple_of(2) => Wish::RawOther,
                     wish => wish,
                 };
-                // One that is over soon may run out while the line falls silent before it.
+                // An order with a short time may expire while the line goes silent before it.
                 let short = ms(self.dice.within(3..=80));
                 let expiry = [ms(2_000), ms(2_000), ms(400), short][self.dice.within(0..=3) as usize];
                 self.plain(index, bus, drive, wish, expiry);
@@ -142,7 +142,7 @@ impl World {
         }
     }
 
-    /// One order of a burst; behind the last one a silence that ends about when the lease does, or long after.
+    /// An order of a burst; after the last one a silence that ends about when the lease does, or long after.
     pub(super) fn operate(&mut self, index: usize, bus: usize, drive: usize) {
         let ms = Duration::from_millis;
         let left = match self.clients[index].burst.2 {
@@ -165,7 +165,7 @@ impl World {
                 .as_ref()
                 .map_or(ms(1_000), |s| s.timeout);
             let silence = if self.dice.chance(0.7) {
-                // The same drive again: it may be back just in time, or just not.
+                // The next burst goes to the drive of this one: the client may be back just in time, or just not.
                 self.clients[index].burst.2 = self.dice.within(1..=3);
                 timeout.mul_f64(0.9 + 0.3 * self.dice.unit())
             } else {
@@ -237,7 +237,7 @@ impl World {
         self.buses[bus].command_came(self.now);
     }
 
-    /// Its order was answered at once: it waits a moment.
+    /// An order was answered at once, so the client waits a moment.
     fn turned_away(&mut self, client: usize) {
         if !self.scenario.floods {
             self.clients[client].next += TURNED_AWAY;
@@ -299,7 +299,7 @@ impl World {
         }
     }
 
-    /// The broker delivers a message once more: it is no new order, unless it is a stop.
+    /// The broker delivers a message again: the repetition is not a new order, unless it is a stop.
     fn repeat(&mut self, client: usize, id: usize, message: Incoming) {
         let Record { bus, drive, wish, .. } = self.records[id];
         let now = self.now;

@@ -23,7 +23,7 @@ impl World {
         }
     }
 
-    /// The same after a step: those who wait for a write are only asked when one was answered.
+    /// Collects answers after a step: clients that wait for a write are checked only when one was answered.
     pub(super) fn collect_news(&mut self) {
         let before = std::mem::replace(&mut self.answered, self.writes.seconds().count);
         for client in 0..self.clients.len() {
@@ -219,7 +219,7 @@ impl World {
         self.figures.confirmed += u64::from(code == "confirmed");
     }
 
-    /// Of an order that stops and does more only the stop was done: that it was, and that the rest is what the answer says.
+    /// Checks an order of which only the stop was done: that it was done, and that the answer reports the rest.
     fn check_stop_only(&self, id: usize, record: &Record, outcome: Option<&Outcome>) {
         let (profile, truth) = (&self.buses[record.bus].profile, &self.truths[record.bus][record.drive]);
         let stops = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
@@ -262,13 +262,13 @@ impl World {
         );
     }
 
-    /// What the drive was too busy for was tried until its time was over, and an exception that leaves open what became of a
-    /// write is no refusal.
+    /// Checks a refusal: a busy drive was tried until the time expired, and an exception that leaves the result of a write
+    /// open is not a refusal.
     fn check_refused(&self, id: usize, record: &Record, outcome: Option<&Outcome>) {
         let Some(Outcome::Exception(code)) = outcome.filter(|_| record.wish != Wish::RawRead) else {
             return;
         };
-        // What was not sent, because the drive did not say what it has, it refused.
+        // An order that was not sent because the state of the drive was unknown counts as refused.
         assert!(
             record.sent.is_none() || !matches!(code.0, 0x05 | 0x0A | 0x0B),
             "order {id} is told to be refused, and the answer was {code}"
@@ -280,7 +280,7 @@ impl World {
         );
     }
 
-    /// What was acknowledged was done.
+    /// Checks that an acknowledged order was carried out.
     pub(super) fn check_done(&self, id: usize, record: &Record, code: &str, outcome: Option<&Outcome>) {
         let bus = &self.buses[record.bus];
         let (profile, truth) = (&bus.profile, &self.truths[record.bus][record.drive]);
@@ -322,7 +322,7 @@ impl World {
         }
     }
 
-    /// What was converted rests on a maximum frequency that the drive had not long ago.
+    /// Checks that a converted order used a maximum frequency that the drive had recently.
     fn check_converted(&self, id: usize, record: &Record) {
         let (bus, truth) = (&self.buses[record.bus], &self.truths[record.bus][record.drive]);
         let image = &bus.handle.image.drives[record.drive];

@@ -126,7 +126,7 @@ impl World {
         all.filter(|(bus, drive)| self.is_alive(*bus, *drive))
     }
 
-    /// One drive of each line is stopped: whatever came before, the stop is on the wire soon.
+    /// Stops one drive of each line: whatever came before, the stop is on the wire soon.
     fn stop_at_once(&mut self) -> Vec<(usize, usize, Instant)> {
         let mut stops = Vec::new();
         let client = self.clients.len();
@@ -225,7 +225,7 @@ impl World {
             let remains = bus.core.remains(self.now);
             let wanted = Remains {
                 away: bus.line.dead.len(),
-                // Of probes.
+                // Probes of dead drives may leave late replies open.
                 late_replies: if bus.line.dead.is_empty() {
                     0
                 } else {
@@ -274,7 +274,7 @@ impl World {
                         PollClass::Fast => *best + round + probe + self.exchange(bus) / 2 + STEP,
                         _ => 2 * bus.slow_round.max(bus.line.slow_cycle) + 2 * round,
                     };
-                    // In the sound world nobody orders anything, and nothing is refreshed.
+                    // The sound world has no orders and no refresh.
                     let most = if bus.line.refresh.is_some() { 3 * most / 2 } else { most };
                     assert!(
                         age.is_some_and(|age| age <= most),
@@ -308,7 +308,7 @@ fn note_ages(ages: &mut Ages, handle: &drivegate_world::plant::BusHandle, now: I
     }
 }
 
-/// The same on a line of the same drives that never had a fault.
+/// Ages of the reads on a line of equal drives that never had a fault.
 fn sound_ages(bus: &WorldBus, window: Duration) -> Ages {
     let line = crate::scenario::Line {
         faults: String::new(),

@@ -1,4 +1,4 @@
-//! What befalls drives and ports, and what the gateway does with a new configuration.
+//! Incidents of drives and ports, and reloads of the gateway.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! What goes over the lines: each request and each reply is checked.
+//! Traffic on the lines: each request and each reply is checked.
 
 use super::*;
 
@@ -23,7 +23,8 @@ impl World {
             statistics.silence_violations, 0,
             "a request came before the line was silent"
         );
-        // Behind a late reply that stood for the present one, that is still to come: nobody can know.
+        // After a late reply that was taken for the present one, the present one is still to come: that cannot be
+        // known.
         if !self.buses[index].late {
             assert_eq!(statistics.collisions, 0, "a request met a reply");
             assert_eq!(statistics.provoked_overlaps, 0, "a request met noise");
@@ -66,7 +67,7 @@ impl World {
         let truth = &mut self.truths[bus][drive];
         truth.action.take_if(|action| action.pdu != *pdu);
         if let Some(run) = run_command(&profile, pdu) {
-            // What was read just before the drive lost its supply is not known to be lost.
+            // The run command was lost with the supply: a value read just before still shows it.
             let lost = truth.lost_word.is_some_and(|at| now - at < Duration::from_secs(1));
             if run && !truth.run && !lost {
                 let until = truth
@@ -186,7 +187,7 @@ impl World {
         words.any(|words| sets(pdu, &words))
     }
 
-    /// A write goes out that no client asked for: the lease must have run out, and no client be back.
+    /// Checks a write that no client ordered: the lease must have expired, and no client be back.
     pub(super) fn supervision_acts(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         let now = self.now;
         // An order that ended in this step waits no more.
@@ -200,7 +201,7 @@ impl World {
         );
         let retries = self.buses[bus].line.retries;
         let truth = &mut self.truths[bus][drive];
-        // What is on the wire when a client comes back stands, lost or not: its tries go on.
+        // An action on the wire when a client comes back is not taken back, lost or not: its tries go on.
         let began = truth.action_began(pdu, retries, now);
         if let Some(heard) = truth.heard.0 {
             assert!(
@@ -256,7 +257,7 @@ impl World {
         );
         let first = record.sent.is_none();
         record.sent.get_or_insert(now);
-        // Of an order that stops and does more these words are the rest, which overtakes nothing.
+        // The words of an order that stops and does more are its rest, which overtakes nothing.
         if first {
             let (place, earliest) = (record.place, record.earliest);
             let truth = &mut self.truths[bus][drive];
@@ -322,8 +323,8 @@ impl World {
             self.now - at
         );
         let truth = &self.truths[bus][asked.drive];
-        // The drive may have said it in answer to an earlier try; the image dates it back then.
-        // The checksum of N2 does not show two flipped bits that make up for each other.
+        // The drive may have answered so to an earlier try; the image dates it back then. The checksum of N2 does not
+        // detect two flipped bits that compensate each other.
         let flipped = self.buses[bus].line.protocol == Protocol::N2 && self.buses[bus].line.flips_bits();
         let alike = |words: &Vec<u16>| {
             let bits = words

@@ -1,4 +1,4 @@
-//! What must hold at any time.
+//! Conditions that must hold at any time.
 
 use super::*;
 
@@ -113,7 +113,7 @@ impl World {
                 let due = last.max(running).max(online) + supervision.timeout + ACTION + round;
                 let repeated = truth.repeated_until.is_some_and(|until| self.now < until);
                 let waits = repeated || self.open.contains_key(&(index, drive));
-                // Until the motor was seen to run, the lease of one that stood has ended.
+                // Until the motor was seen to run, the lease of a motor that stood has ended.
                 let armed = running <= last + supervision.timeout || truth.carried.is_some_and(|at| at >= last);
                 let noisy = bus.line.is_noisy();
                 let late = if noisy { due + Duration::from_secs(2) } else { due };
@@ -137,7 +137,7 @@ impl World {
         }
     }
 
-    /// On a sound line the process data of a drive that answers stays fresh, whoever commands what.
+    /// On a sound line the process data of a drive that answers stays fresh, whichever client commands.
     pub(super) fn check_polls(&self) {
         let sound = |bus: &&WorldBus| bus.open && !bus.line.is_noisy() && self.scenario.incidents.is_none();
         for bus in self.buses.iter().filter(sound) {
@@ -156,7 +156,7 @@ impl World {
         }
     }
 
-    /// A drive that does not answer is asked again within 10 s, and what else is on the line.
+    /// A drive that does not answer is probed again within 10 s plus the other traffic on the line.
     pub(super) fn check_probes(&self) {
         for (bus, truths) in self.buses.iter().zip(&self.truths) {
             let round = bus.handle.image.health().fast.last.unwrap_or_default();

@@ -15,7 +15,7 @@ use super::*;
 const EVERY: (usize, usize) = (8, 8);
 
 impl World {
-    /// One drive after the other is read.
+    /// Reads one drive after the other.
     pub(super) fn read_by_http(&mut self) {
         self.readings += 1;
         if !self.readings.is_multiple_of(EVERY.0) {
@@ -61,7 +61,7 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
         match &point.source {
             Source::Raw(_) => {
                 let most = match point.class {
-                    // Its value is that of its monitoring register, until comparisons agree.
+                    // The value comes from its monitoring register until comparisons agree.
                     PollClass::Fast if monitored.contains(&index) => slow,
                     PollClass::Fast => plant.stale_after,
                     PollClass::Slow => slow,

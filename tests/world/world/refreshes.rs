@@ -1,9 +1,10 @@
-//! What is written again for a drive's own timeout: only what was ordered, and only while that stands.
+//! Refreshes for a drive's own timeout: only ordered values, and only while the order stands.
 
 use super::*;
 
 impl World {
-    /// A frame of a refresh goes out: nothing that no order wrote, none behind a stop but its word, none to a motor that stands.
+    /// Checks the frame of a refresh: no value that no order wrote, only the word of a stop behind a stop, and none to a motor
+    /// that stands.
     pub(super) fn check_refresh(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         self.collect();
         let now = self.now;
@@ -43,7 +44,7 @@ impl World {
             "drive {} gets a run command again that it does not have",
             drive + 1
         );
-        // What the drive showed right before.
+        // State that the drive showed directly before.
         let within = Duration::from_millis(500);
         assert!(
             truth.turned_at.is_some_and(|at| now - at <= within),
