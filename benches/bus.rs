@@ -1,4 +1,4 @@
-//! How near the gateway comes to the limit of the wire, beside other masters on the same simulated line.
+//! How near the gateway comes to the limit of the wire, compared with other masters on the same simulated line.
 //!
 //! `cargo bench --bench bus` (options: `-- --seconds 2 --runs 7 --baud 38400`). Ten drives, reads of the eleven process
 //! data registers, 8N1, turnaround 0.5 ms, 3.5 characters of silence. The gateway runs whole, and its Modbus TCP and HTTP
@@ -34,7 +34,7 @@ const TIMEOUT: Duration = Duration::from_millis(100);
 /// Part of a pause in which a master watches the clock: the kernel wakes it late by some ten microseconds.
 const SPIN: Duration = Duration::from_micros(60);
 
-/// Who polls the line.
+/// The master that polls the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Master {
     Bare,
@@ -73,7 +73,7 @@ impl Master {
     }
 }
 
-/// What one run of one master gave.
+/// Result of one run of one master.
 #[derive(Debug, Clone, Copy)]
 struct Run {
     /// Replies a second.

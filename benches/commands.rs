@@ -46,7 +46,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
         let mut waits: Vec<Duration> = Vec::new();
         let mut failed = 0;
         for value in 1..=commands.min(9_999) {
-            // Not in step with the line.
+            // The pauses vary, so that they are not in step with the line.
             tokio::time::sleep(Duration::from_micros(30_000 + u64::from(value) * 7_919 % 17_000)).await;
             let drive = plant.drive(&format!("line-{}", value % 10 + 1)).ok_or("no drive")?;
             let point = drive

@@ -1,5 +1,5 @@
-//! What a gateway takes of a small box: processor time, wake-ups, memory, and instructions an exchange, with 1 and 4 buses
-//! of a 10 ms cycle and 4 saturated buses.
+//! Load of a gateway on a small machine: processor time, wake-ups, memory, and instructions per transaction, with 1 and 4
+//! buses of a 10 ms cycle and 4 saturated buses.
 //!
 //! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The daemon and
 //! the simulator are processes of their own. Instructions are counted by callgrind in a run of its own, as they do not depend on how busy the
@@ -207,7 +207,7 @@ impl Blocks {
         }
     }
 
-    /// The instructions that were executed, if the line tells of any.
+    /// The instructions that were executed, if the line reports any.
     fn line(&mut self, line: &[u8]) -> Option<u64> {
         let address = |text: &[u8]| u64::from_str_radix(std::str::from_utf8(text).ok()?, 16).ok();
         if line.starts_with(b"Trace") {
@@ -228,7 +228,7 @@ impl Blocks {
     }
 }
 
-/// The environment that the systemd unit gives the daemon; it says how memory is kept.
+/// The environment that the systemd unit gives the daemon; it controls how memory is kept.
 fn unit_environment() -> impl Iterator<Item = (&'static str, &'static str)> {
     include_str!("../systemd/drivegate.service")
         .lines()

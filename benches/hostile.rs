@@ -1,10 +1,10 @@
-//! What clients without a right can do to those who have one.
+//! Effects of clients without rights on clients that have them.
 //!
 //! `cargo bench --bench hostile` (option: `-- --seconds 8`, the time of each attack). One gateway with ten drives; an
 //! operator at 127.0.0.2, the only one who may write, opens a connection for each command, one a second; a SCADA client at
 //! 127.0.0.3 polls every 20 ms over one connection. Attackers at 127.0.0.9 may connect and nothing else. For each attack:
-//! commands answered, the audit of them, the latency of the SCADA client and the cadence of the line, beside the same figures
-//! without an attack. Fails if an answer or an audit entry of the operator is missing; times are for reading.
+//! commands answered, the audit of them, the latency of the SCADA client and the cadence of the line, next to the same
+//! figures without an attack.
 
 mod common;
 
@@ -79,7 +79,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
     }
 }
 
-/// Runs one attack beside operator and SCADA client; how many answers and audit entries are missing.
+/// Runs one attack while operator and SCADA client work; returns the number of missing answers and audit entries.
 async fn phase(
     attack: Attack,
     north: North,
@@ -208,7 +208,7 @@ async fn audited(http: SocketAddr, first: u16, last: u16) -> Result<usize, Box<d
     Ok((first..=last).filter(|value| has(*value)).count())
 }
 
-/// What an attacker does.
+/// Kind of an attack.
 #[derive(Debug, Clone, Copy)]
 enum Attack {
     None,
@@ -259,7 +259,7 @@ impl Attack {
         }
     }
 
-    /// One turn of one attacker.
+    /// One turn of an attacker.
     async fn run(self, north: North, number: usize) -> io::Result<()> {
         match self {
             Attack::None => {}

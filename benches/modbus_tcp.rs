@@ -1,4 +1,4 @@
-//! The Modbus TCP server beside others: tokio-modbus, libmodbus with epoll, pymodbus.
+//! The Modbus TCP server compared with others: tokio-modbus, libmodbus with epoll, pymodbus.
 //!
 //! `cargo bench --bench modbus_tcp` (options: `-- --seconds 0.5 --runs 15`). Every server is a process of its own, reads are
 //! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs; `drivegate ratio`
@@ -44,7 +44,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// What a server did in one turn.
+/// Result of a server in one turn.
 #[derive(Clone, Copy)]
 struct Turn {
     load: Load,
@@ -167,7 +167,7 @@ impl Stolen {
         Stolen(Self::now())
     }
 
-    /// Of the time that was wanted since then.
+    /// Share of the requested processor time since then that was stolen.
     fn percent(&self) -> f64 {
         let ([stolen, wanted], [stolen_before, wanted_before]) = (Self::now(), self.0);
         100.0 * (stolen - stolen_before) / (wanted - wanted_before).max(1.0)

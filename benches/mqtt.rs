@@ -222,7 +222,7 @@ impl Broker {
         Ok(broker)
     }
 
-    /// What arrives for a filter from now on.
+    /// Messages that arrive for a filter from now on.
     fn subscribe(&self, runtime: &Runtime, filter: &str) -> Result<Receiver<Arrived>, Box<dyn Error>> {
         let mut options = MqttOptions::new(
             format!("bench-{filter}").replace(['/', '+'], "-"),

@@ -1,4 +1,4 @@
-//! What many buses cost: processor time an exchange, memory, and the rate of each bus, beside one bus alone.
+//! Costs of many buses: processor time per transaction, memory, and the rate of each bus, compared with a single bus.
 //!
 //! `cargo bench --bench scale` (options: `-- --seconds 10 --runs 3 --baud 38400 --buses 32`). The daemon
 //! (`drivegate run`) and the simulator (`drivegate simulate`) are processes of their own, so that the processor time of
@@ -26,7 +26,7 @@ fn main() -> ExitCode {
     common::exit(measure())
 }
 
-/// What one run gave.
+/// Result of one run.
 #[derive(Debug, Clone, Copy)]
 struct Run {
     /// Exchanges a second and bus.

@@ -1,8 +1,8 @@
 //! A measuring rod: the least that a Modbus RTU master can do on a port. Write, read until the expected length, keep
 //! 3.5 characters of silence, next.
 //!
-//! It schedules nothing, retries nothing and trusts whatever comes; its rate on a simulated line is what operating system
-//! and pseudo-terminal leave of the wire's limit, and so the rate that a bus task is measured against.
+//! The bare master schedules nothing, retries nothing and accepts any reply; its rate on a simulated line is what
+//! operating system and pseudo-terminal leave of the wire's limit, and so the rate that a bus task is measured against.
 
 use drivegate::codec::{Decoded, LineFormat, Request, rtu};
 use drivegate::line::{poll_until, sharpen_timers, wait_until};
@@ -26,7 +26,7 @@ pub(crate) struct BareOptions {
     pub(crate) spin: Duration,
 }
 
-/// The rate that the wire allows: request, 3.5 characters until the drive knows its end, turnaround, reply, silence.
+/// The rate that the wire allows: request, 3.5 characters that mark its end, turnaround, reply, silence.
 pub(crate) fn wire_limit(options: &BareOptions, request: &Request, turnaround: Duration) -> f64 {
     let characters = request.pdu.encoded_len() + request.pdu.reply_len() + 2 * rtu::OVERHEAD;
     let format = &options.format;
@@ -62,7 +62,8 @@ pub(crate) fn run(port: &Path, options: &BareOptions, requests: &[Request], time
     Ok(())
 }
 
-/// One exchange, which ends with a reply, a corrupt frame or the timeout: what came is in the transcript of the line.
+/// A transaction, which ends with a reply, a corrupt frame or the timeout: the transcript of the line has the bytes
+/// received.
 fn exchange(
     port: &mut File,
     options: &BareOptions,

@@ -10,7 +10,7 @@ use drivegate::sim::wire::SimulatedBus;
 use crate::common::gateway::{Bus, Gateway, NORTH, settings};
 use crate::{DRIVES, record};
 
-/// What the bare master reads, and nothing else.
+/// A profile with the registers that the bare master reads, and no others.
 const PROFILE: &str = "name = \"process-data\"\nprotocols = [\"modbus-rtu\"]\n\
     [[range]]\ntable = \"holding\"\nfirst = 2100\nlast = 2110\nread = 20\nholes = true\n\
     [[point]]\nname = \"fault\"\nat = \"holding 2100.3\"\nclass = \"fast\"\n\

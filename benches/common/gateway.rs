@@ -48,7 +48,7 @@ impl Bus<'_> {
     }
 }
 
-/// Both north sides that are read, on any ports.
+/// Both north sides that are read, on free ports.
 pub const NORTH: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\n[http]\nlisten = \"127.0.0.1:0\"\n";
 
 /// The settings of `[gateway]` with its name and what follows.
@@ -83,7 +83,7 @@ impl Gateway {
         Ok(gateway)
     }
 
-    /// Its first bus.
+    /// First bus of the gateway.
     pub fn bus(&self) -> Result<Arc<BusImage>, Box<dyn Error>> {
         Ok(self.plant.buses.first().ok_or("no bus")?.image.clone())
     }

@@ -1,4 +1,5 @@
-//! What the benches share: the gateway under test, clients of its north sides, medians, and what a transcript shows.
+//! Parts that the benches share: the gateway under test, clients of its north sides, medians, and the evaluation of a
+//! transcript.
 // Each bench uses its own part.
 #![allow(dead_code, unreachable_pub)]
 
@@ -65,7 +66,7 @@ pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
 /// Waits up to two minutes until `there` holds.
 ///
 /// # Errors
-/// It does not.
+/// The condition is not met in time.
 pub fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
     let patience = Instant::now() + Duration::from_secs(120);
     while !there() {
@@ -80,7 +81,7 @@ pub fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> 
 /// Resident memory of a process, MiB.
 ///
 /// # Errors
-/// There is no such process.
+/// The process does not exist.
 pub fn resident_memory(process: u32) -> Result<f64, Box<dyn Error>> {
     let status = std::fs::read_to_string(format!("/proc/{process}/status"))?;
     let line = status

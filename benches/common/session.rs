@@ -51,7 +51,7 @@ pub fn options(client_id: &str, host: &str, port: u16) -> Options {
     }
 }
 
-/// One bus of Vacon NX drives, which nobody polls.
+/// A bus of Vacon NX drives without a poller.
 pub fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
     let profile = Profiles::built_in().get("vacon-nx").ok_or("no profile")?.clone();
     let image = |n: u16| {

@@ -1,4 +1,5 @@
-//! A client that asks as fast as it is answered: one thread, any number of connections, batches of any depth.
+//! A client that sends the next request as soon as it is answered: one thread, any number of connections, batches of
+//! any depth.
 
 use std::error::Error;
 use std::io::{ErrorKind, Read, Write};
@@ -13,7 +14,7 @@ use crate::common::quantile;
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 1, 3, 0x08, 0x34, 0, 11];
 const ANSWER: usize = 31;
 
-/// What came of it.
+/// Result of the client.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Load {
     /// Requests answered in a second.

@@ -64,7 +64,7 @@ impl Process {
         })
     }
 
-    /// One of the servers of this program.
+    /// Starts one of the servers of this program.
     pub(crate) fn own(name: &'static str) -> Result<Process, Box<dyn Error>> {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["--serve", name]);
@@ -121,7 +121,7 @@ async fn until_input_ends() {
     let _ = tokio::task::spawn_blocking(|| std::io::stdin().lines().for_each(drop)).await;
 }
 
-/// One drive at 115200 baud behind a server.
+/// A drive at 115200 baud behind a server.
 fn one_drive(port: &str) -> Result<Settings, Box<dyn Error>> {
     let bus = Bus {
         name: "line",
