@@ -10,10 +10,10 @@
 //! Commands go down: a server gives a command to the drive's handle ([`plant`]), which checks authority, limits and presence
 //! ([`mod@command`]) and queues it for the bus; the client gets exactly one result.
 //!
-//! This package holds `main` and gives every crate of `crates/` the name of its room; Cargo enforces which may use which.
-//! From the bottom: [`codec`] (`drivegate-proto`), [`bacnet`] (`-bacnet`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],
-//! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`spec`], [`start_guard`], [`stop_all`], [`version`] (`-core`), [`mod@line`], [`bus`],
-//! [`north`], [`sim`], [`config`] and [`daemon`] (`-gateway`), [`cli`] (`-tools`).
+//! The package holds `main` and gives every crate of `crates/` the name of its room; Cargo enforces which may use which. From the bottom:
+//! [`codec`] (`drivegate-proto`), [`bacnet`] (`-bacnet`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],
+//! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`spec`], [`start_guard`], [`stop_all`], [`version`]
+//! (`-core`), [`mod@line`], [`bus`], [`north`], [`sim`], [`config`] and [`daemon`] (`-gateway`), [`cli`] (`-tools`).
 //!
 //! Deliberately absent:
 //!
