@@ -5,13 +5,13 @@ use drivegate_proto::RequestPdu;
 /// A write to a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
-    /// One register by function 06.
+    /// A register written with function 06.
     Word(u16, u16),
-    /// One register by function 16.
+    /// A register written with function 16.
     Single(u16, u16),
     /// Two registers by function 16.
     Pair(u16, u16, u16),
-    /// One coil by function 05.
+    /// A coil written with function 05.
     Coil(u16, bool),
 }
 

@@ -1,4 +1,4 @@
-//! What the tests of several packages share: plants made by hand, and what came out of a queue or the audit.
+//! Parts that the tests of several packages share: plants made by hand, and readers of a queue or the audit.
 //!
 //! No bus runs: a test fills the process images and empties the queues. The unit tests of `drivegate-core` compile this
 //! source as a module of their own, because this package depends on that one.
