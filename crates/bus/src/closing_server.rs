@@ -1,6 +1,6 @@
-//! A device server that closes its connection soon after a reply. A request that is sent before that is seen goes into a
-//! connection that nobody reads: it holds the line until its time is over. So the bus notes after how many replies, and how
-//! soon, the server closes, and sends nothing there before it has. Pure: time is an argument.
+//! A device server that closes its connection soon after a reply. A request that is sent before the close is seen goes into
+//! a connection that the server no longer reads: it holds the line until its time is over. So the bus notes after how many
+//! replies, and how soon, the server closes, and sends nothing in that time. Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ const MARGIN: Duration = Duration::from_millis(10);
 /// After so many further replies over one connection the server is taken to stay.
 const STAYED: u32 = 3;
 
-/// What the bus knows of a device server, and of its present connection.
+/// Knowledge of a device server and of its present connection.
 #[derive(Debug, Default)]
 pub(super) struct ClosingServer {
     /// Replies over this connection, and when the last one came.

@@ -36,7 +36,7 @@ const MOST_STOPS: u32 = 8;
 /// The next step of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next {
-    /// This request on the line.
+    /// The next request for the line.
     Send(Step),
     /// Nothing before then.
     Wait(Instant),
@@ -46,11 +46,11 @@ pub enum Next {
 /// The properties of the command that its steps depend on.
 #[derive(Debug)]
 struct Scope {
-    /// It sets every bit that can be commanded, except reset bits.
+    /// Whether the command sets every bit that can be commanded, except reset bits.
     whole: bool,
-    /// It sets references only.
+    /// Whether the command sets references only.
     reference_only: bool,
-    /// It is acknowledged only when the drive shows its effect.
+    /// Whether the command is acknowledged only when the drive shows its effect.
     reads_back: bool,
 }
 
@@ -58,18 +58,18 @@ struct Scope {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum OnWire {
     Nothing,
-    /// Only reads that prepare a write.
+    /// Only reads that prepare a write were sent.
     Reads,
     /// A write; of a command that reads, its read.
     Command,
 }
 
-/// What is left to send.
+/// Steps that are left to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
     /// The steps as ordered.
     Steps,
-    /// The same, after the last word of a sequence, which starts the motor: if the rest fails, a stop follows.
+    /// The last word of a sequence, which starts the motor, was sent: if the rest fails, a stop follows.
     MotorStarted,
     /// The end of a pulse, or that stop, which is sent whatever happens.
     OnlyEnds,
@@ -96,7 +96,7 @@ struct Tries {
     doubt: Doubt,
     /// Consecutive "busy" replies.
     busy: u32,
-    /// It is tried again after that time.
+    /// Pause before the next try.
     pause: Option<Duration>,
 }
 
@@ -124,13 +124,13 @@ pub struct CommandRun {
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
-    /// The drive is being asked whether its motor runs.
+    /// The drive is being read to see whether its motor runs.
     look: Option<Look>,
     /// The direction that it orders, and that waits for the next start.
     next_start: Option<bool>,
-    /// It says the direction, or starts the motor.
+    /// Whether the command sets the direction, or starts the motor.
     turns: bool,
-    /// It waited for a late reply since its last step was chosen.
+    /// Whether the command waited for a late reply since its last step was chosen.
     held_up: bool,
     /// Stops that were done since it was last written.
     overtaken: u32,
@@ -235,7 +235,7 @@ impl CommandRun {
     /// The stop of a client that it is, as it was ordered: the bus that takes the place of this one sends it as a whole.
     ///
     /// # Errors
-    /// It is none.
+    /// The command is not a stop of a client.
     pub fn into_stop(mut self) -> Result<Command, Box<CommandRun>> {
         if self.urgency != Urgency::Stop || !self.is_of_client() {
             return Err(Box::new(self));
@@ -264,7 +264,7 @@ impl CommandRun {
         self.urgency
     }
 
-    /// Whether it sets references only, which starts no motor.
+    /// Whether the command sets references only, which starts no motor.
     pub fn is_reference_only(&self) -> bool {
         self.scope.reference_only
     }
@@ -274,7 +274,8 @@ impl CommandRun {
         self.expires
     }
 
-    /// The thread stood still for long, the machine being suspended for `slept` of it. What has begun is not continued.
+    /// The thread did not run for long, with the machine suspended for `slept` of it. A command that has started is not
+    /// continued.
     pub fn interrupted(&mut self, slept: Duration, now: Instant) {
         let expires = self.expires.checked_sub(slept).unwrap_or(now);
         self.expires = if self.reached_the_wire() {
@@ -290,12 +291,12 @@ impl CommandRun {
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
     }
 
-    /// Whether it renews the lease of its drive.
+    /// Whether the command renews the lease of its drive.
     pub fn is_heard(&self) -> bool {
         self.renews && self.is_of_client()
     }
 
-    /// Those who gave it.
+    /// The clients that gave the command.
     pub fn origins(&self) -> impl Iterator<Item = &Origin> {
         self.tickets.iter().map(Ticket::origin)
     }
@@ -307,17 +308,17 @@ impl CommandRun {
             .any(|ticket| ticket.origin().kind == SourceKind::Slot)
     }
 
-    /// Whether only supervision wants it.
+    /// Whether the command comes only from supervision.
     pub fn is_of_supervision(&self) -> bool {
         self.tickets.iter().all(|ticket| ticket.origin().is_lease())
     }
 
-    /// Whether it may write more than the end of a pulse.
+    /// Whether the command may write more than the end of a pulse.
     pub fn may_write_on(&self) -> bool {
         self.phase != Phase::OnlyEnds
     }
 
-    /// Whether it, or a part of it, was on the wire; a preparatory read does not count.
+    /// Whether the command, or a part of it, was on the wire; a preparatory read does not count.
     pub fn has_begun(&self) -> bool {
         self.on_wire == OnWire::Command
     }
@@ -380,7 +381,7 @@ impl CommandRun {
         self.on_wire = self.on_wire.max(sent);
         if step.pdu.is_write() {
             self.overtaken = 0;
-            // It is seen again before the next write.
+            // The motor must be read again before the next write.
             self.known.motor = None;
         }
     }
@@ -417,19 +418,19 @@ impl CommandRun {
         }
     }
 
-    /// Whether it waits while a late reply could be mistaken for the reply to its step. A stop waits only once it was
-    /// sent.
+    /// Whether the command waits while a late reply could be mistaken for the reply to its step. A stop waits only once
+    /// it was sent.
     pub fn waits_for_late(&self) -> bool {
         self.urgency != Urgency::Stop || self.tries.doubt == Doubt::LateReply
     }
 
-    /// It must wait for a late reply: what it has read is outdated by then.
+    /// The command must wait for a late reply: values that it has read are outdated by then.
     pub fn hold_up(&mut self) {
         self.held_up = true;
     }
 
-    /// It may continue. Returns whether it first repeats the reads from before the wait: the motor may have been
-    /// stopped meanwhile.
+    /// The command may continue. Returns whether it first repeats the reads from before the wait: the motor may have
+    /// been stopped meanwhile.
     pub fn asks_again(&mut self) -> bool {
         let held_up = std::mem::take(&mut self.held_up);
         if held_up && self.is_checked() {
@@ -449,13 +450,13 @@ impl CommandRun {
         self.by_other_function = false;
     }
 
-    /// It has expired, and its remaining steps are not cancelled yet.
+    /// Whether the command has expired, and its remaining steps are not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && self.may_write_on()
     }
 }
 
-/// Whether an order says the direction, or starts the motor; a raw write that reaches one of the places of these does.
+/// Whether an order sets the direction, or starts the motor; a raw write to one of their places counts.
 fn turns(profile: &Profile, order: &Order) -> bool {
     match order {
         Order::Points(values) => {

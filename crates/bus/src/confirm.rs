@@ -16,7 +16,7 @@ const RIPPLE: f64 = 0.25;
 /// On a busy line the next read may come late: it is reported only after this multiple of the confirmation time.
 const UNREAD: u32 = 5;
 
-/// What a read must show.
+/// The effect that a read must show.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Effect {
     /// The motor runs.
@@ -39,7 +39,7 @@ impl Effect {
         }
     }
 
-    /// What was not seen, as text.
+    /// The missing effect, as text.
     fn missing(self, profile: &Profile) -> String {
         match self {
             Effect::Runs => "the motor does not run".to_string(),
@@ -91,7 +91,7 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
                 }
             }
         }
-        // It is read back before it is acknowledged.
+        // A parameter is read back before it is acknowledged.
         Order::Parameter(_) => {}
         Order::Read(_) => {}
     }
@@ -112,7 +112,7 @@ fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effec
     readable.then_some(Effect::ReadBack(index, value))
 }
 
-/// Whether the reading shows it, by samples that were read after `since`; none where there is no such sample.
+/// Whether the reading shows the effect, by samples that were read after `since`; none where there is no such sample.
 fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> {
     let after = |sample: crate::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
     let model = |point| after(reading.model(point));
@@ -121,7 +121,7 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
         Effect::NoFault => model(ModelPoint::Fault).map(|fault| !fault.as_bool()),
         Effect::Stops => {
             let stopped = model(ModelPoint::Running).map(|running| !running.as_bool());
-            // Not the speed: in percent of a band from a minimum frequency, 0 % is a motor that turns.
+            // The speed is not used: in percent of a band from a minimum frequency, 0 % is a motor that turns.
             let stands = model(ModelPoint::OutputFrequency).map(is_standstill);
             stopped.into_iter().chain(stands).reduce(|a, b| a || b)
         }
@@ -186,7 +186,7 @@ struct Watch {
     unseen: Option<String>,
     /// Supervision wanted it, or the gateway that stops.
     own: bool,
-    /// Of those waiting for confirmation; empty once the time has passed without a conclusion.
+    /// Receipts of clients that wait for confirmation; empty once the time has passed without a conclusion.
     receipts: Vec<Receipt>,
 }
 
@@ -204,7 +204,7 @@ impl Watch {
         self.has(Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
     }
 
-    /// Whether it is too early to report an effect as missing because it was not read yet.
+    /// Whether it is too early to report an unread effect as missing.
     fn waits_for_reads(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.since) < self.within * UNREAD
     }
@@ -227,7 +227,7 @@ impl Watch {
         missing
     }
 
-    /// What was not seen, as text.
+    /// The missing effects, as text.
     fn report(&self, missing: &[Awaited], profile: &Profile, now: Instant) -> String {
         let Watch { what, within, .. } = self;
         if missing.iter().all(|awaited| !awaited.was_read) {
@@ -275,11 +275,11 @@ impl Watch {
 /// A command that showed no effect in time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unconfirmed {
-    /// What was not seen, as text.
+    /// The missing effects, as text.
     pub text: String,
     /// The motor was to run, and does not.
     pub does_not_run: bool,
-    /// It was the action of a lease.
+    /// Whether the command was the action of a lease.
     pub own: bool,
 }
 

@@ -21,7 +21,7 @@ use crate::plant::BusHandle;
 use crate::process_image::Taping;
 use crate::stalls::Stalls;
 
-/// What to do with the port.
+/// Next action on the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
     /// Read the received bytes; if there are none, write what [`BusCore::sending`] returns to the port.
@@ -37,7 +37,7 @@ pub enum Action {
     },
 }
 
-/// What to do after a device server closed the connection.
+/// Reaction to a device server that closed the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Closed {
     /// Reconnect at once: the server has replied over it, or a reply may arrive over the next one.
@@ -48,12 +48,12 @@ pub enum Closed {
     Lost,
 }
 
-/// What happened since the port was opened or reconnected.
+/// Events since the port was opened or reconnected.
 #[derive(Debug, Default)]
 struct Connection {
-    /// It replaced a connection over which the server had replied.
+    /// Whether the connection replaced one over which the server had replied.
     anew: bool,
-    /// It was made to send something.
+    /// Whether the connection was made to send something.
     to_ask: bool,
     asked: bool,
     answered: bool,
@@ -93,7 +93,7 @@ pub struct BusCore {
     writes: Arc<WriteStats>,
     /// Empty; kept for its memory.
     news: Vec<News>,
-    /// Those of its thread; none before that runs.
+    /// Stalls of the bus's thread; none before it runs.
     stalls: Option<Stalls>,
     /// There was one since the request on the line was sent.
     stood: bool,
@@ -134,8 +134,9 @@ impl BusCore {
         }
     }
 
-    /// Its thread runs at `now`; `boot` is the time since the machine was started, suspensions included. Whether it stood
-    /// still since it ran last: then what came meanwhile is to be read before anything else.
+    /// Records that the thread runs at `now`; `boot` is the time since the machine was started, suspensions included.
+    /// Returns whether the thread was stalled since it ran last: then bytes that came meanwhile must be read before
+    /// anything else.
     pub fn ran(&mut self, now: Instant, boot: Duration) -> bool {
         let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
         let before = stalls.ran();
@@ -151,7 +152,7 @@ impl BusCore {
         true
     }
 
-    /// Its thread runs on: since it ran last it did something else, such as to open the port.
+    /// Records that the thread runs on: since it ran last it did other work, such as opening the port.
     pub fn runs_on(&mut self, now: Instant, boot: Duration) {
         match &mut self.stalls {
             Some(stalls) => stalls.go_on(now, boot),
@@ -188,7 +189,7 @@ impl BusCore {
             return Closed::Reconnect;
         }
         if asked && !self.line.is_underway() {
-            // Nobody answered, but it was there for as long as a reply may take.
+            // No reply came, but the connection lasted as long as a reply may take.
             return Closed::ReconnectToAsk;
         }
         if asked && anew && vain + 1 < MOST_IN_VAIN {
@@ -202,7 +203,7 @@ impl BusCore {
         Closed::Lost
     }
 
-    /// It was connected to again.
+    /// The port was reconnected.
     pub fn reconnected(&mut self) {
         let Connection { to_ask, vain, .. } = self.connection;
         self.connection = Connection {
@@ -351,7 +352,7 @@ impl BusCore {
                                                                                              silent; sending anyway");
         }
         let quiet_since = self.line.quiet_since();
-        // What a drive needs beyond the silence of the bus is no pause of the line.
+        // Extra silence that a drive needs beyond that of the bus is not a pause of the line.
         let needed = self.line.silence_before(self.master.silence_of(&turn));
         let paused = now.saturating_duration_since(quiet_since + needed.saturating_sub(self.line.silence()));
         self.report.diagnosis.sending(paused);

@@ -18,7 +18,7 @@ use crate::plant::BusHandle;
 const PAUSE: Duration = Duration::from_secs(30);
 /// Pause before a counter whose reply was lost is read again.
 const AGAIN: Duration = Duration::from_secs(1);
-/// Not sent after this.
+/// Time after which the request is not sent.
 const EXPIRY: Duration = Duration::from_secs(20);
 
 /// The readings of all drives of a bus.
@@ -38,7 +38,7 @@ enum State {
 }
 
 impl DriveCounters {
-    /// Of the drives of a bus that count.
+    /// The counters of those drives of a bus that count.
     pub(super) fn new(bus: &BusHandle, now: Instant) -> DriveCounters {
         let drives = bus.image.drives.enumerate();
         let counting = drives.filter(|(_, drive)| drive.spec.profile.counts_messages);
@@ -98,7 +98,8 @@ impl DriveCounters {
                             }
                         }
                     }
-                    // A drive that refuses it is not asked soon again; what was lost on the line is.
+                    // A drive that refuses the counters is left alone for long; a request that was lost on the line is
+                    // repeated sooner.
                     Ok(Answer {
                         outcome: Outcome::Exception(_),
                         ..
@@ -111,7 +112,7 @@ impl DriveCounters {
     }
 }
 
-/// Asks for the counter behind those that were read.
+/// Requests the counter behind those that were read.
 fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
     let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");

@@ -24,18 +24,18 @@ pub(super) const FRESH: Duration = Duration::from_secs(2);
 pub(super) struct DriveState {
     /// A status older than that does not show whether the motor runs.
     pub(super) fresh: Duration,
-    /// Its own command words.
+    /// Command words of the drive.
     pub(super) words: KnownWords,
     /// The places of what orders write, and of the command word where the drive shows its own: they are kept from every read.
     pub(super) commanded: Vec<(Table, u16)>,
     /// Replies that it may still send.
     pub(super) late: LateReplies,
     pub(super) repeated_stops: RepeatedStops,
-    /// Its lease.
+    /// Lease of the drive.
     pub(super) supervision: Supervision,
-    /// What is written again for its own timeout.
+    /// Refresh for the drive's own timeout.
     pub(super) refresh: Refresh,
-    /// Why that ended, where it is not told yet.
+    /// Why the refresh ended, until that is reported.
     pub(super) refresh_ended: Option<End>,
     /// Commands that it acknowledged and has not shown yet.
     pub(super) confirmations: Confirmations,
@@ -47,7 +47,7 @@ pub(super) struct DriveState {
     pub(super) vain_stops: VainStops,
     /// The longest recent transaction.
     pub(super) answers_within: Duration,
-    /// It was read since its confirmations were looked at.
+    /// Whether the drive was read since its confirmations were checked.
     pub(super) was_read: bool,
     /// When its reference, and an end of its frequency range, were written last, whether or not it took that.
     pub(super) written: LastWritten,
@@ -60,7 +60,7 @@ pub(super) struct DriveState {
     pub(super) local: Option<bool>,
 }
 
-/// What the started commands of a drive need.
+/// Next need of the started commands of a drive.
 #[derive(Debug)]
 pub(super) enum Wanted {
     /// A step of the command of that rank.
@@ -142,7 +142,7 @@ impl DriveState {
         of_client.map(CommandRun::expires).max()
     }
 
-    /// What the started commands need at `now`, highest rank first. Those that have ended get their result.
+    /// The next need of the started commands at `now`, highest rank first. Commands that have ended get their result.
     pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
@@ -219,7 +219,7 @@ impl DriveState {
                 .extend(run.origins().map(|origin| (origin.clone(), is_stop)));
         }
         if urgency == Urgency::Stop && run.has_begun() {
-            // Stops without end must not make each other news.
+            // Repeated stops must not reset the time of the first.
             self.stopped = outcome.is_ok().then(|| self.stopped.unwrap_or(now));
         }
         if urgency == Urgency::Stop
@@ -255,7 +255,7 @@ impl DriveState {
         }
     }
 
-    /// What the end of a command changes for the refresh.
+    /// Updates the refresh when a command has ended.
     fn refresh_after(&mut self, run: &CommandRun, outcome: &Outcome, image: &DriveImage, now: Instant) {
         let is_command = matches!(run.intent().order, Order::Points(_) | Order::Write(_));
         if !is_command || !run.has_begun() {
@@ -277,7 +277,7 @@ impl DriveState {
         self.refresh_ended = ended.or(self.refresh_ended.take());
     }
 
-    /// The refresh ends for that reason, if it has begun.
+    /// Ends the refresh for this reason, if it has started.
     pub(super) fn end_refresh(&mut self, why: End) {
         let ended = self.refresh.end(why);
         self.refresh_ended = ended.or(self.refresh_ended.take());

@@ -6,11 +6,10 @@
 //! reply would look the same could be answered wrongly. Such a request waits until no late reply can come any more. The
 //! same request may be sent again at once: whichever reply comes, it is true of the same registers.
 //!
-//! But the reply that comes then may be the older one, and the newer one is still to come: a drive that is always a
-//! little slower than the deadline stays one reply behind as long as the same request follows upon itself. Until that is
-//! settled, samples are dated by the request before. What settles it is a reply that can be none of these: a drive answers
-//! in order, so a reply to a request of another look shows that nothing asked before is still to come. A plan has such requests:
-//! its slow reads.
+//! The reply that comes then may still be the older one, with the newer one to come: a drive that is always a little slower than
+//! the deadline stays one reply behind as long as a request is repeated. Until that is settled, samples are dated by the request
+//! before. A reply that cannot be any of these settles it: a drive answers in order, so a reply to a request of another form
+//! shows that no earlier reply is still to come. A plan has such requests: its slow reads.
 //!
 //! Look-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
 //! held back too after a while, and the drive gets the time to catch up.
@@ -20,9 +19,9 @@
 //! it may belong to the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
 //! written in between, either acknowledgement is true: the drive's last word is a stop.
 //!
-//! Nor does a stop wait for look-alikes. The acknowledgement of a write of several registers or coils has first address
-//! and count, not the values. So a stop by such a write is sent once more for each acknowledgement of another one that
-//! may still come. From then on it is the stop whose acknowledgement may come late, instead of the other write's.
+//! A stop does not wait for look-alikes, either. The acknowledgement of a write of several registers or coils has first
+//! address and count, not the values. So a stop by such a write is sent again for each acknowledgement of another one
+//! that may still come. From then on it is the stop whose acknowledgement may come late, instead of the other write's.
 
 use std::time::{Duration, Instant};
 
@@ -134,8 +133,9 @@ impl LateReplies {
         self.overtake(pdu);
     }
 
-    /// A reply to `pdu` came that is no exception: nothing that was asked before and looks otherwise is still to come. It
-    /// shows nothing where it may itself be the late reply to an earlier request. To be called before [`LateReplies::answered`].
+    /// A reply to `pdu` came that is not an exception: no reply to an earlier request of another form is still to come. The
+    /// reply shows nothing where it may itself be the late reply to an earlier request. To be called before
+    /// [`LateReplies::answered`].
     pub(crate) fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
         let owed = |late: &&LateReply| late.ends() > now && look_alike(&late.pdu, pdu);
         if self.expected.iter().any(|late| owed(&late)) {
@@ -154,9 +154,9 @@ impl LateReplies {
         }
     }
 
-    /// Whether the reply to `pdu`, sent at `sent`, may be that to an earlier request: to another one that looks the same,
-    /// or to the same write before another one. To be asked before [`LateReplies::answered`]; true once for each
-    /// late reply, and `pdu`, which is to be sent once more, is expected in its place.
+    /// Whether the reply to `pdu`, sent at `sent`, may belong to an earlier request: to another one of equal form, or to
+    /// an equal write before another one. To be called before [`LateReplies::answered`]; true once for each late reply,
+    /// and `pdu`, which is to be sent again, is expected in its place.
     pub(crate) fn proves_nothing(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
         let owed = |late: &LateReply| late.ends() > sent;
         let same = |late: &&mut LateReply| owed(late) && late.pdu == *pdu && late.overtaken > 0;
@@ -177,8 +177,8 @@ impl LateReplies {
         true
     }
 
-    /// When the request was sent at the latest whose reply an answer to `pdu` at `now` may be: earlier than this one while a
-    /// late reply to the same request may come. To be asked before [`LateReplies::answered`].
+    /// The latest time at which the request of an answer to `pdu` at `now` may have been sent: earlier than the present
+    /// request while a late reply to an equal request may come. To be called before [`LateReplies::answered`].
     pub(crate) fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
         let doubtful = |late: &LateReply| late.ends() > now && !late.settled;
         let same = self.expected.iter().find(|late| late.pdu == *pdu && doubtful(late));

@@ -1,11 +1,12 @@
 //! The bus: one owner of the line, one transaction at a time.
 //!
-//! - `line_loop`: the thread, the port, the clock; it does what the core says. [`prober`] does the same for `scan`.
+//! - `line_loop`: the thread, the port, the clock; it carries out the actions of the core. [`prober`] does this for
+//!   `scan`.
 //! - [`core`](self::core): the bus without its thread: bytes and time in, what to do with the port out.
 //! - [`line_state`]: how long the line has been silent, and the transaction that is in progress, a [`transaction`].
 //! - `closing_server`: when a device server is about to close its connection, and nothing is sent over it.
-//! - [`master`]: what goes on the line next (`choose`), the result (`results`), the stops at shutdown (`shutdown`).
-//!   [`schedule`] knows which poll is due, [`predict`] what that comes to on a given line.
+//! - [`master`]: the next request for the line (`choose`), the result (`results`), the stops at shutdown (`shutdown`).
+//!   [`schedule`] knows which poll is due, [`predict`] the resulting times on a given line.
 //! - `drive_state`: what is known of one drive besides its samples, polls and N2 session: its started commands
 //!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
 //!   still send ([`late_replies`]).
@@ -15,9 +16,9 @@
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
 //! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows the result.
 //! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
-//! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
+//! - [`news`]: the results of the master; `report` applies them to the process image, to events and to the log.
 //!
-//! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
+//! Only `line_loop` and [`prober`] do I/O and read the clock; everything else takes time as an argument. `report` and
 //! `tap`, which feeds the trace, add the time of day to what they report.
 
 mod closing_server;

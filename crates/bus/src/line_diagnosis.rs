@@ -87,7 +87,7 @@ impl LineDiagnosis {
         }
     }
 
-    /// What the counters of the drives of a finding show about the disturbed direction.
+    /// The disturbed direction, as far as the counters of the drives of a finding show it.
     fn directions(&self, finding: &Finding) -> String {
         let about = self.figures.drives.enumerate().zip(&self.names).zip(&self.by_drive);
         let about = about.filter(|(((index, _), _), _)| finding.drive.is_none_or(|drive| drive == *index));
@@ -113,7 +113,7 @@ impl LineDiagnosis {
         at: Instant,
     ) {
         let transaction = &exchanged.transaction;
-        // A drive may well ignore what a tool asks of it that no codec knows.
+        // A drive may well ignore a request of a tool that no codec knows.
         if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
             return;
         }

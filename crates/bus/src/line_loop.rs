@@ -116,9 +116,9 @@ impl BusTask {
         self.halt();
     }
 
-    /// The same for a bus that another one replaces: stops wait for it, handed over by [`BusHandle::take_over`].
-    /// The stops of the drives of `last`, which none serves any more, are sent before; a drive that does not answer is not waited
-    /// for longer than two seconds. Returns the handover.
+    /// Ends a bus that another one replaces: stops wait for that one, handed over by [`BusHandle::take_over`]. The stops of the
+    /// drives of `last`, which no bus serves any more, are sent before; the wait for a silent drive is at most two seconds.
+    /// Returns the handover.
     pub fn make_room(mut self, last: Vec<DriveIndex>) -> Handover {
         let began = Instant::now();
         let queue = self.handle.queue.clone();
@@ -222,7 +222,7 @@ impl Worker {
         let handle = self.handle.clone();
         let core = ListenCore::new(handle, &self.options, events, writes, Instant::now());
         self.keep_open(core);
-        // Drives of such a bus have no leases, and nothing was asked.
+        // Drives of such a bus have no leases, and no request was sent to them.
         Handover::default()
     }
 
@@ -266,7 +266,7 @@ impl Worker {
     }
 
     /// Serves an open port until the bus is to stop. A device server that closes its connection after a reply or after a pause
-    /// is no lost port: it is connected to again.
+    /// is not a lost port: it is reconnected.
     ///
     /// # Errors
     /// Why the port is lost.
@@ -339,7 +339,7 @@ impl Worker {
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
             if core.ran(now, line::since_boot()) {
-                // What came meanwhile is a reply, whatever time it is now.
+                // Bytes that came during the stall are a reply, although its time is over.
                 let count = line.receive(&mut buffer)?;
                 core.heard(buffer.get(..count).unwrap_or_default(), now);
             }
@@ -561,7 +561,7 @@ mod tests {
         let mut pauses = ReopenPauses::default();
         assert_eq!(next(&mut pauses), first);
         assert_eq!(next(&mut pauses), [REOPEN.1; 6]);
-        // It opens and goes again at once.
+        // The port opens and is lost again at once.
         pauses.was_open_for(Duration::from_millis(2999));
         assert_eq!(pauses.next(), REOPEN.1);
         pauses.was_open_for(REOPEN.1);

@@ -8,7 +8,7 @@ use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_
 use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::drive::plan::WireTime;
 
-/// A line that never goes silent is spoken on after this time: a stop must get out.
+/// Time after which the bus sends on a line that never goes silent: a stop must get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
 
 /// Baud rates are off by at most 2 %, and times are not exact: anything faster than this share of its time is too
@@ -29,8 +29,8 @@ const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
 const WEIGHT_OF_DOUBTED: u32 = 40;
 /// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
-/// What a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks like an early
-/// one: while fewer than one reply in four is early, the line keeps its protection.
+/// Weight that a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks like an
+/// early one: while fewer than one reply in four is early, the line keeps its protection.
 const REGULAR_ON_N2: u32 = 8;
 /// An early reply that could belong to another request and was believed. One in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
@@ -275,7 +275,8 @@ impl LineState {
     /// Time went by.
     ///
     /// # Errors
-    /// The time until which more is waited for, while the transaction is not over; none where there is no transaction.
+    /// The time until which more bytes are awaited, while the transaction is not over; none where there is no
+    /// transaction.
     pub fn on_time(&mut self, now: Instant) -> Result<Exchanged, Option<Instant>> {
         let Some(underway) = self.underway.as_mut() else {
             return Err(None);
@@ -355,7 +356,7 @@ impl LineState {
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
             Ended::Reply(_) if doubtful => 0,
             Ended::Reply(_) => self.weight_of(WEIGHT_OF_EARLY),
-            // What else came may be what is left of the reply itself.
+            // The other bytes may be the rest of the reply itself.
             Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => self.weight_of(WEIGHT_OF_DOUBTED),
             Ended::Silent | Ended::Corrupt(_) => 0,
         };

@@ -1,9 +1,9 @@
 //! The master of a line: decides the next request and applies results. Pure: time is an argument.
 //!
 //! [`Master::next`] chooses among stops, other commands, forwarded reads, polls and background transactions;
-//! [`Master::done`] takes the result of a transaction and says what that changes. All that is known of one drive is in
-//! its `DriveState`. Choosing is in `choose`, results are in `results`, background transactions in `background`, the
-//! end of the gateway is in `shutdown`.
+//! [`Master::done`] takes the result of a transaction and returns the changes. The state of one drive is in its
+//! `DriveState`. Choosing is in `choose`, results are in `results`, background transactions in `background`, the end of
+//! the gateway is in `shutdown`.
 
 mod background;
 mod choose;
@@ -54,7 +54,7 @@ use crate::process_image::{DriveImage, Timing};
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 /// Response timeouts for which an N2 reply may come late.
 const N2_LATE: u32 = 3;
-/// But no longer than this: a silent drive is probed within 10 s.
+/// Longest wait for a late reply: a silent drive is probed within 10 s.
 const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
 /// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
 /// slower: probed every 10 s, it costs less than 2 % of the line by that.
@@ -62,12 +62,12 @@ const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
 /// Every so many probes of a drive one waits as long as any request: the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
-/// One transaction: drive, purpose and request.
+/// A transaction: drive, purpose and request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
     /// Place of the drive on the bus.
     pub drive: DriveIndex,
-    /// Its purpose.
+    /// Purpose of the transaction.
     pub purpose: Purpose,
     pdu: RequestPdu,
 }
@@ -94,7 +94,7 @@ pub enum Purpose {
     Session(Session, Before),
 }
 
-/// What follows a step of an N2 session.
+/// Continuation after a step of an N2 session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Before {
     /// A read of the plan.
@@ -134,7 +134,7 @@ pub struct TurnEnd {
     pub began: Instant,
     /// When it ended: no later than a reply can have left the drive.
     pub at: Instant,
-    /// The thread stood still meanwhile: that nothing came may be its own doing.
+    /// Whether the thread was stalled meanwhile: the missing reply may be due to that.
     pub stood: bool,
     /// How long the line was taken.
     pub took: Duration,
@@ -146,12 +146,12 @@ pub struct TurnEnd {
     pub frame: Vec<u8>,
 }
 
-/// What goes on with a drive over a reload.
+/// State of a drive that continues over a reload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Carried {
-    /// Its lease.
+    /// Lease of the drive.
     pub lease: Lease,
-    /// What is written again for its own timeout.
+    /// Refresh for the drive's own timeout.
     pub repeated: Repeated,
     /// The stops that are to be written again.
     pub stops: RepeatedStops,
@@ -167,7 +167,7 @@ impl Carried {
         }
     }
 
-    /// The lease when its time stood for so long.
+    /// The lease after a time in which it did not run.
     #[must_use]
     pub fn after(self, stood: Duration) -> Carried {
         Carried {
@@ -184,7 +184,7 @@ pub struct Handover {
     pub leases: Vec<Carried>,
     /// Until when a reply to its request may arrive; none if no bus used the line before.
     pub quiet_until: Option<Instant>,
-    /// Its findings about the line.
+    /// Findings about the line.
     pub learned: Option<Learned>,
 }
 
@@ -198,7 +198,7 @@ pub struct Master {
     silence: Duration,
     schedule: Schedule,
     drives: PerDrive<DriveState>,
-    /// What a transaction may have to wait for.
+    /// Conditions that a transaction may have to wait for.
     waits: Waits,
     /// The last reply on the line, valid or damaged: it may be repeated.
     last_answered: Option<(DriveIndex, RequestPdu)>,
@@ -208,7 +208,7 @@ pub struct Master {
     /// The last one was passed on to drives of the bus as a command.
     passed_on_last: bool,
     shutdown: Option<Shutdown>,
-    /// The line was spoken on before it was opened: by this bus, or by the one before it.
+    /// Whether the line was in use before it was opened: by this bus, or by the one before it.
     successor: bool,
     writes: Arc<WriteStats>,
     /// Consecutive probes without a reply, by drive.
@@ -323,7 +323,7 @@ impl Master {
         queue.gate.settle(|_| false);
         drop(queue);
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
-            // One that came while the port was lost, and that nobody has looked at.
+            // A heartbeat that came while the port was lost has not been taken yet.
             if let Some(at) = image.take_heartbeat() {
                 drive.supervision.renew(at);
             }
@@ -510,8 +510,8 @@ impl Master {
             silence: self.silence_of(turn),
             response_timeout: self.timeout_of(turn),
             late_may_come: self.late_before,
-            // An N2 reply does not even show whose it is. What was last on a line that was spoken on before
-            // is not known when it is opened again.
+            // An N2 reply does not even show its drive. The last request on a line that was in use before is not known
+            // when it is opened again.
             could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
                 false => *of == turn.drive && look_alike(last, &turn.pdu),

@@ -1,13 +1,13 @@
 //! Late replies on an N2 line. Pure: time is an argument.
 //!
 //! An N2 reply names neither drive nor request; it shows only its form. After a transaction without a valid reply, the
-//! reply may come during a later transaction, of whichever drive. So the line remembers which forms may still come, and
-//! for how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot
-//! be the reply of the present transaction is the late one, which is no longer expected from then on. What a reply
-//! shares with a late one by chance, such as a refusal, is not believed.
+//! reply may come during a later transaction, of any drive. So the line remembers which forms may still come, and for
+//! how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot be
+//! the reply of the present transaction is the late one, which is no longer expected from then on. A reply whose form a
+//! late one may share by chance, such as a refusal, is not accepted.
 //!
 //! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has another
-//! form, nothing that it was asked before is still to come. And process data may be asked for again at once, as long as the
+//! form, no reply to an earlier request is still to come. Process data may be requested again at once, as long as the
 //! request was not answered since: whichever reply comes, it is the same object of the same drive. Its value is dated by
 //! the first of these requests.
 
@@ -50,7 +50,7 @@ struct Late {
     until: Instant,
     /// Replies that may still come: the request was sent so often without success.
     count: u32,
-    /// The same request was answered since, by an unknown one of the replies.
+    /// Whether an equal request was answered since, by an unknown one of the replies.
     answered: bool,
 }
 
@@ -59,9 +59,10 @@ struct Late {
 pub enum Taken {
     /// As far as late replies are concerned it may be the reply.
     Reply,
-    /// It is a late reply: so many bytes are to be dropped.
+    /// The frame is a late reply: this many bytes are to be dropped.
     Late(usize),
-    /// It may be the reply or a late one. As many are to come as before, perhaps the reply itself.
+    /// The frame may be the reply or a late one. The number of late replies stays, perhaps with the reply itself among
+    /// them.
     Doubtful,
 }
 
@@ -106,7 +107,7 @@ impl N2LateReplies {
         }
     }
 
-    /// When the object was asked for that the reply to this request shows, which came now.
+    /// When the object in the reply that came now was requested.
     pub(crate) fn asked_by(&self, address: u8, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let late = self.0.iter().find(|late| late.is_of(address, pdu) && late.until > now);
         late.map(|late| late.asked)
@@ -133,7 +134,7 @@ impl N2LateReplies {
         self.alike(wanted, now).map(|late| late.until).max()
     }
 
-    /// The same for a poll: one of process data may go out again, unless it was answered since.
+    /// Until when a poll is blocked: process data may be requested again, unless it was answered since.
     pub(super) fn blocks_poll(&self, address: u8, read: &PlannedRead, now: Instant) -> Option<Instant> {
         let pdu = read.pdu();
         let again = |late: &Late| read.class == PollClass::Fast && !late.answered && late.is_of(address, &pdu);
@@ -239,14 +240,14 @@ impl Late {
         self.address == address && self.pdu == *pdu
     }
 
-    /// Whether it may still come and be taken for a reply of that form.
+    /// Whether the late reply may still come and pass for a reply of this form.
     fn could_pass_for(&self, wanted: Form, now: Instant) -> bool {
         self.until > now && self.form.is_like(wanted)
     }
 
     fn could_be(&self, answer: &Answer) -> bool {
         match (self.form, answer) {
-            // Whatever was asked may have been refused.
+            // Any request may have been refused.
             (_, Answer::Nak(_)) => true,
             (Form::Identity, Answer::Data(digits)) => {
                 digits.eq_ignore_ascii_case(format!("{:02X}", self.device).as_bytes())

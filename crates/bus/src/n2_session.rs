@@ -21,11 +21,11 @@ pub const MOST_POLLS: u8 = 16;
 enum Phase {
     /// Identified never, or not since it went away.
     Unknown,
-    /// It has reported that it waits for Identify.
+    /// The drive has reported that it waits for Identify.
     Waiting,
-    /// It reports what has changed: polls left, and whether the next one acknowledges the report before.
+    /// The drive reports its changes: polls left, and whether the next one acknowledges the report before.
     Reporting { left: u8, again: bool },
-    /// It is read and commanded.
+    /// The drive is read and commanded.
     Ready,
 }
 
@@ -34,7 +34,7 @@ struct Drive {
     options: N2Options,
     phase: Phase,
     polled: Option<Instant>,
-    /// It has replied since it was identified.
+    /// Whether the drive has replied since it was identified.
     proved: bool,
     /// The device type that was reported last.
     device: Option<u8>,
@@ -45,13 +45,13 @@ struct Drive {
 pub enum Progress {
     /// The next step is decided again.
     Going,
-    /// The drive is of another type than its profile says; reported once.
+    /// The drive is of another type than its profile has; reported once.
     Unlike(u8),
     /// Something has changed: the drive is to be read.
     Changed,
     /// The drive has restarted.
     Restarted,
-    /// It gave no valid reply.
+    /// The drive gave no valid reply.
     Failed,
 }
 
@@ -115,7 +115,7 @@ impl N2Sessions {
         match (step, reply) {
             (Session::Identify, reply) => drive.identified(reply),
             (_, Reply::Changes(digits)) => drive.reported(!digits.is_empty(), now),
-            // A drive that knows no polls, or no reports, is read all the same.
+            // A drive without polls, or without reports, is still read.
             _ => drive.reported(false, now),
         }
     }
@@ -146,7 +146,7 @@ impl N2Sessions {
         }
     }
 
-    /// Drives that are due for a poll and would not be asked otherwise, because nothing of them is read so often.
+    /// Drives that are due for a poll and would get no request otherwise, because nothing of them is read so often.
     pub(crate) fn neglected(&self, now: Instant) -> impl Iterator<Item = DriveIndex> {
         let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
         let drives = self.drives.enumerate();
@@ -199,7 +199,7 @@ impl Drive {
             Phase::Reporting { left, .. } => self.phase = Phase::Reporting { left, again: false },
             Phase::Ready => {}
         }
-        // One that refuses to be identified is there all the same.
+        // A drive that refuses to be identified is present nevertheless.
         let Reply::Identified(device) = reply else {
             return Progress::Going;
         };

@@ -1,4 +1,4 @@
-//! The master's news about its drives, for the process image, events and the log.
+//! Results of the master about its drives, for the process image, events and the log.
 
 use std::time::{Duration, Instant};
 
@@ -8,7 +8,7 @@ use crate::drive::{DriveIndex, PlannedRead};
 use crate::order::Refusal;
 use crate::queue::Denied;
 
-/// One piece of news. Drives are named by their place on the bus.
+/// A result of the master. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub enum News {
     /// A round of the fast class was started, so long after the one before.
@@ -65,7 +65,7 @@ pub enum News {
     },
     /// A drive whose lease expired does not report whether it runs.
     RunningUnknown(DriveIndex),
-    /// What is written again for the drive's own timeout is so no more.
+    /// The refresh for the drive's own timeout has ended.
     RefreshEnded {
         /// Which drive.
         drive: DriveIndex,
@@ -88,8 +88,8 @@ pub enum News {
 /// Whether a drive that ran when the gateway started got its lease started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Adopted {
-    /// Its lease runs from now on.
+    /// The lease of the drive runs from now on.
     Yes,
-    /// It waits for a client.
+    /// The drive waits for a client.
     No,
 }

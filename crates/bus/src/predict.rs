@@ -29,7 +29,7 @@ const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 1
 /// their profile.
 const MOST_LOAD: f64 = 0.8;
 
-/// Share of the line that polls have at least beside refreshes.
+/// Least share of the line that polls have while refreshes run.
 const LEAST_LEFT: f64 = 0.5;
 
 /// Part of a cadence by which it may be missed before it is reported.
@@ -264,7 +264,7 @@ impl<'a> Line<'a> {
         self.room_beside(rounds, slow_share(self.shares(rounds).1))
     }
 
-    /// The same where they get `least` in any case.
+    /// The share of slow polls where they get `least` in any case.
     fn room_beside(&self, rounds: &Rounds, least: f64) -> f64 {
         if rounds.fast == 0.0 {
             return 1.0;
@@ -359,7 +359,7 @@ impl<'a> Line<'a> {
         bauds
     }
 
-    /// Buses that the drives fit on, first fit by decreasing time; none when one drive alone asks too much.
+    /// Buses that the drives fit on, first fit by decreasing time; none when a single drive needs too much.
     fn split(&self, baud: u32) -> Option<usize> {
         let mut drives = self.rounds(baud);
         let time = |one: &Rounds| one.fast + one.slow;
@@ -401,8 +401,8 @@ impl<'a> Line<'a> {
         }
     }
 
-    /// The shortest cadence whose idle time has room for the slow class: as many of its longest requests that
-    /// `fitting * mean / cycle` is the share it asks for.
+    /// The shortest cadence whose idle time has room for the slow class: as many of its longest requests that `fitting
+    /// * mean / cycle` is its share.
     fn roomy_cycle(&self, rounds: &Rounds) -> Option<Duration> {
         let (_, slow) = self.shares(rounds);
         let spare = rounds.mean_slow() - slow * rounds.longest_slow;

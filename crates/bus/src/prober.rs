@@ -64,7 +64,7 @@ impl Answer {
 }
 
 impl Prober<'_> {
-    /// Speaks `protocol` on an open line; `timeout` is the time for the first byte of a reply.
+    /// Sends requests of `protocol` on an open line; `timeout` is the time for the first byte of a reply.
     pub fn new(
         line: &Line,
         protocol: Protocol,
@@ -86,7 +86,7 @@ impl Prober<'_> {
         self.state.patience(request, self.timeout)
     }
 
-    /// The same without a line.
+    /// The longest time of a request, calculated without a line.
     pub fn patience_of(
         protocol: Protocol,
         format: LineFormat,

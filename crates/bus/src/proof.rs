@@ -156,8 +156,8 @@ impl Proof {
     }
 }
 
-/// Neither a writable point nor a parameter may share a register with the commands, but a point that has bits of its own in a word
-/// whose other bits are kept.
+/// Neither a writable point nor a parameter may share a register with the commands, except a point that has bits of its own in a
+/// word whose other bits are kept.
 fn overlaps(profile: &Profile) -> Result<(), Box<Counterexample>> {
     let found = |what: String, command: String| {
         Err(Box::new(Counterexample {
@@ -183,13 +183,13 @@ fn overlaps(profile: &Profile) -> Result<(), Box<Counterexample>> {
     Ok(())
 }
 
-/// One command to a drive in one state.
+/// A command to a drive in one state.
 #[derive(Debug)]
 struct Case<'p> {
     profile: &'p Profile,
     control: &'p Control,
     start: Start,
-    /// The gateway knows the control word.
+    /// Whether the gateway knows the control word.
     known: bool,
     sets: Sets,
     order: Order,
@@ -203,7 +203,7 @@ struct Progress<'p> {
     frames: Vec<Frame>,
     /// When the reset was set.
     reset_at: Option<Instant>,
-    /// It ran when the command was given, or at a stop in between.
+    /// Whether the motor ran when the command was given, or at a stop in between.
     ran: bool,
 }
 
@@ -289,7 +289,7 @@ impl<'p> Case<'p> {
             reset_at: None,
         };
         if self.known {
-            // What is known of a drive that has restarted since is from when it ran.
+            // The gateway knows a restarted drive as it was when it ran.
             let before = match self.start {
                 Start::RestartedSince => Drive::new(self.profile, self.control, Start::Running { reverse: false }),
                 _ => None,
@@ -501,13 +501,13 @@ impl<'p> Case<'p> {
                 return Err(self.wrong("a stop does not stop the motor in one request", progress));
             }
         }
-        // A drive that refuses its end says so.
+        // A drive that refuses the end of the pulse answers with an exception.
         if progress.drive.reset_stands() && !matches!(outcome, Outcome::Exception(_)) {
             return Err(self.wrong("a reset bit is left set", progress));
         }
         let sequence = matches!(self.control.run, Run::Steps(_));
         let refused = matches!(outcome, Outcome::Exception(_) | Outcome::Refused(_));
-        // One that was stopped at its panel starts with whatever is written of a run command.
+        // A drive that was stopped at its panel starts at any write of a run command.
         let late = self.start == Start::StoppedSince && self.says(ModelPoint::Run) == Some(true);
         if !outcome.is_ok() && runs && !progress.ran && !late && (sequence || refused) {
             return Err(self.wrong("the command failed but the motor runs", progress));

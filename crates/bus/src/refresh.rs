@@ -1,9 +1,9 @@
 //! The refresh of one drive: what its clients ordered last is written again every so often, for a drive whose own timeout counts only
 //! writes of its control word or reference. Pure: time is an argument.
 //!
-//! A round reads first and writes then: the drive must show that it runs by the word that is repeated, or stands by a stop, and
-//! that nobody else has written to it. What does not fit ends the refresh, and only an acknowledged order of a client begins it again.
-//! A refresh renews no lease, and counts as no order and no start.
+//! A round reads first and writes then: the drive must show that it runs by the repeated word, or stands by a stop, and that no other
+//! client has written to it. A contradiction ends the refresh, and only an acknowledged order of a client starts it again. A refresh
+//! renews no lease, and does not count as an order or a start.
 
 mod end;
 mod ordered;
@@ -35,11 +35,11 @@ enum Beginner {
     Action,
 }
 
-/// A refresh that has begun.
+/// A refresh that has started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Going {
     does: Does,
-    /// The order that began it ended then: what was read before says nothing.
+    /// When the order that started it ended: earlier reads are not valid.
     since: Instant,
     /// Stops of the drive that were accepted before.
     stops: u64,
@@ -70,13 +70,13 @@ pub(super) enum OrderEnd {
     Action,
     /// The drive refused a step of it.
     Refused,
-    /// What the drive took of it is unknown.
+    /// Which part of the order the drive took is unknown.
     Unknown,
     /// An order of the gateway itself was sent.
     Other,
 }
 
-/// What is known beside the samples of the drive.
+/// Facts about the drive besides its samples.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Around {
     /// Stops of the drive that were accepted so far.
@@ -94,9 +94,9 @@ pub(super) struct Refresh {
     settings: Option<(Duration, Repeats)>,
     repeated: Repeated,
     round: Option<Round>,
-    /// Stops that were accepted before the order that has begun.
+    /// Stops that were accepted before the order that has started.
     stops: u64,
-    /// The order that has begun said whether the motor is to run.
+    /// Whether the order that has started decides whether the motor is to run.
     says_run: bool,
     /// The drive does not take word and reference in one request.
     apart: bool,
@@ -105,7 +105,7 @@ pub(super) struct Refresh {
 }
 
 impl Refresh {
-    /// The refresh of a drive of that profile, which has not begun.
+    /// The refresh of a drive of this profile, which has not started.
     pub(super) fn new(profile: &Profile, every: Option<Duration>) -> Refresh {
         Refresh {
             settings: every.and_then(|every| Some((every, profile.repeats().ok()?))),
@@ -123,22 +123,22 @@ impl Refresh {
         }
     }
 
-    /// What the next bus goes on with.
+    /// The part with which the next bus continues.
     pub(super) fn handed_over(&self) -> Repeated {
         self.repeated
     }
 
-    /// Whether it has begun, and neither ended nor is the drive away.
+    /// Whether the refresh has started, and has neither ended nor lost its drive.
     pub(super) fn is_going(&self) -> bool {
         self.repeated.going.is_some_and(|going| going.lost.is_none())
     }
 
-    /// Whether it has begun.
+    /// Whether the refresh has started.
     pub(super) fn has_begun(&self) -> bool {
         self.repeated.going.is_some()
     }
 
-    /// An order to the drive has begun, after so many stops.
+    /// An order to the drive has started, after this many stops.
     pub(super) fn order_begins(&mut self, stops: u64) {
         (self.stops, self.says_run) = (stops, false);
     }
@@ -193,7 +193,7 @@ impl Refresh {
             OrderEnd::Done => (held, Beginner::Client),
             OrderEnd::Drill => (held, Beginner::Drill),
             OrderEnd::Action => (self.by_lease, Beginner::Action),
-            // What was taken before that may be another command than the one that is repeated.
+            // The part taken before may be another command than the repeated one.
             OrderEnd::Refused if self.repeats_what_was_ordered() => return None,
             OrderEnd::Refused | OrderEnd::Unknown => return self.end(End::Unknown),
             OrderEnd::Other => return self.end(End::Other),
@@ -242,7 +242,7 @@ impl Refresh {
         self.repeated.going = going.or(ordered.does.map(anew)).filter(|_| fits);
     }
 
-    /// Ends it, and forgets what it repeats. The reason where it had begun.
+    /// Ends the refresh, and forgets what it repeats. Returns the reason where it had started.
     pub(super) fn end(&mut self, why: End) -> Option<End> {
         let had_begun = self.has_begun();
         match why {
@@ -250,7 +250,7 @@ impl Refresh {
                 (self.repeated.going, self.round) = (None, None);
                 self.by_lease = true;
             }
-            // The reference stands, and may be repeated beside the word of the stop.
+            // The reference stays in force, and may be repeated with the word of the stop.
             End::Stop => {
                 (self.repeated.going, self.round) = (None, None);
                 (self.repeated.ordered.does, self.repeated.ordered.word) = (None, None);
@@ -311,7 +311,7 @@ impl Refresh {
 }
 
 impl Going {
-    /// What the samples since the order say against it.
+    /// Checks the samples since the order for a contradiction.
     fn is_contradicted(&mut self, reading: &Reading<'_>) -> Option<End> {
         let shown = |point: ModelPoint| {
             let sample = reading.model(point);

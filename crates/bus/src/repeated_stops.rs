@@ -15,7 +15,7 @@ const MAY_ARRIVE: Duration = Duration::from_secs(30);
 /// The stops of a drive that are still to be written again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RepeatedStops {
-    /// When a write got no answer last that is no stop.
+    /// When a write other than a stop last got no answer.
     unanswered: Option<Instant>,
     due: [Option<Instant>; AGAIN.len()],
 }

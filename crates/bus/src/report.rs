@@ -1,4 +1,4 @@
-//! Applies the master's news to the process image, and turns it into events and log lines.
+//! Applies the master's results to the process image, and converts them to events and log lines.
 
 mod changes;
 mod events;
@@ -38,7 +38,7 @@ pub(super) struct Report {
     writes: Arc<WriteStats>,
     window: Instant,
     busy: Duration,
-    /// Fault code of each drive as last reported; `None` is no fault.
+    /// Fault code of each drive as last reported; `None` means no fault.
     faults: PerDrive<Option<i64>>,
     /// The other reported states of each drive, in the order of [`WATCHED`].
     watched: PerDrive<[Watched; WATCHED.len()]>,
@@ -49,11 +49,11 @@ pub(super) struct Report {
     /// The diagnosis of the line.
     pub(super) diagnosis: LineDiagnosis,
     up: bool,
-    /// It was reported that the bus is down, and it is still.
+    /// Whether the bus is down, and that was reported.
     down_reported: bool,
 }
 
-/// What the master must read because of a piece of news.
+/// Reads that the master must make because of a result.
 #[derive(Debug, Default)]
 pub(super) struct Wanted {
     /// The drive with a new fault.
@@ -67,7 +67,7 @@ pub(super) struct Wanted {
 struct Response {
     /// Since it came online.
     looked_at: bool,
-    /// That it has none.
+    /// Whether the missing response was reported.
     told: bool,
 }
 
@@ -98,7 +98,7 @@ impl Report {
         }
     }
 
-    /// Applies one piece of news.
+    /// Applies a result of the master.
     pub(super) fn apply(&mut self, news: &News, now: Instant) -> Wanted {
         match news {
             News::FastRound(cycle) => self.fast_round(*cycle),
@@ -190,7 +190,7 @@ impl Report {
         self.events.pauses().is_deaf(now)
     }
 
-    /// The thread of the bus stood still.
+    /// The thread of the bus was stalled.
     pub(super) fn stood(&self, stall: Stall) {
         if stall.is_pause() {
             self.events.publish_pause(stall, SystemTime::now());
@@ -418,7 +418,7 @@ impl Report {
         tap::noise(&self.image, bytes, quiet_since, now);
     }
 
-    /// One transaction used the line for that time.
+    /// A transaction used the line for this time.
     pub(super) fn in_use(&mut self, took: Duration) {
         self.busy += took;
         self.image.transactions.observe(took);

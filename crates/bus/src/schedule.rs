@@ -1,10 +1,10 @@
 //! Decides what is sent next: cycles, fairness and back-off. Pure: time is an argument.
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls, background transactions. Five rules
-//! soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more of a
-//! line that is busy with polls than process data; slow polls that had less than their share of the time
-//! ([`slow_share`]) go before fast ones; background transactions have the time that is left over and else a small share
-//! ([`crate::order::Pace`]); a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! soften it: after eight commands in a row a due poll goes first; commands, and the reads that they cause, have no
+//! more of a line that is busy with polls than process data; slow polls that had less than their share of the time
+//! ([`slow_share`]) go before fast ones; background transactions have the idle time and else a small share
+//! ([`crate::order::Pace`]); a drive that does not answer is probed so seldom that it costs at most 2 %.
 
 mod background;
 mod choice;
@@ -279,7 +279,7 @@ impl Schedule {
     pub(crate) fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
-            // One without a result is made up for among the slow polls.
+            // A read without a result is repeated among the slow polls.
             item.wanted |= item.asked.take().is_some();
         }
         let turn = std::mem::replace(&mut self.turn, Turn::Due);
@@ -288,7 +288,7 @@ impl Schedule {
                 self.commanded += took;
                 self.share.read(took);
             }
-            // Neither the least that slow polls have nor a drive that is away is at the cost of process data alone.
+            // Neither the least share of slow polls nor an absent drive is charged to process data alone.
             Turn::OnCredit => self.share.polled(Duration::ZERO),
             Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
             Turn::Due => self.share.polled(took),
@@ -542,7 +542,7 @@ impl Schedule {
         self.share.polled(Duration::ZERO);
     }
 
-    /// That drive is not polled until then; none: all drives are polled.
+    /// Polls the drive no more until this time; none: all drives are polled.
     pub fn keep_quiet(&mut self, quiet: Option<(DriveIndex, Instant)>) {
         for (index, drive) in self.drives.enumerate_mut() {
             drive.quiet_until = quiet.filter(|(quiet, _)| *quiet == index).map(|(_, until)| until);

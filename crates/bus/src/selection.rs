@@ -1,6 +1,6 @@
-//! Whether process data holds what the profile says. On several families a selector parameter decides what a register of
-//! process data shows; the profile names the register that always has the value ([`Point::monitor`]), and the two are compared
-//! when the drive comes online, until a comparison proves something. Pure.
+//! Whether process data holds the value of its profile. On several families a selector parameter decides the content of a
+//! register of process data; the profile names the register that always has the value ([`Point::monitor`]), and the two are
+//! compared when the drive comes online, until a comparison proves something. Pure.
 //!
 //! From the first comparison that differs on, the value comes from the monitoring register, which is slower and always right.
 //! Two comparisons that agree bring the process data back; three that differ show that the selection was changed.
@@ -51,7 +51,7 @@ enum Trust {
     /// No comparison has proved anything; the next one where there is something to compare, and the pause after it.
     Unproven(Instant, Duration),
     Proven,
-    /// Its comparisons differ so often, and agreed so often since.
+    /// Number of comparisons that differed, and of those that agreed since.
     Doubted(u8, u8),
     /// The selection was changed; comparisons that agree since.
     Differs(u8),
@@ -62,7 +62,7 @@ enum Trust {
 enum Verdict {
     Agrees,
     Differs,
-    /// Both are about 0, or the register may not exist.
+    /// Both values are about 0, or the register may not exist.
     Nothing,
 }
 
@@ -80,7 +80,7 @@ pub(super) struct Findings {
 }
 
 impl Selections {
-    /// Of drives with these points.
+    /// The comparisons of drives with these points.
     pub(super) fn new<'p>(drives: impl Iterator<Item = &'p PerPoint<Point>>, now: Instant) -> Selections {
         let compared = |(point, monitor): (PointIndex, PointIndex)| Compared {
             point,
@@ -213,7 +213,7 @@ impl Compared {
         matches!(self.trust, Trust::Doubted(..) | Trust::Differs(_))
     }
 
-    /// Whether process data that was just read matters: it is asked after each read.
+    /// Whether process data that was just read is to be compared: evaluated after each read.
     fn looks_at(&self, point: &Point, now: Instant) -> bool {
         match self.trust {
             Trust::Unproven(next, _) => now >= next || is_code(point) || self.open.is_some(),

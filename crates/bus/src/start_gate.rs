@@ -21,16 +21,16 @@ use crate::start_guard::BusGuards;
 
 /// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
-/// After a time in which the thread stood still, so long a point that was not read since stops no motor.
+/// Time after a stall of the thread in which a point that was not read since stops no motor.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The guards of the bus, and the stops of their interlocks.
 #[derive(Debug)]
 pub(super) struct StartGate {
     guards: Arc<BusGuards>,
-    /// Until when the thread last stood still.
+    /// Until when the thread was last stalled.
     stood: Option<Instant>,
-    /// News to report.
+    /// Results to report.
     told: Vec<News>,
     trips: PerDrive<Trip>,
 }
@@ -74,7 +74,7 @@ impl StartGate {
         })
     }
 
-    /// The thread stood still.
+    /// The thread was stalled.
     pub(super) fn stood(&mut self, stall: Stall) {
         self.stood = Some(stall.ended);
     }
@@ -108,7 +108,7 @@ impl StartGate {
         self.guards.guards(index)
     }
 
-    /// News to report.
+    /// Takes the results to report.
     pub(super) fn take_told(&mut self) -> Vec<News> {
         std::mem::take(&mut self.told)
     }

@@ -40,13 +40,13 @@ enum State {
     /// No client has commanded the drive since the gateway started.
     #[default]
     Unheard,
-    /// Neither, and it was reported that the drive runs.
+    /// No client has commanded the drive since the gateway started, and it was reported that the drive runs.
     RunsUnheard,
-    /// It runs since then.
+    /// The lease runs since this time.
     Held(Instant),
-    /// It expired while the drive ran, and the action is not acknowledged yet.
+    /// The lease expired while the drive ran, and the action is not acknowledged yet.
     RanOut,
-    /// It ended: the motor stood without a run command when it expired, or the action was acknowledged.
+    /// The lease ended: the motor stood without a run command when it expired, or the action was acknowledged.
     Ended,
 }
 
@@ -60,12 +60,12 @@ impl From<State> for Lease {
 }
 
 impl Lease {
-    /// One that runs since then.
+    /// A lease that runs since this time.
     pub fn held(since: Instant) -> Lease {
         State::Held(since).into()
     }
 
-    /// The same when its time stood for so long.
+    /// The lease after a time in which it did not run.
     #[must_use]
     pub fn after(self, stood: Duration) -> Lease {
         match self.state {
@@ -77,7 +77,8 @@ impl Lease {
         }
     }
 
-    /// What ends with it if no drive continues it, as text; none for one that has ended or never started.
+    /// The protection that ends with the lease if no drive continues it, as text; none for a lease that has ended or
+    /// never started.
     pub fn ends(self) -> Option<&'static str> {
         match self.state {
             State::Unheard | State::RunsUnheard | State::Ended => None,
@@ -94,7 +95,7 @@ pub(super) struct Orders {
     pub(super) held_until: Option<Instant>,
 }
 
-/// What supervision requests.
+/// Request of supervision.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Demand {
     /// Nothing.
@@ -114,7 +115,7 @@ pub(super) struct Supervision {
     next_try: Option<Instant>,
     /// Why it could not be written, as it was reported.
     refused: Option<Refusal>,
-    /// It was reported that the drive does not report whether it runs.
+    /// Whether it was reported that the drive does not show whether it runs.
     blind_reported: bool,
     /// For how long the drive has answered without showing whether its motor runs, and until when that is calculated.
     waited: Option<(Duration, Instant)>,
@@ -160,7 +161,8 @@ impl Supervision {
         self.begin_anew();
     }
 
-    /// The gateway itself heard nobody for that time: the lease lasts longer by it, by one timeout in all since it was renewed.
+    /// The gateway itself received nothing for this time: the lease lasts longer by it, by one timeout in all since it was
+    /// renewed.
     pub(super) fn prolong(&mut self, time: Duration, timeout: Duration) {
         if let State::Held(since) = &mut self.lease.state {
             let time = time.min(timeout.saturating_sub(self.lease.prolonged));
@@ -209,7 +211,7 @@ impl Supervision {
                 self.tell_failure(news, drive);
                 Demand::None
             }
-            // The action of the lease before, which a client that is back has suspended for good.
+            // The action of the previous lease, which a client that is back has suspended permanently.
             State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
                 if has_run_out(since, spec.timeout, now) && !held {
@@ -466,11 +468,11 @@ fn has_failed(outcome: &Outcome) -> bool {
 /// A drive's own response to a silent master, as far as its registers show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OwnResponse {
-    /// Not read yet, or the profile knows no point for it.
+    /// The response was not read yet, or the profile has no point for it.
     Unknown,
-    /// It has none: the point that says so.
+    /// The drive has no response: the point that shows that.
     Off(&'static str),
-    /// It responds, if what no register shows is set too (such as the timeout of an option board).
+    /// The drive responds, if settings without a register are set too (such as the timeout of an option board).
     On,
 }
 
@@ -481,7 +483,7 @@ const RESPONSES: [(&str, f64); 3] = [
     (COMMUNICATION_ERROR_REACTION, 3.0),
 ];
 
-/// The drive's own response: none where any of the points that the profile has says so.
+/// The drive's own response: none where any of the points that the profile has shows that.
 pub(super) fn own_response(reading: &Reading<'_>) -> OwnResponse {
     let mut seen = OwnResponse::Unknown;
     for (name, none) in RESPONSES {

@@ -187,7 +187,7 @@ impl Hearing {
         let last = part.range.end.saturating_sub(1);
         let first = self.arrival(part.range.start).unwrap_or(quiet_since);
         let end = self.arrival(last).unwrap_or(first);
-        // Its first byte was on the wire for a character before it arrived, and the whole for its own time.
+        // The first byte was on the wire for a character before it arrived, and the whole frame for its own time.
         let by_first = first.checked_sub(self.format.chars(1)).unwrap_or(first);
         let by_last = end.checked_sub(self.format.chars(part.range.len())).unwrap_or(end);
         (by_first.min(by_last).saturating_duration_since(quiet_since), end)
@@ -228,7 +228,7 @@ mod tests {
             bytewise.times(&part(0..10), start),
             (ms(5), start + ms(5) + format.chars(10))
         );
-        // The same handed over as a whole.
+        // A frame delivered in one piece gives equal times.
         let mut whole = Hearing::new(format, start);
         whole.add(&[0; 10], start + ms(5) + format.chars(10));
         assert_eq!(

@@ -2,11 +2,11 @@
 //!
 //! Garbage does not end a transaction at once: noise may have run into the beginning of a sound reply, and the rest of
 //! a broken one may still be on the line. The transaction goes on until as many characters came as a reply has, or
-//! nothing more came for their time, never beyond the deadline. A whole Modbus reply that stands behind the garbage is
-//! believed: address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they
-//! would have to be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage
-//! it is not believed, the request is repeated. N2 replies are not believed there at all. What stands before the colon
-//! of a Modbus ASCII frame is no garbage but noise, which its decoder skips.
+//! nothing more came for their time, never beyond the deadline. A whole Modbus reply behind the garbage is accepted:
+//! address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they would have to
+//! be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage it is not
+//! accepted, the request is repeated. N2 replies are not accepted there at all. Bytes before the colon of a Modbus
+//! ASCII frame are not garbage but noise, which its decoder skips.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -40,7 +40,7 @@ pub enum Ended {
     Corrupt(&'static str),
 }
 
-/// What to do next.
+/// Next action of the transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
     /// Wait for bytes until then.
@@ -250,9 +250,8 @@ impl Transaction {
         }
     }
 
-    /// Whether a doubtful frame is worth the time until the deadline: it says that the drive restarted, or who it is,
-    /// without which nothing else can be asked. If each such answer were in doubt for the one before, that would never
-    /// end.
+    /// Whether a doubtful frame is worth the time until the deadline: it reports a restart, or the device type, without
+    /// which nothing else can be requested. If each such answer were in doubt for the one before, that would never end.
     fn awaits_another(&self) -> bool {
         let identifies = matches!(self.request.pdu, RequestPdu::N2(Session::Identify));
         let restarted = matches!(
@@ -307,7 +306,7 @@ impl Transaction {
     /// A complete reply after garbage.
     fn behind_garbage(&mut self, now: Instant) -> Option<Step> {
         if self.echo && !self.echo_seen {
-            // It could be the echo of a write.
+            // The frame could be the echo of a write.
             return None;
         }
         let (at, used, reply) = (1..self.received.len()).find_map(|at| {
@@ -364,8 +363,9 @@ impl Transaction {
         Step::Done(ended)
     }
 
-    /// An adapter that hears itself sends the request back before the reply. A read cannot be answered by its own
-    /// frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known already.
+    /// An adapter that receives its own bytes returns the request before the reply. A read cannot be answered by its
+    /// own frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known
+    /// already.
     fn strip_echo(&mut self) -> bool {
         let could_be_echo = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
         let noise = self.protocol.noise(&self.received);

@@ -1,5 +1,5 @@
-//! Commands of a family that is commanded as `[control]` of its profile says: the words of a start, a stop, a change of direction
-//! and a reset, and the steps of a sequence. Pure.
+//! Commands of a family that follows the `[control]` of its profile: the words of a start, a stop, a change of direction and a
+//! reset, and the steps of a sequence. Pure.
 //!
 //! A stop is one write and waits for nothing. A sequence is entered by a run command only; one that fails behind its last word
 //! ends with a stop.
@@ -21,7 +21,7 @@ pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);
 /// A word of the control register, made of what the drive has when its turn comes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Word {
-    /// Stops, with that direction where the order says one.
+    /// A stop, with a direction where the order has one.
     Stop(Option<bool>),
     /// The direction alone.
     Direction(bool),
@@ -29,9 +29,9 @@ pub(super) enum Word {
     DirectionElsewhere(bool),
     /// The direction that was kept for this start, at a place of its own.
     KeptDirection,
-    /// Runs, in that direction where the order says one.
+    /// A run, with a direction where the order has one.
     Run(Option<bool>),
-    /// That word of a sequence.
+    /// The word of this number in the sequence.
     Sequence(usize, Option<bool>),
     /// Before a pulse of these bits, a reset as a rule: they are not set, nor the run command of a motor that stands.
     ResetLow(Setting),
@@ -52,7 +52,7 @@ impl Word {
         }
     }
 
-    /// What it wants to write without saying whether the motor is to run.
+    /// The kind of write, where the word does not decide whether the motor is to run.
     fn wants(self) -> Option<Wants> {
         match self {
             Word::Stop(_) | Word::KeptDirection | Word::Run(_) | Word::Sequence(..) => None,
@@ -69,7 +69,7 @@ impl Word {
 /// The result of making a word.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Made {
-    /// This request.
+    /// The request to send.
     Send(Step),
     /// Nothing: the drive has it.
     Nothing,
@@ -77,7 +77,7 @@ pub(super) enum Made {
     Look,
     /// Nothing: this direction is kept for the next start.
     AtNextStart(bool),
-    /// Its effect would be unknown.
+    /// The order is refused, as its effect would be unknown.
     Refused(Refusal),
 }
 
@@ -186,7 +186,7 @@ impl Ordered {
         true
     }
 
-    /// Whether the value says whether the motor is to run.
+    /// Whether the value decides whether the motor is to run.
     pub(super) fn says_run(mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         self.takes(profile, index, value) && self.run.is_some()
     }
@@ -240,7 +240,7 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
         None => actions.push(Action::Word(Word::Stop(reverse))),
         Some(place) => actions.push(Action::Send(write(place, control.stop.applied(0), profile))),
     }
-    // What lets it run elsewhere goes, too.
+    // Run settings at other places are taken away, too.
     let stands = |setting: &Setting| !setting.once && setting.place != control.stop.place;
     let mut done: Vec<ControlItem> = Vec::new();
     for setting in control.runs().iter().filter(|setting| stands(setting)) {
@@ -273,7 +273,7 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
             }
         }
         Some(place) => {
-            // One hold for both: the run command, and the reset as it was.
+            // One hold serves both: the run command goes low, and the reset returns to its former value.
             if !stopped {
                 actions.push(Action::Word(Word::ResetLow(setting)));
             }
@@ -397,7 +397,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
                 let run = if reverse { back } else { forward };
                 match runs && run.place.is_none() {
                     true => sent(at, run.applied(stays)),
-                    // No bit of the drive says it while the motor stands.
+                    // While the motor stands no bit of the drive holds the direction.
                     false => Made::AtNextStart(reverse),
                 }
             }
@@ -456,7 +456,7 @@ fn stops_by_reset(control: &Control, reset: Setting) -> bool {
     reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run))
 }
 
-/// What may stand in a word beside what it is made for; one that says whether the motor is to run asks nobody. `released` is the
+/// Which other bits may be written with a word; a word that decides whether the motor is to run needs no read. `released` is the
 /// control word as it is known, without a reset.
 ///
 /// # Errors
@@ -518,7 +518,7 @@ fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> 
     }
     match (control.own_word, word) {
         (OwnWord::Shadow, _) => false,
-        // They are no control words.
+        // These words are not written to the control word.
         (_, Word::DirectionElsewhere(_) | Word::KeptDirection) => false,
         (OwnWord::Read, Word::Stop(_) | Word::ResetEnd(_)) => false,
         (OwnWord::Read, Word::Run(_)) if control.run_place() != control.at => false,

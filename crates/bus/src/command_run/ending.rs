@@ -10,7 +10,7 @@ use crate::confirm::Effect;
 use crate::order::{Interruption, Outcome, Receipt, Refusal};
 
 impl CommandRun {
-    /// It goes no further, and ends with that outcome; a motor that it started is stopped.
+    /// Ends the command with this outcome; a motor that it started is stopped.
     pub(super) fn give_up(&mut self, outcome: Outcome) {
         self.actions.clear();
         self.cut.get_or_insert(outcome);
@@ -22,8 +22,8 @@ impl CommandRun {
         }
     }
 
-    /// It may not go on, and ends so, except for the end of a pulse. A motor that it started is left to the one who has the
-    /// drive now, or who stopped it; else it is stopped.
+    /// Ends a command that the rules deny, except for the end of a pulse. A motor that it started is left to the client
+    /// that has the drive now, or that stopped it; else it is stopped.
     pub fn denied(&mut self, outcome: Outcome) {
         let outcome = match outcome {
             Outcome::Refused(refusal @ (Refusal::HeldByOther(_) | Refusal::NeedsTake(_))) => {
@@ -46,12 +46,12 @@ impl CommandRun {
         self.cut_off(outcome);
     }
 
-    /// Whether it is still pending: nothing of it was sent, or the drive was busy each time.
+    /// Whether the command is still pending: nothing of it was sent, or the drive was busy each time.
     pub fn is_owed(&self) -> bool {
         !self.has_begun() || (self.tries.busy > 0 && !self.in_doubt())
     }
 
-    /// Its result when it is withdrawn before it is due.
+    /// Result of a command that is withdrawn before it is due.
     pub fn taken_back(&self) -> Outcome {
         match self.has_begun() {
             true => Outcome::Exception(Exception::BUSY),

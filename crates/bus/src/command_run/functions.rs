@@ -1,4 +1,5 @@
-//! Which functions a drive takes for a write of one item: as its profile says, until the drive itself says otherwise. Pure.
+//! Functions that a drive takes for a write of one item: as its profile has them, until the drive itself shows otherwise.
+//! Pure.
 
 use crate::codec::{Protocol, RequestPdu};
 use crate::drive::Profile;
@@ -6,11 +7,11 @@ use crate::drive::Profile;
 /// The functions that a drive has shown to accept, if any.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct TakenFunctions {
-    /// One register is written by function 16, not 06.
+    /// Whether a register is written by function 16, not 06.
     registers_by_16: Option<bool>,
-    /// One coil is written by function 15, not 05.
+    /// Whether a coil is written by function 15, not 05.
     coils_by_15: Option<bool>,
-    /// It refused function 22.
+    /// Whether the drive refused function 22.
     refuses_22: bool,
 }
 
@@ -50,7 +51,7 @@ impl TakenFunctions {
     }
 }
 
-/// The same write of one item by the other function; none for anything else.
+/// The write of one item by the other function; none for anything else.
 pub(super) fn other(pdu: &RequestPdu) -> Option<RequestPdu> {
     match pdu {
         RequestPdu::WriteRegister { address, value } => Some(RequestPdu::WriteRegisters {

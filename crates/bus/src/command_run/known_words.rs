@@ -25,7 +25,7 @@ pub struct KnownWords {
     pub(super) direction: Option<bool>,
     /// The word at the drive has another one: the next start has it.
     waits_for_start: bool,
-    /// Those that were ever read successfully.
+    /// Words that were read successfully at least once.
     reported: BTreeSet<(Table, u16)>,
     /// The functions that it takes, which it keeps when it restarts.
     pub(super) functions: TakenFunctions,
@@ -45,7 +45,7 @@ impl KnownWords {
     pub fn written(&mut self, sent: &RequestPdu) {
         self.stop = None;
         if let RequestPdu::MaskWrite { address, .. } = sent {
-            // Its other bits may have been changed since.
+            // Other bits of the word may have been changed since.
             self.words.remove(&(Table::Holding, *address));
         }
         for (table, address, word) in written(sent).into_iter().flat_map(|(table, items)| {
@@ -124,7 +124,7 @@ impl KnownWords {
         (self.direction, self.waits_for_start) = (Some(reverse), true);
     }
 
-    /// Another order has said the direction since, or started the motor.
+    /// Another order has set the direction since, or started the motor.
     pub(crate) fn forget_direction(&mut self) {
         self.waits_for_start = false;
     }

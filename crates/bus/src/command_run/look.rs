@@ -1,4 +1,4 @@
-//! What is read of a drive right before a word is written to it: which requests show whether its motor runs, and the replies to
+//! The reads of a drive right before a word is written to it: the requests that show whether its motor runs, and the replies to
 //! them. Pure.
 
 use std::collections::BTreeMap;
@@ -70,13 +70,13 @@ impl Look {
         Look::of(profile, &[])
     }
 
-    /// Whether it runs by the bus: a faulted drive may show its motor as it was before the fault, and one that is commanded at its
-    /// panel does not run by a word of the gateway.
+    /// The reads that show whether the motor runs by the bus: a faulted drive may show its motor as it was before the fault, and
+    /// one that is commanded at its panel does not run by a word of the gateway.
     pub(crate) fn at_motor(profile: &Profile) -> Option<Look> {
         Look::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
     }
 
-    /// Whether it runs is read last.
+    /// The running bit is read last, so that it is the newest.
     fn of(profile: &Profile, more: &[ModelPoint]) -> Option<Look> {
         let shown = |point: ModelPoint| more.contains(&point).then(|| Shown::of(profile, point)).flatten();
         let running = Shown::of(profile, ModelPoint::Running)?;
@@ -123,7 +123,7 @@ impl Look {
         self.answered > self.more.len()
     }
 
-    /// Everything is asked anew.
+    /// Starts the reads again from the first one.
     pub(crate) fn begin_again(&mut self) {
         self.answered = 0;
         self.words.clear();
@@ -166,7 +166,7 @@ impl CommandRun {
         }
     }
 
-    /// What a look shows where nothing is decoded.
+    /// Sets the result of a look without a reply to decode.
     pub(crate) fn sees(&mut self, runs: bool) {
         self.look = None;
         self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
@@ -185,7 +185,7 @@ impl CommandRun {
         Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
     }
 
-    /// What is told of an earlier try that was not answered goes before that outcome.
+    /// The outcome of an earlier try that was not answered takes precedence over this outcome.
     pub(super) fn unless_in_doubt(&self, outcome: Outcome) -> Outcome {
         match self.in_doubt() {
             true => self.tries.unanswered.clone(),
@@ -209,11 +209,11 @@ impl CommandRun {
         }
         self.known.motor = None;
         self.next_start = Some(reverse);
-        // What is shown of the rest would pass for its effect.
+        // The remaining effects would be taken for the effect of the direction.
         self.effects.clear();
     }
 
-    /// The direction that it ordered is kept or, where it says another one, no longer.
+    /// Keeps the direction that the command ordered or, where it ordered another one, drops the kept one.
     pub(crate) fn note_direction(&self, words: &mut KnownWords) {
         match self.next_start {
             Some(reverse) => words.keep_direction(reverse),
@@ -222,7 +222,7 @@ impl CommandRun {
         }
     }
 
-    /// What is to be told of an order whose direction waits for the next start.
+    /// Note on an order whose direction waits for the next start.
     pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
         self.next_start.map(|_| standing::AT_NEXT_START)
     }

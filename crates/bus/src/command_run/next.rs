@@ -1,4 +1,4 @@
-//! What a started command needs next. Pure: time is an argument.
+//! The next step of a started command. Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
@@ -10,19 +10,19 @@ use crate::codec::Exception;
 use crate::drive::Profile;
 use crate::order::{Interruption, Outcome};
 
-/// What becomes of the first action.
+/// Result of evaluating the first action.
 enum First {
-    /// This step is sent.
+    /// The step is sent.
     Step(Box<Step>),
-    /// It changes nothing: the next one is looked at.
+    /// The action changes nothing: the next one is evaluated.
     Nothing,
-    /// It was taken away, or another one stands in its place.
+    /// The action was removed, or replaced by another one.
     Changed,
 }
 
 impl CommandRun {
-    /// What the command needs next. `running` is what the drive last reported. Once it has expired nothing more is
-    /// sent, except to clear a reset bit that is set.
+    /// The next step of the command. `running` is the state that the drive reported last. Once the command has expired
+    /// nothing more is sent, except to clear a reset bit that is set.
     pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
         (self.known.running, self.known.masks) = (running, words.functions.masks(profile));
         self.end_late(now);
@@ -48,7 +48,7 @@ impl CommandRun {
         Next::Done
     }
 
-    /// One that has expired sends nothing more than the end of a pulse.
+    /// An expired command sends nothing more than the end of a pulse.
     fn end_late(&mut self, now: Instant) {
         if !self.is_late(now) {
             return;
@@ -177,7 +177,7 @@ impl CommandRun {
         }
         if let Some(Action::Word(word @ Word::Sequence(..))) = self.actions.front_mut() {
             let Word::Sequence(number, _) = *word else { return };
-            // Not the first word any more, even where the sequence has but one.
+            // A sequence of one word must not restart with its first word.
             *word = match number {
                 0 => Word::Run(reverse),
                 number => Word::Sequence(number, reverse),

@@ -1,4 +1,4 @@
-//! One parameter set as one command: read the value, check that the motor is stopped, write, read back. Pure.
+//! A parameter that is set as one command: read the value, check that the motor is stopped, write, read back. Pure.
 //!
 //! A write without a reply is not repeated before its effect has been read.
 
@@ -18,7 +18,7 @@ const LOOKS: u32 = 3;
 enum Stage {
     /// The value is read from the drive.
     Value,
-    /// It is asked whether its motor runs.
+    /// The drive is read to see whether its motor runs.
     Running,
     /// The motor stands: the write goes next on the line.
     Write,
@@ -51,7 +51,7 @@ pub(super) struct ParameterRun {
 }
 
 impl ParameterRun {
-    /// One that has not started; none where the family does not report whether its motor runs.
+    /// A run that has not started; none where the family does not report whether its motor runs.
     pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
         let look = Look::at_running(profile)?;
         let mut run = ParameterRun {
@@ -96,7 +96,7 @@ impl ParameterRun {
         self.stage == Stage::Write
     }
 
-    /// Something else went on the line: whether the motor runs is asked again.
+    /// Another request went on the line: whether the motor runs is read again.
     pub(super) fn check_again(&mut self) {
         if self.stage == Stage::Write {
             self.asks_running();
@@ -108,7 +108,7 @@ impl ParameterRun {
         self.in_doubt = true;
     }
 
-    /// No valid reply came: what the drive has is asked before anything is written again.
+    /// No valid reply came: the value of the drive is read before anything is written again.
     pub(super) fn begin_again(&mut self) {
         if self.stage != Stage::Release {
             self.look.begin_again();
@@ -153,7 +153,7 @@ impl ParameterRun {
         Then::Go
     }
 
-    /// It is asked whether the motor runs, from the first request on.
+    /// Reads whether the motor runs, from the first request on.
     fn asks_running(&mut self) -> Then {
         self.look.begin_again();
         self.go(Stage::Running)
@@ -163,7 +163,7 @@ impl ParameterRun {
         if !self.look.hears(reply) {
             return Then::Go;
         }
-        // A reply that does not say so is no motor that stands.
+        // A reply without the running state does not prove that the motor stands.
         if self.look.runs() == Some(false) {
             return self.go(Stage::Write);
         }
@@ -183,7 +183,7 @@ impl ParameterRun {
     fn heard_value(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
-            // Anyone who asks sees by the reply that nothing was written.
+            // The client sees from the reply that nothing was written.
             let reply = if self.in_doubt { Reply::Written } else { reply.clone() };
             return Then::Over(Outcome::Acknowledged(reply));
         }

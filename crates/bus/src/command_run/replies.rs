@@ -67,7 +67,7 @@ impl CommandRun {
                 self.looked(&reply);
                 None
             }
-            // It says nothing of an earlier try that was not answered.
+            // The exception says nothing about an earlier try that was not answered.
             (StepPurpose::Execute, Reply::Exception(code)) if self.in_doubt() => self.ended(Outcome::Unknown(code)),
             (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
             (purpose, reply) => {
@@ -102,7 +102,7 @@ impl CommandRun {
         None
     }
 
-    /// It ends so; where its sequence started the motor, a stop goes before that.
+    /// Ends the command with this outcome; where its sequence started the motor, a stop goes before that.
     fn ended(&mut self, outcome: Outcome) -> Option<Outcome> {
         if self.urgency == Urgency::Stop || self.phase != Phase::MotorStarted {
             let cut = self.cut.clone().filter(|_| !self.may_write_on());
@@ -187,7 +187,7 @@ impl CommandRun {
         if let Some((table, address)) = self.settings()
             && words.is_reported(table, address)
         {
-            // It reported its settings before: what was read then is no longer what it has.
+            // The drive reported its settings before: they may have changed since.
             return Some(refused);
         }
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
@@ -209,7 +209,7 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// No valid reply came; `how` says which way. The outcome, when the tries are used up.
+    /// No valid reply came; `how` is the way it failed. Returns the outcome when the tries are used up.
     pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
         self.tries.failures += 1;
         self.tries.unanswered = how;
@@ -275,8 +275,8 @@ impl CommandRun {
         self.tries.doubt != Doubt::No
     }
 
-    /// The word was asked for without success. Whether the command goes on with what is known all the same: where the
-    /// drive never reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
+    /// The word was read without success. Returns whether the command goes on with the known word: where the drive
+    /// never reports it (`unreadable`), and at the end of a pulse, which must not wait for a read.
     fn goes_on(&mut self, unreadable: bool) -> bool {
         let goes_on = self.known.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {

@@ -5,30 +5,30 @@
 
 use crate::order::Refusal;
 
-/// What the drive showed of its motor, in the same command and right before the write.
+/// State of the motor as the drive showed it in this command, right before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Motor {
-    /// It runs by the bus, as far as the drive shows who commands it.
+    /// The motor runs by the bus, as far as the drive shows its control place.
     Runs,
-    /// It runs, and is commanded elsewhere.
+    /// The motor runs, and is commanded elsewhere.
     RunsElsewise,
-    /// It stands, or the drive has a fault.
+    /// The motor stands, or the drive has a fault.
     Stands,
-    /// No status says it.
+    /// No status shows the state of the motor.
     NotShown,
 }
 
 /// The run command in the drive's word as it is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Holds {
-    /// It is set.
+    /// The run command is set.
     Run,
     /// The word is neither a run command nor a stop.
     Other,
     Unknown,
 }
 
-/// What an order wants to write without saying whether the motor is to run.
+/// Kind of a write that does not decide whether the motor is to run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wants {
     /// The direction, within the control word.
@@ -45,7 +45,7 @@ pub(super) enum Wants {
     Others,
 }
 
-/// What may be written.
+/// The word that may be written.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Verdict {
     /// The word with the run command that stands.
@@ -57,8 +57,8 @@ pub(super) enum Verdict {
     Refused(Refusal),
 }
 
-/// What an order may write to a drive whose known word is no stop. `told`: the drive itself said in this command what its word is;
-/// that of one which runs is then no memory, whoever commands it.
+/// Decides the word that an order may write to a drive whose known word is not a stop. `told`: the drive itself reported its word
+/// in this command; the word of a running drive is then current, whichever client commands it.
 pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Verdict {
     use Verdict::{AsItStands, AtNextStart, WithoutRun};
 
@@ -106,7 +106,7 @@ pub(super) fn not_seen(why: &str) -> Refusal {
     ))
 }
 
-/// Told with a direction that is kept for the next start.
+/// Note on a direction that is kept for the next start.
 pub(super) const AT_NEXT_START: &str = "the direction takes effect with the next start: the motor is not seen to run by a run command \
      of this gateway, and no control word was written";
 
@@ -125,7 +125,8 @@ mod tests {
     const MOTORS: [Motor; 4] = [Motor::Runs, Motor::RunsElsewise, Motor::Stands, Motor::NotShown];
     const HELD: [Holds; 3] = [Holds::Run, Holds::Other, Holds::Unknown];
 
-    /// r as it stands, w without run, n at the next start, x refused, ? refused as unknown. One column for each of `WANTS`.
+    /// r with the run command as it is, w without run, n at the next start, x refused, ? refused as unknown. One column for
+    /// each of `WANTS`.
     const TABLE: &str = "\
         Run     told Runs         r r r r r r
         Run     told RunsElsewise r r r r r r
@@ -172,7 +173,7 @@ mod tests {
         assert_eq!(rows, 6 * 20);
     }
 
-    /// Where nobody looks, the answer is the same whatever the motor does.
+    /// Where no look is made, the verdict does not depend on the motor.
     #[test]
     fn a_look_is_spared_only_where_it_decides_nothing() {
         for (wants, holds) in WANTS.into_iter().flat_map(|wants| HELD.map(|holds| (wants, holds))) {

@@ -53,31 +53,32 @@ pub(super) enum Action {
 pub enum StepPurpose {
     /// Reads the drive's own word, whose other bits are to stay as they are.
     ReadWord,
-    /// Asks whether the drive has the value already, which would spare its memory a write.
+    /// Reads whether the drive has the value already, which would spare its memory a write.
     Compare,
     /// Does what was ordered.
     Execute,
     /// Gives an overridden output back to the drive's own control.
     Release,
-    /// Asks whether the motor runs, right before a parameter is written or a word that does not say whether it is to.
+    /// Reads whether the motor runs, right before a write of a parameter, or of a word that does not decide whether it
+    /// is to run.
     Look,
-    /// Asks for the state that ends a step of a sequence.
+    /// Reads the state that ends a step of a sequence.
     AskState,
-    /// Asks whether the drive took a parameter.
+    /// Reads whether the drive took a parameter.
     ReadBack,
 }
 
-/// One request of a command.
+/// A request of a command.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// Its purpose.
+    /// Purpose of the request.
     pub purpose: StepPurpose,
     /// The request.
     pub pdu: RequestPdu,
 }
 
 impl Action {
-    /// Whether it sets a reset.
+    /// Whether the action sets a reset.
     pub(super) fn is_reset(&self) -> bool {
         matches!(
             self,
@@ -104,7 +105,7 @@ impl Step {
 pub(super) enum Check {
     NotYet,
     Read,
-    /// It does not report it.
+    /// The drive does not report its word.
     InVain,
 }
 
@@ -114,7 +115,7 @@ pub(super) struct Known {
     pub(super) check: Check,
     /// The word cannot be read.
     pub(super) blind: bool,
-    /// The command says whether the motor is to run.
+    /// Whether the command decides whether the motor is to run.
     pub(super) names_run: bool,
     /// A stop of the motor is on its way: nothing carries a run command any more, whatever the drive shows.
     pub(super) stopped: bool,
@@ -122,7 +123,7 @@ pub(super) struct Known {
     pub(super) running: bool,
     /// The drive changes bits of a register by itself.
     pub(super) masks: bool,
-    /// What the drive showed of its motor right before; none where it was not asked.
+    /// State of the motor as the drive showed it right before; none without a look.
     pub(super) motor: Option<Motor>,
 }
 
@@ -158,7 +159,7 @@ pub(super) fn unsendable(profile: &Profile, values: &[(PointIndex, Value)]) -> O
     })
 }
 
-/// Whether a command says whether the motor is to run.
+/// Whether a command decides whether the motor is to run.
 pub(super) fn names_run(profile: &Profile, values: &[(PointIndex, Value)]) -> bool {
     let Some(control) = &profile.control else {
         return false;
@@ -326,13 +327,14 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
 pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: Known) -> Option<Step> {
     let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
     match action {
-        // They are made where they have their turn.
+        // These actions are converted into requests when their turn comes.
         Action::Hold(_) | Action::Word(_) | Action::Await(_) => None,
         Action::Send(pdu) | Action::ResetElsewhere(pdu) | Action::ResetOver(pdu) => Some(execute(pdu)),
         Action::Parameter(run) => Some(run.step()),
         Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),
         Action::Change { pdu, table, items } => match known.check {
-            // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.
+            // An earlier read is not proof: the value may have been changed at the drive since. It must not let a write
+            // be left out.
             Check::NotYet if words.differs(*table, items) => Some(execute(pdu)),
             Check::NotYet => {
                 let read = read_of(*table, items).map(|read| Step::new(StepPurpose::Compare, read));
@@ -370,7 +372,7 @@ fn bits(
     };
     let read = Step::new(StepPurpose::ReadWord, read);
     if profile.is_settings(raw.table, address) && !matches!(action, Action::PulseEnd { .. }) {
-        // What was read earlier is no proof: other bits may have been changed at the drive since.
+        // An earlier read is not proof: other bits may have been changed at the drive since.
         if known.masks {
             return Some(Step::new(StepPurpose::Execute, mask(address, &changes)));
         }
@@ -408,8 +410,8 @@ fn mask(address: u16, changes: &[(u8, bool)]) -> RequestPdu {
     }
 }
 
-/// A write that spares the drive's memory, where its words are such that wear: left out when the drive says that it has
-/// them, and what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
+/// A write that spares the drive's memory, where its words wear it: left out when the drive reports that it has them;
+/// an N2 override is released afterwards, where the profile requires that. A stop is never left out.
 pub(super) fn write_on_change(action: Action, profile: &Profile) -> Vec<Action> {
     let written = match &action {
         Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),

@@ -72,7 +72,7 @@ impl ObedientDrive {
         (CommandRun::new(command, &self.profile), receiver)
     }
 
-    /// Its registers; the status words say that it is commanded by the bus, and whether its motor runs.
+    /// Registers of the drive; the status words show that it is commanded by the bus, and whether its motor runs.
     fn shows(&self, start: u16, count: u16) -> Reply {
         let status = [(2100, u16::from(self.running) << 1), (2101, 1 << 13)];
         let word = |address| {
@@ -284,7 +284,7 @@ fn exceptions_and_silence_end_it() {
     assert_eq!(command.success(), Outcome::Garbled);
 }
 
-/// What the command sends next.
+/// The next step of the command.
 fn sends(bench: &ObedientDrive, command: &mut CommandRun) -> Step {
     match command.next(&bench.words, &bench.profile, bench.running, bench.now) {
         Next::Send(step) => step,
@@ -292,7 +292,7 @@ fn sends(bench: &ObedientDrive, command: &mut CommandRun) -> Step {
     }
 }
 
-/// The command asks whether the motor runs, and is told.
+/// The command reads whether the motor runs, and gets the reply.
 fn looks(bench: &mut ObedientDrive, command: &mut CommandRun) {
     let step = sends(bench, command);
     assert_eq!(step.purpose, StepPurpose::Look, "{step:?}");
@@ -377,8 +377,8 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     assert_eq!(sends(&bench, &mut start), read, "it is asked again");
 }
 
-/// A drive looks at its control word once in an update period: a bit that was taken away by the word before and is set again at
-/// once is no edge to it.
+/// A drive evaluates its control word once in an update period: a bit that the previous word took away and that is set again at
+/// once does not count as an edge.
 #[test]
 fn a_reset_bit_that_a_stop_took_away_is_low_as_long_as_between_two_pulses() {
     for (late, expected) in [(0, 20), (15, 5), (5000, 0)] {
@@ -429,7 +429,7 @@ fn a_drive_that_is_busy_is_written_again_until_the_time_of_the_command_is_over()
         assert_eq!(tries[..5], *all);
         assert_eq!(outcome, Outcome::Exception(Exception::BUSY), "it did not take it");
     }
-    // What was sent before and not answered may have been taken.
+    // An earlier write without an answer may have been taken.
     let mut bench = ObedientDrive::new(0);
     let (mut run, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     let sent = sends(&bench, &mut run);
@@ -500,7 +500,7 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
 #[test]
 fn what_cannot_be_sent_is_no_success() {
     let refused = |run: &CommandRun| matches!(run.success(), Outcome::Refused(_));
-    // Its place is that of another point, which is not named.
+    // The derived value goes to another point, which the order does not name.
     let mut bench = ObedientDrive::new(0);
     let (mut derived, _a) = bench.begin(&[("run", 1.0), ("frequency_reference", 20.0)], Urgency::Command);
     assert_eq!(bench.run(&mut derived), [], "not a part of it either");
@@ -508,7 +508,7 @@ fn what_cannot_be_sent_is_no_success() {
     let (mut large, _a) = bench.begin(&[("speed_reference", 1e9)], Urgency::Command);
     assert_eq!(bench.run(&mut large), []);
     assert!(refused(&large), "{:?}", large.success());
-    // Of a stop goes out what can.
+    // The parts of a stop that can be sent are sent.
     let mut bench = ObedientDrive::new(1);
     let (mut stop, _a) = bench.begin(&[("frequency_reference", 0.0), ("run", 0.0)], Urgency::Stop);
     assert_eq!(bench.run(&mut stop), [(0, 2000, 0)]);

@@ -13,7 +13,7 @@ struct CommandedDrive {
     drive: DriveImage,
     stats: Arc<WriteStats>,
     confirmations: Confirmations,
-    /// Of the command that was acknowledged last.
+    /// Confirmation of the command that was acknowledged last.
     confirmation: Option<tokio::sync::oneshot::Receiver<Result<Duration, String>>>,
     now: Instant,
 }
@@ -128,7 +128,7 @@ fn a_stop_is_confirmed_when_the_motor_does_not_run_or_stands() {
     }
 }
 
-/// From 10 Hz down the speed in percent of the band from 10 Hz says nothing any more.
+/// From 10 Hz down the speed in percent of the band from 10 Hz no longer shows the deceleration.
 #[test]
 fn below_the_minimum_frequency_the_motor_still_slows_down() {
     let mut rig = CommandedDrive::new();
@@ -230,7 +230,7 @@ fn what_is_read_seldom_is_not_missing_before_it_was_read() {
     rig.read(2000, &[1]);
     assert!(rig.expired().is_empty() && rig.confirmations.is_empty());
 
-    // What was read is told in time, and what is read later then.
+    // Effects that were read are reported in time, effects that are read later at that later time.
     order(&mut rig, true);
     rig.read(2100, &[0]);
     rig.now += Duration::from_secs(2);
@@ -293,7 +293,7 @@ fn a_fall_that_ceases_above_zero_is_told() {
     let mut at = None;
     while rig.now < since + Duration::from_secs(12) {
         let passed = (rig.now - since).as_secs_f64();
-        // It falls to 40 % within 5 s and stays there.
+        // The speed falls to 40 % within 5 s and stays there.
         rig.speed((90.0 - 10.0 * passed).max(40.0));
         reported.append(&mut rig.expired());
         if reported.len() == 1 {

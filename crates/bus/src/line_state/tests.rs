@@ -224,7 +224,7 @@ fn an_n2_line_without_wire_time_is_believed_after_three_replies() {
     }
 }
 
-/// The process stood still between the reply and its reading.
+/// The process did not run between the reply and its reading.
 #[test]
 fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
     for late in [Duration::ZERO, Duration::from_secs(10)] {

@@ -1,6 +1,6 @@
-//! What another master commands: told when it changes, so that a master that writes the same words in every cycle fills neither
-//! audit nor log. Commands that switch are told at once, references once a second at most, the last one in any case. Pure: time
-//! is an argument.
+//! Commands of another master: reported when they change, so that a master that writes equal words in every cycle fills neither
+//! audit nor log. Commands that switch are reported at once, references once a second at most, the last one in any case. Pure:
+//! time is an argument.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -141,7 +141,7 @@ fn outcome(ended: Option<&Ended>) -> Outcome {
         Some(Ended::Reply(Reply::Exception(code))) => Outcome::of_exception(*code),
         Some(Ended::Reply(reply)) => Outcome::Acknowledged(reply.clone()),
         Some(Ended::Corrupt(_)) => Outcome::Garbled,
-        // Nobody answers a broadcast.
+        // A broadcast has no reply.
         Some(Ended::Silent) | None => Outcome::TimedOut,
     }
 }

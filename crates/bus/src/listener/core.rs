@@ -32,7 +32,8 @@ struct Known {
     unanswered: u32,
     /// When it was last received; the opening of the port, before that.
     heard: Instant,
-    /// Longest pause between two replies of it lately: a whole round of the other master, where that asks drive after drive.
+    /// Longest recent pause between two replies of the drive: a whole round of the other master, where that polls drive
+    /// after drive.
     pause: Duration,
     commands: Commands,
     /// First addresses of its values of two registers, which are never stored in halves.
@@ -110,7 +111,7 @@ impl ListenCore {
         }
     }
 
-    /// It was reconnected: the traffic in between is not known.
+    /// The port was reconnected: the traffic in between is not known.
     pub fn reconnected(&mut self) {
         self.decoder = decoder(&self.bus);
         self.report.reconnected();
@@ -269,7 +270,7 @@ impl ListenCore {
             if exchange.doubt.is_none() {
                 let spec = &self.bus.image.spec;
                 let replied = exchange.replied.unwrap_or(exchange.at);
-                // By so much silence a drive knows that a request has ended, which is no part of its turnaround.
+                // The silence that marks the end of a request is not part of the drive's turnaround.
                 let recognition = spec.protocol.recognition(&spec.format);
                 image.set_turnaround(replied.saturating_duration_since(exchange.sent + recognition));
             }

@@ -147,7 +147,7 @@ impl Decoder {
 
     /// Bytes arrived at `now`, the last of them just then.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Heard>) {
-        // What waited for its rest until a time that has ended is cut before.
+        // A frame whose time for its rest has ended is cut before the new bytes are added.
         self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);
         self.frames.add(bytes, now);
         self.cut(now, heard);

@@ -13,7 +13,7 @@ use crate::codec::{LineFormat, Parity, Protocol};
 /// Requests that decide.
 const ENOUGH: u64 = 3;
 
-/// One protocol that is tried.
+/// A protocol that is tried.
 #[derive(Debug)]
 struct Try {
     protocol: Protocol,

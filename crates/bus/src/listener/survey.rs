@@ -12,7 +12,7 @@ use crate::transaction::Ended;
 /// Different requests to one address that are counted apart.
 const MOST_REQUESTS: usize = 256;
 
-/// One request, each time it was received.
+/// A request, each time it was received.
 #[derive(Debug, Clone)]
 pub struct Asked {
     /// The request, as text.

@@ -23,7 +23,7 @@ use crate::transaction::{CONNECTION_CLOSED, Ended};
 /// Time of a transaction whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 
-/// What was chosen for the line: a command to drives that waited among their others, or a background request.
+/// A choice for the line: a command to drives that waited among their others, or a background request.
 #[derive(Debug)]
 pub(super) enum Sending {
     Command(Box<Command>),
@@ -36,7 +36,7 @@ pub(super) struct Begun {
     pub(super) sending: Sending,
     /// Whose time it takes; none where it goes as a command.
     pub(super) admission: Option<Admission>,
-    /// Its transaction is on the line, or was.
+    /// Whether its transaction is, or was, on the line.
     pub(super) sent: bool,
 }
 
@@ -49,7 +49,7 @@ impl Begun {
         }
     }
 
-    /// Its number among the commands to drives of the bus.
+    /// Number of the command among those to drives of the bus.
     pub(super) fn number(&self) -> Option<u64> {
         Some(self.command()?.intent.number)
     }
@@ -132,7 +132,7 @@ impl Master {
     pub(super) fn background(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
         self.drop_background_in_vain(now);
         let mut again: Option<Instant> = None;
-        // Both kinds take turns: they have the same share.
+        // Both kinds take turns, since they have equal shares.
         for passed_on in [!self.passed_on_last, self.passed_on_last] {
             let paces = if passed_on { &Pace::ALL[..1] } else { &Pace::ALL[..] };
             for pace in paces {
@@ -237,7 +237,7 @@ impl Master {
         let bus = &self.bus.image.spec.name;
         let command = match &begun.sending {
             Sending::Command(command) => command,
-            // It is refused when it is chosen again.
+            // A request without its right is refused when it is chosen again.
             Sending::Request(request) => return lost_right(request, Stage::Write, bus).is_none(),
         };
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
@@ -280,7 +280,7 @@ impl Master {
         }
     }
 
-    /// Whether it is the turn of a background transaction that a client requested.
+    /// Whether a background transaction that a client requested has its turn.
     pub(super) fn background_of_others(&self) -> bool {
         let begun = self.background.as_ref();
         begun.is_some_and(|begun| begun.origin().kind != SourceKind::Schedule)
@@ -397,7 +397,7 @@ impl Master {
         }
     }
 
-    /// The address that a turn asks where no drive is configured at it.
+    /// The address of a turn, where no drive is configured at it.
     pub fn stranger(&self, turn: &Turn) -> Option<u8> {
         let begun = self
             .background
@@ -447,7 +447,7 @@ impl Master {
             return Outcome::Acknowledged(reply);
         };
         let proves_nothing = turn.pdu.is_write() && drive.late.proves_nothing(&turn.pdu, end.began, now);
-        // The reply to an earlier try says how it was then.
+        // The reply to an earlier try shows the value of that time.
         let older = drive.late.asked_by(&turn.pdu, now) < end.began;
         drive.late.answered(&turn.pdu, end.began, now);
         match proves_nothing || older {

@@ -38,7 +38,7 @@ impl Turns {
         None
     }
 
-    /// That rank has its turn, before lower ones or not.
+    /// Counts a turn of this rank, with lower ranks waiting or not.
     fn served(&mut self, rank: Urgency, lower_waits: bool) {
         for (of, count) in RANKS.into_iter().zip(&mut self.0) {
             if of < rank {
@@ -94,7 +94,7 @@ impl Master {
         Err(soon)
     }
 
-    /// One decision; none where it changed what is to be decided on.
+    /// Makes one decision; none where it changed the conditions of the decision.
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
         let quiet = self.bus.queue.quiet(now);
@@ -158,8 +158,8 @@ impl Master {
         }
     }
 
-    /// The write of a parameter to a drive that said, in the transaction before, that its motor stands: nothing but a
-    /// stop goes between the two.
+    /// The write of a parameter to a drive that reported, in the transaction before, that its motor stands: nothing but
+    /// a stop goes between the two.
     fn checked_write(&mut self, now: Instant) -> Option<NextStep> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);
         let Master { drives, bus, waits, .. } = self;
@@ -209,7 +209,7 @@ impl Master {
             let want = |drive: &mut DriveState| drive.wanted(image, &waits.n2_late, now);
             match wanted(bus, index, (drive, image), want, now) {
                 Wanted::Step(slot, step) => {
-                    // What N2 needs said before is blocked by late replies as the step itself is.
+                    // The session step that N2 needs first can be blocked by late replies like the step itself.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
                     let blocked = before.and_then(|before| waits.n2_late.blocks(&before, now));
                     let waits = drive.run(slot).is_some_and(|run| run.waits_for_late());

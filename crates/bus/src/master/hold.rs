@@ -1,4 +1,4 @@
-//! Who holds the drives, as the line sees it: who was carried out, and which drive is under local control.
+//! Holders of the drives, as the line sees them: whose orders were carried out, and which drive is under local control.
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -1,4 +1,4 @@
-//! What a stall of the thread changes: leases, what waits, what has begun.
+//! Effects of a stall of the thread: on leases, waiting commands, and started commands.
 
 use std::time::{Duration, Instant};
 
@@ -7,8 +7,8 @@ use crate::order::Urgency;
 use crate::stalls::Stall;
 
 impl Master {
-    /// The thread stood still until `now`. What waits is judged by that when it is chosen again. A command of several steps
-    /// that a pause interrupted is not continued, but for the end of a pulse.
+    /// The thread did not run until `now`. Waiting commands are judged by that when they are chosen again. A command of
+    /// several steps that a pause interrupted is not continued, except for the end of a pulse.
     pub(crate) fn stood(&mut self, stall: Stall, now: Instant) {
         let slept = stall.slept;
         self.prolong(stall.length());
@@ -41,7 +41,7 @@ impl Master {
         }
     }
 
-    /// Nobody was heard for that time, since the gateway itself stood still: leases last longer by it.
+    /// The gateway itself did not run for this time and received nothing: leases last longer by it.
     pub(crate) fn prolong(&mut self, time: Duration) {
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
             if let Some(supervision) = &image.spec.supervision {

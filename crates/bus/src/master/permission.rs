@@ -1,4 +1,4 @@
-//! What the master tells the gate of its drives, and the question that it asks before each frame of a started command.
+//! The state of its drives that the master reports to the gate, and the check before each frame of a started command.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ use crate::queue::Denied;
 /// was decided when that was accepted.
 const RANGE_AGE: Duration = Duration::from_secs(60);
 
-/// What is seen of the drives when the turn of a command comes.
+/// State of the drives when the turn of a command comes.
 pub(super) struct AtTurn {
     images: Vec<Arc<DriveImage>>,
     written: PerDrive<LastWritten>,
@@ -71,7 +71,7 @@ pub(super) fn may_write(
     bus.queue.lock().gate.ask(&ask)
 }
 
-/// What the started commands of a drive need, once those that may not go on have ended.
+/// The next need of the started commands of a drive, once those that may not go on have ended.
 pub(super) fn wanted(
     bus: &BusHandle,
     index: DriveIndex,
@@ -116,7 +116,7 @@ impl Master {
         };
         let written = drive.written;
         let Some(run) = drive.run(slot) else { return true };
-        // It is refused, or waits, when it is chosen again.
+        // A denied command is refused, or waits, when it is chosen again.
         matches!(
             may_write(&self.bus, index, image, (run, written), now),
             Verdict::Go | Verdict::LookFirst

@@ -24,7 +24,7 @@ enum May {
 }
 
 impl Master {
-    /// Ends refreshes by what time, samples and accepted orders have changed, and tells which go on.
+    /// Ends refreshes that time, samples or accepted orders contradict, and reports which go on.
     pub(super) fn look_at_refreshes(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master { bus, drives, .. } = self;
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
@@ -133,7 +133,8 @@ impl Master {
         is_under_way && matches!(self.may_refresh(turn.drive, Stage::Write, now), May::Yes)
     }
 
-    /// The rules, asked in the name of the gateway: what stands is repeated, whoever holds the drive now.
+    /// Judges a refresh by the rules, in the name of the gateway: a standing order is repeated, whoever holds the drive
+    /// now.
     fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
         let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
             return May::NotNow;

@@ -5,8 +5,8 @@ use std::time::Instant;
 use super::Master;
 use crate::drive_state::DriveState;
 
-/// What a bus still keeps of transactions that failed and of commands that were started. On a sound line on which
-/// nobody commands everything of it ends by itself: its `Default`.
+/// State that a bus still keeps of failed transactions and of started commands. On a sound line without commands
+/// everything in it ends by itself: its `Default`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Remains {
     /// Requests whose reply may still come late.
@@ -25,7 +25,7 @@ pub struct Remains {
     pub owed_actions: usize,
     /// Drives that do not answer.
     pub away: usize,
-    /// Reads that wait behind failures: not answered, or not done since something asked for them.
+    /// Reads that wait behind failures: not answered, or requested by a command and not done.
     pub held_reads: usize,
 }
 

@@ -60,11 +60,11 @@ impl Master {
         self.schedule.monitor(drive, covers, at);
     }
 
-    /// What may still come of the transaction: nothing where the drive's own reply came mangled, unless a late reply of
-    /// an earlier transaction may have been that.
+    /// Records the reply that may still come for the transaction: none where the drive's own reply came damaged, unless
+    /// that may have been a late reply to an earlier transaction.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
         if self.is_broadcast(turn) {
-            // Nobody answers it.
+            // A broadcast has no reply.
             return;
         }
         let came_mangled = self.came_mangled(end);
@@ -114,12 +114,13 @@ impl Master {
         }
     }
 
-    /// Whether it was mangled that came: the drive's own reply, unless a late one of an earlier transaction may have been that.
+    /// Whether the drive's own reply came damaged; not where that may have been a late reply to an earlier transaction.
     fn came_mangled(&self, end: &TurnEnd) -> bool {
         end.mangled && !self.late_before
     }
 
-    /// The same on an N2 line. What waited for a late reply that will not come is due again.
+    /// Records the reply that may still come on an N2 line. Reads that waited for a late reply that will not come are
+    /// due again.
     fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, came_mangled: bool, now: Instant) {
         let configured = self.bus.image.drives.get(turn.drive);
         let Some(address) = configured
@@ -174,7 +175,7 @@ impl Master {
         let failed = progress == Progress::Failed;
         let ended = match end.ended {
             Ended::Corrupt(why) => Ended::Corrupt(why),
-            // It has failed, whatever was answered.
+            // The session step has failed, whatever the answer was.
             Ended::Silent | Ended::Reply(_) => Ended::Silent,
         };
         let end = TurnEnd { ended, ..end };
@@ -190,7 +191,7 @@ impl Master {
         }
     }
 
-    /// The drive has restarted: nothing that is known of it holds.
+    /// The drive has restarted: no known state of it holds.
     pub(super) fn restarted(&mut self, drive: DriveIndex, now: Instant, news: &mut Vec<News>) {
         if let Some(state) = self.drives.get_mut(drive) {
             state.restarted();
@@ -202,7 +203,7 @@ impl Master {
     /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.refresh_debt = self.refresh_debt.saturating_sub(end.took);
-        // Of a step before the poll this is known already.
+        // After a session step before the poll this is known already.
         let heard = self.waits.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
@@ -210,7 +211,7 @@ impl Master {
         let took = end.took;
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
-            // A gateway in between cannot reach the drive: its reply says nothing about the drive.
+            // A gateway in between cannot reach the drive: its exception is no evidence about the drive.
             Ended::Reply(reply) if says_no_answer(&reply) => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) if self.proves_nothing(poll, &reply) => {
@@ -221,7 +222,7 @@ impl Master {
                 self.read(poll.drive, poll.read, reply, (end.began, end.at), now, news);
                 Polled::Ok
             }
-            // Its reply may have been lost by that: it does not count as away before it is asked again.
+            // The stall may have lost the reply: the drive does not count as away before another request.
             Ended::Silent if end.stood => Polled::Garbled,
             // The drive is there, though a reply that came so early is not believed yet.
             Ended::Silent if end.doubted => Polled::Garbled,
@@ -236,7 +237,8 @@ impl Master {
         }
         let change = self.schedule.poll_done(poll, polled, took, now);
         if poll.probe && end.doubted {
-            // The drive is there: a second early reply is believed, and is asked for at once instead of with the next probe.
+            // The drive is there: a second early reply is accepted, so it is requested at once instead of with the next
+            // probe.
             self.schedule.seen(poll.drive, now);
         }
         if let Some(round) = self.schedule.take_slow_round() {
@@ -250,8 +252,8 @@ impl Master {
         }
     }
 
-    /// Whether the reply is one to a read that no manual states, and may be that of a drive which ignores the number of items: all
-    /// behind the first is 0. One that shows more proves the read for good, until the drive goes away.
+    /// Whether the reply answers a read that no manual states, and may come from a drive that ignores the number of items: all
+    /// behind the first is 0. A reply that shows more proves the read permanently, until the drive goes away.
     fn proves_nothing(&mut self, poll: &Poll, reply: &Reply) -> bool {
         if !self.schedule.is_trial(poll.drive, &poll.read) {
             return false;
@@ -410,7 +412,7 @@ impl Master {
             return;
         };
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
-            // It was sent, perhaps without success: it is sent again when its reply can be trusted.
+            // The step was sent, perhaps without success: it is sent again when its reply can be trusted.
             if let Some(run) = drive.run(slot) {
                 run.wait_for_late_replies();
             }
@@ -428,9 +430,9 @@ impl Master {
             drive.vain_stops.not_answered(took);
         }
         let retries = match *ended {
-            // The request may never have reached the drive, which is no sign of it.
+            // The request may never have reached the drive, so the failure is no evidence about it.
             Ended::Corrupt(CONNECTION_CLOSED) => retries.max(1),
-            // As is the reply that was lost while the thread stood still.
+            // A reply lost during a stall of the thread also earns one more try.
             _ if online => retries.max(u32::from(stood)),
             _ => 0,
         };
@@ -447,8 +449,8 @@ impl Master {
         }
     }
 
-    /// Registers were written, or may be: they are read back soon. What was read of the frequency range before says
-    /// nothing where an end of it was among them, and both ends are read again.
+    /// Registers were written, or may be: they are read back soon. An earlier reading of the frequency range is invalid
+    /// where an end of it was among them, and both ends are read again.
     pub(super) fn note_write(&mut self, index: DriveIndex, table: Table, items: &[(u16, u16)], now: Instant) {
         let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return;
@@ -482,7 +484,7 @@ impl Master {
     }
 }
 
-/// Whether a gateway in between says that the drive did not answer.
+/// Whether a gateway in between reports that the drive did not answer.
 fn says_no_answer(reply: &Reply) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer())
 }
@@ -492,7 +494,7 @@ fn leaves_open(reply: &Reply, step: &Step) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer() || (step.pdu.is_write() && code.leaves_open()))
 }
 
-/// A step of a command that the drive did not look at, since it wants this first.
+/// The session step in place of a command's step, since the drive requires it first.
 fn unheard(session: Session) -> Step {
     Step {
         purpose: StepPurpose::Execute,

@@ -36,7 +36,7 @@ pub(super) struct Shutdown {
 struct Stop {
     drive: DriveIndex,
     state: State,
-    /// It was ordered, and not acknowledged.
+    /// Whether the stop was ordered, and not acknowledged.
     in_vain: bool,
     /// The result then, as text.
     last: Option<String>,
@@ -44,13 +44,13 @@ struct Stop {
 
 #[derive(Debug)]
 enum State {
-    /// It is to be ordered then.
+    /// The stop is to be ordered at this time.
     Due(Instant),
-    /// Its answer is waited for.
+    /// The stop is ordered, and its answer awaited.
     Ordered(Receiver<Answer>),
-    /// It was acknowledged.
+    /// The stop was acknowledged.
     Acknowledged,
-    /// It cannot be ordered.
+    /// The stop cannot be ordered.
     Refused(String),
 }
 
@@ -138,7 +138,7 @@ impl Shutdown {
 }
 
 impl Master {
-    /// Begins the shutdown when it is asked for; commands what is due, ends when all is done or its time has ended.
+    /// Starts a requested shutdown; orders due stops, and ends when all are done or the time has ended.
     pub(super) fn look_at_shutdown(&mut self, now: Instant) {
         // The queue is free again when the broadcast is put into it.
         let stopping = self.bus.queue.lock().take_stopping();
@@ -164,8 +164,8 @@ impl Master {
             shutdown.end(bus);
             return;
         }
-        // Drives that do not answer come last: each of them costs a whole timeout. Without polls one that was online
-        // before it went silent counts as online for good.
+        // Silent drives come last: each of them costs a whole timeout. Without polls a drive that was online before it
+        // went silent counts as online permanently.
         let answers = |stop: &Stop| schedule.is_online(stop.drive) && !stop.in_vain;
         let others_first = shutdown.stops.iter().any(|stop| !stop.is_over() && answers(stop));
         for stop in &mut shutdown.stops {

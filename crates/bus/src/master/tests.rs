@@ -30,9 +30,9 @@ mod timing;
 
 /// Kept before each request.
 const SILENCE: Duration = Duration::from_micros(1750);
-/// What an exchange takes.
+/// Time of a transaction.
 const COST: Duration = Duration::from_millis(20);
-/// What one without an answer takes.
+/// Time of a transaction without an answer.
 const TIMEOUT: Duration = Duration::from_millis(110);
 
 /// Registers of a drive, and whether it answers.
@@ -42,9 +42,9 @@ struct Registers {
     silent: bool,
     /// How its next write ends.
     next_write: Option<Ended>,
-    /// It answers that to so many writes.
+    /// Number of writes that get this exception.
     to_writes: Option<(u32, Exception)>,
-    /// It answers that to every read.
+    /// Exception for every read.
     to_reads: Option<Exception>,
     /// The drive is of another family.
     family: Option<family_drive::FamilyDrive>,
@@ -120,7 +120,7 @@ struct Rig {
     master: Master,
     stats: Arc<WriteStats>,
     drives: Vec<Registers>,
-    /// They do not hear a broadcast.
+    /// Whether the drives do not receive a broadcast.
     deaf: bool,
     news: Vec<News>,
     /// All that went onto the line.
@@ -214,7 +214,7 @@ impl Rig {
         self.master.opened(self.now);
     }
 
-    /// One exchange, or the wait for the next one.
+    /// One transaction, or the wait for the next one.
     fn step(&mut self) {
         let mut news = Vec::new();
         match self.master.next(self.now, &mut news) {
@@ -258,7 +258,7 @@ impl Rig {
         self.news.append(&mut news);
     }
 
-    /// What is stored in the process image.
+    /// Stores a read in the process image.
     fn apply(&self, news: &News) {
         let image = |drive: &DriveIndex| self.bus.image.drives[drive.place()].clone();
         match news {
@@ -355,7 +355,7 @@ fn a_lease_ends_with_the_action_though_its_order_waited_longer_than_it() {
     assert!(rig.news.contains(&News::LeaseRanOut(DriveIndex::new(0))));
 }
 
-/// While the port is lost nobody looks at heartbeats; a reload takes them along.
+/// While the port is lost heartbeats are not evaluated; a reload takes them along.
 #[test]
 fn a_heartbeat_of_an_outage_is_handed_over_with_the_lease() {
     let mut rig = Rig::new(1);
@@ -379,7 +379,7 @@ fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
     let mut run = rig.switch(0, "a", true);
     rig.run(Duration::from_millis(50));
     assert_eq!(outcome(&mut run), Some(Outcome::Offline), "at once, and unsent");
-    // It is back, and nobody knows yet.
+    // The drive is back, which the gateway does not know yet.
     rig.drives[0].silent = false;
     rig.drives[0].holding.insert(2000, 1);
     let mut stop = rig.switch(0, "a", false);
@@ -456,7 +456,7 @@ fn cyclic_stops_of_a_drive_that_stands_do_not_make_each_other_urgent() {
         ranks.len() > 50 && ranks.iter().all(|rank| *rank == Urgency::Command),
         "{ranks:?}"
     );
-    // One that the drive did not acknowledge leaves a doubt.
+    // A stop without an acknowledgement leaves a doubt.
     rig.drives[0].next_write = Some(Ended::Corrupt("noise"));
     let _doubtful = rig.switch(0, "plc", false);
     rig.drives[0].silent = true;
@@ -491,7 +491,7 @@ fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
     let mut rig = Rig::new(2);
     let from = rig.wire.len();
     for round in 0..300 {
-        // A run behind it makes each stop news.
+        // The run behind each stop makes the next stop effective again.
         let _stop = rig.switch(0, "flood", false);
         let _run = rig.switch(0, "flood", true);
         let _reference = rig.order(
@@ -598,7 +598,7 @@ fn exceptions_that_refuse_nothing_end_no_command_as_refused() {
         }
         let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22].map(Exception);
         for refused in refused {
-            // A drive that does not know function 06 is asked by function 16.
+            // To a drive that does not know function 06 the write is repeated with function 16.
             let writes = if refused == Exception::FUNCTION { 2 } else { 1 };
             assert_eq!(excepted(run, u32::MAX, refused), (Outcome::Exception(refused), writes));
         }

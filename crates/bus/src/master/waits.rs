@@ -1,4 +1,5 @@
-//! What a transaction may have to wait for: replies that may still come late, N2 sessions, guards of starts, a drill.
+//! Conditions that a transaction may have to wait for: replies that may still come late, N2 sessions, guards of starts,
+//! a drill.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -13,7 +14,7 @@ use crate::order::{BackgroundRequest, Command, Order, PassedOn, Urgency};
 use crate::queue::Ready;
 use crate::start_gate::StartGate;
 
-/// What a transaction may have to wait for.
+/// Conditions that a transaction may have to wait for.
 #[derive(Debug)]
 pub(super) struct Waits {
     /// The N2 sessions of the drives.

@@ -13,7 +13,7 @@ pub fn faster_points(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> 
     with_faster_points(drives).filter(|faster| predict(spec, silence, faster).is_comfortable())
 }
 
-/// The same whatever the line carries.
+/// The drives with these points in the fast class, whatever the line carries.
 pub(super) fn with_faster_points(drives: &[DriveSpec]) -> Option<Vec<DriveSpec>> {
     // Drives of a family share their profile.
     let mut made: Vec<(Arc<Profile>, Arc<Profile>)> = Vec::new();

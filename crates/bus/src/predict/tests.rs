@@ -86,8 +86,8 @@ fn a_saturated_line_gives_slow_polls_five_percent() {
     let shortage = p.shortage.unwrap();
     assert_eq!(shortage.fast.unwrap().requests, 10);
     assert_eq!(shortage.slow.unwrap().requests, 20);
-    // Three slow requests fit behind the fast ones of a round: 114.375 + 3 * 10.9167 ms = 147.1 ms, and
-    // 3 * 10.9167 / 148 is the share they ask for. One drive alone asks too much: no split helps.
+    // Three slow requests fit behind the fast ones of a round: 114.375 + 3 * 10.9167 ms = 147.1 ms, and 3 * 10.9167 /
+    // 148 is the share they need. A single drive needs too much: no split helps.
     let cycle = Duration::from_millis(148);
     assert_eq!(shortage.remedies, [Remedy::Cycle { cycle, baud: None }]);
     assert_eq!(

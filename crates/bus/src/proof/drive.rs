@@ -15,7 +15,7 @@ pub(super) enum Start {
     PoweredUp,
     /// Stopped by the gateway.
     Stopped,
-    /// One word before the end of its sequence.
+    /// Prepared up to the last word of its sequence.
     Prepared,
     Running {
         reverse: bool,
@@ -25,18 +25,18 @@ pub(super) enum Start {
     FaultedStopped,
     /// Stopped by another of its own means: that one of the words of the profile.
     StoppedOtherwise(usize),
-    /// It ran when it was polled last, and a fault came since.
+    /// The motor ran at the last poll, and a fault came since.
     FaultedSince,
-    /// It ran when it was polled last, and was switched off and on since.
+    /// The motor ran at the last poll, and the drive was switched off and on since.
     RestartedSince,
-    /// It ran when it was polled last, and was stopped at its panel since; it starts whenever a command is written while its word
+    /// The motor ran at the last poll, and was stopped at the panel since; it starts whenever a command is written while its word
     /// is a run command.
     StoppedSince,
-    /// Its word is a run command but for the bits of `always`.
+    /// The control word is a run command except for the bits of `always`.
     WithoutAlways,
     /// Commanded at its panel; the gateway's word is a stop.
     Local,
-    /// The same, and the gateway's word is a run command.
+    /// Commanded at its panel; the gateway's word is a run command.
     LocalRunning,
 }
 

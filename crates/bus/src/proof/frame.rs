@@ -11,11 +11,11 @@ pub(super) enum Fate {
     RequestLost,
     ReplyLost,
     Refused(Exception),
-    /// It arrives twice.
+    /// The request arrives twice.
     Repeated,
 }
 
-/// What was sent, or came in between.
+/// A request, or an event in between.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Frame {
     Request(RequestPdu, Option<Fate>),

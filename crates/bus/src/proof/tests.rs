@@ -30,7 +30,7 @@ fn with(control: &str) -> String {
     )
 }
 
-/// What is found wrong: when the profile is read, or by the proof.
+/// The errors found when the profile is read, or by the proof.
 fn refused(text: &str) -> Option<String> {
     let lines = |problems: Vec<Problem>| problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
     match Profile::parse("p.toml", text, false) {
@@ -91,7 +91,7 @@ fn wrong_profiles_are_refused_with_what_is_wrong() {
     assert_eq!(refused(&with(cia)), None);
 }
 
-/// A counterexample says what a person needs: state, command, words in hex.
+/// A counterexample names what a person needs: state, command, words in hex.
 #[test]
 fn a_counterexample_names_state_command_and_words() {
     let control = "run = { bit = 0 }\nstop = { bit = 0, is = 0 }\nfault_reset = { mask = 5, value = 5 }";

@@ -1,4 +1,4 @@
-//! What the orders of the gateway wrote last to a drive. Pure.
+//! Words and references last written by orders of the gateway. Pure.
 
 use std::time::Instant;
 
@@ -30,7 +30,7 @@ impl Reference {
     }
 }
 
-/// What the orders of the gateway wrote last, as far as the drive acknowledged it.
+/// Words last written by orders of the gateway, as far as the drive acknowledged them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Ordered {
     pub(super) does: Option<Does>,
@@ -46,7 +46,7 @@ pub(super) struct Ordered {
 }
 
 impl Ordered {
-    /// Whether the registers of the reference were read since it was written, and say something else though they said it before.
+    /// Whether the registers of the reference were read since it was written, and differ from it though they matched before.
     pub(super) fn is_foreign(&mut self, reading: &Reading<'_>) -> bool {
         let (Some(reference), Some(referred)) = (self.reference, self.referred) else {
             return false;
@@ -65,7 +65,8 @@ impl Ordered {
         }
     }
 
-    /// The registers of the reference are these, or were not read. Whether that is what was written, as far as the drive tells it.
+    /// The registers of the reference have these values, or were not read. Returns whether they match the written reference, as
+    /// far as the drive reports it.
     pub(super) fn tells(&mut self, read: &[u16]) -> bool {
         let Some(reference) = self.reference.filter(|r| read.len() == r.words().len()) else {
             return true;
@@ -77,7 +78,7 @@ impl Ordered {
     }
 }
 
-/// What a word at that place says of run and stop; none where it says nothing.
+/// Effect of a word at this place on run and stop; none where it has none.
 pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<Does>> {
     let word = if place == control.at {
         control.without_reset(word)

@@ -12,16 +12,16 @@ use crate::drive::control::Control;
 /// A step of a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
-    /// A reference that does not lie beside the control word.
+    /// A reference that is not adjacent to the control word.
     Reference,
-    /// The control word of the drive, and the reference beside it.
+    /// The control word of the drive, and the reference adjacent to it.
     Own,
     /// How the motor stands.
     Look,
     Write,
 }
 
-/// A round that has begun.
+/// A round that has started.
 #[derive(Debug)]
 pub(super) struct Round {
     stage: Stage,
@@ -45,7 +45,7 @@ impl Refresh {
         }
     }
 
-    /// Whether a round has begun, and its next step must follow at once.
+    /// Whether a round has started, and its next step must follow at once.
     pub(crate) fn is_under_way(&self) -> bool {
         self.round.is_some()
     }
@@ -79,7 +79,7 @@ impl Refresh {
         }
     }
 
-    /// What the round writes, as far as the rules of the gate ask: word and reference.
+    /// The write of the round that the rules of the gate judge: word and reference.
     pub(crate) fn writes(&self, profile: &Profile) -> Option<RequestPdu> {
         let control = profile.control.as_ref()?;
         match self.reference_apart(profile, control) {
@@ -88,7 +88,7 @@ impl Refresh {
         }
     }
 
-    /// What is written behind the reads.
+    /// The write behind the reads.
     fn write(&self, profile: &Profile, control: &Control) -> Option<RequestPdu> {
         let (_, repeats) = self.settings?;
         let ordered = &self.repeated.ordered;
@@ -109,7 +109,7 @@ impl Refresh {
         })
     }
 
-    /// The reference, where it lies beside the control word and one request writes both.
+    /// The reference, where it is adjacent to the control word and one request writes both.
     fn together(&self, profile: &Profile, control: &Control) -> Option<Reference> {
         let at = control.at.address;
         let reference = self.repeated.ordered.reference?;
@@ -126,7 +126,7 @@ impl Refresh {
         (!alone && self.together(profile, control).is_none()).then_some(reference)
     }
 
-    /// The read of the control word of the drive, with the reference beside it.
+    /// The read of the control word of the drive, with the adjacent reference.
     fn read_own(&self, profile: &Profile, control: &Control) -> RequestPdu {
         let at = control.at.address;
         let beside = self.together(profile, control).filter(|r| r.start > at);
@@ -223,7 +223,7 @@ impl Refresh {
         }
     }
 
-    /// Whether the motor stands as the word says: that is written, or nothing this time.
+    /// Whether the motor is in the state of the word: then that is written, else nothing this time.
     fn judge_motor(&mut self, motor: Motor) -> Result<bool, End> {
         let Some(going) = &mut self.repeated.going else {
             return Ok(false);
@@ -256,7 +256,7 @@ impl Refresh {
         }
     }
 
-    /// The thread stood still for that time, in which nothing was written.
+    /// The thread was stalled for this time, in which nothing was written.
     pub(crate) fn stood(&mut self, time: Duration, now: Instant) {
         self.round = None;
         if let Some(going) = &mut self.repeated.going {

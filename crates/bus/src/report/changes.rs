@@ -9,7 +9,7 @@ use crate::order::Origin;
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
-/// The same until it shows it standing.
+/// Time from a command to the poll that shows the motor standing.
 const STOPS_WITHIN: Duration = Duration::from_secs(300);
 
 /// Points whose changes are events: what they are when the point comes and goes, in words.
@@ -55,7 +55,7 @@ pub(super) struct Watched {
 /// A change to be reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Change {
-    /// Its present value.
+    /// Present value of the bit.
     pub(super) value: bool,
     /// When it changed before, if it was seen to.
     pub(super) before: Option<Instant>,
@@ -64,8 +64,8 @@ pub(super) struct Change {
 }
 
 impl Watched {
-    /// It was read. What holds at the first read is no change. A bit that changes too often is reported now and then, with what
-    /// was left out, and at last as it is.
+    /// Takes a reading of the bit. The value at the first read is not a change. A bit that changes too often is reported now
+    /// and then, with the number of changes left out, and finally with its value.
     pub(super) fn read(&mut self, value: bool, now: Instant) -> Option<Change> {
         let Some((seen, before)) = self.seen else {
             (self.seen, self.reported) = (Some((value, None)), Some(value));
@@ -87,7 +87,7 @@ impl Watched {
         })
     }
 
-    /// Whether it was set when it was read last.
+    /// Whether the bit was set at the last read.
     fn is_set(&self) -> bool {
         self.seen.is_some_and(|(value, _)| value)
     }
@@ -118,8 +118,8 @@ fn cause(who: &str) -> String {
 }
 
 impl Report {
-    /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
-    /// event; what changed while the drive was offline is one.
+    /// Starts, stops, warnings and control places that changed with the last poll. The value at the first read is not
+    /// an event; a change while the drive was offline is one.
     pub(super) fn look_at_state(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         let reading = drive.reading(now, RECENT);
@@ -161,8 +161,8 @@ impl Report {
         self.diagnosis.figures().set_running(runs, age);
     }
 
-    /// Who ordered a motor to start or to stop that has done so: the last order to the drive, if it was that and nothing else
-    /// came of it before.
+    /// The client that ordered the start or stop of a motor: that of the last order to the drive, if the order fits and had
+    /// no other effect before.
     fn who(&self, drive: &str, change: Change, now: Instant) -> Option<String> {
         let ordered = self.writes.audit().last_ordered(drive)?;
         let within = if change.value { STARTS_WITHIN } else { STOPS_WITHIN };
@@ -218,7 +218,7 @@ mod tests {
             }
             let most = u64::from(BURST) + (now - start).as_secs() / EVERY.as_secs() + 1;
             prop_assert!(reported <= most, "{} of {}", reported, most);
-            // It stays as it is.
+            // The bit stays as it is.
             let last = last.unwrap();
             if let Some(change) = bit.read(last, now + 2 * EVERY) {
                 told = Some(change.value);

@@ -171,7 +171,7 @@ impl Report {
         });
     }
 
-    /// A drive says that it is of another device type than its profile expects.
+    /// Reports a drive of another device type than its profile expects.
     pub(super) fn unlike(&self, index: DriveIndex, device: u8) {
         let Some(drive) = self.drive(index) else { return };
         let profile = &drive.spec.profile;

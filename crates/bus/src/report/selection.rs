@@ -1,4 +1,5 @@
-//! Process data that does not hold what its profile says: the comparisons of [`crate::selection`] applied to the image.
+//! Process data that does not hold the value of its profile: the comparisons of [`crate::selection`] applied to the
+//! image.
 
 use std::time::Instant;
 

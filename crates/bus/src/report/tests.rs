@@ -1,4 +1,4 @@
-//! What a reader on another thread sees while the image changes.
+//! The view of a reader on another thread while the image changes.
 
 use drivegate_testkit::{bus_spec, monitored, nx};
 
@@ -202,7 +202,7 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
     assert_eq!((drive.supervisions(), drive.supervision_failures()), (1, 3));
 }
 
-/// A motor that starts and stops: the words of the status register, and who is told to have been the cause.
+/// A motor that starts and stops: the words of the status register, and the client reported as the cause.
 #[test]
 fn an_event_tells_who_started_and_stopped_a_motor() {
     use crate::order::{Origin, Outcome, SourceKind, Ticket};
@@ -246,7 +246,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     };
     let acknowledged = || Outcome::Acknowledged(Reply::Written);
     let refused = || Outcome::Exception(Exception(4));
-    // What happens, and who is named after it.
+    // Order and status, and the client that is named.
     let (stands, runs, faults) = (1u16, 3u16, 8u16);
     read(stands, now);
     for (ordered, after, word, expected) in [
@@ -282,7 +282,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     }
     let kinds = |kind| events.recent().iter().filter(|event| event.kind == kind).count();
     assert_eq!((kinds(EventKind::Started), kinds(EventKind::Stopped)), (4, 3));
-    // It flaps: a few events, then one now and then that counts the rest.
+    // The bit flaps: a few events, then one now and then that counts the rest.
     for n in 0..1000 {
         now += Duration::from_millis(100);
         read(if n % 2 == 0 { stands } else { runs }, now);

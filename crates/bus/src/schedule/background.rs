@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::{Schedule, Turn};
 use crate::order::Pace;
 
-/// What the shares have earned and not used, in seconds of wire time; less than nothing after a transaction that took
+/// Time that the shares have earned and not used, in seconds of wire time; negative after a transaction that took
 /// longer than it had earned.
 #[derive(Debug, Default)]
 pub(super) struct BackgroundShare {
@@ -23,7 +23,7 @@ pub enum Admission {
     InIdleTime(Duration),
     /// Instead of a poll that is due: its share pays for it.
     InShare,
-    /// Not before then, unless the line rests earlier.
+    /// The request is not admitted before this time, unless the line rests earlier.
     NotBefore(Instant),
 }
 
@@ -61,7 +61,7 @@ impl Schedule {
         if idle && fits && owes_nothing {
             return Admission::InIdleTime(cost);
         }
-        // Reads that a command asked for and probes are few, and slow polls on credit pay for themselves.
+        // Reads for commands and probes are few, and slow polls on credit pay for themselves.
         let instead_of_process_data = idle || self.turn == Turn::Due;
         let missing = share.missing(pace, cost.as_secs_f64() * (1.0 - 1e-9));
         if missing.is_zero() && instead_of_process_data {
@@ -70,7 +70,7 @@ impl Schedule {
         Admission::NotBefore(now + missing.max(Duration::from_millis(1)))
     }
 
-    /// What is on account of the share of that pace took so long, and was no background transaction.
+    /// Charges a transaction that was not a background one to the share of this pace.
     pub(crate) fn background_owes(&mut self, pace: Pace, took: Duration) {
         if let Some(balance) = self.background.balance.get_mut(pace as usize) {
             *balance -= took.as_secs_f64();
@@ -85,7 +85,7 @@ impl Schedule {
             Admission::InShare | Admission::NotBefore(_) => took,
         };
         if matches!(admission, Admission::InShare) {
-            // It had the turn of a poll: what waited for that waits no longer.
+            // The transaction had the turn of a poll, so polls that waited for that turn wait no longer.
             self.share.polled(Duration::ZERO);
         }
         if answered && let Admission::InIdleTime(cost) = admission {

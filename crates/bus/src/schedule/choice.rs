@@ -7,9 +7,9 @@ use super::{FIRST_SHARE, Poll, RoundStart, Schedule, Turn};
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 
 impl Schedule {
-    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
-    /// the line rests where none of them fits. The greater share that they have at first is one of what commands leave:
-    /// with half of the line for commands, process data would have nothing.
+    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full, idle moments in which
+    /// none of them fits do not help them. The greater share that they have at first is one of the time that commands
+    /// leave: with half of the line for commands, process data would have nothing.
     pub(super) fn earn(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.earned_until);
         self.earned_until = now;
@@ -104,7 +104,7 @@ impl Schedule {
             .map(|(_, poll, _)| poll)
     }
 
-    /// The drive that is asked whether it answers: the one waiting longest.
+    /// The probe of the absent drive that waits longest.
     fn due_probe(&self, now: Instant) -> Option<Poll> {
         let due = |drive: &DriveSchedule| match drive.presence {
             Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
@@ -201,7 +201,7 @@ impl Schedule {
     }
 }
 
-/// What is due already waits for its turn, not for a time.
+/// A due request waits for its turn, not for a time.
 fn is_ahead(due: Instant, now: Instant) -> bool {
     due > now
 }

@@ -57,9 +57,9 @@ pub(super) struct Item {
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
-    /// Its last failed poll.
+    /// Time of the last failed poll.
     pub(super) failed_at: Option<Instant>,
-    /// A read of the once class, or one that a fault asks for, that is still to be done.
+    /// A read of the once class, or one for a fault, that is still to be done.
     pub(super) wanted: bool,
     /// Never answered so far.
     pub(super) unread: bool,
@@ -72,7 +72,7 @@ pub(super) struct Item {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Presence {
     Online,
-    /// Asked again at that time; the pause before it.
+    /// Probed again at this time; the pause before it.
     Away(Instant, Duration),
 }
 
@@ -85,13 +85,14 @@ pub(super) struct DriveSchedule {
     pub(super) quiet_until: Option<Instant>,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
-    /// It answered a session step (Identify, poll of N2) since its last probe.
+    /// Whether the drive answered a session step (Identify, poll of N2) since its last probe.
     pub(super) heard: bool,
-    /// It did not answer a command: a fast poll shows whether it is there, before anything else is read.
+    /// Whether the drive left a command unanswered: a fast poll shows whether it is there, before anything else is
+    /// read.
     pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,
-    /// It did not answer when it was asked last.
+    /// Whether the last request got no answer.
     pub(super) unanswered: bool,
     /// The read without a reply that took it away, and the probes since.
     pub(super) away_by: Option<PlannedRead>,
@@ -99,7 +100,7 @@ pub(super) struct DriveSchedule {
     /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
-    /// Those that decide its state.
+    /// Reads of the plan that decide the drive's state.
     pub(super) behind_state: Vec<PlannedRead>,
     /// Slow reads of the plan that show bits of the status word.
     pub(super) behind_status_word: Vec<PlannedRead>,
@@ -218,7 +219,7 @@ impl DriveSchedule {
         self.quiet_until.is_some_and(|until| now < until)
     }
 
-    /// A drive that was not asked yet.
+    /// A drive without a request so far.
     pub(super) fn new(items: Vec<Item>, plan: &Plan, retries: u32, now: Instant) -> DriveSchedule {
         DriveSchedule {
             retries,
@@ -264,7 +265,8 @@ impl DriveSchedule {
         self.items.splice(index..=index, parts.collect::<Vec<_>>());
     }
 
-    /// The drive is away: anyone who comes back may be another, and is asked by what every one answers.
+    /// The drive is away: the one that comes back may be another, so only reads that every drive answers are used
+    /// first.
     fn doubt_trials(&mut self, now: Instant) {
         for block in self.trials.clone() {
             let within: Vec<PlannedRead> = self.items.iter().map(|item| item.read).collect();
@@ -275,8 +277,8 @@ impl DriveSchedule {
         self.unproved.clone_from(&self.trials);
     }
 
-    /// It does not answer; the last request took the line for `took`. When it is probed next: the first probes come soon, then
-    /// the pause doubles, and the probe's cost stays within its share of the line.
+    /// The drive does not answer; the last request took the line for `took`. Sets the time of the next probe: the first probes
+    /// come soon, then the pause doubles, and the probe's cost stays within its share of the line.
     pub(super) fn is_away(&mut self, now: Instant, took: Duration) {
         let pause = match self.presence {
             Presence::Online => Duration::ZERO,
@@ -290,7 +292,7 @@ impl DriveSchedule {
             return;
         }
         self.presence = if pause.is_zero() {
-            // What is on the line then, and what goes before it, is within the longest pause too.
+            // The transaction on the line at that time, and those before the probe, fit within the longest pause, too.
             Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first)
         } else {
             let doubled = doubled(pause);

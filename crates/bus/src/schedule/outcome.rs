@@ -57,7 +57,7 @@ impl Schedule {
             item.wanted = matches!(item.read.class, PollClass::Fast | PollClass::Slow);
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
-                // Read before its time because a command asked for it, it is due a whole cycle later.
+                // A slow read made early for a command is due a whole cycle later.
                 let early = item.due > now;
                 item.due = if next < now || early { now + slow } else { next };
             }
@@ -77,7 +77,7 @@ impl Schedule {
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
             drive.probes += usize::from(drive.tried);
-            // A drive that has just answered something is there: it is asked again at once.
+            // A drive that has just answered another request is there: the request is repeated at once.
             if (!drive.tried || drive.heard) && drive.failures <= retries {
                 drive.presence = Presence::Away(now, pause);
                 return Change::None;
@@ -108,7 +108,7 @@ impl Schedule {
         }
         drive.failures += 1;
         drive.troubled = Some(now);
-        // While it is tried again, nothing else is asked of it; what was garbled shows that something is there.
+        // While it is retried, the drive gets no other request; a damaged reply shows that something is there.
         drive.doubted &= drive.failures <= retries && poll.read.class == PollClass::Fast;
         if drive.failures <= retries {
             if poll.read.class == PollClass::Fast {

@@ -22,8 +22,8 @@ impl Lead {
         self.took = took;
     }
 
-    /// What goes whether there is room or not leaves none until something is paid, and is not calculated beyond that:
-    /// others would wait without bound.
+    /// Transactions that go regardless of room leave none until they are paid, and are not counted beyond that: others
+    /// would wait without limit.
     fn fill(&mut self, took: Duration) {
         let full = (self.time + took).min(COMMANDS_IN_A_ROW * took);
         (self.time, self.took) = (self.time.max(full), took);
@@ -40,21 +40,21 @@ impl Lead {
 
 #[derive(Debug, Default)]
 pub(super) struct CommandShare {
-    /// Of everything that commands caused, over process data; calculated since polls last had nothing to do.
+    /// Time caused by all commands, in excess of process data; counted since polls last had nothing to do.
     all: Lead,
-    /// Of stops alone: they wait for no other command.
+    /// Time of stops alone: they wait for no other command.
     stops: Lead,
-    /// Since the last poll, the reads that commands asked for being theirs.
+    /// Commands since the last poll, with the reads that they cause.
     in_a_row: u32,
     stops_in_a_row: u32,
-    /// Commands since the last read that one of them asked for.
+    /// Commands since the last read that one of them caused.
     unread: u32,
     /// No poll since such a read.
     asked_last: bool,
 }
 
 impl CommandShare {
-    /// No poll is due: anyone who wants the line may have it.
+    /// No poll is due: any request may have the line.
     pub(super) fn line_is_free(&mut self) {
         self.all.time = Duration::ZERO;
         self.stops.time = Duration::ZERO;
@@ -71,13 +71,14 @@ impl CommandShare {
         }
     }
 
-    /// Whether a read that a command asked for goes before the next command. One such read shows the effect of all
-    /// commands before it, so those that wait go first, eight of them.
+    /// Whether a read for a command goes before the next command. One such read shows the effect of all commands before
+    /// it, so waiting ones go first, eight of them.
     pub(super) fn reads_before_commands(&self, command_waits: bool) -> bool {
         !command_waits || self.unread >= COMMANDS_IN_A_ROW
     }
 
-    /// Whether it goes before a poll that is due: two of them never do, and none on top of stops that have all their half.
+    /// Whether a read for a command goes before a due poll: two of them never do, and none on top of stops that have all
+    /// their half.
     pub(super) fn reads_before_polls(&self) -> bool {
         let room = self.all.has_room() && self.stops.has_room();
         !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && room
@@ -97,7 +98,7 @@ impl CommandShare {
         }
     }
 
-    /// A read that a command asked for took that time.
+    /// A read for a command took this time.
     pub(super) fn read(&mut self, took: Duration) {
         self.in_a_row += 1;
         self.stops_in_a_row = 0;

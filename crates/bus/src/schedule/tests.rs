@@ -1,4 +1,4 @@
-//! Cadence and fairness of a line in virtual time; commands, drives that are away, and chance are beside.
+//! Cadence and fairness of a line in virtual time; commands, absent drives, and chance have files of their own.
 
 use std::collections::BTreeMap;
 
@@ -224,7 +224,7 @@ fn a_dear_slow_poll_gets_its_turn_on_a_saturated_slow_line() {
             }
         }
     }
-    // They ask for nearly three lines and get a third of one.
+    // The slow polls need nearly three lines and get a third of one.
     assert!((65..=75).contains(&slow), "{slow} slow polls in 300 s");
 }
 

@@ -40,7 +40,7 @@ fn acknowledged() -> Outcome {
     Outcome::Acknowledged(Reply::Written)
 }
 
-/// One drive, whose lease is looked at as the master does.
+/// A drive whose lease is evaluated as the master does.
 struct SupervisedDrive {
     bus: BusHandle,
     drive: DriveState,
@@ -95,7 +95,7 @@ impl SupervisedDrive {
         );
     }
 
-    /// `ms` later the drive says whether it runs, and its lease is looked at.
+    /// `ms` later the drive shows whether it runs, and its lease is evaluated.
     fn look(&mut self, ms: u64, runs: bool) {
         self.now += Duration::from_millis(ms);
         self.shows(ModelPoint::Running, Value::Bool(runs));
@@ -189,13 +189,13 @@ impl SupervisedDrive {
         answer
     }
 
-    /// What waits is begun.
+    /// Starts the waiting command.
     fn begin(&mut self) {
         let command = self.take().expect("an order");
         self.drive.begin(CommandRun::new(command, &self.image().spec.profile));
     }
 
-    /// The next step of what was begun is on the wire.
+    /// Sends the next step of the started command.
     fn send(&mut self) -> (Urgency, Step) {
         let Wanted::Step(urgency, step) = self.drive.wanted(&self.image(), &N2LateReplies::default(), self.now) else {
             panic!("nothing to send")
@@ -234,7 +234,7 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
             command.answer(&failed, rig.now);
             assert!(rig.after(10, true).is_none(), "a pause first");
         }
-        // Also when the drive was seen to stand meanwhile: nobody knows why.
+        // The action is not repeated even if the drive was seen to stand meanwhile: the cause is unknown.
         let command = rig.after(1_000, false).expect("the action");
         command.answer(&acknowledged(), rig.now);
         for _ in 0..20 {
@@ -256,7 +256,7 @@ fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     assert_eq!(rig.reported(), 1);
 }
 
-/// What a command writes to a drive that has the run command: the point that takes it, and its value there.
+/// Writes of a command to a drive that has the run command: the point that takes it, and its value there.
 fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Value)> {
     let mut run = CommandRun::new(command, profile);
     let (mut words, mut now, mut sets) = (KnownWords::default(), now, Vec::new());
@@ -527,7 +527,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     assert!(rig.after(4_900, true).is_none());
     assert_eq!(rig.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
     assert_eq!(rig.after(100, true).expect("the stop").urgency(), Urgency::Stop);
-    // Whoever commands it before it is seen to run has his lease.
+    // A client that commands the drive before it is seen to run has its own lease.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     rig.heartbeat();
     assert!(rig.after(100, true).is_none());

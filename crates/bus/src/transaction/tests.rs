@@ -1,4 +1,4 @@
-//! Exchanges in Modbus RTU; those in Modbus ASCII, and what chance makes of both, are beside.
+//! Transactions in Modbus RTU; those in Modbus ASCII, and random ones of both, have files of their own.
 
 use super::*;
 use crate::codec::{Table, rtu};

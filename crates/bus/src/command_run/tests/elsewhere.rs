@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// A drive whose word the gateway knows from when it ran.
+/// A drive whose word the gateway knows from the time when it ran.
 fn bench(word: u16) -> ObedientDrive {
     let mut bench = ObedientDrive::new(word);
     bench.running = true;
@@ -22,7 +22,7 @@ fn the_word_is_read_before_a_run_bit_that_is_not_named_is_written() {
         assert!(asks(&sends(&bench, &mut command)));
         assert_eq!(bench.run(&mut command), [(0, 2000, written)], "{has}");
     }
-    // Nothing that could start the motor: no read.
+    // Nothing here could start the motor, so no read is needed.
     let mut bench = bench(0);
     bench.words.learn(Table::Holding, 2000, 0);
     assert_eq!(sends(&bench, &mut reverse(&bench)), word(2));
@@ -64,7 +64,7 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
         let expected = if running { Next::Send(word(3)) } else { Next::Done };
         assert_eq!(next, expected, "polled: {polled}, running: {running}");
     }
-    // One that is only busy, or silent, is not overruled while its motor runs.
+    // The run bit of a drive that is only busy, or silent, is kept while its motor runs.
     let mut bench = bench(1);
     let mut command = reverse(&bench);
     let read = sends(&bench, &mut command);

@@ -4,7 +4,7 @@ use super::*;
 
 const SETTINGS: u16 = 299;
 
-/// Acts like a drive that knows these functions of writes only; what it was asked, as function and value.
+/// A drive that knows only these functions of writes; it records its requests, as function and value.
 struct Drive {
     knows: &'static [u8],
     word: u16,
@@ -40,7 +40,7 @@ impl Drive {
         }
     }
 
-    /// Lets it answer a command to its end; what it was asked meanwhile.
+    /// Answers a command to its end; returns the requests meanwhile.
     fn carries_out(&mut self, bench: &mut ObedientDrive, mut run: CommandRun) -> (Vec<(u8, u16)>, Outcome) {
         self.asked.clear();
         for _ in 0..20 {
@@ -82,7 +82,7 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
         let (asked, outcome) = drive.carries_out(&mut bench, run);
         assert_eq!((asked.len(), asked[0].0, outcome.is_ok()), (1, 16, true), "{points:?}");
     }
-    // It starts anew, and is the same drive.
+    // The drive restarts, and is still the same machine.
     bench.words.forget();
     let run = stop(&bench);
     let (asked, _) = drive.carries_out(&mut bench, run);
@@ -158,7 +158,7 @@ fn a_settings_register_is_read_before_one_bit_of_it_is_written() {
     let (asked, outcome) = drive.carries_out(&mut bench, run);
     assert_eq!(asked, [(3, 0x0230), (6, 0x0234)]);
     assert!(outcome.is_ok());
-    // It is read each time, also right after its own write.
+    // The register is read each time, even right after its own write.
     drive.word = 0x0004;
     let run = sets(&bench, 0.0);
     assert_eq!(drive.carries_out(&mut bench, run).0, [(3, 0x0004), (6, 0)]);
@@ -194,7 +194,7 @@ fn a_drive_with_function_22_changes_the_bit_itself() {
     assert_eq!((asked, outcome.is_ok()), (vec![(22, 0x0134)], true));
     let run = sets(&bench, 0.0);
     assert_eq!(drive.carries_out(&mut bench, run).0, [(22, 0x0130)]);
-    // One that does not have it after all.
+    // A drive that turns out not to have function 22.
     let (mut bench, mut drive) = (settings("ranges = { mask_write = true }"), Drive::new(&[6]));
     drive.word = 0x0130;
     for on in [1.0, 0.0] {

@@ -7,24 +7,25 @@ use crate::drive::control::{Control, ControlItem, OwnWord, Run};
 use crate::drive::{Derived, PointIndex, Raw, Source};
 use crate::order::{Arrival, Window, written};
 
-/// What became of the drive since it was polled last, when its motor ran by a word of the gateway.
+/// Events at a drive since its last poll, when its motor ran by a word of the gateway.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Since {
-    /// It runs on.
+    /// The motor runs on.
     Nothing,
-    /// It was stopped at its panel, and its word stands.
+    /// The motor was stopped at the panel, and the control word is unchanged.
     Stopped,
-    /// It has no word any more.
+    /// The drive has lost its control word.
     Restarted,
     Faulted,
 }
 
-/// A drive of any family: it answers status reads as its motor stands, and runs whenever its word says so.
+/// A drive of any family: it answers status reads with the state of its motor, and runs whenever its word is a run
+/// command.
 struct AnyDrive<'p> {
     profile: &'p Profile,
     control: &'p Control,
     words: BTreeMap<(Table, u16), u16>,
-    /// What is written of a run command while the motor does not run.
+    /// Run commands written while the motor does not run.
     started: Vec<(u16, u16)>,
     reads: usize,
 }
@@ -253,7 +254,7 @@ fn a_motor_that_is_seen_to_run_is_turned() {
     }
 }
 
-/// A direction that waits is that of the next start, in every form in which a family says it.
+/// The next start has the direction that waits, in every form in which families encode it.
 #[test]
 fn the_next_start_has_the_direction_that_was_kept() {
     for profile in families() {
@@ -309,7 +310,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
     }
 }
 
-/// A lost look leaves the order unsent, and says so; one that the drive refuses, too.
+/// After a lost look, or one that the drive refuses, the order is not sent, and the outcome reports that.
 #[test]
 fn an_order_whose_look_is_lost_is_not_sent() {
     let mut bench = ObedientDrive::new(1);

@@ -27,7 +27,7 @@ impl Rig {
         answer
     }
 
-    /// Runs while each client asks again as soon as it has its answer.
+    /// Runs while each client sends its next request as soon as it has its answer.
     fn run_asking(&mut self, time: Duration, clients: &[(&str, Pace)]) {
         let end = self.now + time;
         let mut waiting: Vec<Option<Receiver<Answer>>> = clients.iter().map(|_| None).collect();
@@ -98,7 +98,7 @@ fn a_busy_line_loses_no_more_process_data_than_the_share_says() {
 fn time_that_is_left_over_is_used_and_no_round_is_late_by_that() {
     let cycle = Duration::from_millis(100);
     let mut rig = Rig::at(1, "vacon-nx", Protocol::ModbusRtu, cycle);
-    // The first exchanges show that this drive takes longer than its profile says.
+    // The first transactions show that this drive takes longer than its profile states.
     rig.run_asking(Duration::from_secs(10), &[("params", Pace::Slow)]);
     let from = rig.wire.len();
     let late = rig.late_rounds(cycle, &[]);
@@ -127,7 +127,7 @@ fn a_drive_that_is_silent_to_a_request_delays_no_more_than_the_share() {
             silent += 1;
             answer = rig.ask(0, "params", Pace::Slow);
         }
-        // Only the background request finds it silent.
+        // Only background requests find the drive silent.
         let mut news = Vec::new();
         rig.drives[0].silent = match rig.master.next(rig.now, &mut news) {
             Ok(turn) => is_background(&turn),
@@ -209,7 +209,7 @@ fn every_request_is_answered_once_whatever_happens() {
             .iter_mut()
             .filter_map(|answer| outcome(answer).is_none().then_some(()));
         assert_eq!(missing.count(), 0);
-        // What waits when the gateway ends is answered, too.
+        // A request that waits when the gateway ends is answered, too.
         let mut last = rig.ask(1, "late", Pace::Slow);
         let _missing = rig.bus.queue.begin_shutdown(now + Duration::from_secs(1), now);
         assert_eq!(outcome(&mut last), Some(Outcome::ShuttingDown));

@@ -21,10 +21,10 @@ fn plant(rig: &Rig) -> (Plant, Drills) {
     (plant, drills)
 }
 
-/// Drills the first of two drives; `meanwhile` is called with what is said of it.
+/// Drills the first of two drives; `meanwhile` is called with the report of each step.
 fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig, DrillReport) {
     let mut rig = Rig::new(2);
-    // It takes orders from the fieldbus, and turns at 10 % where it turns.
+    // The drive takes orders from the fieldbus, and turns at 10 % when it turns.
     rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
     rig.run(Duration::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
@@ -86,7 +86,7 @@ fn a_drive_that_goes_on_turning_fails() {
     );
 }
 
-/// What happens while the motor should come to stand.
+/// Incident while the motor should come to a standstill.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meanwhile {
     /// The first replies behind a silence are lost; the motor stands before any comes.
@@ -176,7 +176,7 @@ fn a_standstill_counts_from_when_it_was_seen() {
     assert_eq!(report.state, DrillState::Passed, "{report:#?}");
     let took = report.steps[0].took_ms.unwrap();
     assert!((1_000..1_200).contains(&took), "{took} ms");
-    // It stands just in time, and the reply that would have shown that is lost.
+    // The motor stands just in time, and the reply that would have shown that is lost.
     let mut began = None;
     let (_, report) = drill(Kind::Order, |rig, report| {
         if says(report, "a stop command") {
@@ -187,7 +187,7 @@ fn a_standstill_counts_from_when_it_was_seen() {
         }
     });
     assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
-    // One that was seen to turn after the limit has failed.
+    // A motor that was seen to turn after the limit has failed the drill.
     let mut began = None;
     let (_, report) = drill(Kind::Order, |rig, report| {
         if says(report, "a stop command") {
@@ -324,7 +324,7 @@ fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
         let plant = self::plant(&rig);
         plant.1.restore(saved);
         let mut events = plant.0.events.subscribe();
-        // Its client is still there, so that no lease stops the motor.
+        // The client sends heartbeats, so that no lease stops the motor.
         let (alice, until) = (Origin::new(SourceKind::Http, "alice"), rig.now + Duration::from_secs(2));
         while rig.now < until {
             plant.0.drives().next().unwrap().heartbeat(&alice, rig.now);

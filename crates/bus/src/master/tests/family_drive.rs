@@ -1,4 +1,4 @@
-//! A drive of any family, as its profile says: it runs and stops by its words, and shows that in its states.
+//! A drive of any family, by its profile: it runs and stops by its words, and shows that in its states.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ pub(super) struct FamilyDrive {
 }
 
 impl FamilyDrive {
-    /// One that stands, without a fault, commanded by the bus.
+    /// A drive that stands, without a fault, commanded by the bus.
     pub(super) fn new(profile: &Arc<Profile>) -> FamilyDrive {
         let mut drive = FamilyDrive {
             profile: profile.clone(),

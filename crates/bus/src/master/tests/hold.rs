@@ -1,4 +1,4 @@
-//! Who holds a drive, on the line: no order of one who does not hold it, every stop.
+//! The holder of a drive, on the line: no order of another client, and every stop.
 
 use super::*;
 use crate::drive::DriveIndex;
@@ -7,7 +7,7 @@ use crate::permit::{Mode, Principal, Rules, Verb};
 use crate::plant::{DriveHandle, OrderRequest, Plant};
 use std::time::Duration as Time;
 
-/// The NX says by that bit that the fieldbus controls it.
+/// Bit by which the NX reports that the fieldbus controls it.
 const FIELDBUS: (u16, u16) = (2101, 1 << 13);
 
 fn guarded(drives: u8, mode: Mode) -> (Rig, Plant) {
@@ -189,7 +189,7 @@ fn the_turn_is_judged_again() {
     assert_eq!((code(&mut waits), writes(&rig, from)), ("not_allowed", 0));
 }
 
-/// Its client gives the drive back while the order still waits.
+/// The client releases the drive while its order still waits.
 #[test]
 fn an_order_whose_drive_is_free_at_its_turn_takes_it() {
     let (mut rig, plant) = guarded(1, Mode::Exclusive);

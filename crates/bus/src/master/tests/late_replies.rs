@@ -31,7 +31,7 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
 }
 
-/// What an adapter or a repeater sends twice may come mangled first and sound afterwards.
+/// A reply that an adapter or a repeater sends twice may come damaged first and sound afterwards.
 #[test]
 fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
     for (mangled, expected) in [(true, true), (false, false)] {
@@ -115,8 +115,8 @@ fn fail(rig: &mut Rig, doubted: bool) {
     rig.news.append(&mut news);
 }
 
-/// The reply of a drive that was just switched on may be too early for the configured baud rate: it is asked again at once, not
-/// after the pause between two probes.
+/// The reply of a drive that was just switched on may be too early for the configured baud rate: the request is repeated at
+/// once, not after the pause between two probes.
 #[test]
 fn a_probe_whose_reply_was_not_believed_is_repeated_at_once() {
     for (doubted, soon) in [(true, true), (false, false)] {

@@ -34,7 +34,7 @@ impl Rig {
         }
     }
 
-    /// It ended at that time, the thread having stood still or not; the news.
+    /// Ends the turn at this time, after a stall of the thread or not; returns the news.
     fn ends(&mut self, turn: &Turn, ended: Ended, (at, stood): (Instant, bool)) -> Vec<News> {
         let (began, mut news) = (self.now, Vec::new());
         self.now = self.now.max(at);
@@ -92,7 +92,7 @@ fn a_drive_is_not_away_because_the_gateway_stood_still() {
 
 #[test]
 fn a_lease_lasts_longer_by_what_nobody_was_heard_but_not_twice_as_long() {
-    // Of 500 ms; how long the thread stands still 100 ms after each other, and how long the motor runs then.
+    // A lease of 500 ms: stalls of the thread, each 100 ms after the last, and how long the motor runs then.
     for (stalls, least, most) in [
         (&[][..], 450, 600),
         (&[300], 750, 900),

@@ -111,7 +111,7 @@ impl Plant {
             .collect()
     }
 
-    /// Nothing is written again for so many seconds, and the image says so.
+    /// The refresh has stopped for several seconds, and the image shows that.
     fn assert_ended(&mut self, why: &str) {
         self.rig.run(Duration::from_millis(300));
         let refreshes = self.refreshes(8);
@@ -219,7 +219,7 @@ fn references_without_end_do_not_hold_up_the_word() {
     }
 }
 
-/// What ends a refresh, and nothing but an order begins it again.
+/// Events that end a refresh; only an order starts it again.
 #[test]
 fn a_refresh_ends_for_good_with_everything_that_contradicts_it() {
     type Event = fn(&mut Plant);
@@ -373,7 +373,7 @@ fn stands_still(rig: &mut Rig, ms: u64) {
     rig.master.stood(crate::stalls::Stall::new(began, rig.now), rig.now);
 }
 
-/// What a round has read holds no longer when the port was lost, or the thread stood still, before its write.
+/// Values read in a round no longer hold when the port was lost, or the thread was stalled, before its write.
 #[test]
 fn a_round_that_was_interrupted_reads_again_before_it_writes() {
     type Event = fn(&mut Rig);
@@ -395,7 +395,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
                 plant.rig.step();
                 assert!(plant.rig.now < until, "{name}");
             }
-            // The motor stands now, and nobody has seen that.
+            // The motor stands now, which no read has shown yet.
             plant.drive().stand();
             happens(&mut plant.rig);
             let from = plant.rig.wire.len();

@@ -170,7 +170,7 @@ fn outcome(exchange: &mut Exchange) -> Option<&'static str> {
     }
 }
 
-/// What a tool sends unchecked: to a drive, to all of them, to an address at which none is configured.
+/// Unchecked requests of a tool: to a drive, to all of them, to an address at which none is configured.
 #[test]
 fn what_is_passed_on_for_a_tool_needs_its_right_at_its_turn() {
     let run = RequestPdu::write_register(2000, 1);

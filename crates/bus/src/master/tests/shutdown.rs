@@ -55,10 +55,10 @@ fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
         let (broadcast, single) = shutdown_of(&mut rig);
         assert!(broadcast.expect("one broadcast") <= COST, "{broadcast:?}");
         assert!(single > broadcast.unwrap() && single <= Duration::from_millis(500));
-        // What the broadcast says is not believed.
+        // A broadcast is not acknowledged, so each drive still gets its own stop.
         assert!((0..20).all(|drive| !rig.runs(drive)));
     }
-    // One that is to go on, or that may not be commanded, keeps the others from it.
+    // A drive that is to run on, or that may not be commanded, rules out the broadcast for all.
     let hold = |spec: DriveSpec| DriveSpec {
         on_shutdown: if spec.address == 4 {
             OnShutdown::Hold

@@ -1,4 +1,4 @@
-//! A stop of all drives: the broadcast and the stops on the line, and what is told of each drive.
+//! A stop of all drives: the broadcast and the stops on the line, and the result for each drive.
 
 use super::*;
 use crate::plant::Plant;
@@ -61,7 +61,7 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
         assert!(report.ok, "{report:?}");
         assert_eq!(outcomes(&report), [Stopped::Standing; 20]);
         assert_eq!(order.acknowledged.try_recv(), Ok(true));
-        // What was read of a drive before the flood may be old when the last one is seen to stand.
+        // A reading from before the flood may be old when the last drive is seen to stand.
         rig.run(Duration::from_secs(2));
         assert_eq!(not_standing(&plant.drives().collect::<Vec<_>>(), rig.now), 0);
         let writes: Vec<_> = rig.wire[from..]
@@ -184,7 +184,7 @@ fn a_second_order_joins_stops_that_wait_and_sends_those_that_were_acknowledged_a
 fn a_motor_that_runs_down_is_told_as_stopping() {
     let mut rig = running(2);
     let (plant, stop_all) = (plant(&rig), StopAll::default());
-    // 12 Hz, whatever the control word says.
+    // The output is at 12 Hz, whatever the control word is.
     rig.drives[1].holding.insert(2103, 1200);
     let mut order = order(&rig, &plant, &stop_all, &Scope::Gateway);
     let report = answered(&mut rig, &plant, &stop_all, &mut order);

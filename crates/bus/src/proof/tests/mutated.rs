@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// One change of a `[control]`; none where it has nothing to change.
+/// A change of a `[control]`; none where it has nothing to change.
 type Fault = fn(&mut Control) -> Option<()>;
 
 fn run_of(control: &mut Control) -> Option<&mut Setting> {

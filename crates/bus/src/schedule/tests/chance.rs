@@ -28,7 +28,7 @@ fn case() -> impl Strategy<Value = Case> {
         any::<u64>(),
     )
         .prop_map(|(drives, cost_ms, cycle_ms, every_ms, seed)| Case {
-            // One in four is dead.
+            // About one drive in four is dead.
             dead: drives.iter().map(|(_, flag, dice)| *flag && *dice < 2).collect(),
             plans: drives.into_iter().map(|(reads, _, _)| reads).collect(),
             cost_ms,
@@ -60,7 +60,7 @@ fn plan_of(reads: &[(u8, u16)]) -> Plan {
 const DEADLINE: Duration = Duration::from_millis(110);
 const SLOW: Duration = Duration::from_secs(1);
 
-/// What was seen in a minute behind a start of fifteen seconds, in which the dead are found dead.
+/// Figures of a minute behind a start of fifteen seconds, in which the dead drives are detected.
 #[derive(Default)]
 struct Seen {
     fast_counts: BTreeMap<(usize, u16), usize>,

@@ -28,8 +28,8 @@ fn eight_commands_then_a_poll() {
     assert_eq!(commands - fast, 8, "behind the first eight, each has its half");
 }
 
-/// Ten seconds of a line at 38400 baud whose two drives are written to as often as they will: time of fast polls, slow
-/// polls, reads that the commands asked for, and commands. `again` is the rank of the command that waits all the time.
+/// Ten seconds of a line at 38400 baud whose two drives get writes continuously: time of fast polls, slow polls, reads
+/// for commands, and commands. `again` is the rank of the command that always waits.
 fn flooded(again: Option<Urgency>) -> ([Duration; 4], Duration) {
     let ms = |fraction: f64| Duration::from_secs_f64(fraction / 1e3);
     let (fast, slow, command) = (ms(11.44), ms(7.28), ms(6.76));

@@ -45,7 +45,7 @@ fn dead_drives_cost_two_percent_each() {
     let ratio = total(&some) / total(&all);
     assert!(ratio >= 0.94, "{ratio}");
     assert_eq!(some.offline, [2, 5, 9], "reported once each");
-    // It comes back within ten seconds, and its once class is read again.
+    // The drive comes back within ten seconds, and its once class is read again.
     some.dead.clear();
     some.log.clear();
     some.run(Duration::from_secs(14));

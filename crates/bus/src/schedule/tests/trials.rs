@@ -8,7 +8,7 @@ use super::super::*;
 use crate::codec::Table;
 use crate::drive::DriveIndex;
 
-/// What a drive does with a read of several bits.
+/// Reaction of a drive to a read of several bits.
 #[derive(Clone, Copy, PartialEq)]
 enum Does {
     Answers,

@@ -74,7 +74,7 @@ fn a_read_that_an_order_needs_first_has_reached_the_wire() {
 
 #[test]
 fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
-    // Begun, and over before anything of it was sent.
+    // Started, and ended before anything of it was sent.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     let _answer = rig.order();
     rig.begin();

@@ -11,9 +11,9 @@ enum Event {
     Heartbeat,
     /// A reference of a client is queued.
     Order,
-    /// What waits is begun, or the next step of what was begun is sent.
+    /// The waiting command starts, or the next step of the started one is sent.
     Send,
-    /// What was begun ends so.
+    /// The started command ends, acknowledged or not.
     End(bool),
 }
 
@@ -27,14 +27,14 @@ fn event() -> impl Strategy<Value = Event> {
     ]
 }
 
-/// What the client did, as a model of one line.
+/// Actions of the client, as a model of one line.
 #[derive(Default)]
 struct Client {
-    /// When it was last heard of.
+    /// When the client was last known to be alive.
     heard: Option<Instant>,
     /// The action was acknowledged since.
     acted: bool,
-    /// Until when what waits, and what was begun, hold the lease; whether the latter is on the wire.
+    /// Until when the waiting and the started command hold the lease; whether the latter is on the wire.
     queued: Option<Instant>,
     begun: Option<(Instant, bool)>,
 }

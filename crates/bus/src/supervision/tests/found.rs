@@ -1,4 +1,4 @@
-//! What the state machine must do where answers and heartbeats cross.
+//! Requirements on the state machine where answers and heartbeats cross.
 
 use super::*;
 

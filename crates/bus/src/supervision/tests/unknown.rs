@@ -73,7 +73,7 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     assert_eq!(rig.news, []);
     online(&rig);
     assert!(rig.after(10, true).is_some());
-    // But not for ever, if it answers and this is not read again, whatever comes instead: it acts when the lease runs out.
+    // The wait has a limit: if the drive answers but this is not read again, the lease acts when it expires.
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();
@@ -106,7 +106,7 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
         }
     }
     assert!(answered >= Duration::from_millis(1_800), "{answered:?}");
-    // So does one that does not answer at all, though it refused before.
+    // A drive that does not answer at all keeps its lease as well, though it refused before.
     let mut rig = cx();
     rig.refuses_running();
     rig.image().update(|s| s.link = Link::Offline(SystemTime::now()));

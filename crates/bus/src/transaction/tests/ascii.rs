@@ -44,7 +44,7 @@ fn an_ascii_reply_is_found_behind_noise_foreign_frames_and_broken_ones() {
             assert_eq!(step, truth, "{:?} by {chunk}", String::from_utf8_lossy(before));
         }
     }
-    // Not behind a broken frame: an exception, which is short.
+    // An exception behind a broken frame is not accepted, as it is short.
     let mut transaction = start_ascii(&request, &frame, now, false);
     let bytes = b":01030400050000F4\r\n:0183027A\r\n";
     assert!(matches!(transaction.on_bytes(now, bytes), Step::Wait(_)));

@@ -4,7 +4,7 @@ use super::ascii::{in_ascii, start_ascii};
 use super::*;
 use proptest::prelude::*;
 
-/// What a fault makes of a reply on its way.
+/// A reply that a fault has changed on its way.
 fn mutated() -> impl Strategy<Value = Vec<u8>> {
     let truth = reply(0x4711);
     let len = truth.len();
@@ -146,7 +146,7 @@ proptest! {
             }
             step = transaction.on_bytes(now, piece);
         }
-        // Noise and the first bytes of the reply make a sound frame of nobody once in some ten thousand cases.
+        // Noise and the first bytes of the reply form a sound frame of another address once in some ten thousand cases.
         prop_assert!(step == done(0x4711) || transaction.foreign() > strange, "{:?}", step);
     }
 }
