@@ -401,8 +401,8 @@ impl<'a> Line<'a> {
         }
     }
 
-    /// The shortest cadence whose idle time has room for the slow class: as many of its longest requests that `fitting
-    /// * mean / cycle` is its share.
+    /// The shortest cadence whose idle time has room for the slow class: for as many of its longest requests as make
+    /// `fitting * mean / cycle` its share.
     fn roomy_cycle(&self, rounds: &Rounds) -> Option<Duration> {
         let (_, slow) = self.shares(rounds);
         let spare = rounds.mean_slow() - slow * rounds.longest_slow;
