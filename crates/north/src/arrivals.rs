@@ -12,7 +12,7 @@ const MOST_PIECES: usize = 64;
 pub(super) struct Arrivals(VecDeque<(usize, Arrival)>);
 
 impl Arrivals {
-    /// That number of bytes came so.
+    /// Adds this number of bytes with their arrival.
     pub(super) fn came(&mut self, count: usize, arrival: Arrival) {
         if count == 0 {
             return;

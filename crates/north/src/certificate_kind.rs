@@ -46,12 +46,12 @@ const ALGORITHMS: [(&str, &str, bool); 17] = [
 /// The kind of a certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Kind {
-    /// Its subject, for messages.
+    /// Subject of the certificate, for messages.
     pub(super) name: String,
-    /// Its issuer, for messages.
+    /// Issuer of the certificate, for messages.
     pub(super) issuer: String,
     pub(super) self_issued: bool,
-    /// Of a version before 3, which has no extensions.
+    /// Whether the certificate is of a version before 3, which has no extensions.
     pub(super) is_old: bool,
     /// May issue certificates.
     pub(super) is_ca: bool,
@@ -67,7 +67,7 @@ pub(super) struct Kind {
 /// The kind of a public key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct KeyKind {
-    /// Such as `P-521`, `RSA with 1024 bits`.
+    /// Name of the key type, such as `P-521`, `RSA with 1024 bits`.
     pub(super) name: String,
     /// Whether a peer with it can be verified.
     pub(super) verifies: bool,
@@ -108,7 +108,7 @@ impl Kind {
         }
     }
 
-    /// Whether it is for a host or address, as far as its names tell.
+    /// Whether the certificate is for a host or address, as far as its names show.
     pub(super) fn is_for(&self, host: &str) -> bool {
         let Ok(host_name) = ServerName::try_from(host) else {
             return false;

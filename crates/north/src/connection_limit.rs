@@ -57,7 +57,7 @@ impl Limits {
 struct Open {
     address: IpAddr,
     authority: Authority,
-    /// It does not yield to another connection of the same address. See [`ConnectionPlace::use_at`].
+    /// Whether the connection keeps its place against another one of its address. See [`ConnectionPlace::use_at`].
     in_use: bool,
     /// Time of its last use, ms.
     used: u64,
@@ -165,7 +165,7 @@ pub(super) enum CloseReason {
     /// The configuration was reloaded.
     #[error("closed: the new configuration does not allow it")]
     NotAllowed,
-    /// Of the client's certificate, or of the rights of its role.
+    /// The client's certificate, or the rights of its role, ended.
     #[error("closed: its certificate is no longer accepted with the same rights")]
     CertificateRefused,
 }
@@ -280,7 +280,7 @@ pub(super) struct Newcomer<'c> {
 /// Why a connection gets no place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum NoPlace {
-    /// It may not connect at all.
+    /// The client may not connect at all.
     NotAllowed,
     /// A limit is reached and no other connection yields.
     Limit(LimitReached),
@@ -304,8 +304,9 @@ impl ConnectionLimit {
         self.lock().limits = limits;
     }
 
-    /// A place for a newcomer, and the address of the connection that it displaced. `judge` says what the newcomer may
-    /// do, or that it may not connect; it is called while no [`ConnectionLimit::review`] runs, so a reload misses nobody.
+    /// A place for a new connection, and the address of the connection that it displaced. `judge` returns the rights of
+    /// the client, or that it may not connect; it is called while no [`ConnectionLimit::review`] runs, so that a reload
+    /// misses no connection.
     ///
     /// # Errors
     /// Why there is none.

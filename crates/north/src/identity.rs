@@ -32,7 +32,7 @@ pub struct ServerIdentity {
 pub enum TlsFile {
     /// The certificate of the server, followed by intermediate certificates.
     Certificate,
-    /// Its private key.
+    /// Private key of the certificate.
     Key,
     /// The CA certificates that client certificates are verified against.
     ClientCa,
@@ -247,7 +247,7 @@ pub(super) fn trusted_servers(ca: Option<&Path>) -> Result<ServerTrust, RootsErr
             }
         }
         None => {
-            // One certificate of the system that rustls cannot parse must not disable TLS.
+            // A certificate of the system that rustls cannot parse must not disable TLS.
             store.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
         }
     }
@@ -271,9 +271,9 @@ pub fn client_tls(ca: Option<&Path>) -> Result<Arc<ClientConfig>, String> {
     Ok(Arc::new(builder.with_no_client_auth()))
 }
 
-/// What will or may keep the server `host` from being trusted by the certificates of a PEM file: those that have ended, or end
-/// within 30 days of `now`, whose keys are not supported, or that are its own and for another host. Each as what is wrong and
-/// what to do.
+/// Problems that will or may keep the server `host` from being trusted by the certificates of a PEM file: certificates that
+/// have ended, or end within 30 days of `now`, whose keys are not supported, or that are its own and for another host. Each
+/// with error and remedy.
 ///
 /// # Errors
 /// The file cannot be read, or contains no certificate.
@@ -292,7 +292,7 @@ fn unfit_for(kind: Kind, file: String, host: &str) -> Option<FileProblem> {
         return Some(unsupported_key(kind, file));
     }
     let name = kind.name.clone();
-    // One of version 1 does not say whether it is a CA.
+    // A certificate of version 1 does not show whether it is a CA.
     let is_own = !kind.is_ca && !kind.is_old;
     let other = is_own && !kind.is_for(host);
     other.then(|| FileProblem::OtherHost {

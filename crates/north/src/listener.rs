@@ -95,7 +95,7 @@ struct OpenListener<H> {
 /// Where a listener of a new configuration has its socket from.
 #[derive(Debug)]
 enum Socket {
-    /// It is the open listener's.
+    /// The socket of the open listener is kept.
     Open,
     New(std::net::TcpListener),
     /// There is none yet: the machine does not have the address.
@@ -143,7 +143,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         of_kind.map(|listener| listener.bound).collect()
     }
 
-    /// Binds the sockets that are missing. What is open goes on, with one exception: a socket that is no longer wanted is
+    /// Binds the sockets that are missing. Open ones go on, with one exception: a socket that is no longer configured is
     /// closed early if a new one overlaps it, because the system does not allow both at one time.
     ///
     /// A server that starts takes an address that the machine does not have yet: it comes with its interface, and

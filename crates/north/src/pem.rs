@@ -119,7 +119,7 @@ impl Found {
     }
 }
 
-/// Whether this begins as a sequence of DER does, whose length is no text.
+/// Whether the bytes begin like a sequence of DER, whose length field does not occur in text.
 fn is_sequence(bytes: &[u8]) -> bool {
     match bytes {
         [0x30, length @ 0..0x80, content @ ..] => usize::from(*length) == content.len(),
@@ -152,7 +152,7 @@ pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemErro
 /// All certificate revocation lists of a file, at least one: PEM, or a single one in DER as CAs publish it.
 pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, PemError> {
     let bytes = content(file)?;
-    // A DER file begins with the tag of a sequence, which is no letter of PEM.
+    // A DER file begins with the tag of a sequence, which is not a letter of PEM.
     if Found::of(&bytes) == Found::Binary {
         return Ok(vec![bytes.into()]);
     }

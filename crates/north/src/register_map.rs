@@ -59,9 +59,9 @@ pub(crate) const STATUS_BITS: [ModelPoint; 8] = [
 /// How a value is encoded in registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// One register, 0 to 65534; 0xFFFF is not available.
+    /// A register, 0 to 65534; 0xFFFF is not available.
     U16,
-    /// One register, -32767 to 32767; 0x8000 is not available.
+    /// A register, -32767 to 32767; 0x8000 is not available.
     I16,
     /// Two registers, high word first, 0 to 2^32 - 2; 0xFFFFFFFF is not available.
     U32,
@@ -136,7 +136,7 @@ pub enum Content {
     Command,
     /// Any write renews the supervision; reads 0.
     Heartbeat,
-    /// Who holds the drive.
+    /// The holder of the drive.
     Holder,
     /// For how long.
     HoldLeft,
@@ -144,12 +144,12 @@ pub enum Content {
     Hold,
 }
 
-/// One value of the map.
+/// A value of the map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
     /// First PDU address.
     pub address: u16,
-    /// Its content.
+    /// Content of the value.
     pub content: Content,
     /// How it is encoded.
     pub form: Form,
@@ -251,9 +251,9 @@ impl Entry {
 /// Whether the port of a bus is open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum BusState {
-    /// It is open.
+    /// The port of the bus is open.
     Up,
-    /// It is closed, so no value is current.
+    /// The port of the bus is closed, so no value is current.
     Down,
 }
 
@@ -263,7 +263,7 @@ pub(crate) struct DriveView<'r> {
     reading: &'r Reading<'r>,
     bus: BusState,
     stale: bool,
-    /// Its hold, and whether it is the client's own; none where `[authority]` is off.
+    /// Hold of the drive, and whether it is the client's own; none where `[authority]` is off.
     hold: Option<(HoldView, bool)>,
 }
 
@@ -279,7 +279,7 @@ impl<'r> DriveView<'r> {
         }
     }
 
-    /// The same with its hold, and whether it is the client's own.
+    /// Adds the hold, and whether it is the client's own.
     pub(crate) fn with_hold(mut self, hold: Option<(HoldView, bool)>) -> DriveView<'r> {
         self.hold = hold;
         self
@@ -337,7 +337,7 @@ impl<'r> DriveView<'r> {
         }
     }
 
-    /// 0 nobody, 1 this client, 2 another one, 3 the local control place, 4 reserved after a stop.
+    /// 0 free, 1 this client, 2 another one, 3 the local control place, 4 reserved after a stop.
     fn holder(&self) -> u16 {
         match &self.hold {
             None => NO_U16,

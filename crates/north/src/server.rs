@@ -18,13 +18,13 @@ pub trait Server: Sized + std::fmt::Debug {
     const NAME: &'static str;
     /// Time limit for it to stop.
     const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
-    /// Its configuration.
+    /// Configuration of the server.
     type Options: Clone + PartialEq + std::fmt::Debug;
 
     /// Starts it; it runs until `cancel`.
     ///
     /// # Errors
-    /// It cannot run so: an address, a certificate or a thread cannot be had.
+    /// The server cannot run with these options: an address, a certificate or a thread is not available.
     async fn start(
         options: Self::Options,
         plant: SharedPlant,
@@ -49,7 +49,7 @@ pub trait Reconfigure: Server {
     /// Does all that can fail; nothing changes for any client.
     ///
     /// # Errors
-    /// It cannot run so: it runs as before.
+    /// The server cannot run with these options: it runs as before.
     async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError>;
 
     /// Applies a prepared change.

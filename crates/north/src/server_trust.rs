@@ -41,7 +41,7 @@ impl ServerTrust {
     /// Trusts certificates signed by the CAs in `roots`, and those in `named`.
     ///
     /// # Errors
-    /// There is no CA.
+    /// There is no usable CA.
     pub(super) fn new(roots: RootCertStore, named: Vec<CertificateDer<'static>>) -> Result<ServerTrust, Error> {
         let provider = provider();
         let algorithms = provider.signature_verification_algorithms;
@@ -76,7 +76,7 @@ impl ServerCertVerifier for ServerTrust {
             .by_ca
             .verify_server_cert(certificate, intermediates, host, ocsp, now);
         verified.map_err(|error| match Kind::of(certificate) {
-            // One that signed itself is unknown before it is anything else.
+            // A self-signed certificate is reported as unknown before any other defect.
             Some(kind) if kind.self_issued && is_of_ca(&error) || is_unknown(&error) => other(UnknownIssuer {
                 name: kind.name,
                 issuer: kind.issuer,
@@ -159,7 +159,7 @@ fn verify_with_key(
     signed: &DigitallySignedStruct,
     algorithms: &WebPkiSupportedAlgorithms,
 ) -> Result<HandshakeSignatureValid, Error> {
-    // In TLS 1.2 the scheme does not say which curve, so several algorithms may fit; the key tells which.
+    // In TLS 1.2 the scheme does not name the curve, so several algorithms may fit; the key shows which.
     let of_scheme = algorithms.mapping.iter().filter(|(scheme, _)| *scheme == signed.scheme);
     let wanted = key.algorithm.to_der().map_err(|_| bad_encoding())?;
     let bytes = key.subject_public_key.as_bytes().ok_or_else(bad_encoding)?;

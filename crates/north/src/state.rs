@@ -1,4 +1,4 @@
-//! What the servers share.
+//! State that the servers share.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -14,7 +14,8 @@ use crate::history::{History, Recordings};
 use crate::parameters::Vault;
 use crate::stop_all::StopAll;
 
-/// What the servers share and a reload, which replaces servers, keeps: counters, recent commands, and what is recorded.
+/// State that the servers share and that survives a reload, which replaces servers: counters, recent commands, and
+/// recordings.
 #[derive(Debug, Default)]
 pub struct NorthState {
     /// How long starts and reloads wait for the disk.
@@ -29,13 +30,13 @@ pub struct NorthState {
     pub drills: Arc<Drills>,
     /// Trends, counters and events of the past.
     pub history: Arc<History>,
-    /// Of the Modbus TCP server.
+    /// Figures of the Modbus TCP server.
     pub modbus_tcp: ModbusTcpStats,
-    /// Of the MQTT client.
+    /// Figures of the MQTT client.
     pub mqtt: MqttStats,
-    /// Of the tool slots.
+    /// Figures of the tool slots.
     pub slots: SlotStats,
-    /// Of the BACnet server.
+    /// Figures of the BACnet server.
     pub bacnet: BacnetStats,
     /// Refused connections of all servers.
     pub refused: RefusalStats,
@@ -47,9 +48,9 @@ pub struct NorthState {
     pub(super) commands: RememberedCommands,
     /// The slots that BACnet clients had before the start were taken up, or are void: none of them comes back.
     pub(super) kept_slots_read: AtomicBool,
-    /// What an MQTT client leaves to the next one.
+    /// State that an MQTT client leaves to the next one.
     pub mqtt_left: Handover,
-    /// Of those who publish to the broker.
+    /// Rights of clients that publish to the broker.
     pub(super) broker_rights: BrokerRights,
 }
 

@@ -84,13 +84,13 @@ impl ServerKind {
 /// Why a connection was refused, or closed in favour of another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConnectionRefusal {
-    /// Its address is not in `allow`.
+    /// The address of the client is not in `allow`.
     NotAllowed,
     /// The server has as many connections as it may have.
     Full,
-    /// Its address has as many connections as it may have.
+    /// The address of the client has its maximum number of connections.
     AddressFull,
-    /// It was closed in favour of another connection.
+    /// The connection was closed in favour of another one.
     Displaced,
     /// The handshake failed: no certificate, an untrusted or expired one, a malformed role, or no TLS at all.
     Tls,
@@ -191,7 +191,7 @@ impl ModbusTcpStats {
     }
 }
 
-/// Of the BACnet server, while it runs.
+/// Figures of the BACnet server, while it runs.
 #[derive(Debug, Default)]
 pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
 
@@ -244,7 +244,7 @@ pub enum SlotOutcome {
     Abandoned,
     /// No reply arrived within a second.
     Late,
-    /// Not a valid frame.
+    /// The bytes were not a valid frame.
     Broken,
 }
 

@@ -13,7 +13,7 @@ use super::server::{Reconfigure, Server};
 use super::{NorthState, ServerError, ServerKind};
 use crate::plant::SharedPlant;
 
-/// What one TCP server does differently from the others.
+/// Differences of one TCP server from the others.
 pub(crate) trait TcpService<Options>: Debug + Sized {
     /// Name in messages.
     const NAME: &'static str;
@@ -21,7 +21,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     const KIND: ServerKind;
     /// Handles the connections to a listener.
     type Handler: ConnectionHandler + Debug;
-    /// What of a change is prepared in addition to the sockets, such as certificates.
+    /// Prepared parts of a change besides the sockets, such as certificates.
     type Prepared;
 
     /// A service without listeners; `tasks` end with `cancel`.

@@ -50,7 +50,7 @@ pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
                 Peer::Client => "give the client a certificate of the CA in client_ca".to_string(),
             },
         ),
-        // The rest is no fault of a configuration.
+        // Other errors are not caused by a configuration.
         error => return Some(format!("TLS: {error}")),
     };
     Some(format!("{what}; {remedy}"))
@@ -79,7 +79,7 @@ fn found<'a>(error: &'a (dyn StdError + 'static)) -> Option<&'a Error> {
         if let Some(found) = error.downcast_ref::<Error>() {
             return Some(found);
         }
-        // What an I/O error contains is not its source.
+        // The error inside an I/O error is not returned by `source`.
         let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
         next = match inner {
             Some(inner) => Some(inner),

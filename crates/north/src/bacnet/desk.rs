@@ -57,7 +57,7 @@ pub(super) struct Desk {
     leases: HashMap<u32, u64>,
     /// Devices with a slot that awaits the next reading.
     uncertain: BTreeSet<u32>,
-    /// When datagrams were taken up that came otherwise than just then, and how they came.
+    /// When datagrams were taken up that arrived earlier than that, and how they arrived.
     arrivals: VecDeque<(Instant, Arrival)>,
     /// Over which the datagrams of [`Desk::receive`] come.
     connection: Connection,
@@ -91,7 +91,7 @@ impl Desk {
         }
     }
 
-    /// It says that it is there.
+    /// Announces the devices with I-Am.
     pub(super) fn start(&mut self, now: Instant) {
         self.view.look(now);
         self.server.start(&self.view, now);

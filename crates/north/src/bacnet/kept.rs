@@ -93,7 +93,7 @@ impl KeptSlot {
 /// Reads the file; one that is not there holds nothing.
 ///
 /// # Errors
-/// It cannot be read, or is none of these.
+/// The file cannot be read, or is not a list of slots.
 pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
     match files::read(path, LONGEST)? {
         Some(text) => serde_json::from_slice(&text).map_err(|error| error.to_string()),
@@ -104,7 +104,7 @@ pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
 /// Writes the file.
 ///
 /// # Errors
-/// It cannot be written.
+/// The file cannot be written.
 fn save(path: &Path, slots: &[KeptSlot]) -> Result<(), String> {
     let text = serde_json::to_vec_pretty(slots).map_err(|error| error.to_string())?;
     files::replace(path, &text).map_err(|error| error.to_string())
@@ -142,7 +142,7 @@ type Kept = (PathBuf, Vec<KeptSlot>);
 /// The file as a server keeps it up to date, one write behind the other.
 #[derive(Debug, Default)]
 pub(super) struct KeptFile {
-    /// What is known to be on disk, and where.
+    /// Slots known to be on disk, and their file.
     written: Option<Kept>,
     writing: Option<JoinHandle<Result<Option<Kept>, String>>>,
     /// When a write that failed is tried again.
@@ -150,7 +150,7 @@ pub(super) struct KeptFile {
 }
 
 impl KeptFile {
-    /// It was read.
+    /// The file was read.
     pub(super) fn read(&mut self, path: PathBuf, slots: Vec<KeptSlot>) {
         self.written = Some((path, slots));
     }

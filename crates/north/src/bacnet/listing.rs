@@ -6,7 +6,7 @@ use super::objects::{self, Flat, Shown};
 use super::{Options, units};
 use crate::process_image::{BusSpec, DriveSpec};
 
-/// One object.
+/// An object in the list.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Line {
     /// Instance of its device.

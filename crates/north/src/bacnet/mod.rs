@@ -1,8 +1,8 @@
 //! The BACnet/IP server: each drive is its own device behind a virtual network (`docs/bacnet.md`).
 //!
-//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` says what a drive shows, `view` reads it from
-//! the process image, `writes` makes commands of what clients write, `desk` brings them together, `task` moves
-//! datagrams, `offline` does so without sockets.
+//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` lists the objects of a drive, `view` reads their
+//! values from the process image, `writes` converts writes of clients to commands, `desk` brings them together, `task`
+//! moves datagrams, `offline` does so without sockets.
 
 mod desk;
 pub mod ede;
@@ -44,17 +44,17 @@ use crate::server::{self, Reconfigure};
 /// The behaviour of an offline drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum WhenOffline {
-    /// It answers nothing.
+    /// An offline drive answers nothing.
     #[default]
     Silent,
-    /// It answers, with the flag fault.
+    /// An offline drive answers, with the flag fault.
     Fault,
 }
 
 /// `[bacnet]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Its address.
+    /// Address of the server.
     pub listen: SocketAddrV4,
     /// Instance of the gateway; that of a drive is greater by its unit.
     pub device: u32,
@@ -66,9 +66,9 @@ pub struct Options {
     pub offline: WhenOffline,
     /// Whether clients may write at all.
     pub commands: bool,
-    /// Who may ask.
+    /// Networks that may read.
     pub allow: Vec<IpNet>,
-    /// Who may write.
+    /// Networks that may write.
     pub write: Vec<IpNet>,
     /// Whether inactives that protect people outlive a restart.
     pub keep_priorities: bool,
@@ -250,7 +250,7 @@ impl Reconfigure for Server {
             self.address = SocketAddr::V4(sockets.address);
             self._state = self.stats.listeners.add(ServerKind::Bacnet, self.address);
         }
-        // Before the task knows of it: what is under way is judged by it at once.
+        // The rights change before the task has the new options: writes in progress are judged by them at once.
         self.rights.set(Some(&options));
         self.options = options.clone();
         // A task that has ended ends with the process.

@@ -39,9 +39,9 @@ const OTHER: &str = "other";
 /// The meaning of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Meaning {
-    /// That point of the profile.
+    /// A point of the profile.
     Point(PointIndex),
-    /// That point, an enumeration.
+    /// A point of the profile that is an enumeration.
     Enumeration(PointIndex),
     /// The state of the drive.
     State,
@@ -287,7 +287,7 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
     for (number, (index, point)) in (OWN..).zip(own) {
         let writable = point.write && spec.access == Access::Control;
         let unread = point.raw().is_some() && point.class == PollClass::Never;
-        // It keeps its number all the same.
+        // A point that is left out still keeps its number.
         if point.hidden || (unread && !writable) {
             continue;
         }

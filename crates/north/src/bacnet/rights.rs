@@ -20,7 +20,7 @@ impl HostRights {
         HostRights(Arc::new(ArcSwapOption::from_pointee(options.clone())))
     }
 
-    /// From now on these options count; none: nobody may write.
+    /// These options count from now on; none: no client may write.
     pub(super) fn set(&self, options: Option<&Options>) {
         self.0.store(options.cloned().map(Arc::new));
     }
@@ -30,7 +30,7 @@ impl HostRights {
         self.0.load().is_some()
     }
 
-    /// That of a client.
+    /// The right of a client.
     pub(super) fn of(&self, client: &Address) -> Right {
         Right::of(Arc::new(HostRight {
             options: self.0.clone(),
@@ -38,7 +38,7 @@ impl HostRights {
         }))
     }
 
-    /// That of a client by the name that the audit has; what is no address has none.
+    /// The right of a client by its name in the audit; a name that is not an address has no right.
     pub(super) fn of_name(&self, who: &str) -> Right {
         match who.parse::<Address>() {
             Ok(client) => self.of(&client),

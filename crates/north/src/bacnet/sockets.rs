@@ -75,7 +75,7 @@ fn prefix(address: Ipv4Addr, routes: &str) -> u8 {
     let networks = routes.lines().skip(1).filter_map(|line| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let number = |place: usize| Some(u32::from_str_radix(fields.get(place)?, 16).ok()?.swap_bytes());
-        // Those that a gateway leads to are not on the interface.
+        // Networks behind a gateway are not on the interface.
         let (network, gateway, mask) = (number(1)?, number(2)?, number(7)?);
         let own = gateway == 0 && mask != 0 && u32::from(address) & mask == network;
         own.then_some(mask.leading_ones())

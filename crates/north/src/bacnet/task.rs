@@ -58,7 +58,7 @@ type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
-    /// Of the sockets: for this host, and for all.
+    /// Readers of the sockets: for this host, and for all.
     readers: [Reader; 3],
     stats: Arc<NorthState>,
     busy: Arc<AtomicBool>,

@@ -105,7 +105,7 @@ impl ControlledDrive {
         writes::begin(&self.view, &job, Arrival::now(self.now), self.now)
     }
 
-    /// What is refused, or done, at once.
+    /// Result of a write that is refused, or done, at once.
     fn at_once(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Result<(), Error> {
         match self.begin(client, object, priority, value) {
             Begun::Answered(result) => result,
@@ -117,7 +117,7 @@ impl ControlledDrive {
         }
     }
 
-    /// What becomes an order, with its outcome: point, value and client.
+    /// The order that results from a write, with its outcome: point, value and client.
     fn order(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>, outcome: Outcome) -> String {
         let Begun::Waits(mut waiting) = self.begin(client, object, priority, value) else {
             panic!("no order");
@@ -152,7 +152,7 @@ impl ControlledDrive {
         text
     }
 
-    /// What stands in a slot, for a reader.
+    /// Values in the slots, as a client reads them.
     fn slots(&self, object: ObjectId) -> Vec<(u8, Datum)> {
         let commands = self.view.commands(DEVICE, self.place(object)).unwrap();
         (1..)

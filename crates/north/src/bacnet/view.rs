@@ -229,7 +229,7 @@ impl View {
         let (state, reliability) = match reading.state() {
             Some(State::Offline) => (State::Offline, Reliability::CommunicationFailure),
             Some(state) => (state, Reliability::NoFault),
-            // It answers, and does not say it.
+            // The drive answers but does not report its state.
             None => (State::NotReady, Reliability::UnreliableOther),
         };
         Sample {
@@ -387,7 +387,7 @@ impl Application for View {
         };
         let (what, now) = (write.object.to_string(), self.now.get().0);
         let refusal = Refusal::NotAllowed(why.to_string());
-        // Its answer says no more than that.
+        // The client gets no more detail than this.
         drive
             .handle
             .refuse(&what, refusal, super::writes::origin(&self.rights, from, None), now);

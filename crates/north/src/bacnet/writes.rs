@@ -18,14 +18,14 @@ use crate::process_image::Machine;
 
 /// The priority that belongs to minimum on and off times.
 const MINIMUM_TIMES: u8 = 6;
-/// That of a write that names none.
+/// Priority of a write without one.
 const LOWEST: u8 = 16;
 
 /// The progress of a job.
 #[derive(Debug)]
 pub(super) enum Begun {
     Answered(Result<(), Error>),
-    /// It waits for the drive.
+    /// The write waits for the drive.
     Waits(Box<Waiting>),
 }
 
@@ -175,7 +175,7 @@ fn slot(
                 };
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
-                // What comes to govern was written long ago; its order is given now.
+                // The entry that comes to govern was written long ago; its order is given now.
                 let mut came = arrival.clone();
                 let mut expires = expiry(job);
                 if !own {
@@ -187,7 +187,7 @@ fn slot(
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {
-                    // Its owner's order is refused, so it gives its slot back, too.
+                    // The order of its owner is refused, so that slot is released, too.
                     Some(next) if !write.also.contains(&next) => write.also.push(next),
                     _ => return waits(handle, placed, Some(write.id)),
                 }

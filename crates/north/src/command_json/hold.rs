@@ -6,7 +6,7 @@ use super::result::ErrorObject;
 use crate::order::Refusal;
 use crate::permit::HoldView;
 
-/// Who holds a drive, and the result of an act upon that.
+/// The holder of a drive, and the result of an action on the hold.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldReply<'r> {
     drive: &'r str,
@@ -18,7 +18,7 @@ pub(crate) struct HoldReply<'r> {
     error: Option<ErrorObject>,
     #[serde(flatten)]
     hold: HoldFields,
-    /// Whether it is the client's own.
+    /// Whether the hold is the client's own.
     #[serde(skip_serializing_if = "Option::is_none")]
     own: Option<bool>,
 }

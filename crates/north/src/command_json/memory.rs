@@ -19,7 +19,7 @@ const MOST_COMMANDS: usize = 1 << 18;
 pub(crate) struct Taken<'t> {
     /// Where it came in: its topic, or the user and the drive.
     pub(crate) topic: &'t str,
-    /// Its payload.
+    /// Payload of the command.
     pub(crate) payload: &'t [u8],
     /// Where its result goes: response topic and correlation data.
     pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
@@ -40,7 +40,7 @@ pub(crate) struct Memory<R> {
     /// By topic, `id` and payload. Trees, because entries come and go all day: a hash table doubles when removals have used up
     /// its free places, and keeps the size that a flood needed.
     known: BTreeMap<u64, Known>,
-    /// The same by the time until which they are remembered.
+    /// The remembered commands by the time until which they are remembered.
     ends: BTreeMap<(Instant, u64), u64>,
     /// The last command by topic and `id`.
     last_of: BTreeMap<u64, u64>,
@@ -50,8 +50,8 @@ pub(crate) struct Memory<R> {
     abandoned: u64,
 }
 
-/// What the clients of one broker, or the connections of the HTTP server, share, also with those that a reload starts in
-/// their place: the same commands come again over a new connection. Results by way of a broker are payloads.
+/// Memory of the clients of one broker, or of the connections of the HTTP server, shared with those that a reload starts
+/// in their place: repeated commands may come over a new connection. Results by way of a broker are payloads.
 #[derive(Debug)]
 pub(crate) struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
 
@@ -111,7 +111,7 @@ struct Known {
 /// The fingerprint of a message.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Fingerprint {
-    /// Of everything but the packet id.
+    /// Fingerprint of everything except the packet id.
     whole: u64,
     /// Hash of topic and `id`, if it has one; and with the payload.
     identity: Option<(u64, u64)>,

@@ -91,7 +91,7 @@ pub(crate) struct Asked {
 }
 
 impl Asked {
-    /// What is asked for by `points`, where `refused` says what else is not understood.
+    /// A command with `points`, where `refused` is the error of the part that is not understood.
     ///
     /// # Errors
     /// The refusal, unless there is a stop among the points, which is carried out all the same.
@@ -113,12 +113,12 @@ impl Asked {
         })
     }
 
-    /// Whether it has a stop, which is executed whatever becomes of the rest.
+    /// Whether the command has a stop, which is executed whatever happens to the rest.
     pub(crate) fn stops(&self, profile: &Profile) -> bool {
         stop_of(&self.points, profile).is_some()
     }
 
-    /// Whether it does more than stop, so that its repetition is not executed.
+    /// Whether the command does more than stop, so that its repetition is not executed.
     pub(crate) fn does_more(&self, profile: &Profile) -> bool {
         let whole = || matches!(Parts::of(Order::Points(self.points.clone()), profile), Parts::One(_));
         self.refused.is_none() && !(self.stops(profile) && whole())
@@ -162,7 +162,7 @@ pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal>
 /// Refuses a payload that is too long.
 ///
 /// # Errors
-/// It is longer than [`MAX_PAYLOAD`].
+/// The payload is longer than [`MAX_PAYLOAD`].
 pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
     match size > MAX_PAYLOAD {
         true => Err(Refusal::BadValue(format!(
@@ -172,7 +172,7 @@ pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
     }
 }
 
-/// `refused` says what is wrong with the whole, a stop apart.
+/// Reads the points; `refused` is an error of the whole, which a stop ignores.
 fn points_of(fields: Fields, refused: Option<Refusal>, profile: &Profile) -> Result<Asked, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
@@ -283,7 +283,8 @@ fn brief(value: &Json) -> String {
     }
 }
 
-/// The fields of an object. If some of its values are none in JSON (`NaN`, `1e999`), they are null, and the refusal says so.
+/// The fields of an object. If some of its values are not valid in JSON (`NaN`, `1e999`), they are null, and the refusal
+/// reports that.
 fn object(payload: &[u8]) -> Result<(Fields, Option<Refusal>), Refusal> {
     let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
     let value: Json = match serde_json::from_slice(payload) {

@@ -18,10 +18,10 @@ pub(crate) struct CommandResult<'r> {
     result: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<ErrorObject>,
-    /// Of a command whose stop alone was carried out: the code of the rest.
+    /// Code of the rest of a command, where only its stop was carried out.
     #[serde(skip_serializing_if = "Option::is_none")]
     rest: Option<&'static str>,
-    /// Of a start that must wait: after which it may be tried again.
+    /// Time after which a refused start may be retried.
     #[serde(skip_serializing_if = "Option::is_none")]
     retry_after_ms: Option<u64>,
     #[serde(flatten)]
@@ -52,7 +52,7 @@ pub(super) struct ErrorObject {
     pub(super) message: String,
 }
 
-/// Who keeps the client from the drive.
+/// The client that keeps others from the drive.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 struct KeptBy {
     #[schema(required = false)]
@@ -62,7 +62,7 @@ struct KeptBy {
     hold_left_s: Option<u64>,
 }
 
-/// Of an outcome that someone else's right to the drive is the reason for.
+/// The holder that is the reason for this outcome.
 fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
     match outcome {
         Outcome::Refused(refusal) => refusal.holder().map(|holder| KeptBy {

@@ -10,7 +10,7 @@ use crate::order::{Origin, Outcome, Refusal};
 use crate::plant::{Plant, turn_away};
 use crate::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
 
-/// What a stop of several drives is called in audit and events, and the drives that it is for.
+/// Names of a stop of several drives, and of its drives, in audit and events.
 const STOP_ALL: &str = "stop all";
 const DRIVES: &str = "all drives";
 
@@ -26,7 +26,7 @@ pub struct StopBody {
 /// Which drives are to be stopped, and how long the answer waits for them to stand. An empty body stops all.
 ///
 /// # Errors
-/// It is not clear which.
+/// The request does not specify the drives clearly.
 pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
     let unclear = |why: String| {
         let shown = excerpt(payload);
@@ -51,7 +51,7 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
             return Err(Refusal::BadValue(why.to_string()));
         }
     };
-    // A wait that is none is no reason not to stop.
+    // An invalid wait must not prevent the stop.
     let wait = body.wait_s.filter(|wait| *wait >= 0.0).unwrap_or(WAIT.as_secs_f64());
     Ok((scope, Duration::from_secs_f64(wait.min(LONGEST_WAIT.as_secs_f64()))))
 }

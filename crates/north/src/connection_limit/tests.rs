@@ -192,7 +192,7 @@ fn newcomer() -> impl Strategy<Value = (u8, bool, u8)> {
 }
 
 proptest! {
-    /// Whoever comes and goes in whatever order, no limit is exceeded, and nobody yields who must not.
+    /// With any sequence of connections no limit is exceeded, and no connection yields that must not.
     #[test]
     fn limits_hold_and_operators_stay(limits in limits(), newcomers in prop::collection::vec(newcomer(), 1..200)) {
         let mut rig = LimitedPlaces::new(limits);

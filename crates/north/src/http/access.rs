@@ -10,7 +10,7 @@ use super::hosts::{Host, Hosts};
 use super::replies::refused;
 use super::tokens::{Scope, Tokens};
 
-/// Who is answered.
+/// Conditions under which a request is answered.
 #[derive(Debug, PartialEq)]
 pub(super) struct Access {
     pub(super) hosts: Hosts,
@@ -36,7 +36,7 @@ pub(super) enum AccessError {
 }
 
 impl AccessError {
-    /// Whether another way to show who asks can take the place of the token.
+    /// Whether another proof of identity can take the place of the token.
     pub(super) fn is_for_want_of_a_token(&self) -> bool {
         matches!(
             self,

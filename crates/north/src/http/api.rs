@@ -15,7 +15,7 @@ use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 
-/// One point in time on both clocks.
+/// A point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clock {
     now: Instant,
@@ -40,7 +40,7 @@ impl Clock {
 #[derive(Debug, Serialize)]
 struct Time(#[serde(serialize_with = "crate::event::rfc3339")] SystemTime);
 
-/// One drive with all its points.
+/// A drive with all its points.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Drive<'d> {
     name: &'d str,
@@ -65,7 +65,7 @@ pub(super) struct Drive<'d> {
     fault_text: String,
     /// Why it does not run, in one word each.
     blocked_by: Vec<String>,
-    /// The same with evidence and remedy.
+    /// The causes with evidence and remedy.
     why: Vec<Cause>,
     /// Why it takes no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -75,7 +75,7 @@ pub(super) struct Drive<'d> {
     stop_waits_ms: Option<u64>,
     /// Whether what was ordered last is being written again for the drive's own timeout.
     refreshing: bool,
-    /// Who holds it, where `[authority]` is on.
+    /// Holder of the drive, where `[authority]` is on.
     #[serde(flatten)]
     #[schema(value_type = HoldFields)]
     hold: Option<HoldFields>,
@@ -148,7 +148,7 @@ impl<'d> Drive<'d> {
         self
     }
 
-    /// Only these of its points.
+    /// Shows only these of its points.
     pub(super) fn only(mut self, shown: Option<&'d HashSet<String>>) -> Drive<'d> {
         self.points.shown = shown;
         self
@@ -211,7 +211,7 @@ struct Point<'p> {
     age_ms: Option<u64>,
     #[schema(value_type = Option<String>)]
     time: Option<Time>,
-    /// A newer state says otherwise.
+    /// Whether a newer state contradicts the value.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     contradicted: bool,
 }
@@ -235,7 +235,7 @@ impl Points<'_> {
     }
 }
 
-/// One bus with its statistics.
+/// A bus with its statistics.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Bus<'b> {
     name: &'b str,
@@ -273,7 +273,7 @@ pub(super) struct Bus<'b> {
 struct Cycle {
     /// As configured.
     aim_ms: f64,
-    /// Of the last round.
+    /// Time of the last round.
     cycle_ms: Option<f64>,
     rounds: u64,
 }

@@ -23,8 +23,8 @@ pub(super) struct AppState {
     pub(super) cancel: CancellationToken,
     /// Open event streams.
     pub(super) listeners: Arc<ConnectionLimit>,
-    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
-    /// and `/healthz` does not wait for it.
+    /// Large replies are rendered one at a time: a client that sends such requests continuously shares the turns with
+    /// all others, and `/healthz` does not wait for it.
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
     files: Semaphore,
@@ -54,7 +54,7 @@ impl AppState {
         self.rendering.acquire().await.ok()
     }
 
-    /// What `read` finds in files, away from the tasks of other clients, one reader at a time.
+    /// Reads files with `read`, away from the tasks of other clients, one reader at a time.
     ///
     /// # Errors
     /// 503 where the gateway ends.

@@ -28,7 +28,7 @@ pub enum CredentialError {
     /// An unknown scope.
     #[error("`{0}` is not a scope; use read, metrics or control")]
     Scope(String),
-    /// Not a hash of the kind in the text.
+    /// The hash is not of the kind in the text.
     #[error("the hash is not {0}")]
     Hash(&'static str),
     /// More lines than any plant needs.

@@ -13,10 +13,10 @@ use crate::plant::Plant;
 /// Why a request is not for this gateway, with its status.
 type Unmet = (StatusCode, String);
 
-/// Whether the gateway is what the header [`EXPECT`] says, if there is one.
+/// Whether the gateway is the one of the header [`EXPECT`], if there is one.
 ///
 /// # Errors
-/// It is another one, or runs with another configuration.
+/// The gateway is another one, or runs with another configuration.
 pub(super) fn check(headers: &HeaderMap, plant: &Plant, reached: &Reached) -> Result<(), Unmet> {
     let Some(header) = headers.get(EXPECT) else {
         return Ok(());
@@ -44,7 +44,7 @@ fn has_configuration(wanted: &Path, reached: &Reached) -> Result<(), Unmet> {
     Err((StatusCode::MISDIRECTED_REQUEST, other))
 }
 
-/// What owns the file's port is its gateway, or was before the file was edited; any other gateway has nothing to do with it.
+/// The owner of the file's port is its gateway, or was before the file was edited; any other gateway is unrelated.
 fn has_drive(expected: &ExpectedDrive, plant: &Plant) -> Result<(), Unmet> {
     let name = &expected.drive;
     let names_differ = (plant.gateway != expected.gateway).then(|| {

@@ -20,7 +20,7 @@ impl InUse {
         InUse(place)
     }
 
-    /// The same body, which keeps the connection in use.
+    /// A body that keeps the connection in use until its end.
     pub(super) fn until_end_of<B>(self, body: B) -> InUseBody<B> {
         InUseBody { body, _in_use: self }
     }

@@ -16,7 +16,7 @@ use crate::history::line::{Exchanges, Figures, LastHour, LineHistory, STEP};
 use crate::plant::BusHandle;
 use crate::process_image::HistogramSnapshot;
 
-/// One bus, its statistics, and what they were minute by minute.
+/// A bus, its statistics, and their history by minute.
 pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
     let plant = app.plant.load();
     let handle = find_bus(&plant, &name)?;
@@ -25,7 +25,7 @@ pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<Strin
     let line = app.north.history.line(&name);
     let hour = match &line {
         Some(line) => line.lock().unwrap_or_else(PoisonError::into_inner).last_hour(clock),
-        // It is being started.
+        // The bus is being started and has no history yet.
         None => LineHistory::new(&handle.image, clock).last_hour(clock),
     };
     Ok(Json(Line::new(handle, hour)).into_response())
@@ -58,7 +58,7 @@ struct DriveLine<'b> {
     online: bool,
     turnaround_ms: Option<f64>,
     turnaround: Turnarounds,
-    /// Of each step; `null` where the gateway did not run.
+    /// Transactions in each step; `null` where the gateway did not run.
     transactions: Vec<Option<u32>>,
     errors: Vec<Option<u32>>,
 }

@@ -24,7 +24,7 @@ pub struct ErrorReply {
 }
 
 impl ErrorReply {
-    /// One without names.
+    /// An error reply without known names.
     pub fn new(error: impl Into<String>) -> ErrorReply {
         ErrorReply {
             error: error.into(),
@@ -33,7 +33,7 @@ impl ErrorReply {
     }
 }
 
-/// What to do with the hold of a drive.
+/// An action on the hold of a drive.
 #[derive(Debug, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct HoldAct {
@@ -55,7 +55,8 @@ pub struct DrillWish {
     pub speed: Option<f64>,
 }
 
-/// What a client expects, in the header [`EXPECT`]: another gateway replies 421, one with another configuration 412.
+/// The gateway that a client expects, in the header [`EXPECT`]: another gateway replies 421, one with another
+/// configuration 412.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Expected {
@@ -110,7 +111,7 @@ pub fn port_of(bus: &BusSpec) -> String {
 /// Why a drive does not run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Why {
-    /// Whether it runs, and why not.
+    /// Whether the drive runs, and why not.
     #[serde(flatten)]
     pub explanation: Explanation,
     /// Name of its profile.
@@ -125,7 +126,7 @@ pub struct Why {
 pub struct ReadParameters {
     /// Reads every address, regardless of what earlier readings found.
     pub afresh: bool,
-    /// It may take 18 % of a busy line instead of 1.5 %.
+    /// Whether the reading may take 18 % of a busy line instead of 1.5 %.
     pub brisk: bool,
 }
 
@@ -139,13 +140,13 @@ pub enum RestoreAct {
     CarryOut(PreparedRestore),
     /// Resumes an interrupted one.
     Resume,
-    /// One that was cut off is taken back.
+    /// An interrupted restore is undone.
     Undo,
-    /// One that was cut off is left as it is.
+    /// An interrupted restore is left as it is.
     Release,
 }
 
-/// What is to be restored.
+/// The request of a restore.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RestoreWish {
@@ -184,7 +185,7 @@ pub struct ReloadOutcome {
 /// Whether the gateway is ready.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Health {
-    /// As `/readyz` says.
+    /// Ready state as in `/readyz`.
     pub ready: bool,
     /// Why it is not.
     pub reasons: Vec<String>,
@@ -193,7 +194,7 @@ pub struct Health {
 /// A recording in progress.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Recorded {
-    /// Its id.
+    /// Id of the recording.
     pub id: String,
     /// Time until it is complete, s.
     pub after_s: f64,
@@ -241,9 +242,9 @@ impl StoredReading {
 /// A reading of parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ParameterReading {
-    /// Its number.
+    /// Number of the reading.
     pub number: u64,
-    /// Addresses that were asked.
+    /// Number of addresses requested so far.
     pub done: usize,
     /// Addresses to ask in all.
     pub total: usize,
@@ -283,9 +284,9 @@ impl ParameterReading {
 /// A restore of parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Restore {
-    /// Its number.
+    /// Number of the restore.
     pub number: u64,
-    /// Its stage.
+    /// Stage of the restore.
     pub stage: Stage,
     /// Addresses that were read, or parameters that are done.
     pub done: usize,
@@ -316,15 +317,15 @@ pub enum Stage {
     Reading,
     /// The plan is ready.
     Prepared,
-    /// It may not be done.
+    /// The restore may not be carried out.
     Refused,
     /// Parameters are written.
     Working,
-    /// It has ended.
+    /// The restore has ended.
     Done,
-    /// It was given up.
+    /// The restore was given up.
     Failed,
-    /// One that this version does not know.
+    /// A stage that this version does not know.
     #[serde(other)]
     Other,
 }
@@ -382,7 +383,7 @@ pub struct PointValue {
     pub unit: String,
     /// `good`, `stale` or `bad`.
     pub quality: String,
-    /// Why there is no value.
+    /// Reason why there is no value.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
 }
@@ -437,7 +438,7 @@ impl PointValue {
         }
     }
 
-    /// The point with its sample; `why` is asked only where that is not good.
+    /// The point with its sample; `why` is called only where the sample is not good.
     pub(crate) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
         let value = sample.good();
         PointValue {
@@ -450,7 +451,7 @@ impl PointValue {
         }
     }
 
-    /// Whether it has a value.
+    /// Whether the point has a value.
     pub fn is_good(&self) -> bool {
         !self.value.is_null()
     }

@@ -90,7 +90,7 @@ pub fn is_host(text: &str) -> bool {
 /// The running server.
 pub type Http = TcpServer<HttpService, Options>;
 
-/// What serves the clients of the listener.
+/// The service for the clients of the listener.
 #[derive(Debug)]
 pub struct HttpService {
     terms: Arc<ArcSwap<Terms>>,
@@ -161,7 +161,7 @@ impl TcpService<Options> for HttpService {
         });
     }
 
-    /// Without the server nobody commands by it, requests that are still coming in included.
+    /// Without the server no client commands over it, including requests that are still coming in.
     fn retire(&mut self) {
         self.operating.set_users(None);
     }
@@ -286,7 +286,7 @@ impl HttpConnections {
             address: peer.ip(),
             coverage,
         };
-        // One token for each command whose reply is to come.
+        // Each token is a command whose reply is still to come.
         let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
@@ -336,7 +336,7 @@ impl HttpConnections {
                         () = last => Ok(()),
                     }
                 }
-                // There is no reply to finish.
+                // No request is in progress, so there is no reply to finish.
                 false => Ok(()),
             }
         };
@@ -368,7 +368,7 @@ fn set_socket_options(stream: &TcpStream) {
     let _ = rustix::net::sockopt::set_tcp_user_timeout(stream, millis);
 }
 
-/// What `/api/v1/drives/{name}` says of a drive at `now`, which is `wall` on the calendar. Pure.
+/// The JSON of `/api/v1/drives/{name}` for a drive at `now`, which is `wall` on the calendar. Pure.
 ///
 /// # Errors
 /// None is known; a value that JSON cannot express would be one.

@@ -24,7 +24,7 @@ pub(super) const PATH: &str = "/api/v1/openapi.json";
 
 const JSON: &str = "application/json";
 
-/// What is not a success, and what it says; the last two of requests that reach a drive only.
+/// Failures with their description; the last two only for requests that reach a drive.
 const FAILURES: [(&str, &str); 4] = [
     ("4XX", "refused, and why"),
     (
@@ -51,7 +51,7 @@ pub(super) struct Doc {
     body: Option<RefOr<Schema>>,
     content_type: &'static str,
     reply: Option<RefOr<Schema>>,
-    /// What a reply has that is no success, where it is no error of the request itself.
+    /// Body of a failure reply, where it is not an error of the request itself.
     failure: Option<RefOr<Schema>>,
     schemas: Vec<(String, RefOr<Schema>)>,
 }

@@ -43,7 +43,7 @@ pub(super) async fn points(
 async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) -> Vec<PointValue> {
     let profile = &drive.image.spec.profile;
     let now = Instant::now();
-    // One look at the image, so that all values of one poll are of one poll.
+    // A single snapshot of the image, so that all values of one poll belong together.
     let reading = drive.reading(now);
     let mut points = Vec::with_capacity(wanted.len());
     for one in wanted {
@@ -66,7 +66,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
     points
 }
 
-/// What a name requests.
+/// The value that a name requests.
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
     /// A point, by its index.

@@ -15,7 +15,7 @@ use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
 use crate::order::{Proof, Right, SourceKind};
 
-/// What a connection may request.
+/// Requests that a connection may make.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Coverage {
     Everything,
@@ -49,7 +49,7 @@ pub(crate) struct LocalUser {
     pub(crate) who: Arc<str>,
     /// The proof from its connection.
     pub(crate) proof: Proof,
-    /// Its right to write.
+    /// Right of the user to write.
     pub(crate) right: Right,
     /// The gateway itself, where that has a configuration file.
     pub(crate) control: Option<Control>,

@@ -44,7 +44,7 @@ impl Form {
     }
 }
 
-/// The form that a query asks for.
+/// The form in the query.
 fn form(query: Option<&str>) -> Result<Form, QueryError> {
     let [format] = query::parameters(query, &["format"])?;
     match format.as_deref() {
@@ -67,7 +67,7 @@ pub(super) async fn list(State(app): State<Arc<AppState>>) -> Response {
     Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
-/// One recording with all its samples and frames; with `format=csv` its samples, with `format=pcap` its frames, with
+/// A recording with all its samples and frames; with `format=csv` its samples, with `format=pcap` its frames, with
 /// `format=dgrec` as the gateway keeps it, as a file.
 pub(super) async fn one(
     State(app): State<Arc<AppState>>,

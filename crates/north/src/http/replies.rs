@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use super::messages::ErrorReply;
 use crate::plant::{BusHandle, Plant};
 
-/// A reply that says why not. Boxed: it goes through many results.
+/// A reply with the reason of a refusal. Boxed: it goes through many results.
 #[derive(Debug)]
 pub(super) struct Refused(Box<Response>);
 
@@ -42,13 +42,13 @@ pub(super) fn not_found(error: String, known: Vec<String>) -> Refused {
     (StatusCode::NOT_FOUND, error).into_response().into()
 }
 
-/// Where there is no such drive.
+/// The reply where the drive is unknown.
 pub(super) fn no_drive(plant: &Plant, name: &str) -> Refused {
     let known = plant.drives().map(|drive| drive.image.spec.name.clone());
     not_found(format!("there is no drive `{name}`"), known.collect())
 }
 
-/// Where there is no such bus.
+/// The reply where the bus is unknown.
 pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
     let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
     not_found(format!("there is no bus `{name}`"), known.collect())

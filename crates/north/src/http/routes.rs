@@ -30,7 +30,7 @@ use crate::order::AuditRecord;
 use crate::plant::SharedPlant;
 use crate::stop_all::StopReport;
 
-/// Only at the socket.
+/// The route exists only at the socket.
 const RELOAD: &str = "/api/v1/reload";
 
 /// All routes.
@@ -286,7 +286,7 @@ async fn guard(
     let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
     let (method, path) = (request.method(), request.uri().path());
     let is_local = reached.local.is_some();
-    // Nobody logs in at the socket.
+    // The socket has no logins.
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
     // A command of someone who may give it is served on the last connection too.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));

@@ -55,7 +55,7 @@ impl SocketDoor {
             address: reached.address,
             coverage: Coverage::Everything,
         };
-        // One token for each command whose reply is to come.
+        // Each token is a command whose reply is still to come.
         let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
@@ -100,7 +100,7 @@ impl SocketDoor {
     }
 }
 
-/// The same for a command of this very process, which has buses of its own and no socket.
+/// The door for a command of this very process, which has buses of its own and no socket.
 #[derive(Debug)]
 pub struct InProcess {
     door: SocketDoor,

@@ -30,10 +30,10 @@ impl std::fmt::Debug for Tls {
 }
 
 impl Terms {
-    /// Those of the configuration.
+    /// The terms of the configuration.
     ///
     /// # Errors
-    /// Its certificates cannot be used.
+    /// The certificates cannot be used.
     pub(super) fn new(options: &Options) -> Result<Terms, ServerError> {
         let tls = options.identity.as_ref().map(|identity| {
             let mut config = identity.server_config(None)?;

@@ -35,7 +35,7 @@ pub enum Scope {
 impl Scope {
     pub const ALL: [Scope; 3] = [Scope::Read, Scope::Metrics, Scope::Control];
 
-    /// Its name in the file.
+    /// Name of the scope in the file.
     pub fn name(self) -> &'static str {
         match self {
             Scope::Read => "read",
@@ -145,7 +145,7 @@ impl Tokens {
 /// The SHA-256 of a secret.
 pub(super) fn hash(secret: &str) -> [u8; BYTES] {
     let digest = digest(&SHA256, secret.as_bytes());
-    // Both have the length of a SHA-256.
+    // The conversion cannot fail: digest and hash both have the length of a SHA-256.
     digest.as_ref().try_into().unwrap_or_default()
 }
 

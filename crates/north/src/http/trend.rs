@@ -105,7 +105,7 @@ pub(super) async fn trend(
             let trend = history.trend();
             points.iter().filter_map(|point| part(&trend, point)).collect()
         }
-        // Its bus is being started.
+        // The bus of the drive is being started, so there is no history yet.
         None => {
             let nothing = DriveTrend::new(profile, Reach::FULL, clock);
             points.iter().filter_map(|point| part(&nothing, point)).collect()

@@ -70,8 +70,8 @@ impl User {
     }
 }
 
-/// The memory in which passwords are compared, one after the other. The allocator would keep each that is given back: so it is
-/// taken once.
+/// The memory in which passwords are compared, one after the other. It is allocated once, because the allocator would keep
+/// each block that is freed.
 #[derive(Debug, Default)]
 pub(super) struct Workspace(Vec<Block>);
 
@@ -82,7 +82,7 @@ impl Workspace {
         found.unwrap_or(false)
     }
 
-    /// What `hash` is if this is its password; nothing if it is no whole hash.
+    /// Computes `hash` for this password; none if it is not a complete hash.
     fn compute(&mut self, hash: &PasswordHash<'_>, password: &str) -> password_hash::Result<Option<Output>> {
         let (Some(salt), Some(length)) = (hash.salt, hash.hash.map(|own| own.len())) else {
             return Err(password_hash::Error::PhcStringField);
@@ -104,7 +104,7 @@ impl Workspace {
     }
 }
 
-/// The part of a hash that says how it is computed: name, version and parameters of the function.
+/// The part of a hash that defines its computation: name, version and parameters of the function.
 fn cost(hash: &str) -> &str {
     let end = hash.match_indices('$').nth(3).map(|(at, _)| at);
     end.and_then(|end| hash.get(..=end)).unwrap_or_default()

@@ -150,7 +150,7 @@ pub(super) async fn params(
     Ok(Json(parameters).into_response())
 }
 
-/// Whether a query asks for the last reading as its file.
+/// Whether a query requests the last reading as its file.
 fn params_as_file(query: Option<&str>) -> Result<bool, QueryError> {
     let [format] = query::parameters(query, &["format"])?;
     match format.as_deref() {
@@ -190,7 +190,7 @@ pub(super) async fn all_params(State(app): State<Arc<AppState>>, RawQuery(query)
     Ok(Json(readings.await?.unwrap_or_default()).into_response())
 }
 
-/// What `read` finds in the store, away from the tasks of other clients; nothing where readings are not stored.
+/// Reads from the store with `read`, away from the tasks of other clients; none where readings are not stored.
 async fn from_store<T: Send + 'static>(
     app: &AppState,
     read: impl FnOnce(Store) -> Result<T, String> + Send + 'static,

@@ -28,7 +28,7 @@ const REBIND: (Duration, Duration) = (Duration::from_millis(100), Duration::from
 /// Frees the address of a socket that is about to be closed, also while a copy of the socket is open: a process that
 /// was forked has one until it executes its program.
 pub(super) fn stop_listening(socket: &impl AsFd) {
-    // It fails for a socket that is lost, which listens no longer.
+    // The shutdown fails for a socket that is lost, which no longer listens anyway.
     let _ = shutdown(socket, Shutdown::Both);
 }
 
@@ -82,7 +82,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
     /// Accepts until the socket is lost; why.
     async fn accept(&self, mut socket: impl Accept) -> io::Error {
         let log = LogThrottle::default();
-        // A client may have connected, and sent something, while this runtime stood still.
+        // A client may have connected, and sent bytes, while this runtime did not run.
         let reader = Reader::here();
         loop {
             let at_once = socket.accept().now_or_never();

@@ -44,7 +44,7 @@ impl ListenerStates {
         }
     }
 
-    /// One line for each listener that does not listen.
+    /// A line of text for each listener that does not listen.
     pub fn reasons(&self) -> Vec<String> {
         let line = |entry: &Entry| {
             let (server, address) = (entry.server.title(), entry.address);
@@ -71,7 +71,7 @@ impl ListenerStates {
 }
 
 impl ListenerState {
-    /// It listens, or does not for that reason.
+    /// Sets the state: listening, or not listening for this reason.
     pub(super) fn set(&self, why: Option<String>) {
         if let Some(entry) = self.all.lock().listeners.get_mut(&self.number) {
             entry.why = why;

@@ -227,7 +227,7 @@ fn specs(addresses: &[SocketAddr]) -> Vec<ListenerSpec> {
     addresses.iter().map(spec).collect()
 }
 
-/// None of those that the system gives to whoever asks for any, who would have it before it is bound again.
+/// An address outside the range that the system assigns, so that no other program gets it before it is bound again.
 fn free_address() -> SocketAddr {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     let first = 7_000 + (std::process::id() % 25) as u16 * 100;

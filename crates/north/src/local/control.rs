@@ -9,7 +9,7 @@ use crate::http::messages::ReloadOutcome;
 /// Most waiting commands; there are no more clients than that.
 const WAITING: usize = super::MAX_CLIENTS;
 
-/// Someone wants the gateway to read its configuration again.
+/// A request to reload the configuration.
 #[derive(Debug)]
 pub struct ReloadOrder {
     pub who: String,
@@ -38,7 +38,7 @@ impl Control {
         (Control { config, orders }, arrive)
     }
 
-    /// Its file, as [`absolute`] names it.
+    /// Configuration file, as [`absolute`] names it.
     pub(crate) fn config(&self) -> &Path {
         &self.config
     }
@@ -53,7 +53,7 @@ pub fn absolute(config: &Path) -> PathBuf {
 /// Lets the gateway read its configuration again, and waits for the outcome.
 ///
 /// # Errors
-/// It has none, or stops.
+/// The gateway has no configuration file, or is shutting down.
 pub(crate) async fn reload(control: Option<&Control>, who: String) -> Result<ReloadOutcome, String> {
     let stops = || "the gateway is shutting down and no longer reads its configuration".to_string();
     let control = control.ok_or("the gateway has no configuration file to reload")?;

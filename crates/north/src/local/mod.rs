@@ -1,9 +1,9 @@
 //! The local socket: the HTTP API for commands on the machine of the gateway (`http/socket_door.rs`).
 //!
-//! Who may connect is decided by the permissions of the socket's file, and anyone who may connect may command, as far
-//! as the drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited
+//! The permissions of the socket's file decide who may connect, and any client that may connect may command, as far as
+//! the drives allow it. Commands take the route of all others ([`crate::plant::DriveHandle::place`]) and are audited
 //! with the user id of the client's process. Connections and times are bounded; when there are too many connections,
-//! one that waits for no response is closed in favour of the newcomer.
+//! one that waits for no response is closed in favour of the new one.
 
 pub(crate) mod control;
 mod path;
@@ -119,12 +119,13 @@ impl server::Server for Local {
         })
     }
 
-    /// Its file says who may command, and is there no more: another one may be open to others.
+    /// The permissions of the file are the right to command, and the file is gone: another one may be open to other
+    /// users.
     fn end_rights(&self, _: Option<&Options>) {
         self.right.store(false, Ordering::Release);
     }
 
-    /// Its file is removed; a request that is being carried out gets its response from the bus.
+    /// The file is removed; a request that is being carried out gets its response from the bus.
     async fn stopped(self) {
         if let Err(error) = self.task.await {
             tracing::error!(target: "drivegate::local", "the local socket ended unexpectedly: {error}; please report \
@@ -140,7 +141,7 @@ async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel:
         listener: 0,
         cancel: &cancel,
     };
-    // A client may have connected, and sent something, while this runtime stood still.
+    // A client may have connected, and sent bytes, while this runtime did not run.
     let reader = Reader::here();
     loop {
         let accepted = match bound.listener.accept().now_or_never() {

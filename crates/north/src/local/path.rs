@@ -43,7 +43,7 @@ pub struct RuntimeDirectories {
 }
 
 impl RuntimeDirectories {
-    /// Those of this process.
+    /// The directories of this process.
     pub fn of_this_process() -> RuntimeDirectories {
         let variable = |name| {
             std::env::var_os(name)
@@ -106,7 +106,7 @@ pub(super) struct Bound {
 
 impl Drop for Bound {
     fn drop(&mut self) {
-        // It still listens, so no other gateway has put its own file there; someone else may have.
+        // The socket still listens, so no other gateway has put its own file there; another program may have.
         if std::fs::symlink_metadata(&self.path).is_ok_and(|file| (file.dev(), file.ino()) == self.id) {
             let _ = std::fs::remove_file(&self.path);
         }
@@ -142,7 +142,7 @@ async fn bind(path: &Path) -> io::Result<Bound> {
     remove_if_dead(path).await?;
     let socket = UnixSocket::new_stream()?;
     socket.bind(path)?;
-    // Nobody can connect before it listens.
+    // The mode is set before the socket listens, so no client can connect earlier.
     std::fs::set_permissions(path, Permissions::from_mode(MODE))?;
     let listener = socket.listen(BACKLOG)?;
     let file = std::fs::symlink_metadata(path)?;

@@ -58,7 +58,7 @@ impl Format {
                 ranges.filter(|(named, _)| format == Format::Prometheus || named.is_none_or(|named| named == version));
             fits.map(|(_, weight)| weight).fold(0.0, f64::max)
         };
-        // Who accepts nothing of all that gets the plain text.
+        // A client that accepts none of the types gets the plain text.
         let [.., (format, _, plain)] = TYPES;
         let (mut best, mut chosen) = (0.0, (format, plain));
         for (format, version, content_type) in TYPES {

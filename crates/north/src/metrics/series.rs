@@ -27,7 +27,7 @@ impl Labels {
         }
     }
 
-    /// These with one of its own.
+    /// The labels with one more.
     pub(super) fn with(&self, name: &'static str, value: impl Into<Cow<'static, str>>) -> Labels {
         Labels {
             of: self.of.clone(),
@@ -35,7 +35,7 @@ impl Labels {
         }
     }
 
-    /// These with two of its own.
+    /// The labels with two more.
     pub(super) fn with_both(&self, first: Label, second: Label) -> Labels {
         Labels {
             of: self.of.clone(),
@@ -66,11 +66,11 @@ pub(super) enum Kind {
 
 #[derive(Debug)]
 pub(super) enum SeriesValue {
-    /// Of a gauge.
+    /// Value of a gauge.
     Value(f64),
-    /// Of a counter of events.
+    /// Value of a counter of events.
     Count(u64),
-    /// Of a counter of seconds.
+    /// Value of a counter of seconds.
     Total(f64),
     Histogram(HistogramSnapshot),
 }

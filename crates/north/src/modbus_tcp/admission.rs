@@ -1,4 +1,4 @@
-//! Who may connect to a listener, and with which rights.
+//! Clients that may connect to a listener, and their rights.
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
@@ -35,13 +35,13 @@ const KEEPALIVE_PROBES: u32 = 3;
 /// How the rights of a client are determined.
 #[derive(Debug, Clone)]
 pub(super) enum WriteAccess {
-    /// Its address: these networks may write.
+    /// The address decides: these networks may write.
     ByAddress(Vec<IpNet>),
     /// The role in its certificate.
     ByCertificate(Arc<TlsAuthenticator>),
 }
 
-/// Who may connect to a listener, and with which rights. A reload replaces it.
+/// Clients that may connect to a listener, and their rights. A reload replaces it.
 #[derive(Debug, Clone)]
 pub(super) struct Policy {
     pub(super) allow: Vec<IpNet>,

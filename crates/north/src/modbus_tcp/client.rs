@@ -11,15 +11,15 @@ use crate::order::{Authority, Grants, Origin, Proof, Right, SourceKind};
 #[derive(Debug, Clone)]
 pub(super) struct Client {
     pub(super) rights: Rights,
-    /// Its name in the audit: its address, after the name in its certificate if it has one.
+    /// Name of the client in the audit: its address, after the name in its certificate if it has one.
     pub(super) who: String,
-    /// The same without the port: all connections of a client share it.
+    /// Name without the port: all connections of a client share it.
     client: Arc<str>,
     proof: Proof,
     right: Right,
 }
 
-/// What a client may write to: as its address or certificate allows, on the buses that its listener shows.
+/// Drives that a client may write to: as its address or certificate allows, on the buses that its listener shows.
 #[derive(Debug)]
 struct ClientRight {
     rights: Rights,
@@ -52,7 +52,7 @@ impl Client {
         }
     }
 
-    /// The same at a listener with that view.
+    /// Sets the view of the listener, which limits the right.
     pub(super) fn seeing(mut self, view: &Arc<PlantView>) -> Client {
         self.right = Right::of(Arc::new(ClientRight {
             rights: self.rights.clone(),

@@ -1,4 +1,4 @@
-//! One connection: reads requests from the socket and writes the answers, with time limits.
+//! A connection: reads requests from the socket and writes the answers, with time limits.
 
 use std::convert::Infallible;
 use std::io;
@@ -105,7 +105,7 @@ struct Connection<'p, S> {
     place: &'p ConnectionPlace,
     /// The time as of the last wait; the clock is read once per request.
     now: Instant,
-    /// That of the stream.
+    /// Reader of the stream.
     reader: Arc<Reader>,
     /// Requests since the last yield.
     since_yield: usize,
@@ -117,7 +117,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         // Once this is set, reading stops; the requests that wait for the bus are still answered.
         let mut input_end: Option<End> = None;
         let mut half_frame_since: Option<Instant> = None;
-        // One future for the whole connection, so that it registers with the token once and not with every request.
+        // A single future for the whole connection, so that it registers with the token once and not with every
+        // request.
         let place = self.place;
         let mut closing = std::pin::pin!(place.closing().cancelled());
         loop {

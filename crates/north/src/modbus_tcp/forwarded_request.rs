@@ -25,7 +25,7 @@ pub(super) struct ForwardedRequest {
     pub(super) request: RequestPdu,
     /// Whether the command includes a fault reset by 0x8100.
     pub(super) resets: bool,
-    /// What is read once the write is done.
+    /// The read that follows once the write is done.
     pub(super) then: Option<ReadBehind>,
     read: Option<PartialRead>,
 }
@@ -85,9 +85,9 @@ impl PartialRead {
 pub(super) enum Progress {
     /// A command of it is in the queue.
     Pending(PendingRequest),
-    /// Its outcome is known.
+    /// The outcome of the request is known.
     Done(Box<ForwardedRequest>, Outcome),
-    /// Of a stop of all drives: whether every drive acknowledged it.
+    /// A stop of all drives has ended: whether every drive acknowledged it.
     Stopped(Header, RequestPdu, bool),
 }
 

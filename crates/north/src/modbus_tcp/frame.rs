@@ -31,7 +31,7 @@ pub(crate) struct Frame<'b> {
     pub(crate) used: usize,
 }
 
-/// Not Modbus TCP. The beginning of the next frame cannot be found, so the connection is closed.
+/// Bytes that are not Modbus TCP. The beginning of the next frame cannot be found, so the connection is closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum NotModbus {
     #[error("protocol id {0} instead of 0")]
@@ -53,7 +53,7 @@ pub(crate) fn of_serial_line(bytes: &[u8]) -> Option<NotModbus> {
         return ascii::decode_request(whole).map(|_| NotModbus::Serial("ASCII"));
     }
     // A read from address 0 has the protocol id of Modbus TCP, and its number of registers passes for the length: of a frame that
-    // is not complete yet, or of the shortest that there is. A complete longer one is no RTU, whatever its bytes add up to.
+    // is not complete yet, or of the shortest possible one. A complete longer one is not RTU, even if its check code fits.
     let whole = bytes.get(..rtu::request_len(bytes)?)?;
     let is_rtu = bytes.get(1).is_some_and(|function| rtu::is_known(*function)) && rtu::decode_request(whole).is_some();
     (is_rtu && !matches!(decode(bytes), Ok(Some(frame)) if frame.used > SHORTEST)).then_some(NotModbus::Serial("RTU"))

@@ -48,8 +48,8 @@ pub use self::offline::Offline;
 pub use self::routes::{Registers, View};
 pub use self::tls::{Identity, Role, Tls};
 
-/// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
-/// accepted.
+/// The role in a client certificate in DER, for the fuzzer; `None` if the bytes are not a certificate, an error if the
+/// role is not accepted.
 pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
     let certificate = certificate::read(der).ok()?;
     Some(certificate.role.map_err(|why| why.to_string()))
@@ -130,24 +130,24 @@ pub struct Listener {
     pub allow: Vec<IpNet>,
     /// Networks that may write.
     pub write: Vec<IpNet>,
-    /// What its clients see.
+    /// The register view that clients see.
     pub view: View,
 }
 
 /// How raw reads outside the poll plan are handled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Uncached {
-    /// They are forwarded to the drive.
+    /// The reads are forwarded to the drive.
     #[default]
     Forward,
-    /// They are refused with exception 02.
+    /// The reads are refused with exception 02.
     Refuse,
 }
 
 /// The running server.
 pub type Server = TcpServer<ModbusTcp, Options>;
 
-/// What serves the clients of the listeners.
+/// The service for the clients of the listeners.
 #[derive(Debug)]
 pub struct ModbusTcp {
     authenticator: Option<Arc<TlsAuthenticator>>,
@@ -270,7 +270,7 @@ impl TcpService<Options> for ModbusTcp {
         });
     }
 
-    /// Without the server nobody commands by it.
+    /// Without the server no client commands over it.
     fn retire(&mut self) {
         let options = self.state.options.load_full();
         self.state.options.store(Arc::new(Options {

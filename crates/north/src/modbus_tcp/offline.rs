@@ -16,7 +16,7 @@ use crate::order::Authority;
 use crate::plant::SharedPlant;
 use crate::reading::{Reader, Watch};
 
-/// One client of a server without sockets. Time is an argument of [`Offline::receive`].
+/// A client of a server without sockets. Time is an argument of [`Offline::receive`].
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
@@ -62,7 +62,8 @@ impl Offline {
         }
     }
 
-    /// Shows whether the thread runs that reads what all its clients send. One that was never told that it runs sees no stalls.
+    /// Shows whether the thread runs that reads the bytes of all its clients. A watch that was never set to running sees no
+    /// stalls.
     pub fn watch(&self) -> &Arc<Watch> {
         &self.watch
     }

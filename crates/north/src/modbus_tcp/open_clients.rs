@@ -30,14 +30,14 @@ struct State {
 
 #[derive(Debug)]
 struct OpenClient {
-    /// Its own certificate first.
+    /// Certificate chain of the client, its own certificate first.
     chain: Vec<CertificateDer<'static>>,
     role_name: Option<String>,
     role: Role,
     /// For the log.
     who: String,
     refused: CancellationToken,
-    /// Its rights, once it has a place.
+    /// Rights of the client, once it has a place.
     rights: Option<Rights>,
 }
 
@@ -140,7 +140,7 @@ pub(super) struct CertificateGuard {
 }
 
 impl CertificateGuard {
-    /// These are its rights: they end with its certificate or its role.
+    /// Sets the rights of the client: they end with its certificate or its role.
     pub(super) fn watch(&self, rights: &Rights) {
         let mut state = self.clients.lock();
         if let Some(client) = state.open.get_mut(&self.id) {

@@ -9,7 +9,7 @@ use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 use crate::register_map::{FIRST, GATEWAY_UNIT, STOP_ALL};
 use crate::stop_all::{Scope, StopAll};
 
-/// What the clients of one listener see.
+/// The part of the plant that the clients of one listener see.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct View {
     /// Names of the visible buses; `None` for all.
@@ -164,7 +164,7 @@ impl PlantView {
         self.shown.load().view.has(bus)
     }
 
-    /// The routes of the current plant; after a reload, the first client that asks rebuilds them for all.
+    /// The routes of the current plant; after a reload, the first client with a request rebuilds them for all.
     pub(super) fn routes(&self) -> Arc<Routes> {
         let routes = self.routes.load_full();
         if self.is_current(&routes) {
@@ -246,8 +246,8 @@ impl Routes {
         self.shown.view.default_drive.is_some()
     }
 
-    /// Whether what was asked then may have meant another drive or register: a reload has given the unit or the address
-    /// another meaning since.
+    /// Whether a request of that time may have meant another drive or register: a reload has given the unit or the
+    /// address another meaning since.
     pub(super) fn is_older(&self, asked: Instant) -> bool {
         self.shown.since.is_some_and(|since| asked < since)
     }

@@ -52,7 +52,7 @@ impl From<Exception> for Decision {
     }
 }
 
-/// One connected client.
+/// A connected client.
 #[derive(Debug)]
 pub(super) struct ClientSession {
     state: Arc<ServerState>,
@@ -319,7 +319,7 @@ impl ClientSession {
     }
 
     /// Function 23: the write, and behind its answer the read. Both are judged before anything is written; a stop in the
-    /// write is carried out whatever else is asked.
+    /// write is carried out whatever the rest is.
     fn write_and_read(
         &self,
         header: Header,
@@ -586,7 +586,7 @@ fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> 
     forwarded(header, drive, request, work)
 }
 
-/// The refusal of what stands beside a stop that is carried out.
+/// The refusal of the values next to a stop that is carried out.
 fn not_readable(code: Exception, address: u16) -> Refusal {
     match code {
         Exception::ADDRESS => {

@@ -145,10 +145,10 @@ pub(crate) struct Requirements {
 }
 
 impl Requirements {
-    /// Those of the configuration.
+    /// The requirements of the configuration.
     ///
     /// # Errors
-    /// Its certificates cannot be used.
+    /// The certificates cannot be used.
     pub(super) fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
         let verifier = tls.identity.verifier()?;
         Ok(Requirements {

@@ -21,7 +21,7 @@ pub(super) struct Rotation {
 }
 
 impl Rotation {
-    /// Of `count` brokers; begins with this one.
+    /// A rotation of `count` brokers that starts with `current`.
     pub(super) fn new(count: usize, current: usize) -> Rotation {
         Rotation {
             count: count.max(1),

@@ -13,11 +13,11 @@ pub(super) struct BrokerLimits {
     pub(super) window: usize,
     /// Maximum packet size, bytes.
     pub(super) max_packet: usize,
-    /// Whether it acknowledges messages (QoS 1).
+    /// Whether the broker acknowledges messages (QoS 1).
     pub(super) acknowledges: bool,
-    /// Whether it keeps retained messages.
+    /// Whether the broker keeps retained messages.
     pub(super) retains: bool,
-    /// Whether it takes filters with `+` and `#`.
+    /// Whether the broker takes filters with `+` and `#`.
     pub(super) wildcards: bool,
     /// Number of topic aliases.
     pub(super) aliases: u16,
@@ -42,7 +42,7 @@ impl BrokerLimits {
         }
     }
 
-    /// What is lost with a broker that lacks a feature; each completes a sentence about it.
+    /// Losses with a broker that lacks a feature; each completes a sentence about it.
     pub(super) fn losses(&self) -> Vec<&'static str> {
         let all = [
             (
@@ -67,9 +67,9 @@ impl BrokerLimits {
 /// Why a broker refuses a last will.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Lack {
-    /// It has no QoS 1.
+    /// The broker has no QoS 1.
     Acknowledgements,
-    /// It keeps no retained messages.
+    /// The broker keeps no retained messages.
     Retained,
 }
 

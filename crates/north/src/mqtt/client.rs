@@ -115,7 +115,7 @@ impl PlainClient {
         let common = Common::new(link, plant, stats);
         let (observed, stats) = (&common.observed, &common.stats);
         let topics = Topics::new(&options.base, &observed.gateway);
-        // What expires is renewed before.
+        // Messages are renewed before they expire.
         let most = options.message_expiry.map_or(options.max_interval, |expiry| {
             options.max_interval.min(expiry / RENEWED)
         });
@@ -401,7 +401,7 @@ impl session::Client for PlainClient {
         if self.retry.is_due(now) {
             self.outbox.retry();
         }
-        // What the disk had no room for the last time.
+        // Retries messages for which the disk had no room the last time.
         self.store.acknowledge(self.outbox.oldest(MqttKind::Event));
         self.history.acknowledge(self.outbox.oldest(MqttKind::History));
         self.count_lost(now);

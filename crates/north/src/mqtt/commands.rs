@@ -56,7 +56,7 @@ pub(super) struct Rules {
     pub(super) responses: ResponseTopics,
     /// Commands without an `id` are refused, except stops.
     pub(super) require_id: bool,
-    /// Of all who publish to the set topics.
+    /// Right of all clients that publish to the set topics.
     pub(super) right: Right,
 }
 
@@ -66,7 +66,7 @@ pub(super) struct OrdersLeft {
     waiting: PendingCommands,
     confirming: PendingCommands,
     stopping: Vec<PendingStop>,
-    /// Those that the broker has not acknowledged.
+    /// Results that the broker has not acknowledged.
     pub(super) results: Vec<Message>,
 }
 
@@ -136,10 +136,10 @@ impl Commands {
         !self.waiting.is_full(WAITING)
     }
 
-    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
-    /// otherwise its command is in the queue of the bus. A repeated command is not executed again, but answered with the
-    /// previous result or refused; a stop is always executed, that of a command which does more without the rest. `crowded` says whether too many results wait on a topic: a
-    /// command that would be answered there is refused.
+    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once; otherwise its command is
+    /// in the queue of the bus. A repeated command is not executed again, but answered with the previous result or refused; a stop is
+    /// always executed, without the rest where the command does more. `crowded` returns whether too many results wait on a topic: a command
+    /// that would be answered there is refused.
     pub(super) fn take(
         &mut self,
         incoming: Incoming,
@@ -179,7 +179,7 @@ impl Commands {
             let why = match repeated {
                 None => self.may_take(&reply, id.as_ref(), crowded, now).err(),
                 Some(Repetition::Outdated(why)) => Some(repeats(why)),
-                // Its stop is carried out once more, and answered once more.
+                // The stop is carried out again, and answered again.
                 Some(Repetition::Pending | Repetition::Answered(_)) if asked.stops(profile) => {
                     Some(repeats("so only its stop is executed again"))
                 }

@@ -1,4 +1,4 @@
-//! One connection to the broker: a rumqttc client, polled by its own task.
+//! A connection to the broker: a rumqttc client, polled by its own task.
 //!
 //! Client and event loop are discarded after any error: the outbox is better at keeping what rumqttc would keep
 //! (messages in flight). The polling task never publishes, and publishing never waits: what finds no room stays in the
@@ -57,12 +57,12 @@ const SUBSCRIBE_BYTES: usize = 8 << 10;
 const MOST_FILTERS: usize = 8;
 /// Packets with subscriptions, at most: the client takes [`REQUESTS`] at a time. Behind that they have more filters.
 const MOST_PACKETS: usize = REQUESTS / 2;
-/// What the system buffers of sent messages: a result waits behind no more than that.
+/// Buffer of the system for sent messages: a result waits behind no more than that.
 const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
 
-/// What happens on a connection.
+/// Events of a connection.
 #[derive(Debug)]
 pub(super) enum Step {
     /// The broker accepted the connection: the client subscribes.
@@ -81,7 +81,7 @@ pub(super) enum Step {
     Message(Box<Incoming>),
     /// There is room for further messages.
     Room,
-    /// The broker was asked whether it is there.
+    /// A ping was sent to the broker.
     Pinged,
     /// Nothing for the client, such as any other packet from the broker.
     Nothing,
@@ -93,7 +93,7 @@ pub(super) enum Step {
     Lost(String),
 }
 
-/// One connection, from the connection attempt to its end.
+/// A connection, from the connection attempt to its end.
 #[derive(Debug)]
 pub(super) struct Connection {
     client: AsyncClient,
@@ -103,7 +103,7 @@ pub(super) struct Connection {
     silence: Silence,
     /// No message may be published before then.
     held_until: Option<Instant>,
-    /// What a broker that may be silent is asked.
+    /// The subscription that is repeated to test a silent broker.
     question: Option<Filter>,
     /// Number of subscriptions whose answers are awaited, and the answers so far.
     wanted: usize,
@@ -116,7 +116,7 @@ pub(super) struct Connection {
 /// second time, as long as the broker has any.
 #[derive(Debug, Default)]
 struct Aliases {
-    /// With whether the broker knows it.
+    /// Aliases by topic, each with whether the broker knows it.
     named: HashMap<Arc<str>, (u16, bool)>,
     once: HashSet<Arc<str>>,
 }
@@ -276,7 +276,7 @@ impl Connection {
         }
     }
 
-    /// Subscribes, in as many packets as the broker wants; false if the connection does not take it.
+    /// Subscribes, in as many packets as the broker requires; false if the connection does not take it.
     pub(super) fn subscribe(&mut self, filters: Vec<Filter>, limits: BrokerLimits) -> bool {
         (self.wanted, self.answers) = (filters.len(), Vec::new());
         self.question = filters.first().map(|first| Filter {
@@ -291,8 +291,8 @@ impl Connection {
             })
     }
 
-    /// Whether the broker said nothing for so long that the connection is lost. One that has no reason to speak is asked for a
-    /// subscription that it has already: it must answer, and nothing changes.
+    /// Whether the broker was silent for so long that the connection is lost. A broker without a reason to send gets a
+    /// repeated subscription: it must answer, and nothing changes.
     pub(super) fn is_silent(&mut self, limits: Option<BrokerLimits>, now: Instant) -> bool {
         let verdict = self.silence.judge(limits.and_then(|limits| limits.keep_alive), now);
         if verdict == Verdict::Ask
@@ -356,8 +356,8 @@ impl Connection {
         }
     }
 
-    /// Ends the connection without waiting for it, and tells the broker why, as far as it listens. The last will is published if
-    /// it is `true_now`: others take the gateway for online.
+    /// Ends the connection without waiting for it, and sends the broker the reason, as far as it reads. The last will is
+    /// published if it is `true_now`: other clients take the gateway for online.
     pub(super) fn give_up(mut self, why: &str, true_now: bool) {
         let reason = match true_now {
             true => DisconnectReasonCode::DisconnectWithWillMessage,
@@ -396,7 +396,7 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
-/// These topics, without what the gateway itself publishes.
+/// A filter of these topics, without the gateway's own messages.
 pub(super) fn of_others(path: String) -> Filter {
     Filter {
         path,
@@ -460,7 +460,7 @@ fn target(broker: &Broker) -> rumqttc::Broker {
     // TLS would take an IPv6 address with brackets for a name.
     let plain = || rumqttc::Broker::tcp(broker.bare_host(), broker.port);
     let Some(path) = &broker.path else { return plain() };
-    // What cannot be a URL was refused with the configuration.
+    // An invalid URL was refused with the configuration.
     rumqttc::Broker::websocket(format!("ws://{broker}{path}")).unwrap_or_else(|_| plain())
 }
 
@@ -470,7 +470,7 @@ async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender
     let mut elsewhere = String::new();
     loop {
         let event_or_end = eventloop.poll().await;
-        // Packets are read in batches: of all that was read and is not told yet, the earliest.
+        // Packets are read in batches: the earliest arrival of the batch counts.
         let arrival = reader.first();
         let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
@@ -549,8 +549,8 @@ fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
     }
 }
 
-/// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is no packet of
-/// MQTT 5, and closes the connection; some close it at once.
+/// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is not a packet
+/// of MQTT 5, and closes the connection; some close it at once.
 fn refusal(error: &ConnectionError) -> String {
     match error {
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io)))
@@ -558,7 +558,7 @@ fn refusal(error: &ConnectionError) -> String {
         {
             format!("{io}: {SCHEME}")
         }
-        // Of the network or of TLS: it has words of its own.
+        // Errors of the network or of TLS have messages of their own.
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(_))) => reason(error),
         ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
             "the broker closed the connection without accepting it: it does not support MQTT 5, or expects TLS; {MQTT_5}, or \
@@ -568,11 +568,11 @@ fn refusal(error: &ConnectionError) -> String {
     }
 }
 
-/// What to do about a broker that closes a connection before it accepts it.
+/// Remedy for a broker that closes a connection before it accepts it.
 const SCHEME: &str = "the broker did not accept the connection; check the scheme in mqtt.url: mqtts:// for a port with TLS, \
                       usually 8883, mqtt:// for one without, usually 1883";
 
-/// What to do about a broker of an older version.
+/// Remedy for a broker of an older version.
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
 
 /// The broker ended an accepted connection, and did not say why.
@@ -633,7 +633,7 @@ fn reason(error: &ConnectionError) -> String {
             ConnectionError::Io(io) if tls_words::explain(io, tls_words::BROKER).is_none() => {
                 format!("{io}; check mqtt.url, and whether the broker is running")
             }
-            // What cannot be decoded hides that it could not be read, as after an alert of TLS 1.3.
+            // A decoding error may hide a read error, as after an alert of TLS 1.3.
             ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io))) => in_words(io),
             _ => in_words(error),
         };

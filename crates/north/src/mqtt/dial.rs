@@ -11,11 +11,11 @@ use tokio::net::TcpStream;
 
 use super::Broker;
 
-/// Time limit for TCP, TLS and CONNACK: a broker that is busy, or asks its database who connects, takes some seconds.
+/// Time limit for TCP, TLS and CONNACK: a broker that is busy, or checks clients in a database, takes some seconds.
 pub(super) const ACCEPT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time limit for a TCP connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// So many attempts within so long, to whatever address.
+/// Number of attempts within a time, to any address.
 const ATTEMPTS: usize = 3;
 const WITHIN: Duration = Duration::from_secs(1);
 
@@ -24,7 +24,7 @@ const WITHIN: Duration = Duration::from_secs(1);
 struct Pace(VecDeque<Instant>);
 
 impl Pace {
-    /// Counts an attempt at `now`, or says when it may follow.
+    /// Counts an attempt at `now`, or returns when it may follow.
     fn take(&mut self, now: Instant) -> Result<(), Instant> {
         self.0.retain(|at| now.saturating_duration_since(*at) < WITHIN);
         match self.0.front() {

@@ -1,4 +1,4 @@
-//! What a client leaves to the one that a reload puts in its place.
+//! State that a client leaves to the one that a reload puts in its place.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,7 +9,7 @@ use super::commands::OrdersLeft;
 use super::sparkplug::NodeOrdersLeft;
 use crate::event::Event;
 
-/// What the last clients left, until the next ones take it.
+/// State that the last clients left, until the next ones take it.
 #[derive(Debug, Default)]
 pub struct Handover(Mutex<Left>);
 
@@ -19,13 +19,13 @@ pub(super) struct Left {
     pub(super) retained: Vec<String>,
     /// The events that were not read.
     pub(super) unread: Option<Receiver<Arc<Event>>>,
-    /// Of the client with the topics of drivegate.
+    /// State of the client with the topics of drivegate.
     pub(super) client: ClientLeft<OrdersLeft>,
-    /// Of the edge node.
+    /// State of the edge node.
     pub(super) node: ClientLeft<NodeOrdersLeft>,
 }
 
-/// What one of the clients left.
+/// State that one of the clients left.
 #[derive(Debug)]
 pub(super) struct ClientLeft<Orders> {
     /// The commands whose results are still owed.

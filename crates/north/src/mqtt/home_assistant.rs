@@ -1,5 +1,5 @@
 //! Discovery for Home Assistant (`docs/home-assistant.md`): one retained message for the gateway and one for each drive
-//! says which entities there are and on which topics their values are.
+//! lists their entities and the topics of their values.
 //!
 //! The messages are made one at a time, when the last ones are with the broker, so that a thousand drives hold up neither
 //! telemetry nor results. Time is an argument.
@@ -106,7 +106,7 @@ impl Announcer {
         self.pending = (0..self.devices.len()).collect();
     }
 
-    /// The topic on which Home Assistant says that it was started.
+    /// The topic on which Home Assistant reports that it was started.
     pub(super) fn birth_topic(&self) -> String {
         format!("{}/status", self.prefix)
     }
@@ -144,8 +144,8 @@ impl Announcer {
         std::mem::take(&mut self.changed)
     }
 
-    /// The messages of the next device, if there is one and its turn has come; `waits` tells whether a message of a topic
-    /// is still on its way to the broker.
+    /// The messages of the next device, if there is one and its turn has come; `waits` returns whether a message of a
+    /// topic is still in progress to the broker.
     pub(super) fn next(&mut self, now: Instant, waits: impl Fn(&str) -> bool) -> Vec<Update> {
         if self.again.is_some_and(|at| at <= now) {
             (self.again, self.begun) = (None, Some(now));
@@ -191,7 +191,7 @@ impl Announcer {
     }
 
     fn topic(&self, device: &str, part: usize) -> Arc<str> {
-        // What follows the gateway's own id; `gateway` is its own message.
+        // The topic has the part behind the gateway's own id; `gateway` is the gateway's message.
         let name = device.strip_prefix(self.gateway.as_str()).unwrap_or(device);
         let name = name.strip_prefix('_').unwrap_or("gateway");
         match part {

@@ -7,8 +7,8 @@
 //! oldest segment is deleted. Damaged parts are copied to `{name}-{number}-{offset}.damaged`; reading continues at the
 //! next valid record.
 //!
-//! What cannot be written waits in memory behind what is on disk, so the order stays, and is written as soon as the disk
-//! takes it.
+//! Messages that cannot be written wait in memory behind those on disk, so the order stays, and are written as soon as
+//! the disk takes them.
 
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
@@ -65,7 +65,7 @@ pub(super) struct Journal {
     marked: u64,
     unsynced: bool,
     lost: u64,
-    /// Of the gaps in the numbers that are still to be met, those that are counted already: lost messages among those that wait.
+    /// Messages already counted as lost in the gaps that are still to be passed.
     pub(super) counted: u64,
     /// Up to here nothing is kept: the buffer was full. What of it was taken and is not acknowledged is lost.
     pub(super) gone: u64,
@@ -129,7 +129,7 @@ impl Journal {
             journal.adopt(number, path)?;
         }
         journal.marked = journal.acknowledged;
-        // What is missing before the first message was lost or acknowledged in an earlier run.
+        // Messages missing before the first one were lost or acknowledged in an earlier run.
         let first = journal
             .segments
             .iter()
@@ -312,7 +312,8 @@ impl Journal {
                 }
                 Err(range) => {
                     let damaged = bytes.get(range.clone()).unwrap_or_default();
-                    // What cannot be kept is in the log, and stays in its segment until that is acknowledged.
+                    // Damaged bytes that cannot be copied are in the log, and stay in their segment until that is
+                    // acknowledged.
                     let _ = self.quarantine(number, from + range.start as u64, damaged);
                 }
             }
@@ -321,7 +322,7 @@ impl Journal {
         true
     }
 
-    /// What is not passed up to this number is lost.
+    /// Messages up to this number that were not passed are lost.
     fn pass_all(&mut self, last: u64) {
         if last > self.passed {
             self.pass(last);
@@ -372,7 +373,7 @@ impl Journal {
             let (mark, acknowledged) = (record::mark(self.acknowledged), self.acknowledged);
             match self.write_at_end(&mark) {
                 Ok(()) => (self.marked, written) = (acknowledged, true),
-                // Its messages are delivered again after a restart; nothing is dropped for it.
+                // The messages are delivered again after a restart; a full disk drops nothing.
                 Err(error) if is_full(&error) => {}
                 Err(error) => return Err(error),
             }

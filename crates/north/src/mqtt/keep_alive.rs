@@ -27,7 +27,7 @@ pub(super) enum Verdict {
 pub(super) struct Silence {
     /// Time of its last packet.
     heard: Instant,
-    /// Whether it was asked, and the answer is still to come.
+    /// Whether a test subscription was sent, and the answer is still to come.
     asked: bool,
     /// When the library sent a ping; `None` once the broker sent anything since.
     pinged: Option<Instant>,
@@ -52,19 +52,20 @@ impl Silence {
         self.pinged.get_or_insert(now);
     }
 
-    /// The broker was asked.
+    /// A test subscription was sent.
     pub(super) fn asked(&mut self) {
         self.asked = true;
     }
 
-    /// The broker answered; whether it was asked.
+    /// The broker answered; returns whether a test subscription was open.
     pub(super) fn answered(&mut self) -> bool {
         std::mem::take(&mut self.asked)
     }
 
-    /// `interval` is the one that the broker set instead of ours, s; 0: no keep-alive. A broker that is pinged less often
-    /// than we want, or never, has no reason to speak, and is asked. The library closes the connection an interval after a
-    /// ping without an answer, and sends no DISCONNECT then: the connection is lost a little earlier.
+    /// `interval` is the one that the broker set instead of the gateway's, s; 0: no keep-alive. A broker that is pinged
+    /// less often than the gateway requires, or never, has no reason to send, and gets a test subscription. The library
+    /// closes the connection an interval after a ping without an answer, and sends no DISCONNECT then: the connection is
+    /// lost a little earlier.
     pub(super) fn judge(&self, interval: Option<u16>, now: Instant) -> Verdict {
         let silent = now.saturating_duration_since(self.heard);
         let interval = interval.unwrap_or(KEEP_ALIVE_S);
@@ -87,8 +88,8 @@ impl Silence {
 mod tests {
     use super::*;
 
-    /// Seconds of an hour at which a broker is asked that says nothing else, and when it is lost, if ever. The library pings it
-    /// once in so many seconds.
+    /// Seconds of an hour at which a silent broker gets a test subscription, and when it is lost, if ever. The library pings it
+    /// at the interval `pings`.
     fn hour(interval: Option<u16>, answers: bool, pings: Option<u64>) -> (Vec<u64>, Option<u64>) {
         let start = Instant::now();
         let (mut silence, mut asked) = (Silence::new(start), Vec::new());

@@ -65,7 +65,7 @@ pub(super) struct BrokerLink {
     rotation: Rotation,
     dial: Dial,
     will: WillForm,
-    /// Of each broker.
+    /// Outages of each broker.
     outages: Vec<OutageLog>,
     takeovers: Takeovers,
     /// The password of the last attempt.
@@ -110,7 +110,7 @@ impl BrokerLink {
         matches!(self.state, State::Up(..))
     }
 
-    /// What the broker can do, once it accepted the connection.
+    /// Features of the broker, once it accepted the connection.
     pub(super) fn limits(&self) -> Option<BrokerLimits> {
         match &self.state {
             State::Up(_, phase) => phase.limits().copied(),
@@ -118,7 +118,7 @@ impl BrokerLink {
         }
     }
 
-    /// What the broker can do, once it answered the subscriptions.
+    /// Features of the broker, once it answered the subscriptions.
     pub(super) fn ready(&self) -> Option<BrokerLimits> {
         match &self.state {
             State::Up(_, Phase::Ready { limits, .. }) => Some(*limits),
@@ -126,7 +126,7 @@ impl BrokerLink {
         }
     }
 
-    /// What happens next on the connection; pending while nothing does. Cancel safe.
+    /// The next event of the connection; pending while there is none. Cancel safe.
     pub(super) async fn next(&mut self) -> Step {
         let step = match &mut self.state {
             State::Down { .. } => std::future::pending().await,
@@ -260,7 +260,7 @@ impl BrokerLink {
     pub(super) fn log_ready(&mut self, limits: BrokerLimits, named: &str) {
         let (prefix, broker) = (self.prefix, self.broker());
         tracing::info!(target: "drivegate::north::mqtt", "{prefix}connected to the broker at {broker}{named}");
-        // What the configuration does without is no news.
+        // A missing feature that the configuration does not use is not reported.
         let retains = limits.retains || !self.options.retain;
         for lost in (BrokerLimits { retains, ..limits }).losses() {
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}the broker at {broker} {lost}");
@@ -275,15 +275,14 @@ impl BrokerLink {
         tracing::warn!(target: "drivegate::north::mqtt", "{}the orderly disconnect timed out; the broker publishes the last will", self.prefix);
     }
 
-    /// Ends the connection for this reason, and tells the broker. The last will is published if it is `true_now`.
+    /// Ends the connection for this reason, and sends it to the broker. The last will is published if it is `true_now`.
     pub(super) fn give_up(&mut self, why: &str, true_now: bool) {
         if let Some(connection) = self.lost(why) {
             connection.give_up(why, true_now);
         }
     }
 
-    /// There is no connection any more, for this reason; returns what was there. Dropping it aborts its task and closes the
-    /// socket.
+    /// The connection is lost, for this reason; returns the lost one. Dropping it aborts its task and closes the socket.
     pub(super) fn lost(&mut self, why: &str) -> Option<Connection> {
         let (now, prefix, broker) = (Instant::now(), self.prefix, self.broker());
         let place = self.rotation.current();
@@ -332,7 +331,7 @@ impl BrokerLink {
         drop(self.turn_to_next(Some(wait), Instant::now()));
     }
 
-    /// Without a connection; the next attempt, to the next broker, follows after `wait` or as the rotation wants.
+    /// Drops the connection; the next attempt, to the next broker, follows after `wait` or as the rotation requires.
     fn turn_to_next(&mut self, wait: Option<Duration>, now: Instant) -> Option<Connection> {
         let held = match &self.state {
             State::Up(_, Phase::Ready { since, .. }) => Some(now.saturating_duration_since(*since)),

@@ -177,9 +177,9 @@ pub enum History {
     /// None.
     #[default]
     Off,
-    /// Those that changed.
+    /// Only values that changed.
     Changes,
-    /// Those of every sample.
+    /// The values of every sample.
     All,
 }
 

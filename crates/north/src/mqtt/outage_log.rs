@@ -8,7 +8,7 @@ const SAME_REASON: Duration = Duration::from_secs(3600);
 /// Number of reasons that are distinguished.
 const REASONS: usize = 16;
 
-/// Why there is no connection: each reason once, and again after an hour or a connection.
+/// Reasons of a missing connection: each is logged once, and again after an hour or a connection.
 #[derive(Debug, Default)]
 pub(super) struct OutageLog(HashMap<String, Instant>);
 

@@ -73,7 +73,7 @@ pub(super) enum Key {
 pub(super) struct Settled {
     /// Topic of the message.
     pub(super) topic: Arc<str>,
-    /// Its queue; `None` for telemetry.
+    /// Queue of the message; `None` for telemetry.
     pub(super) kind: Option<MqttKind>,
 }
 
@@ -81,9 +81,9 @@ pub(super) struct Settled {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Delivery {
     pub(super) telemetry: Qos,
-    /// Of events and history.
+    /// QoS of events and history.
     pub(super) events: Qos,
-    /// Of telemetry, s.
+    /// Expiry of telemetry, s.
     pub(super) expiry: Option<u32>,
 }
 
@@ -91,11 +91,11 @@ pub(super) struct Delivery {
 struct Slot {
     /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
-    /// What is in flight with an acknowledgement to come, in case the broker refuses it.
+    /// Payload in flight with an acknowledgement to come, in case the broker refuses it.
     sent: Option<Vec<u8>>,
-    /// It must arrive and lasts: the status, discovery, and the end of a topic.
+    /// Whether the message must arrive and lasts: the status, discovery, and the end of a topic.
     lasting: bool,
-    /// What lasts expires all the same after this time, s.
+    /// Time after which a lasting message expires as well, s.
     expiry: Option<u32>,
     in_flight: bool,
     /// The broker refused it; it waits for [`Outbox::retry`].

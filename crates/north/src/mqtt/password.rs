@@ -1,4 +1,4 @@
-//! The password of the client: one for good, or that of a file, which is read for each connection, so that a token that
+//! The password of the client: a fixed one, or that of a file, which is read for each connection, so that a token that
 //! another program renews is used without a restart.
 
 use std::fmt;
@@ -24,7 +24,7 @@ impl fmt::Debug for Secret {
 pub enum Password {
     /// The configuration.
     Fixed(Secret),
-    /// This file, whose only line it is.
+    /// The only line of this file.
     File(PathBuf),
 }
 

@@ -31,7 +31,7 @@ pub(super) struct StateContent {
     pub(super) stop_waits: Option<u64>,
     /// Whether what was ordered is being written again; none where it never is.
     pub(super) refreshing: Option<bool>,
-    /// Who holds it; none where `[authority]` is off.
+    /// Holder of the drive; none where `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,
@@ -79,7 +79,7 @@ pub(super) struct StateObject<'s> {
     pub(super) age: Option<Duration>,
     /// Time of day.
     pub(super) wall: SystemTime,
-    /// It is no longer current: part of the history.
+    /// Whether the state is no longer current: part of the history.
     pub(super) historical: bool,
     /// Number of points that are left out because the broker takes no larger message.
     pub(super) omitted: usize,
@@ -199,7 +199,7 @@ pub(super) struct BusState {
 /// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
-    /// Not known until the port was open for a second.
+    /// The load is not known until the port was open for a second.
     pub(super) load: Option<f64>,
     pub(super) fast_cycle_ms: Option<f64>,
     pub(super) slow_cycle_ms: Option<f64>,
@@ -269,7 +269,7 @@ pub(super) fn event(topics: &Topics, event: &Event, plant: &Plant) -> (Vec<Strin
     (drives.iter().map(topic).collect(), payload)
 }
 
-/// A recording that was made, if the event tells of one.
+/// The message about a recording, if the event reports one.
 pub(super) fn recording(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
     let (drive, made) = (event.drive.as_deref()?, event.recording.as_ref()?);
     let payload = serde_json::json!({

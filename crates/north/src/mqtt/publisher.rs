@@ -195,7 +195,7 @@ impl Publisher {
         self.buses.iter_mut().for_each(|b| (b.state, b.figures) = (None, None));
     }
 
-    /// What is to be logged about states that do not fit whole, since the last call.
+    /// Log lines about states that do not fit whole, since the last call.
     pub(super) fn take_reduced(&mut self) -> Vec<String> {
         std::mem::take(&mut self.reduced)
     }
@@ -219,7 +219,7 @@ impl Publisher {
     }
 
     /// The messages to publish now, and when to call again at the latest; `wall` is the time of day at `now`. An update of
-    /// a drive asks for a call earlier.
+    /// a drive requires an earlier call.
     pub(super) fn tick(&mut self, now: Instant, wall: SystemTime) -> (Vec<Update>, Instant) {
         let mut updates = Vec::new();
         let (pace, most) = (self.pace, self.max_packet);
@@ -250,7 +250,7 @@ impl Publisher {
             let fresh = drive.is_fresh();
             let reading = drive.drive.reading(now);
             if reading.age().is_none() {
-                // It was never read, so that there is nothing that happened then.
+                // The drive was never read, so there is no value of that time.
                 drive.look_at = Some(now + LOOK);
                 return;
             }
@@ -269,7 +269,7 @@ impl Publisher {
         (updates, self.next(all, now, None))
     }
 
-    /// What was recorded and not returned yet.
+    /// Messages that were recorded and not returned yet.
     pub(super) fn recorded(&mut self) -> Vec<Update> {
         self.drives
             .iter_mut()

@@ -16,7 +16,7 @@ pub struct Incoming {
     pub topic: String,
     /// A JSON object, or a bare value.
     pub payload: Vec<u8>,
-    /// The message is or was retained, so it is not a command.
+    /// Whether the message is or was retained, so that it is not a command.
     pub retain: bool,
     /// The broker marks it as a repetition.
     pub dup: bool,
@@ -28,7 +28,7 @@ pub struct Incoming {
     pub correlation: Option<Vec<u8>>,
     /// Remaining life of the message, s.
     pub expiry: Option<u32>,
-    /// Who sent it, as its user property `who` says.
+    /// The sender, from the user property `who`.
     pub who: Option<String>,
     /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
     pub oversized: Option<usize>,
@@ -93,7 +93,7 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
     }
 }
 
-/// What a message on a set topic asks for; `point` is the point of a bare value.
+/// The command in a message on a set topic; `point` is the point of a bare value.
 ///
 /// # Errors
 /// Why nothing of it is executed.
@@ -304,7 +304,7 @@ mod tests {
             (r#"{"run": false, "run": true, "id": "a"}"#, "a".into()),
             (r#"{"speed_reference": 1e999, "\u0069d": 3}"#, 3.into()),
             (r#"{"id": 4, "expires_ms": 0}"#, 4.into()),
-            // Not to be known, or no `id`.
+            // Payloads without an `id`, or with an unclear one.
             (r#"{"id": 1, "id": 2}"#, Json::Null),
             (r#"{"id": [1], "run": 2}"#, Json::Null),
             (r#"{"id": null, "run": 2}"#, Json::Null),

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 /// First and longest wait.
 const WAIT: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
 
-/// One wait for all messages refused meanwhile; it doubles while refusals continue.
+/// A single wait for all messages refused meanwhile; it doubles while refusals continue.
 #[derive(Debug)]
 pub(super) struct Retry {
     wait: Duration,

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::Options;
 use crate::order::Right;
 
-/// Who may command: by the set topics, and as a Sparkplug host.
+/// Rights to command: over the set topics, and as a Sparkplug host.
 #[derive(Debug, Default)]
 pub struct BrokerRights {
     topics: Revocable,
@@ -24,7 +24,7 @@ impl Revocable {
         Right::of(right)
     }
 
-    /// What comes later is another right: none of what this one has placed comes back with it.
+    /// A later right is another one: commands placed under this right do not get it back.
     fn end(&self) {
         let mut right = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         right.store(false, Ordering::Release);

@@ -31,7 +31,7 @@ pub(super) struct Will {
     pub(super) retain: bool,
 }
 
-/// What both clients have.
+/// Parts that both clients have.
 pub(super) struct Common {
     pub(super) link: BrokerLink,
     pub(super) plant: SharedPlant,
@@ -57,7 +57,7 @@ impl Common {
     }
 }
 
-/// What differs between the clients.
+/// Differences between the clients.
 pub(super) trait Client {
     fn common(&mut self) -> &mut Common;
 
@@ -102,7 +102,7 @@ pub(super) trait Client {
     /// Publishes pending messages, as far as the connection allows.
     fn publish(&mut self);
 
-    /// Whether the client wants to leave this broker, and how long to wait before the next connection.
+    /// Whether the client needs to leave this broker, and how long to wait before the next connection.
     fn leaves(&mut self) -> Option<Duration> {
         None
     }
@@ -132,7 +132,7 @@ pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
     }
 }
 
-/// Leaves the broker if the client wants to; otherwise publishes pending messages.
+/// Leaves the broker if the client needs to; otherwise publishes pending messages.
 async fn follow(client: &mut impl Client) {
     if let Some(wait) = client.leaves() {
         leave(client).await;
@@ -225,8 +225,8 @@ pub(super) async fn end(client: &mut impl Client) {
     leave(client).await;
 }
 
-/// Says goodbye and disconnects, within half a second; after that time the connection is closed, and the broker publishes
-/// the last will.
+/// Publishes the last state and disconnects, within half a second; after that time the connection is closed, and the
+/// broker publishes the last will.
 async fn leave(client: &mut impl Client) {
     let disconnect = async {
         if !client.say_goodbye().await || !client.common().link.disconnect() {

@@ -64,7 +64,7 @@ pub(super) struct Store {
     pushed: Number,
     /// Up to here nothing waits on disk.
     through: Number,
-    /// Up to here all are acknowledged; `told` of it is what the disk knows.
+    /// Up to this number all are acknowledged; `told` is the number that the disk has.
     acknowledged: Number,
     told: Number,
     opened: bool,
@@ -78,11 +78,11 @@ struct Disk {
     shared: Arc<Shared>,
 }
 
-/// What the client and the thread share.
+/// State that the client and the thread share.
 #[derive(Debug)]
 struct Shared {
     stats: Arc<NorthState>,
-    /// Of all messages of the store.
+    /// Kind of all messages of the store.
     kind: MqttKind,
     /// Size of the messages among the jobs.
     bytes: AtomicUsize,
@@ -137,8 +137,8 @@ impl Store {
         }
     }
 
-    /// Keeps a message. Returns it with its number if it is to be sent now, or if nothing keeps it; `room` says whether
-    /// the outbox has room.
+    /// Keeps a message. Returns it with its number if it is to be sent now, or if nothing keeps it; `room`: whether the
+    /// outbox has room.
     pub(super) fn push(&mut self, message: Message, room: bool) -> Option<(Option<Number>, Message)> {
         let Some(disk) = &self.disk else {
             return Some((None, message));
@@ -158,7 +158,7 @@ impl Store {
         now.then_some((Some(self.pushed), message))
     }
 
-    /// Asks for messages on disk, if there are any that are not in progress.
+    /// Loads messages from disk, if there are any that are not in progress.
     pub(super) fn load(&mut self, room: usize) {
         let Some(disk) = &self.disk else { return };
         if room > 0 && self.opened && !self.loading && self.through < self.pushed {
@@ -166,7 +166,7 @@ impl Store {
         }
     }
 
-    /// What the disk reports next; pending while there is nothing. Cancel safe.
+    /// The next report of the disk; pending while there is none. Cancel safe.
     pub(super) async fn next(&mut self) -> Loaded {
         let report = match &mut self.disk {
             Some(disk) => disk.loaded.recv().await,
@@ -235,7 +235,7 @@ impl Store {
     pub(super) async fn close(self) {
         if let Some(Disk { jobs, mut loaded, .. }) = self.disk {
             drop(jobs);
-            // Its end comes after the last report.
+            // The channel ends after the last report.
             while loaded.recv().await.is_some() {}
         }
     }
@@ -339,7 +339,7 @@ impl Thread {
                     }
                 }
                 count += 1;
-                // The answer tells what is there when it is given: nothing that comes later.
+                // The answer covers the messages present when it is given, no later ones.
                 if count < BATCH && load.is_none() {
                     next = jobs.try_recv().ok();
                 }
@@ -362,7 +362,7 @@ impl Thread {
         }
     }
 
-    /// A number of the journal as the client knows it.
+    /// Converts a number of the journal to the client's.
     fn number(&self, number: u64) -> Number {
         number as Number - self.base as Number
     }

@@ -9,7 +9,7 @@ pub(super) struct Topics {
     root: String,
 }
 
-/// What a message on a topic commands.
+/// The command on a topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Target<'t> {
     /// The drive and, for a bare value, the point.
@@ -87,7 +87,7 @@ impl Topics {
         filters
     }
 
-    /// What a topic commands, and WHO of `as/WHO`; without one it has no owner. `None` for any other topic.
+    /// The command on a topic, and WHO of `as/WHO`; without `as` the command has no owner. `None` for any other topic.
     pub(super) fn parse<'t>(&self, topic: &'t str) -> Option<(Target<'t>, Option<&'t str>)> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
         let levels: Vec<&str> = rest.split('/').collect();

@@ -19,7 +19,7 @@ use crate::parameters::{
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, Machine};
 
-/// A request waits no longer than that for its turn; then it is asked again.
+/// Longest wait of a request for its turn; then it is repeated.
 const EXPIRY: Duration = Duration::from_secs(60);
 /// A drive that does not answer for that long ends its reading.
 const AWAY: Duration = Duration::from_secs(3600);
@@ -62,7 +62,7 @@ pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how
 async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     let (machine, name) = (drive.machine(), drive.image.spec.name.clone());
     let store = vault.store();
-    // What the disk did not take is known all the same.
+    // A reading that the disk did not take is kept in memory.
     let last = match vault.last(&machine) {
         None => latest(store.clone(), name).await.map(Arc::new),
         last => last,
@@ -99,7 +99,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
 
 /// How far a reading is.
 struct Looks {
-    /// Addresses that were asked, and all.
+    /// Number of addresses requested so far, and of all.
     progress: (usize, usize),
     /// Time for that, without the pauses.
     worked: Duration,
@@ -160,7 +160,7 @@ fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &Para
         .filter(|change| {
             let address = spec.profile.parameters.address(change.id.name());
             match address.and_then(|address| drive.image.written(address)) {
-                // It is not known whether it was read before that or after; the next reading tells.
+                // Whether the value was read before that write or after it is not known; the next reading shows it.
                 Some((_, at)) if at >= begun => false,
                 Some((own, _)) => change.after != Some(RawValue::Word(own)),
                 None => true,
@@ -273,7 +273,7 @@ pub async fn keep_reading(plant: SharedPlant, vault: Arc<Vault>, every: Duration
                 if is_due && online {
                     let origin = Origin::new(SourceKind::Schedule, "every");
                     begun.insert(machine, SystemTime::now());
-                    // It has parameters, and its line is the gateway's.
+                    // Only a drive with parameters, on a line that the gateway owns.
                     let how = How {
                         afresh: false,
                         pace: Pace::Slow,

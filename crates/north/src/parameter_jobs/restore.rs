@@ -1,8 +1,8 @@
 //! Restores of parameters: preparing, executing, and resuming or setting aside interrupted ones.
 //!
-//! What the machine in `parameters::restoration` wants is done here: files by threads that may block, commands by the
-//! queue of the bus, one behind the other. While parameters are written the drive takes no commands but stops, and it
-//! takes none either while the journal of a restore that did not end is on disk.
+//! The wishes of the machine in `parameters::restoration` are carried out here: files by threads that may block,
+//! commands by the queue of the bus, one behind the other. While parameters are written the drive takes no commands
+//! except stops, nor while the journal of an unfinished restore is on disk.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -26,7 +26,7 @@ const EXPIRY: Duration = Duration::from_secs(30);
 /// Share of the time of a line that the writes of a restore take at most: one part in so many.
 const SHARE: u32 = 5;
 
-/// What to do with an interrupted restore.
+/// Action on an interrupted restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Again {
     /// Resume it.
@@ -71,7 +71,8 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
     let spec = &drive.image.spec;
     let (name, machine) = (&spec.name, &drive.machine());
     let names = vault.names(&spec.profile.name);
-    // What the file does not have is not written, so it need not be read, unless the drive has another application.
+    // Parameters missing in the file are not written, so they need not be read, unless the drive has another
+    // application.
     let known = match wanted.family == spec.profile.name {
         true => Reading::addresses_of(&spec.profile, &wanted),
         false => Default::default(),
@@ -170,7 +171,7 @@ pub fn carry_out(
     Ok(())
 }
 
-/// What the drive wants before it takes a parameter, if it shows that it lacks it.
+/// The condition that the drive requires before it takes a parameter, if it shows that the condition is not met.
 fn unmet_need(drive: &DriveHandle, journal: &Journal) -> Option<String> {
     let need = journal.plan.handling.needs.as_ref()?;
     let shows = drive.reading(Instant::now()).sample(need.point).good()?.as_bool();
@@ -200,7 +201,7 @@ pub async fn take_up(
     let (file, text) = concerned.own(drive)?;
     let mut journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&file, &spec.name, &why))?;
     if journal.of.machine.is_none() {
-        // Of an earlier version: from now on it says where it belongs.
+        // A journal of an earlier version gets its machine from now on.
         journal.of = Owner {
             drive: journal.of.drive,
             bus: spec.bus.clone(),
@@ -289,7 +290,7 @@ pub(super) async fn blocking<T: Send + 'static>(
 /// Whether a machine is the one to which a restore belongs, by their identities.
 enum Identified {
     Same,
-    /// It has not been read yet since the drive came back.
+    /// The identification has not been read yet since the drive came back.
     NotYet(String),
     Other(String),
 }
@@ -456,7 +457,7 @@ impl Run {
         tokio::time::sleep(pause).await;
     }
 
-    /// It has ended: the drive accepts commands again, or is held because it is half restored.
+    /// The restore has ended: the drive accepts commands again, or is held because it is half restored.
     fn over(self) {
         let (done, all) = self.restoration.progress();
         // A reload may have given the drive another name, by which it is resumed.
@@ -500,7 +501,7 @@ impl Run {
             _ => {}
         }
         if let Some(why) = &held {
-            // Where it is no longer configured, an event told whose journal is left.
+            // Where the drive is no longer configured, an event has reported its remaining journal.
             if let Some(drive) = &drive {
                 let spec = &drive.image.spec;
                 drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
@@ -513,7 +514,7 @@ impl Run {
     }
 }
 
-/// The gateway wrote it: a later reading that shows it tells no change.
+/// Records a write of the gateway: a later reading with this value is not a change at the drive.
 fn note_written(drive: &DriveHandle, write: &RequestPdu, now: Instant) {
     if let Some((_, items)) = written(write) {
         drive.image.note_written(&items, now);

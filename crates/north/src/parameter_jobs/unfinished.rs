@@ -1,5 +1,5 @@
-//! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no commands
-//! but stops. A journal whose machine is no longer configured is reported by an event, and by `drivegate check`.
+//! Unfinished restores: their journals are on disk. The machine of such a journal takes no commands except stops. A
+//! journal whose machine is no longer configured is reported by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,7 +27,7 @@ impl Concerning {
     /// The journal, if it belongs to that machine.
     ///
     /// # Errors
-    /// It belongs to another one, or cannot be read.
+    /// The journal belongs to another machine, or cannot be read.
     pub(super) fn own(self, drive: &DriveHandle) -> Result<(JournalFile, String), String> {
         let spec = &drive.image.spec;
         if let (Claim::Place | Claim::Name, Ok(owner)) = (self.claim, &self.owner) {
@@ -146,8 +146,7 @@ pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     )
 }
 
-/// Why a drive is held by a journal that belongs to a machine which is no longer configured, and why it is not taken
-/// up.
+/// Why a drive is held by a journal of a machine that is no longer configured, and why the restore is not resumed.
 fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
     let but = match claim {
         Claim::Own | Claim::Name => "where no drive is configured now".to_string(),
@@ -181,13 +180,12 @@ pub(super) fn unfinished_event(bus: &str, drive: Option<&str>, text: String) -> 
 struct Configured {
     machine: Machine,
     spec: DriveSpec,
-    /// Its journal was not looked for yet.
+    /// Whether the journal of the drive was not searched for yet.
     is_new: bool,
 }
 
-/// Holds the drives whose journal tells of a restore that was interrupted, before anybody can command them, and tells
-/// of journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow
-/// the disk.
+/// Holds the drives with a journal of an interrupted restore, before any client can command them, and reports journals
+/// that belong to none of them. Each machine is checked once; it is held until that is done, however slow the disk.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
     (events, patience): (&Events, &Patience),

@@ -14,7 +14,7 @@ use tokio::net::{TcpStream, UnixStream};
 
 use super::Reader;
 
-/// What a stream shows beside its bytes.
+/// Properties of a stream besides its bytes.
 pub(crate) trait Source {
     /// Whether there is something to read.
     fn is_readable(&self) -> bool;
@@ -36,7 +36,7 @@ pub(crate) fn is_readable(source: &impl AsFd) -> bool {
     shows(source, PollFlags::IN)
 }
 
-/// What a socket of the system shows.
+/// Properties of a socket of the system.
 macro_rules! source {
     ($($type:ty),*) => {$(
         impl Source for $type {

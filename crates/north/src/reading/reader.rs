@@ -19,11 +19,11 @@ pub(crate) struct Reader {
 struct State {
     /// No byte that is unread came before.
     floor: Instant,
-    /// It has found nothing, and waits.
+    /// Whether the reader found nothing, and waits.
     waited: bool,
-    /// Of what was read last.
+    /// Date of the last read.
     last: Dated,
-    /// Of what was read first since nothing was left.
+    /// Date of the first read since nothing was left.
     first: Dated,
     /// Nothing was left since the last read.
     fresh: bool,
@@ -50,7 +50,7 @@ impl Reader {
         }
     }
 
-    /// The same on the runtime of this thread, for a connection that is opened now.
+    /// A reader on the runtime of this thread, for a connection that is opened now.
     pub(crate) fn here() -> Reader {
         Reader::new(Watch::of_this_thread(), Instant::now())
     }
@@ -64,8 +64,8 @@ impl Reader {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// It found nothing to read at `now`, and waits. The runtime may not have looked since a stall: then `is_there` says
-    /// whether there is something.
+    /// The reader found nothing to read at `now`, and waits. The runtime may not have looked since a stall: then
+    /// `is_there` returns whether there is something.
     pub(crate) fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
         let matters = self.watch.turn(now, None);
         let left = matters && self.watch.just_stood(now) && is_there();
@@ -76,13 +76,13 @@ impl Reader {
         }
     }
 
-    /// It does not read for a time, whatever comes.
+    /// The reader does not read for a time, whatever comes.
     pub(crate) fn ceased(&self) {
         self.state().waited = false;
     }
 
-    /// It read something at `now`; `all`: and nothing is left. `has_gone` says whether the client has closed or reset the
-    /// connection since.
+    /// The reader read bytes at `now`; `all`: and nothing is left. `has_gone` returns whether the client has closed or
+    /// reset the connection since.
     pub(crate) fn came(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
         let mut state = self.state();
         let boot = state.waited.then(|| self.watch.since_boot());

@@ -24,7 +24,7 @@ thread_local! {
     static WORKER_RAN: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Most pauses that are to be told at one time: they are told ten times a second.
+/// Most pauses that wait to be reported: they are reported ten times a second.
 const MOST_UNTOLD: usize = 8;
 
 /// Watches the threads of a runtime.
@@ -33,7 +33,7 @@ pub struct Watch {
     base: Instant,
     /// The time since the machine was started, suspensions included.
     boot: fn() -> Duration,
-    /// One thread does all: what it reads shows that it runs.
+    /// A single thread does all: its reads show that it runs.
     single: bool,
     /// When it ran last, in nanoseconds after `base`; 0 before the watch began: until then nothing is a stall.
     ran: AtomicU64,
@@ -72,13 +72,13 @@ impl Watch {
         })
     }
 
-    /// That of the runtime of this thread; one that sees no stalls where the runtime has none.
+    /// The watch of the runtime of this thread; one that sees no stalls where the runtime has none.
     pub fn of_this_thread() -> Arc<Watch> {
         let own = WATCH.with(|watch| watch.try_borrow().ok().and_then(|watch| watch.clone()));
         own.unwrap_or_else(|| Watch::new(false))
     }
 
-    /// This thread works for the runtime that is watched.
+    /// Makes this thread one of the runtime that is watched.
     pub fn enter(self: &Arc<Watch>) {
         WATCH.with(|watch| {
             if let Ok(mut watch) = watch.try_borrow_mut() {
@@ -87,11 +87,11 @@ impl Watch {
         });
     }
 
-    /// Watches as long as the runtime runs, and tells of pauses.
+    /// Watches as long as the runtime runs, and reports pauses.
     pub async fn run(self: Arc<Watch>, events: Events) {
         let pauses = events.pauses().clone();
         let beat = pauses.reader(Instant::now());
-        // Told by that of the first call, should there be several.
+        // The events of the first call are used, should there be several.
         let _ = self.events.set(events);
         let mut ticks = tokio::time::interval(TICK);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -107,7 +107,7 @@ impl Watch {
         }
     }
 
-    /// The thread runs at `now`, in virtual time. It says so ten times a second while it does.
+    /// The thread runs at `now`, in virtual time. To be called ten times a second.
     pub fn runs(&self, now: Instant) {
         self.tick(now, (self.boot)());
     }
@@ -266,7 +266,7 @@ mod tests {
         assert!(!watch.turn(watch.base + Duration::from_secs(60), None));
     }
 
-    /// Whichever runs first after a stall, the reader or the task, the reader knows of it.
+    /// The reader detects a stall, whether the reader or the task runs first after it.
     #[test]
     fn a_reader_knows_of_a_stall_that_has_just_ended() {
         for single in [true, false] {

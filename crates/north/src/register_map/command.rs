@@ -57,7 +57,7 @@ pub(crate) fn command(
     understood(profile, start, values, before).or_else(|refusal| {
         let place = COMMAND_WORD.checked_sub(start).map(usize::from);
         let word = place.and_then(|place| values.get(place)).copied();
-        // A word with bits that mean nothing says nothing.
+        // A word with undefined bits is not a stop.
         let stop = word.filter(|word| word & (RUN | !(RUN | REVERSE | FAULT_RESET)) == 0);
         let (Some(word), Ok(run)) = (stop, writable(profile, ModelPoint::Run)) else {
             return Err(refusal);
@@ -69,7 +69,7 @@ pub(crate) fn command(
         points.extend(forward.map(|index| (index, Value::Bool(false))));
         Ok(CommandWrite {
             points,
-            // Its reset is not carried out, so the bit is not set by it.
+            // The reset is not carried out, so the bit is not set by it.
             word: Some(word & (before.word.unwrap_or_default() | !FAULT_RESET)),
             heartbeat: false,
             refused: Some(refusal),

@@ -34,7 +34,7 @@ pub struct BusFigures {
 pub struct BusRegister {
     /// Offset in the block of the bus.
     pub offset: u16,
-    /// What it contains.
+    /// Content of the register.
     pub name: &'static str,
     /// How it is encoded.
     pub form: Form,

@@ -190,7 +190,7 @@ fn states_and_status_bits() {
     assert_eq!(read(&image, now, 0x8012, 1), Ok(vec![(-2500i16) as u16]));
 }
 
-/// Not known is neither set nor not set: the word is stale, the state not available.
+/// An unknown bit is neither set nor clear: the word is stale, the state not available.
 #[test]
 fn bits_that_are_not_known() {
     let now = Instant::now();

@@ -17,7 +17,7 @@ use crate::reading::{Dated, Source};
 
 /// Time for a tool to take an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
-/// A tool that asked something so lately is in use: it does not yield to another connection of its address.
+/// Time after a request in which a tool is in use: it does not yield to another connection of its address.
 const IN_USE: Duration = Duration::from_secs(10);
 /// Time limit for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
@@ -44,7 +44,7 @@ pub(super) struct Connection<S> {
     stream: Dated<S>,
     dialogue: Dialogue,
     port: Option<ServedPort>,
-    /// What the stream is to be given.
+    /// Bytes still to be written to the stream.
     output: Vec<u8>,
     last_request: Instant,
 }
@@ -61,8 +61,8 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         }
     }
 
-    /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`.
-    /// What it has asked is answered then, unless the gateway is `stopping`.
+    /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`. An open request is
+    /// answered then, unless the gateway is `stopping`.
     pub(super) async fn serve(
         mut self,
         idle_timeout: Option<Duration>,
@@ -84,7 +84,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         tracing::info!(target: "drivegate::north::slot", tool = self.dialogue.who(), "tool slot: {end}");
     }
 
-    /// Waits for the answer to what the tool asked last, which comes within a second or not at all.
+    /// Waits for the answer to the tool's last request, which comes within a second or not at all.
     async fn finish(&mut self) -> Result<(), End> {
         self.dialogue.finished().await;
         self.flush().await
@@ -98,7 +98,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         let idle_at = idle_timeout.filter(|_| !self.dialogue.is_waiting());
         let idle_at = idle_at.map(|timeout| (timeout, self.last_request + timeout));
         let wake_at = self.dialogue.wake_at().map(Instant::from_std);
-        // So that the place is seen to be free to yield once the tool rests.
+        // This wake-up makes the place free to yield once the tool rests.
         let rests_at = Some(self.last_request + IN_USE).filter(|at| *at > Instant::now());
         let timer = [wake_at, idle_at.map(|(_, at)| at), rests_at]
             .into_iter()

@@ -1,7 +1,7 @@
 //! The dialogue with one tool, bytes in and out, with the time as an argument.
 //!
-//! A line has one request at a time: a tool that asks again has given the request before up, whose answer is dropped, however it
-//! ends. What was accepted for the bus is done all the same.
+//! A line has one request at a time: a tool that sends another one has given the previous one up, whose answer is dropped,
+//! however it ends. A request accepted for the bus is still carried out.
 
 use std::future::poll_fn;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::order::{Arrival, Outcome};
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 /// Time that a byte of a tool takes at least: no line of 460,800 baud brings more, so a tool that floods costs little.
 const BYTE_TIME: Duration = Duration::from_micros(20);
-/// A tool that asks again before it is answered gets no more than one request to the bus in this time, stops apart.
+/// A tool that sends again before it is answered gets no more than one request to the bus in this time, stops apart.
 const IMPATIENT: Duration = Duration::from_millis(20);
 
 /// A request that waits for its answer.
@@ -43,7 +43,7 @@ struct Held {
     deadline: Instant,
 }
 
-/// One tool.
+/// The dialogue with a tool.
 #[derive(Debug)]
 pub(super) struct Dialogue {
     tool: Arc<Tool>,
@@ -130,7 +130,7 @@ impl Dialogue {
             .min()
     }
 
-    /// Waits until nothing is due any more: the answer to what was asked last is in the output, or its time has ended.
+    /// Waits until nothing is due any more: the answer to the last request is in the output, or its time has ended.
     pub(super) async fn finished(&mut self) {
         while self.is_waiting() {
             let wake_at = self.wake_at().map(tokio::time::Instant::from_std);
@@ -153,7 +153,7 @@ impl Dialogue {
         self.give_up(SlotOutcome::Abandoned);
     }
 
-    /// What was asked before is no longer wanted.
+    /// The previous request is no longer wanted.
     fn give_up(&mut self, outcome: SlotOutcome) {
         if self.is_waiting() {
             (self.pending, self.held) = (None, None);
@@ -275,8 +275,8 @@ fn counted(outcome: &Outcome) -> SlotOutcome {
 }
 
 /// The frame of an answer whose bytes were not kept: to a command that may have taken several transactions. An
-/// acknowledgement is the same anyone who makes it. Of a write whose stop alone was carried out the tool learns that the rest
-/// was not; silence tells that nobody knows.
+/// acknowledgement has one form. Where only the stop of a write was carried out the tool gets an exception for the rest; an
+/// unknown result gets silence.
 fn frame_of(protocol: Protocol, request: &ToolRequest, pdu: &RequestPdu, outcome: &Outcome) -> Option<Vec<u8>> {
     match outcome {
         Outcome::Acknowledged(Reply::Written) if protocol == Protocol::N2 => Some(b"A\r".to_vec()),

@@ -1,8 +1,8 @@
 //! The bytes of a tool cut into its requests. Pure: time is an argument.
 //!
-//! A serial program writes a frame in pieces, and a network hands it over in lumps, so pauses within a frame decide nothing: a
-//! request is known by function, length and check code, in Modbus ASCII and N2 by its end. Only what stays incomplete is given up
-//! by silence. A frame of a function that is not decoded here is whole when its check code is right and nothing follows.
+//! A serial program writes a frame in pieces, and a network delivers it in lumps, so pauses within a frame decide nothing: a
+//! request is recognised by function, length and check code, in Modbus ASCII and N2 by its end. Only an incomplete frame is given
+//! up by silence. A frame of a function that is not decoded here is whole when its check code is right and nothing follows.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use crate::codec::{LineFormat, Protocol};
 use crate::order::Arrival;
 
 /// Silence behind half a frame after which the rest is no longer expected: longer than the pauses of serial programs
-/// and the delayed acknowledgements of TCP, shorter than tools wait before they ask again.
+/// and the delayed acknowledgements of TCP, shorter than tools wait before they repeat a request.
 const HALF_FRAME: Duration = Duration::from_millis(250);
 
 /// A request of a tool.

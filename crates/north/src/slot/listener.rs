@@ -1,4 +1,4 @@
-//! Who may connect to an address of a slot, and how its connections are served.
+//! Clients that may connect to an address of a slot, and how their connections are served.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;

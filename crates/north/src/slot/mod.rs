@@ -1,8 +1,8 @@
-//! The tool slot: a program that speaks the drives' own protocol sees the line as if it were alone on it, over TCP, over a
+//! The tool slot: a program that uses the drives' own protocol sees the line as if it were alone on it, over TCP, over a
 //! COM port by RFC 2217 or over a pseudo-terminal.
 //!
-//! `request` says what a frame asks for, `framing` cuts bytes into requests, `terms` decides what a slot lets its tools do,
-//! `dialogue` puts it together; all of them are pure. `connection` and `pty` do the I/O.
+//! `request` reads the request in a frame, `framing` cuts bytes into requests, `terms` decides which requests a slot
+//! permits, `dialogue` puts it together; all of them are pure. `connection` and `pty` do the I/O.
 
 mod connection;
 mod dialogue;
@@ -62,14 +62,14 @@ impl SlotAccess {
     }
 }
 
-/// One slot of a bus.
+/// A slot of a bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Slot {
     /// Name of the bus.
     pub bus: String,
     /// The protocol of its line.
     pub protocol: Protocol,
-    /// Its characters.
+    /// Character format of the line.
     pub format: LineFormat,
     /// Where frames are taken as they are on the line.
     pub listen: Option<SocketAddr>,
@@ -79,7 +79,7 @@ pub struct Slot {
     pub pty: Option<PathBuf>,
     /// The rights of its tools.
     pub access: SlotAccess,
-    /// Who may connect.
+    /// Networks that may connect.
     pub allow: Vec<IpNet>,
     /// A connection without a request for that time is closed; `None`: never.
     pub idle_timeout: Option<Duration>,
@@ -129,7 +129,7 @@ fn limits() -> Limits {
 /// The running slots.
 pub type Server = TcpServer<Slots, Options>;
 
-/// What serves the tools of the listeners and pseudo-terminals.
+/// The service for the tools of the listeners and pseudo-terminals.
 #[derive(Debug)]
 pub struct Slots {
     ptys: Vec<RunningPty>,

@@ -13,7 +13,7 @@ use crate::NorthState;
 use crate::order::{Arrival, Connection, Proof};
 use crate::plant::SharedPlant;
 
-/// One tool of a slot without sockets.
+/// A tool of a slot without sockets.
 #[derive(Debug)]
 pub struct Offline {
     terms: Arc<Terms>,
@@ -62,8 +62,8 @@ impl Offline {
         }
     }
 
-    /// Takes the bytes of the tool, if any, and returns what it is answered by `now`. What it asks for is in the queue of the
-    /// bus when this returns, or waits until [`Offline::wake_at`].
+    /// Takes the bytes of the tool, if any, and returns its answer by `now`. A request is in the queue of the bus when this
+    /// returns, or waits until [`Offline::wake_at`].
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
         let arrival = Arrival::over(connection.clone(), now);

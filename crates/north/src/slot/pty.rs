@@ -25,9 +25,8 @@ const AGAIN: Duration = Duration::from_secs(5);
 /// After that time without a byte the program may have been killed: what the last close of a serial port does is done.
 const RESTS: Duration = Duration::from_secs(2);
 
-/// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot does without, says so
-/// once for each reason, and tries again.
-/// What a program has asked is answered then, unless the gateway is `stopping`.
+/// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot runs without it, logs
+/// each reason once, and retries. An open request of a program is answered at the end, unless the gateway is `stopping`.
 pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: CancellationToken, stopping: CancellationToken) {
     let bus = terms.slot.bus.clone();
     let mut told = String::new();
@@ -71,7 +70,7 @@ fn open(path: &Path) -> io::Result<Pty> {
 
 struct Port {
     pty: Pty,
-    /// The same end of the pseudo-terminal. To the runtime it is a pipe: something that can be read now and then.
+    /// The gateway's end of the pseudo-terminal. The runtime treats it as a pipe.
     reader: Dated<pipe::Receiver>,
     dialogue: Dialogue,
     /// When bytes came or went last; `None` once the port rests.
@@ -123,14 +122,14 @@ impl Port {
             }
         };
         if asked {
-            // What was answered to an earlier request and not read is no answer to this one.
+            // An unread answer to an earlier request is not an answer to this one.
             self.pty.discard_unread();
         }
         self.write();
         Ok(())
     }
 
-    /// Waits for the answer to what the program asked last.
+    /// Waits for the answer to the program's last request.
     async fn finish(&mut self) {
         self.dialogue.finished().await;
         self.write();

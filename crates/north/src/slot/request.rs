@@ -10,7 +10,7 @@ const READING_DIAGNOSTICS: [u16; 10] = [0, 2, 11, 12, 13, 14, 15, 16, 17, 18];
 /// A valid frame of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct ToolRequest {
-    /// Who is asked; 0 is the broadcast, except on N2.
+    /// Address of the receiver; 0 is the broadcast, except on N2.
     pub(super) address: u8,
     /// The function code; 0 on N2.
     pub(super) function: u8,
@@ -26,7 +26,7 @@ pub(super) enum Meaning {
     Write(RequestPdu),
     /// May write, and cannot be checked.
     Unchecked(RequestPdu),
-    /// Nothing that a drive could do: what it is refused with.
+    /// A request that no drive could carry out, with its refusal.
     Faulty(Refused),
 }
 
@@ -56,7 +56,7 @@ impl ToolRequest {
         })
     }
 
-    /// Whether it is a broadcast, which is not answered.
+    /// Whether the request is a broadcast, which is not answered.
     pub(super) fn is_broadcast(&self, protocol: Protocol) -> bool {
         self.address == 0 && protocol != Protocol::N2
     }
@@ -96,10 +96,11 @@ fn meaning(pdu: Vec<u8>) -> Meaning {
         Ok(pdu @ (WriteCoil { .. } | WriteRegister { .. } | WriteCoils { .. } | WriteRegisters { .. })) => {
             Meaning::Write(pdu)
         }
-        // What they write depends on the drive, or goes with a read: no limit could be kept. No supported family has them.
+        // The values that these functions write depend on the drive, or go with a read: no limit could be kept. No
+        // supported family has these functions.
         Ok(MaskWrite { .. } | ReadWrite { .. }) => Meaning::Faulty(Refused::Exception(Exception::FUNCTION)),
         Ok(pdu) => Meaning::Unchecked(pdu),
-        // Of function 43 only the device identification is known.
+        // The only known part of function 43 is the device identification.
         Err(code) if known && !matches!(pdu.as_slice(), [43, mei, ..] if *mei != 14) => {
             Meaning::Faulty(Refused::Exception(code))
         }
@@ -111,7 +112,7 @@ fn of_n2(frame: &[u8]) -> Option<ToolRequest> {
     let (address, heard) = Command::decode(frame)?;
     let command = match heard {
         Ok(command) => command,
-        // A drive stays silent to what was mangled on the way, and the tool asks again.
+        // A drive does not answer a damaged request, and the tool repeats it.
         Err(n2::command::CHECKSUM) => return None,
         Err(code) => return Some(n2_request(address, Meaning::Faulty(Refused::Nak(code)))),
     };

@@ -1,5 +1,5 @@
-//! What a tool may send, as its slot is configured now: a reload counts also for a request that waits for its share of the
-//! line, or of which half has come.
+//! Requests that a tool may send, as its slot is configured now: a reload also counts for a request that waits for its
+//! share of the line, or of which half has come.
 
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -194,7 +194,7 @@ mod tests {
                         0
                     }
                     Goes::Held => {
-                        // It uses up the share of the tools.
+                        // The reference uses up the share of the tools.
                         rig.tool.receive(&frame(1, &reference), rig.now);
                         rig.now += Duration::from_millis(50);
                         rig.tool.receive(first, rig.now);

@@ -1,4 +1,4 @@
-//! What a slot permits its tools, and how their requests reach the bus.
+//! Requests that a slot permits its tools, and their way to the bus.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -56,7 +56,7 @@ impl Work {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
     pub(super) not_before: Instant,
-    /// It stops a drive: it goes at once.
+    /// Whether the request stops a drive: it is then sent at once.
     pub(super) is_stop: bool,
     /// Stops that its drives were given so far.
     pub(super) stops: u64,
@@ -89,7 +89,7 @@ pub(super) struct Terms {
     pub(super) paces: Arc<WritePaces>,
 }
 
-/// One tool that is connected to a slot.
+/// A tool that is connected to a slot.
 #[derive(Debug)]
 pub(super) struct Tool {
     terms: Arc<Terms>,
@@ -148,7 +148,7 @@ impl Tool {
             return pace;
         };
         pace.is_stop = self.writes() && drives.iter().any(|drive| stop_in(drive, pdu, now).is_some());
-        // What is refused anyway, is at once.
+        // A request that will be refused does not wait.
         let admitted = drives
             .iter()
             .all(|drive| permit::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok());
@@ -163,7 +163,7 @@ impl Tool {
         pace
     }
 
-    /// The configured drives that a request asks: one, none, or all.
+    /// The configured drives that a request reaches: one, none, or all.
     fn asked(&self, plant: &Plant, request: &ToolRequest) -> Vec<DriveHandle> {
         let broadcast = request.is_broadcast(self.protocol());
         let on_bus = plant
@@ -174,9 +174,8 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request that came so, and whose drives had been given so many `stops` when it was
-    /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
-    /// is not sent after `deadline`.
+    /// Decides about a request with this arrival, whose drives had this many `stops` when it was complete: after a later stop
+    /// it is not sent. A request given to the bus is in its queue when this returns, and is not sent after `deadline`.
     pub(super) fn decide(
         &self,
         request: &ToolRequest,
@@ -238,7 +237,8 @@ impl Tool {
         Decision::Wait(Work::Command(placed))
     }
 
-    /// What only `access = "raw"` admits: broadcasts, functions that are not decoded, writes to addresses of no configured drive.
+    /// Requests that only `access = "raw"` admits: broadcasts, functions that are not decoded, writes to addresses without a
+    /// configured drive.
     fn raw(&self, case: &Case<'_>, request: &ToolRequest, drives: &[DriveHandle], pdu: &RequestPdu) -> Decision {
         let now = case.now;
         let why = match request.is_broadcast(self.protocol()) {
@@ -264,7 +264,7 @@ impl Tool {
             }
         }
         for drive in drives {
-            // It has no reply: it was a broadcast.
+            // A broadcast has no reply, so the stops are placed without one.
             if let Some(stop) = stop_in(drive, pdu, now) {
                 let request = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
                 drop(drive.place(request.arrived(case.arrival.clone()), now));
@@ -342,7 +342,7 @@ fn stop_in(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> Option<Order>
     (admitted.urgency == Urgency::Stop).then_some(stop)
 }
 
-/// What a write takes of the line, with the read that shows its effect.
+/// Time of a write on the line, with the read that shows its effect.
 fn cost(drive: &DriveHandle, pdu: &RequestPdu) -> Duration {
     let line = &drive.bus.image.spec;
     let silence = line.protocol.silence(Default::default(), &line.format);

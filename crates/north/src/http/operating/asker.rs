@@ -1,5 +1,5 @@
-//! Who gives a request, as an argument of its handler. Whoever may change something is judged by the head of the request,
-//! and once more when its body is complete: a reload may have come in between.
+//! The user of a request, as an argument of its handler. The right of a user to change something is checked at the head
+//! of the request, and again when its body is complete: a reload may have come in between.
 
 use std::sync::Arc;
 
@@ -14,13 +14,13 @@ use super::super::replies::{Refused, Replied};
 use super::state::{Denied, Operator};
 use crate::command_json::MAX_PAYLOAD;
 
-/// Who may see what commands are for.
+/// A user who may see the state of commands.
 pub(in crate::http) struct Viewer(pub(in crate::http) Operator);
 
-/// Who may give a request that changes something.
+/// A user who may give a request that changes something.
 pub(in crate::http) struct Commander(pub(super) Operator);
 
-/// The same with the whole request: its body of at most so many bytes.
+/// A user with the whole request: its body of at most this many bytes.
 pub(in crate::http) struct Ordered<const MOST_BYTES: usize = MAX_PAYLOAD>(pub(super) Operator, pub(super) Bytes);
 
 impl FromRequestParts<Arc<AppState>> for Viewer {

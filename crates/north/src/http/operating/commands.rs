@@ -37,11 +37,11 @@ pub(crate) type SharedReply = watch::Receiver<Option<CommandReply>>;
 
 /// A command that was understood, or not.
 enum Progress {
-    /// Its reply is known.
+    /// The reply is known.
     Known(CommandReply),
-    /// It repeats another command and gets the same reply.
+    /// The command repeats another one and gets its reply.
     Repeated(SharedReply),
-    /// It is in the queue of the bus.
+    /// The command is in the queue of the bus.
     Placed(Box<Waiting>),
 }
 
@@ -50,7 +50,7 @@ struct Waiting {
     placed: Placed,
     id: Option<Id>,
     drive: DriveHandle,
-    /// It has the motor run.
+    /// Whether the command makes the motor run.
     runs: bool,
     /// For those who repeat it; none of a stop, which is always executed.
     shared: Option<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit)>,
@@ -83,7 +83,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         ) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
-        // Of what was not carried out.
+        // The status of the part that was not carried out.
         Outcome::StopOnly(part) | Outcome::StopFailed(part) => status(part),
         Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
         Outcome::TimedOut | Outcome::Unknown(_) | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
@@ -159,7 +159,7 @@ async fn shared(mut reply: SharedReply) -> Replied<CommandReply> {
         .await
         .ok()
         .and_then(|reply| reply.clone());
-    // Its task ends without a reply only when the process does.
+    // The task ends without a reply only when the process does.
     known.ok_or(StatusCode::SERVICE_UNAVAILABLE.into())
 }
 
@@ -177,7 +177,7 @@ impl Waiting {
     }
 }
 
-/// Whether that is all that a command asks for.
+/// Whether the payload requests only a restart of the communication.
 fn restarts(payload: &[u8]) -> bool {
     let wanted = json!({ RESTART_COMMUNICATION: true });
     serde_json::from_slice::<Json_>(payload).is_ok_and(|asked| asked == wanted)
@@ -264,7 +264,7 @@ impl Operating {
     /// Remembers a command that does more than stop.
     ///
     /// # Errors
-    /// It is not to be executed.
+    /// The command must not be executed.
     fn remember(
         &self,
         drive: &DriveHandle,
@@ -309,7 +309,7 @@ impl Operating {
 
 /// Why a command is not executed.
 enum Known {
-    /// It was, and this is its reply.
+    /// The command was executed, and this is its reply.
     Reply(SharedReply),
     Refused(String),
 }
@@ -331,7 +331,7 @@ pub(in crate::http) struct Commandable<'d> {
     points: Vec<CommandablePoint<'d>>,
     /// `null` without `supervision`.
     lease_ms: Option<u64>,
-    /// This login commanded the drive last.
+    /// Whether this login commanded the drive last.
     commanded_last: bool,
     /// Name of the client in `[authority]`.
     principal: Option<String>,

@@ -19,7 +19,7 @@ pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Ve
     Json(app.north.drills.reports())
 }
 
-/// One of them.
+/// The report of one drill.
 pub(in crate::http) async fn drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,

@@ -106,7 +106,7 @@ pub(in crate::http) async fn log_in(
     Ok(response)
 }
 
-/// Of a form of another page the content type would be another.
+/// Reads the login of a page of the gateway; a form of another page would have another content type.
 fn credentials(headers: &HeaderMap, body: &[u8]) -> Option<Credentials> {
     let kind = headers.get(header::CONTENT_TYPE)?.to_str().ok()?;
     let kind = kind.split(';').next()?.trim();

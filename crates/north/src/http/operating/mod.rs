@@ -1,4 +1,4 @@
-//! Who may command over HTTP: users, their sessions, and how a request shows who gave it.
+//! Users who may command over HTTP, their sessions, and the proof of identity of a request.
 //!
 //! A browser logs in and has a cookie from then on; a program sends user and password with each request (HTTP Basic). What
 //! changes something also has to come from this gateway's own page, or from no page at all: `is_own_origin`, and a

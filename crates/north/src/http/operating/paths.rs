@@ -31,12 +31,12 @@ pub(in crate::http) fn may_change(method: &Method, path: &str) -> bool {
     ends_a_drill || (*method == Method::POST && changes)
 }
 
-/// Whether it is about drills.
+/// Whether the path is about drills.
 fn is_drill(path: &str) -> bool {
     path == "/api/v1/drills" || path.starts_with("/api/v1/drills/")
 }
 
-/// Whether it is a command: that is served in whatever way the client got in.
+/// Whether the request is a command: commands are served on any connection.
 pub(in crate::http) fn is_command(method: &Method, path: &str) -> bool {
     may_change(method, path) && (path.ends_with("/commands") || path == "/api/v1/stop" || *method == Method::DELETE)
 }

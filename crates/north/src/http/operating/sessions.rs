@@ -1,4 +1,4 @@
-//! Who is logged in. Pure: time and random numbers are arguments.
+//! The sessions of logged-in users. Pure: time and random numbers are arguments.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -46,7 +46,7 @@ impl Session {
     }
 }
 
-/// All sessions. A cookie is kept as its SHA-256 only, so looking it up tells nothing by the time it takes.
+/// All sessions. A cookie is kept as its SHA-256 only, so the time of looking it up reveals nothing.
 #[derive(Debug, Default)]
 pub(super) struct Sessions {
     open: HashMap<[u8; 32], Session>,

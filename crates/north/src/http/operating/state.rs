@@ -61,7 +61,7 @@ pub(super) struct State {
     operators: HashMap<IpAddr, (Arc<str>, Instant)>,
 }
 
-/// Who gave a request.
+/// The user of a request.
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Operator {
     pub(super) user: Arc<str>,
@@ -77,7 +77,7 @@ pub(in crate::http) struct Operator {
 }
 
 impl Operator {
-    /// Whether it may still give requests that change something; the right of a user is the same for every bus.
+    /// Whether the user may still give requests that change something; the right of a user is equal for every bus.
     pub(super) fn is_still_one(&self) -> bool {
         self.right.allows("")
     }
@@ -117,7 +117,7 @@ pub(in crate::http) enum Denied {
     /// A page of someone else.
     #[error("the request comes from another origin")]
     OtherOrigin,
-    /// Its user was one when the request began.
+    /// The user lost the right while the request was coming in.
     #[error("a reload took the right of this user away while the request came in; nothing was done")]
     RightLost,
     /// The token of the session is missing or wrong.
@@ -194,10 +194,10 @@ impl Operating {
         }
     }
 
-    /// Who gave the request with these headers, by its session or by its password.
+    /// The user of a request with these headers, by its session or by its password.
     ///
     /// # Errors
-    /// Nobody who may command; [`Denied::NotLoggedIn`] if it names nobody.
+    /// The user may not command; [`Denied::NotLoggedIn`] if the request names none.
     pub(in crate::http) async fn operator(
         &self,
         headers: &HeaderMap,
@@ -251,7 +251,7 @@ impl Operating {
         self.is_on().then(|| self.state().sessions.find(cookie, now).cloned())?
     }
 
-    /// Who may give the request that changes something.
+    /// The user of a request that changes something.
     ///
     /// # Errors No user, or the request does not come from this gateway's own page.
     pub(in crate::http) async fn commander(
@@ -261,7 +261,7 @@ impl Operating {
         reached: &Reached,
     ) -> Result<Operator, Denied> {
         if reached.local.is_some() {
-            // No browser comes through a socket, and its file says who may.
+            // Browsers do not use a socket, and its file's permissions decide who may.
             return self.operator(headers, cookies, reached).await;
         }
         is_own_origin(headers)?;
@@ -317,7 +317,7 @@ impl Operating {
         let known = mark.and_then(|mark| Some((mark, self.state().verified.get(&mark).cloned()?)));
         let source = match known {
             Some((_, (user, until))) if Instant::now() < until => return Ok(user),
-            // It was right before: anyone who else fails at this address does not hold it up.
+            // The password was right before: failures of others at this address must not delay it.
             Some((mark, _)) => Source::Known(self.hasher.hash_one(mark)),
             None => source,
         };
@@ -419,7 +419,7 @@ impl State {
 /// nothing.
 ///
 /// # Errors
-/// It comes from a page of someone else.
+/// The request comes from a page of another origin.
 pub(super) fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
     let text = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or("\0"));
     let host = text(header::HOST).next().unwrap_or_default();
@@ -450,7 +450,7 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
-    // A longer one is no password.
+    // A longer text is not a valid password.
     let mut bytes = [0; 512];
     let bytes = Encoding::B64
         .decode(text.trim().trim_end_matches('='), &mut bytes)

@@ -22,7 +22,7 @@ struct Waiting {
     failures: u32,
     number: u64,
     address: IpAddr,
-    /// That of the user, if there is one.
+    /// Hash of the user, if the user exists.
     hash: Option<String>,
     /// Dummy hashes, computed only so that the time is the same.
     others: Vec<String>,

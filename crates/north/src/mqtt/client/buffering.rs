@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// What an event takes on disk, bytes, at most for all but the longest texts.
+/// Size of an event on disk, bytes, at most for all but the longest texts.
 const EVENT_BYTES: u64 = 512;
 
 impl PlainClient {
@@ -124,7 +124,7 @@ impl PlainClient {
         self.store.remember(topics);
     }
 
-    /// Counts what ends with this client, because there is no buffer.
+    /// Counts messages that end with this client, because there is no buffer.
     pub(super) fn count_unkept(&mut self) {
         let (events, history) = (
             self.outbox.unkept(MqttKind::Event),

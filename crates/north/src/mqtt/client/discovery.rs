@@ -5,7 +5,7 @@ use rumqttc::RetainForwardRule;
 use super::*;
 use crate::mqtt::connection::{commanding, of_others};
 
-/// What a subscription is for.
+/// Purpose of a subscription.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Subscribed {
     /// The status that others publish in the gateway's name.
@@ -37,7 +37,7 @@ pub(super) fn discovery_topics(announcer: Option<&mut Announcer>, plant: &Plant)
     })
 }
 
-/// What a connection subscribes to; `plant` if the broker takes no wildcards.
+/// Subscriptions of a connection; `plant` if the broker takes no wildcards.
 pub(super) fn subscriptions(
     topics: &Topics,
     (commands, principals): (bool, Option<&[String]>),

@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 /// Minimum time between two repairs of the status.
 const PACE: Duration = Duration::from_secs(1);
 
-/// Asked for by every status of someone else, due at most once in [`PACE`]; what comes too early waits.
+/// Repairs the status that another client published in the gateway's name, at most once in [`PACE`]; a repair that
+/// comes too early waits.
 #[derive(Debug, Default)]
 pub(super) struct Repair {
     wanted: bool,

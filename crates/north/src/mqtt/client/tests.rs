@@ -244,7 +244,7 @@ async fn a_client_takes_what_the_one_before_left_when_it_is_started() {
     stats.mqtt_left.lock().client.orders = Some(OrdersLeft::default());
     let cancel = CancellationToken::new();
     let started = crate::mqtt::start(options(None), plant, stats.clone(), cancel.clone());
-    // Nothing was awaited, so its task has not begun.
+    // There was no await yet, so its task has not started.
     assert!(stats.mqtt_left.lock().client.orders.is_none());
     stats.mqtt_left.discard();
     cancel.cancel();

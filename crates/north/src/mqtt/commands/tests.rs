@@ -62,7 +62,7 @@ impl SetTopics {
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
-    /// One reload removes the bus, a later one adds it again.
+    /// A reload removes the bus, a later one adds it again.
     fn remove_and_add(&mut self) {
         self.plant = fixture::plant(&["p1"]);
         self.plant.buses[0].take_over(&[], self.now);
@@ -271,7 +271,7 @@ fn a_command_that_waits_over_a_reload_is_answered_once_by_the_client_that_comes_
     assert_eq!((&result["id"], &result["ok"]), (&1.into(), &true.into()));
     assert_eq!(bench.finished(), None);
     assert_eq!(json(&bench.take(run(1)).unwrap()), result, "and remembered");
-    // One that was acknowledged, and whose effect has not been read yet.
+    // A command that was acknowledged, and whose effect has not been read yet.
     assert_eq!(bench.take(run(2)), None);
     let confirmation = bench.take_order().unwrap();
     assert!(bench.commands.try_finished().is_none());

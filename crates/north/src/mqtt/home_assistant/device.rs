@@ -67,12 +67,12 @@ impl Device {
         }
     }
 
-    /// Its id, unique on the broker.
+    /// Id of the device, unique on the broker.
     pub(super) fn id(&self) -> &str {
         &self.id
     }
 
-    /// Its message, in as many parts as `limit`, the largest payload, requires; each describes the device and some of its
+    /// The message, in as many parts as `limit`, the largest payload, requires; each describes the device and some of its
     /// entities. An entity that is larger by itself is a part of its own.
     pub(super) fn payloads(&self, sources: &Sources, limit: usize) -> Vec<Vec<u8>> {
         let (head, entities) = match &self.kind {

@@ -165,7 +165,7 @@ impl DriveEntities<'_> {
         component(platform, name, std::iter::once(own).chain(keys))
     }
 
-    /// Whether it can be commanded from Home Assistant.
+    /// Whether the point can be commanded from Home Assistant.
     fn is_commanded(&self, point: &Point) -> bool {
         let command = point.model.is_some_and(|model| COMMANDS.contains(&model)) && point.write;
         command && self.sources.commands && self.spec.access == Access::Control
@@ -207,8 +207,8 @@ impl DriveEntities<'_> {
         Some(self.entity(platform, name, [json!({ "cmd_t": topic, "qos": 1 }), more, shown]))
     }
 
-    /// Limits of a command; none where only the drive knows them, or where they leave one value only, of which Home Assistant
-    /// makes no number.
+    /// Limits of a command; none where only the drive knows them, or where they leave one value only, which Home Assistant
+    /// does not accept for a number.
     fn limits(&self, point: &Point) -> Option<(f64, f64)> {
         let index = self.spec.profile.point_index(&point.name)?;
         let limits = match self.spec.limits_of(index) {
@@ -255,7 +255,7 @@ impl DriveEntities<'_> {
     }
 
     fn state(&self) -> (String, Value) {
-        // It has something to say of a drive that is offline.
+        // The state is available for an offline drive, too.
         let available = of_gateway_availability(self.sources);
         let states: Vec<&str> = State::ALL.into_iter().map(State::name).collect();
         let more = json!({ "dev_cla": "enum", "ops": states, "avty": available });

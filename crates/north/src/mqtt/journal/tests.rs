@@ -422,7 +422,7 @@ fn what_a_full_disk_left_of_a_file_does_not_keep_the_others_from_being_read() {
     let last = files(dir.path(), SUFFIX).len() + 1;
     let torn = dir.path().join(format!("mqtt-events-{last:012}{SUFFIX}"));
     fs::write(&torn, [7; 100]).unwrap();
-    // There is no room for a copy.
+    // The disk has no room for a copy.
     let copy = dir.path().join(format!("mqtt-events-{last:012}-0{DAMAGED}"));
     std::os::unix::fs::symlink("/dev/full", &copy).unwrap();
     let mut journal = open(dir.path(), 64 << 10);

@@ -61,7 +61,7 @@ pub(in crate::mqtt) async fn run(
     let bd_seq = BdSeq::open(&options.state_dir, &stats.patience).await;
     let mut client = NodeClient::new(options, broker, bd_seq, plant, stats);
     session::run(&mut client, cancel).await;
-    // What is still to come is published by the node that comes after.
+    // Outstanding results are published by the next node.
     session::end(&mut client).await;
     let Common { link, stats, .. } = client.common;
     let mut left = stats.mqtt_left.lock();
@@ -78,7 +78,7 @@ struct Drive {
 }
 
 impl Drive {
-    /// Whether it was updated, or was not looked at for long.
+    /// Whether the drive was updated, or was not evaluated for long.
     fn is_due(&self, now: Instant) -> bool {
         let image = &self.metrics.drive.image;
         self.look_at <= now || self.seen.as_ref().is_none_or(|seen| image.is_newer_than(seen))
@@ -169,7 +169,7 @@ impl NodeClient {
         let (of_node, samples) = model::node_metrics(&self.common.observed, Moment::present());
         self.session.adopt(of_node, definitions);
         self.session.tell_node(samples);
-        // All at once: a birth tells what is, and a drive that was there has not gone.
+        // The samples are set all at once: a birth has the present state, and a drive that was there has not gone.
         for place in 0..self.drives.len() {
             self.tell(place, now, SystemTime::now());
         }

@@ -16,12 +16,12 @@ struct State {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Host {
     state: Option<State>,
-    /// It uses Sparkplug 3.0: a STATE message that an older version left at the broker is ignored.
+    /// Whether the host uses Sparkplug 3.0: a STATE message that an older version left at the broker is then ignored.
     has_objects: bool,
 }
 
 impl Host {
-    /// Its state will be reported again.
+    /// Forgets the state of the host, which will be reported again.
     pub(super) fn forget(&mut self) {
         self.state = None;
     }

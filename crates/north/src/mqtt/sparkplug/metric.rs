@@ -1,4 +1,4 @@
-//! Metrics as the session knows them, and how they become metrics of a payload.
+//! Metrics of the session, and their conversion to metrics of a payload.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
@@ -34,7 +34,7 @@ impl Moment {
         u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
     }
 
-    /// What is known now: good, or bad without a value.
+    /// A sample of now: good, or bad without a value.
     pub(super) fn sample(self, value: Option<Datum>) -> Sample {
         Sample {
             quality: if value.is_some() { Quality::Good } else { Quality::Bad },
@@ -73,7 +73,7 @@ impl From<Value> for Datum {
     }
 }
 
-/// What changes of a metric are worth.
+/// How soon changes of a metric are published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Pace {
     /// Published after the minimum interval.

@@ -30,7 +30,7 @@ enum Source {
     CommandError,
 }
 
-/// One drive: where its metrics come from.
+/// A drive with the sources of its metrics.
 #[derive(Debug)]
 pub(super) struct DriveMetrics {
     pub(super) drive: DriveHandle,
@@ -40,7 +40,7 @@ pub(super) struct DriveMetrics {
 }
 
 impl DriveMetrics {
-    /// With their definitions; `commands` says whether commands over Sparkplug are served.
+    /// The metrics with their definitions; `commands`: whether commands over Sparkplug are served.
     pub(super) fn new(drive: DriveHandle, commands: bool) -> (DriveMetrics, Vec<Definition>) {
         let spec = &drive.image.spec;
         let text = |name: &str| Definition::new(name, DataType::String);
@@ -109,7 +109,7 @@ impl DriveMetrics {
     fn sample(&self, source: Source, reading: &Reading<'_>, moment: Moment) -> Sample {
         let of = |index| {
             let sample = reading.sample(index);
-            // What is no longer good is so now.
+            // A sample that is no longer good has the present time.
             let at = sample.at.filter(|_| sample.quality == Quality::Good);
             (sample.good(), sample.quality, at)
         };

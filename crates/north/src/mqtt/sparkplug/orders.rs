@@ -21,7 +21,7 @@ use crate::plant::{Placed, Plant};
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
 /// only.
 const AWAITED: usize = 4096;
-/// What the audit shows of a command that was not read.
+/// Name in the audit of a command that could not be read.
 const UNREAD: &str = "a Sparkplug command";
 /// Metrics in a command.
 const METRICS: usize = 64;
@@ -33,7 +33,7 @@ pub(super) struct Orders {
     client: Arc<str>,
     awaited: VecDeque<Awaited>,
     memory: SharedMemory,
-    /// Of all hosts.
+    /// Right of all hosts.
     right: Right,
 }
 
@@ -202,7 +202,7 @@ impl Orders {
     }
 }
 
-/// What a message asks for.
+/// The request in a message.
 struct Request {
     /// The metrics as they came, and their place in the session.
     metrics: Vec<(Metric, Option<usize>)>,
@@ -252,7 +252,7 @@ impl Request {
         excerpt(all.join(" ").as_bytes())
     }
 
-    /// What is asked for of the device at this place of the session.
+    /// The command for the device at this place of the session.
     fn asked(
         &self,
         profile: &Profile,
@@ -298,7 +298,7 @@ impl Request {
             let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
             refused = Some(Refusal::BadValue(why));
         }
-        // Of too many only the stop is looked for.
+        // Of too many metrics only the stop is evaluated.
         let run = profile.model_point(ModelPoint::Run).map(|point| point.name.as_str());
         let is_run = |(metric, place): &&(Metric, Option<usize>)| {
             place.and_then(name).as_deref().or(metric.name.as_deref()) == run && run.is_some()
@@ -313,7 +313,8 @@ impl Request {
     }
 }
 
-/// The value of a metric, whatever type of number the host sends; `None` for null, for texts and for what is no number.
+/// The value of a metric, for any type of number that the host sends; `None` for null, for texts and for values such as
+/// NaN.
 fn json(metric: &Metric) -> Option<Json> {
     if metric.is_null == Some(true) {
         return None;

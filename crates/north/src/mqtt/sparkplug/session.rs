@@ -24,7 +24,7 @@ const HISTORY: usize = 200_000;
 const HISTORY_BYTES: usize = 100;
 /// Metrics at the beginning of a birth of the node that are no part of its definitions.
 pub(super) const FIXED_METRICS: usize = 2;
-/// The metric by which a host asks for a birth.
+/// The metric with which a host requests a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
 
 /// The configuration of the session.
@@ -149,8 +149,8 @@ impl Session {
         death(bd_seq, moment)
     }
 
-    /// The broker accepted the connection with this number and takes packets of so many bytes; the state of the host is
-    /// told again.
+    /// The broker accepted the connection with this number and takes packets of this many bytes; the state of the host
+    /// will be reported again.
     pub(super) fn opened(&mut self, bd_seq: u8, max_packet: usize) {
         self.bd_seq = bd_seq;
         self.host.forget();
@@ -161,7 +161,7 @@ impl Session {
         self.closed();
     }
 
-    /// Of this device, or of the node, the first metrics are published from now on, so many.
+    /// Limits the metrics of this device, or of the node, to the first `most` from now on.
     pub(super) fn keep(&mut self, device: Option<&str>, most: usize) {
         let device = match device {
             None => Some(&mut self.node),
@@ -182,7 +182,7 @@ impl Session {
         }
     }
 
-    /// There is no connection any more.
+    /// The connection has ended.
     pub(super) fn closed(&mut self) {
         self.phase = Phase::Away;
         (self.rebirth, self.born_at, self.node.born) = (false, None, false);
@@ -221,7 +221,7 @@ impl Session {
         Ok(false)
     }
 
-    /// A host asks for the births. No data is sent before them.
+    /// A host requests the births. No data is sent before them.
     pub(super) fn request_birth(&mut self) {
         self.rebirth = self.is_alive();
     }
@@ -232,7 +232,7 @@ impl Session {
         self.node.now_is = samples;
     }
 
-    /// What a device is now, and whether it is there.
+    /// Sets the present samples of a device, and whether it is present.
     pub(super) fn tell(&mut self, device: usize, present: bool, samples: Vec<Sample>, now: Instant) {
         let count = self.devices.len().max(1);
         let record = self.rules.history && !self.is_alive();
@@ -240,7 +240,7 @@ impl Session {
             return;
         };
         device.gone |= device.born && !present;
-        // Of a device that was never there, nothing is recorded.
+        // A device that was never present records nothing.
         if record && (present || device.sent.iter().any(Option::is_some)) {
             let bounds = (self.rules.min_interval, (HISTORY / count).max(1));
             if let Some(lost) = device.history.record(&device.sent, &samples, bounds, now) {

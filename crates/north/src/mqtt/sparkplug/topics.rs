@@ -96,7 +96,7 @@ impl Topics {
         (!self.primary_host.is_empty()).then(|| format!("{NAMESPACE}/STATE/{}", self.primary_host))
     }
 
-    /// The same in the form of Sparkplug 2.2.
+    /// The state topic in the form of Sparkplug 2.2.
     pub(super) fn old_state(&self) -> Option<String> {
         (!self.primary_host.is_empty()).then(|| format!("STATE/{}", self.primary_host))
     }

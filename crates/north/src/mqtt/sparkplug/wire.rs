@@ -74,7 +74,7 @@ pub(super) struct PropertyValue {
     pub(super) value: Option<PropertyContent>,
 }
 
-/// Its content, as far as the gateway uses it.
+/// Content of a property, as far as the gateway uses it.
 #[derive(Clone, PartialEq, prost::Oneof)]
 pub(super) enum PropertyContent {
     #[prost(uint32, tag = "3")]

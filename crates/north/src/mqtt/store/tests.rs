@@ -10,7 +10,7 @@ fn event(n: usize) -> Message {
     Message::not_retained("e", n.to_string().into_bytes())
 }
 
-/// A store whose disk does nothing until the test wants it.
+/// A store whose disk works only when the test runs it.
 fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, Arc<NorthState>) {
     let (jobs, todo) = flume::bounded(JOBS);
     let (report, loaded) = mpsc::channel(4);
@@ -143,7 +143,7 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
     assert_eq!(store.push(event(1), true).unwrap().0, Some(2));
 }
 
-/// Waits until the disk has done all that it was told.
+/// Waits until the disk has finished all its jobs.
 async fn settle(store: &mut Store) {
     // The second answer comes after the work of the first.
     for _ in 0..2 {

@@ -219,7 +219,7 @@ async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
             .await
             .is_ok()
     );
-    // It has to be hashed again.
+    // The password must be hashed again.
     for (_, until) in operating.state().verified.values_mut() {
         *until = Instant::now();
     }

@@ -82,8 +82,8 @@ fn what_is_not_understood_stops_nothing_and_says_so() {
     assert_eq!(bench.queued(), 0);
 }
 
-/// What a retained message asks for is refused with event, result and audit. An empty one clears a topic, which is no command
-/// but where an empty message is one.
+/// A command in a retained message is refused with event, result and audit. An empty message clears a topic and is not a
+/// command, except where an empty message is one.
 #[test]
 fn retained_messages_are_refused_and_told() {
     for (topic, payload, drive) in [

@@ -1,4 +1,4 @@
-//! What the broker answers to the subscriptions, and births that fit into its packets.
+//! Answers of the broker to the subscriptions, and births that fit into its packets.
 
 use super::*;
 use crate::mqtt::connection::{PACKET_OVERHEAD, commanding};
@@ -7,7 +7,7 @@ use crate::mqtt::sparkplug::topics::Kind;
 use rumqttc::mqttbytes::QoS;
 
 impl NodeClient {
-    /// What the node subscribes to: commands for itself, the primary host, commands for its devices.
+    /// Subscriptions of the node: commands for itself, the primary host, commands for its devices.
     pub(super) fn subscriptions(&self, limits: BrokerLimits) -> Vec<Filter> {
         let topics = &self.topics;
         let plain = |path| Filter {

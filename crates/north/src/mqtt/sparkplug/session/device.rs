@@ -20,7 +20,7 @@ pub(super) struct Device {
     pub(super) most: usize,
     pub(super) present: bool,
     pub(super) born: bool,
-    /// It went away since its birth, even if it is back.
+    /// Whether the device went away since its birth, even if it is back.
     pub(super) gone: bool,
     pub(super) now_is: Vec<Sample>,
     /// As last published or recorded.
@@ -28,7 +28,7 @@ pub(super) struct Device {
     /// Metrics to be published although they did not change.
     pub(super) repeat: Vec<usize>,
     pub(super) sent_at: Option<Instant>,
-    /// What was told may differ from what was sent.
+    /// Whether the present samples may differ from those sent.
     pub(super) changed: bool,
     pub(super) history: Recorder,
 }
@@ -71,7 +71,7 @@ impl Device {
         metrics
     }
 
-    /// What changed and is due. The second is when to ask again.
+    /// Metrics that changed and are due. The second is when to call again.
     pub(super) fn data(&mut self, least: Duration, now: Instant) -> (Vec<Metric>, Option<Instant>) {
         if !self.changed {
             return (Vec::new(), None);
@@ -104,7 +104,7 @@ impl Device {
         (metrics, None)
     }
 
-    /// One metric as it is now.
+    /// The metric with its present value.
     fn publish(&mut self, place: usize) -> Option<Metric> {
         let (definition, naming) = (self.definitions.get(place)?, *self.namings.get(place)?);
         let sample = self.now_is.get(place)?;

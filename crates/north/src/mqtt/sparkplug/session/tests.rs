@@ -1,4 +1,4 @@
-//! What a host sees of the session, held against the rules of the specification.
+//! The view of a host, compared with the rules of the specification.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::UNIX_EPOCH;
@@ -51,7 +51,7 @@ struct SessionWithHost {
     host: Watcher,
 }
 
-/// A host: what it knows of the node, and every rule that it can check.
+/// A host: its knowledge of the node, and every rule that it can check.
 #[derive(Default)]
 struct Watcher {
     seq: Option<u64>,
@@ -328,7 +328,7 @@ fn changes_keep_their_distance() {
     bench.tell(0, true, 3.0);
     bench.time += 100;
     assert_eq!(bench.send(9), 0);
-    // What somebody tried to change is told again.
+    // A value that a client tried to change is published again.
     bench.session.repeat(0, [0, 0]);
     bench.send(9);
     assert_eq!(bench.kinds(), [of(Kind::DeviceData, "p0")]);
@@ -352,7 +352,7 @@ fn a_rebirth_stops_data_and_repeats_all_births() {
     assert_eq!(bench.session.next(tick), Err(Some(due)), "no data meanwhile");
     bench.time = 1_250;
     bench.send(1);
-    // One more during the births is served after them.
+    // A request during the births is served after them.
     bench.session.request_birth();
     bench.send(9);
     let births = [

@@ -16,7 +16,7 @@ impl Dice {
 }
 
 /// Lost connections, births on request, drives that come and go, reloads, a host that goes offline: a thousand
-/// connections. The watcher checks every message; at the end of each connection the host knows what is.
+/// connections. The watcher checks every message; at the end of each connection the host knows the present state.
 #[test]
 fn a_thousand_connections() {
     for seed in 0..4 {
