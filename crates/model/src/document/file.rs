@@ -21,7 +21,7 @@ enum NotText {
 /// Reads a file for a document.
 ///
 /// # Errors
-/// One problem with the file and, where it stops being text, the line.
+/// The problem of the file and, where it stops being text, the line.
 pub fn read_file(path: &Path) -> Result<String, Problem> {
     let of_file =
         |what: String, remedy: &str| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));

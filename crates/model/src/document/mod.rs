@@ -34,7 +34,7 @@ pub struct Finding {
 }
 
 impl Finding {
-    /// Both parts.
+    /// A finding with both parts.
     pub fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
         Finding {
             what: what.into(),
@@ -136,7 +136,7 @@ impl Document {
             warnings: RefCell::default(),
             known: RefCell::default(),
         };
-        // One bracket that is missing makes an error of every line after it.
+        // A missing bracket makes an error of every line after it, so only the first error is reported.
         for (line, message) in errors.into_iter().take(1) {
             let place = Place {
                 line,
@@ -195,7 +195,7 @@ impl Document {
         Reader::of(self, &self.root, Place::default())
     }
 
-    /// Its path.
+    /// Path of the file.
     pub fn file(&self) -> &str {
         &self.file
     }

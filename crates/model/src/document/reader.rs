@@ -269,7 +269,7 @@ pub fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&
 
 /// Most words that a message proposes.
 const MOST_CANDIDATES: usize = 4;
-/// Shortest part of a word that says something.
+/// Shortest part of a word that identifies it.
 const LEAST_PART: usize = 3;
 
 /// Whether each part of `word` begins a part of `candidate`.

@@ -2,7 +2,7 @@
 
 use toml::de::{DeTable, DeValue};
 
-/// One key of a table: the key, its line, the value.
+/// A key of a table: the key, its line, the value.
 pub type Entry = (String, Option<usize>, Node);
 
 /// A value and its place.

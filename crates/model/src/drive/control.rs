@@ -60,7 +60,7 @@ pub enum OwnWord {
     /// The register reads as the word written last.
     #[default]
     Read,
-    /// It reads as something else, or not at all: the gateway remembers its own.
+    /// The register reads as something else, or not at all: the gateway remembers its own word.
     Shadow,
     /// The commands are single bits of it, as the points of the profile name them; its other bits are kept by every command, and
     /// it is read before it is written while it is not known.
@@ -70,9 +70,9 @@ pub enum OwnWord {
 /// Bits that every word carries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Always {
-    /// Those that are 1.
+    /// Bits that are always 1.
     pub set: u16,
-    /// Those that are 0.
+    /// Bits that are always 0.
     pub clear: u16,
 }
 
@@ -97,7 +97,7 @@ pub struct Setting {
     pub mask: u16,
     /// Their values.
     pub value: u16,
-    /// It acts when written; clearing it undoes nothing.
+    /// Whether the setting acts once, when it is written; clearing it undoes nothing.
     pub once: bool,
 }
 
@@ -137,20 +137,20 @@ impl Setting {
 /// How the motor is started.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Run {
-    /// One setting, forward or as `reverse` says.
+    /// A single setting, forward; `reverse` sets the direction.
     One(Setting),
-    /// One for each direction; never both.
+    /// A setting for each direction; never both.
     Pair {
         /// Forward.
         forward: Setting,
         /// In reverse.
         reverse: Setting,
     },
-    /// One word after another; the last one runs.
+    /// A sequence of words; the last one runs.
     Steps(Vec<Step>),
 }
 
-/// One word of a sequence.
+/// A word of a sequence.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
     /// The word; the bits of `reverse` are set in it as commanded.
@@ -214,12 +214,12 @@ impl Control {
         self.is_own_stop(place, word) || self.is_also_stop(place, word)
     }
 
-    /// Whether it stops as the gateway itself stops.
+    /// Whether the word is the stop that the gateway itself writes.
     pub fn is_own_stop(&self, place: ControlItem, word: u16) -> bool {
         self.stop.place.unwrap_or(self.at) == place && self.stop.holds(word)
     }
 
-    /// Whether it stops by another of the drive's own means.
+    /// Whether the word stops the drive in another of its own ways.
     fn is_also_stop(&self, place: ControlItem, word: u16) -> bool {
         place == self.at && self.also_stop.iter().any(|stop| stop.holds(word))
     }
@@ -289,8 +289,8 @@ impl Control {
         self.runs().into_iter().map(state).collect()
     }
 
-    /// The word from which the next one is made where the drive has `own`: behind one that stops by other means the word of a stop,
-    /// so that nothing that is written later runs.
+    /// The word from which the next one is made where the drive has `own`: after a stop in another way this is the word of a stop,
+    /// so that no later write runs.
     pub fn standing(&self, own: u16) -> u16 {
         match self.is_also_stop(self.at, own) {
             true => self.stop_word(own),

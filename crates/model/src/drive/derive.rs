@@ -9,7 +9,7 @@ use super::model::{Quality, Sample, Value, tidy};
 /// Share of the lower end of a band by which a value may miss it for the rounding of floats.
 const ROUNDING: f64 = 1e-9;
 
-/// One end of a band: another point, or a number from the manual.
+/// An end of a band: another point, or a number from the manual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
     /// Index of a point of the profile.
@@ -161,7 +161,7 @@ impl Derived {
                 let apart = tidy((first.as_f64().abs() - sources.next()?.as_f64().abs()).abs());
                 Some(Value::Bool(apart <= *within))
             }
-            // Not `all`, which would leave sources unasked that decide quality and age.
+            // `all` would stop early and leave out sources that decide quality and age.
             Derived::All { .. } => Some(Value::Bool(
                 sources.fold(first.as_bool(), |all, value| all & value.as_bool()),
             )),
@@ -241,7 +241,7 @@ fn percentage(value: f64, (low, high): (f64, f64)) -> Option<f64> {
     (above >= -low * ROUNDING).then_some(percent.copysign(value))
 }
 
-/// What people read has no negative zero.
+/// Shown values have no negative zero.
 fn unsigned_zero(value: Value) -> Value {
     match value {
         Value::Number(number) => Value::Number(number + 0.0),
@@ -318,7 +318,7 @@ mod tests {
             let share = band.inverse(exact, range).unwrap();
             assert!((0.0..1e-6).contains(&share) && share.is_sign_positive(), "{share} %");
         }
-        // It turns at its minimum. What is seen has no sign then, what is limited does.
+        // The motor turns at its minimum. A shown value has no sign then, a limited one does.
         let seen = |hertz: f64| {
             let sample = Sample {
                 value: Some(Value::Number(hertz)),
@@ -334,7 +334,7 @@ mod tests {
     }
 
     proptest! {
-        /// What is ordered in one unit is that in the other one, and the sign stays, whatever the band.
+        /// A value ordered in one unit converts to the other one and back with its sign, whatever the band.
         #[test]
         fn there_and_back(low in 0.01f64..100.0, width in 0.1f64..100.0, share in -100.0f64..100.0, line in any::<bool>()) {
             let low = if line { -low } else { low };

@@ -371,7 +371,7 @@ fn teco_faults() {
             (9, "motor overload"),
             (12, "undervoltage or power loss"),
         ] {
-            // A higher bit beside it does not count.
+            // A higher bit that is also set does not count.
             let code = lowest.value([Value::Number(f64::from((1 << bit) | 0x1000))], None);
             let Some(Value::Integer(code)) = code else {
                 panic!("{name} {bit}")
@@ -388,7 +388,7 @@ fn teco_faults() {
     }
 }
 
-/// Limits, table 9.26; line facts, section 2; what `show` says of writes, 5.5.
+/// Limits, table 9.26; line facts, section 2; the text of `show` about writes, 5.5.
 #[test]
 fn limits_and_lines() {
     let limit = |name: &str, table, address| {
@@ -473,7 +473,7 @@ fn limits_and_lines() {
     }
 }
 
-/// A title says what is doubtful of its profile.
+/// A title shows the doubts about its profile.
 #[test]
 fn titles_of_unverified_profiles() {
     for profile in Profiles::built_in().iter() {
@@ -483,7 +483,7 @@ fn titles_of_unverified_profiles() {
     }
 }
 
-/// What every family whose manual is at hand can be commanded, and that parameters and outputs of N2 are written on change only.
+/// Commands of every family whose manual is available; parameters and outputs of N2 are written on change only.
 #[test]
 fn commands_of_every_family() {
     for profile in Profiles::built_in().iter().filter(|profile| profile.verified) {
@@ -539,7 +539,7 @@ fn process_data_is_few_requests() {
     }
 }
 
-/// What process data in means by application: [V] tables 28 and 29, [E] tables.
+/// Meaning of process data in by application: [V] tables 28 and 29, [E] tables.
 #[test]
 fn process_data_in_by_application() {
     let multipurpose = [
@@ -580,7 +580,7 @@ fn process_data_in_by_application() {
     );
 }
 
-/// What no manual of the family states, or what they state in two ways.
+/// Points that no manual of the family states, or that manuals state in two ways.
 #[test]
 fn what_is_not_confirmed() {
     for (name, points) in [

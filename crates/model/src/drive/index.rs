@@ -19,7 +19,7 @@ macro_rules! index {
                 $name(place)
             }
 
-            /// Its place, from 0.
+            /// Place of the element, from 0.
             pub const fn place(self) -> usize {
                 self.0
             }
@@ -68,10 +68,10 @@ index! {
     PointIndex
 }
 
-/// One element for each drive of a bus.
+/// A list with an element for each drive of a bus.
 pub type PerDrive<T> = IndexVec<DriveIndex, T>;
 
-/// One element for each point of a profile.
+/// A list with an element for each point of a profile.
 pub type PerPoint<T> = IndexVec<PointIndex, T>;
 
 /// A vector whose elements are found by an index of one type only; otherwise a slice.

@@ -31,7 +31,8 @@ pub use refresh::{REFRESH, Repeats};
 /// P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
-/// What restarts the communication of a drive that counts messages (function 08, subfunction 01); written like a point.
+/// Name of the command that restarts the communication of a drive that counts messages (function 08, subfunction 01);
+/// written like a point.
 pub const RESTART_COMMUNICATION: &str = "restart_communication";
 
 /// Name of the point with what a drive does after a communication error; 3 is that its motor runs on. For TECO 7300PA the first two

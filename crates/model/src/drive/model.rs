@@ -50,7 +50,8 @@ impl Text {
         Some(text)
     }
 
-    /// The text; what is no character of it is shown as U+FFFD, so that nothing of a device reaches a terminal or a log.
+    /// The text; a control character, or a byte that is not a character, is shown as U+FFFD, so that no bytes of a
+    /// device control a terminal or a log.
     pub fn shown(&self) -> String {
         let bytes = self.bytes.get(..usize::from(self.length)).unwrap_or_default();
         let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
@@ -151,7 +152,7 @@ impl Quality {
 pub struct Sample {
     /// The last value read; absent when there never was one.
     pub value: Option<Value>,
-    /// Its quality.
+    /// Quality of the sample.
     pub quality: Quality,
     /// End of the reply that contained it.
     pub at: Option<Instant>,
@@ -243,7 +244,7 @@ pub fn tidy(value: f64) -> f64 {
     if rounded.is_finite() { rounded } else { value }
 }
 
-/// The same of a count that was only multiplied, so that a small product keeps nine digits.
+/// Rounds a count that was only multiplied, so that a small product keeps nine digits.
 pub(crate) fn tidy_product(value: f64) -> f64 {
     if value == 0.0 || value.abs() >= 1.0 {
         return tidy(value);

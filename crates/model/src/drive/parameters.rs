@@ -13,7 +13,7 @@ pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 /// The parameters of a family.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParameterList {
-    /// Those that are known by name, by ascending address.
+    /// Parameters that are known by name, by ascending address.
     pub named: Vec<Parameter>,
     /// Where others may lie; the drive is read to find which of them it has.
     pub spans: Vec<Span>,
@@ -74,14 +74,14 @@ impl Numbering {
     }
 }
 
-/// One parameter that is known by name.
+/// A parameter that is known by name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
     /// As the family calls it: `Cn-02`, `102`, `1.2`, `AO 3`.
     pub id: String,
     /// PDU address of its (first) holding register.
     pub address: u16,
-    /// Its name and unit.
+    /// Name and unit of the parameter.
     pub label: Label,
     /// The accepted range, in its unit; in counts if the scale is unknown. None without a manual.
     pub range: Option<RangeInclusive<f64>>,
@@ -91,7 +91,7 @@ pub struct Parameter {
 const TOLERANCE: f64 = 1e-6;
 
 impl Parameter {
-    /// Whether the drive takes the value, as far as its family says.
+    /// Whether the drive takes the value, as far as its family is known.
     pub fn takes(&self, raw: RawValue) -> bool {
         let scale = match raw {
             RawValue::Word(_) if self.label.scale > 0.0 => self.label.scale,
@@ -145,7 +145,7 @@ fn with_unit(number: &str, unit: &str) -> String {
 /// The value of a parameter as the drive gives it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RawValue {
-    /// One register.
+    /// The value of a register.
     Word(u16),
     /// The bits of an analog output of N2.
     Float(u32),

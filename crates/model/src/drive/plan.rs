@@ -8,7 +8,7 @@ use super::model::ModelPoint;
 use super::profile::{PollClass, Profile, Source};
 use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 
-/// One request of the plan.
+/// A request of the plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PlannedRead {
     /// Poll class.
@@ -33,7 +33,7 @@ impl PlannedRead {
         }
     }
 
-    /// Whether it includes that address.
+    /// Whether the request includes this address.
     pub fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address >= self.start
@@ -62,7 +62,8 @@ pub struct Plan {
     /// Reads of monitoring registers for process data that no other read covers: see
     /// [`super::profile::Point::monitor`].
     pub monitors: Vec<PlannedRead>,
-    /// Those of `reads` that are longer than a manual states: bits that are read singly until a reply proves the whole.
+    /// Requests of `reads` that are longer than a manual states: bits that are read singly until a reply proves the
+    /// whole.
     pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
@@ -244,7 +245,7 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = piece_end.max(end) - u32::from(last.start);
             let adjacent = u32::from(address) <= end || range.holes;
-            // Only bits, which a drive that ignores the number of items reports as 0.
+            // Trials are made for bits only, which a drive that ignores the number of items reports as 0.
             let tried = if class == PollClass::Fast && table.is_bits() {
                 range.try_read
             } else {

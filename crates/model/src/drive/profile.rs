@@ -25,7 +25,7 @@ pub use raw::{Equals, Form, MOST_REGISTERS, Order, Part, Raw};
 pub struct Profile {
     /// Name in configurations.
     pub name: String,
-    /// One line of description.
+    /// Title of the family, in one row.
     pub title: String,
     /// Manual and tables the profile is based on.
     pub source: String,
@@ -61,7 +61,8 @@ pub struct Profile {
     pub functions: WriteFunctions,
     /// All points, in the order of the file.
     pub points: PerPoint<Point>,
-    /// The drive counts what it receives, damaged or not, and tells it by function 08 (subfunctions 0B to 0F).
+    /// Whether the drive counts received messages, damaged or not, and reports them by function 08 (subfunctions 0B to
+    /// 0F).
     pub counts_messages: bool,
     /// The drive may stop by itself when its master goes silent, and no readable point shows whether it does.
     pub may_stop_by_itself: bool,
@@ -69,11 +70,11 @@ pub struct Profile {
     pub broadcast_stop: bool,
     /// Points that are read at once when a drive has a new fault.
     pub on_fault: Vec<PointIndex>,
-    /// How it is commanded, where its profile says so in `[control]`.
+    /// How the drive is commanded, where its profile has `[control]`.
     pub control: Option<Control>,
     /// Whether someone has seen the profile right on hardware, or it is made from manuals of that very family.
     pub verified: bool,
-    /// Its parameters.
+    /// Parameters of the family.
     pub parameters: ParameterList,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
@@ -99,9 +100,9 @@ pub struct FaultText {
     pub text: String,
     /// The panel's display; empty if no available manual gives it.
     pub panel: String,
-    /// Its cause; empty if no available manual gives it.
+    /// Cause of the fault; empty if no available manual gives it.
     pub cause: String,
-    /// Its remedy; likewise.
+    /// Remedy for the fault; empty if no available manual gives it.
     pub remedy: String,
     /// Whether an available manual confirms it.
     pub verified: bool,
@@ -131,9 +132,9 @@ pub struct AddressRange {
 /// The functions by which a family is written where there is a choice.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct WriteFunctions {
-    /// One register by function 16, which alone it takes.
+    /// Whether a register is written by function 16, the only one that the drive takes.
     pub registers_by_16: bool,
-    /// One coil by function 15.
+    /// Whether a coil is written by function 15.
     pub coils_by_15: bool,
     /// Bits of a register by function 22.
     pub mask_write: bool,
@@ -238,7 +239,7 @@ impl PollClass {
     }
 }
 
-/// One named value of a drive.
+/// A named value of a drive.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Point {
     /// Public name.
@@ -256,7 +257,7 @@ pub struct Point {
     /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
     /// when the drive comes online.
     pub monitor: Option<PointIndex>,
-    /// Whether it can be commanded.
+    /// Whether the point can be commanded.
     pub write: bool,
     /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.
     pub write_to: Option<PointIndex>,
@@ -268,7 +269,7 @@ pub struct Point {
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
-    /// It takes other values than those of `texts`, too.
+    /// Whether the point takes other values than those of `texts`, too.
     pub unlisted: bool,
     /// A helper for other points that no server shows and that cannot be commanded.
     pub hidden: bool,
@@ -367,7 +368,7 @@ impl Point {
         first.filter(|_| codes.next().is_none())
     }
 
-    /// Its raw source, if it has one.
+    /// The raw source of the point, if it has one.
     pub fn raw(&self) -> Option<&Raw> {
         match &self.source {
             Source::Raw(raw) => Some(raw),
@@ -432,7 +433,7 @@ impl Profile {
         }
     }
 
-    /// Its title as shown, with any doubt about it.
+    /// The title as shown, with any doubt about the profile.
     pub fn described(&self) -> Cow<'_, str> {
         match self.verified {
             true => Cow::Borrowed(&self.title),
@@ -454,14 +455,14 @@ impl Profile {
         }
     }
 
-    /// What `[control]` says; none where points of one bit each say how it is commanded.
+    /// The `[control]` table; none where points of one bit each define the commands.
     pub fn control_table(&self) -> Option<&Control> {
         self.control
             .as_ref()
             .filter(|control| control.own_word != OwnWord::Kept)
     }
 
-    /// What `[control]` would say of a profile whose commands are points of one bit each.
+    /// The `[control]` table equivalent to commands that are points of one bit each.
     pub(super) fn control_of_bits(&self) -> Option<Control> {
         let setting = |point: ModelPoint, on: bool| {
             // A run command that no one may give is still recognised as one.
@@ -482,7 +483,7 @@ impl Profile {
         };
         let run = setting(ModelPoint::Run, true)?;
         let at = run.place?;
-        // What is in the control word has no place of its own.
+        // A setting within the control word has no place of its own.
         let within = |setting: Setting| Setting {
             place: setting.place.filter(|place| *place != at),
             ..setting
@@ -534,8 +535,8 @@ impl Profile {
         items.iter().all(|(address, _)| spared(*address)) && !items.iter().any(stops)
     }
 
-    /// Whether a register holds settings besides a bit: it is not that of the run command, whose other bits nobody else
-    /// changes unnoticed.
+    /// Whether a register holds settings besides a bit: not the register of the run command, whose other bits no one
+    /// else changes unnoticed.
     pub fn is_settings(&self, table: Table, address: u16) -> bool {
         let is_run = self.run_place() == Some(ControlItem { table, address });
         table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !is_run
@@ -546,8 +547,8 @@ impl Profile {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
-    /// The write that stops every drive of the family on a line when it is sent to all of them: it clears the whole control
-    /// word. None where the family knows none.
+    /// The write that stops every drive of the family on a line when it is broadcast: it clears the whole control word.
+    /// None where the family has no such write.
     pub fn broadcast_stop(&self) -> Option<RequestPdu> {
         let run = self.run_place().filter(|_| self.broadcast_stop)?;
         let pdu = match run.table {

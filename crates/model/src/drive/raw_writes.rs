@@ -1,7 +1,7 @@
 //! Which registers and coils a raw write may set, in addition to those of writable points. Pure.
 //!
-//! A register that no writable point names can change what the writable ones mean: with another maximum frequency 80 %
-//! is another speed, past every limit of the configuration. So it is not written unless the drive's configuration says so.
+//! A register without a writable point can change the meaning of the writable ones: with another maximum frequency 80 % is
+//! another speed, past every limit of the configuration. So it is written only if the drive's configuration permits that.
 
 use std::ops::RangeInclusive;
 
@@ -14,7 +14,7 @@ pub enum RawWrites {
     /// Nothing.
     #[default]
     Points,
-    /// These PDU addresses, of registers and coils alike.
+    /// Only these PDU addresses, of registers and coils alike.
     Ranges(Vec<RangeInclusive<u16>>),
     /// Everything that the profile lets write.
     All,
@@ -93,7 +93,7 @@ pub fn in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
     parts.collect::<Vec<_>>().join("; ")
 }
 
-/// The same without the tables.
+/// The addresses as text, without the tables.
 pub fn addresses_in_words(ranges: &[(Table, RangeInclusive<u16>)]) -> String {
     let words = ranges.iter().map(|(_, range)| match range.clone().into_inner() {
         (first, last) if first == last => first.to_string(),

@@ -1,4 +1,4 @@
-//! What a refresh may repeat of a family: its control word, its reference, or both. Pure.
+//! Parts that a refresh may repeat for a family: its control word, its reference, or both. Pure.
 //!
 //! The timeout of some drives counts only writes of the control word or of a reference, so polling does not feed it; such a write
 //! is repeated. What acts once, lies in a coil or at a place of its own, and what the drive stores, is never repeated.
@@ -12,7 +12,7 @@ use crate::codec::{Protocol, Table};
 /// The shortest and the longest time between two refreshes.
 pub const REFRESH: std::ops::RangeInclusive<Duration> = Duration::from_millis(100)..=Duration::from_secs(60);
 
-/// What a refresh repeats.
+/// The parts that a refresh repeats.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Repeats {
     /// The control word.
@@ -42,7 +42,7 @@ impl Control {
         self.at.table == Table::Holding && self.runs().iter().all(level) && level(&self.stop)
     }
 
-    /// Whether the drive tells its control word.
+    /// Whether the drive reports its control word.
     pub fn is_read(&self) -> bool {
         self.own_word != OwnWord::Shadow
     }
@@ -82,7 +82,7 @@ impl Profile {
         self.references().any(covers) && !self.writes_on_change(Table::Holding, &[(address, 0)])
     }
 
-    /// What a refresh repeats.
+    /// The parts that a refresh repeats, or why there are none.
     ///
     /// # Errors
     /// Why nothing is repeated.
@@ -129,7 +129,7 @@ mod tests {
     use super::*;
     use crate::drive::profile::Profiles;
 
-    /// One row for each family: what is repeated, by hand from what their profiles say of the control word. `-` is nothing.
+    /// A row for each family: the repeated parts, by hand from the control words in their profiles. `-` is nothing.
     #[test]
     fn what_is_repeated_of_each_family() {
         let table = [

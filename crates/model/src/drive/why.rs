@@ -22,14 +22,14 @@ const LOCAL_CONTROL: &str = "local_control";
 /// Interlock, likewise.
 const INTERLOCKED: &str = "interlocked";
 
-/// One reason why a motor does not run.
+/// A reason why a motor does not run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Cause {
     /// The reason in one word, for programs.
     pub cause: String,
     /// The evidence.
     pub evidence: String,
-    /// Its age, ms; absent if it is not a reading.
+    /// Age of the evidence, ms; absent if it is not a reading.
     pub age_ms: Option<u64>,
     /// The remedy.
     pub remedy: String,
@@ -38,7 +38,7 @@ pub struct Cause {
 /// Whether a motor runs, and why not.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Explanation {
-    /// Whether it runs; `None` while that is not known.
+    /// Whether the motor runs; `None` while that is not known.
     pub runs: Option<bool>,
     /// Why it does not, the most significant first; empty while it runs.
     pub causes: Vec<Cause>,
@@ -78,13 +78,13 @@ impl Explanation {
 /// Whether the drive can be reached.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Contact {
-    /// Its process data is fresh.
+    /// The process data of the drive is fresh.
     Fresh,
-    /// It answers, but its process data is older than it may be.
+    /// The drive answers, but its process data is older than it may be.
     Stale,
-    /// It does not answer.
+    /// The drive does not answer.
     Silent,
-    /// It has not been polled yet.
+    /// The drive has not been polled yet.
     Untried,
     /// The port is not open, and why.
     BusDown(Option<String>),
@@ -93,11 +93,11 @@ pub enum Contact {
 /// The last order that concerns the run command.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunOrder {
-    /// Its purpose for the motor.
+    /// Effect of the order on the motor.
     pub run: RunWish,
     /// The result.
     pub fate: Fate,
-    /// Who gave it.
+    /// Kind of the giver of the order.
     pub by: Giver,
     /// Source and client, as text.
     pub who: String,
@@ -125,13 +125,13 @@ pub enum Fate {
     Taken,
     /// The gateway or the drive refused it.
     Refused,
-    /// It was accepted and not sent.
+    /// The order was accepted and not sent.
     NotSent,
-    /// It was sent; whether the drive took it is not known.
+    /// The order was sent; whether the drive took it is not known.
     Unsure,
 }
 
-/// Who gives commands.
+/// Kind of giver of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Giver {
     /// A client.
@@ -142,7 +142,7 @@ pub enum Giver {
     Shutdown,
     /// An interlock that does not hold.
     Interlock,
-    /// The gateway, when the drive's local control place took it while its run command stood.
+    /// The gateway, when the drive's local control place took it while its run command was on.
     LocalControl,
 }
 
@@ -197,7 +197,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(PointIndex) -> Sample, situati
         causes.push(look.unknown());
     }
     Explanation {
-        // It is enabled and stopped: counts as not running.
+        // A drive that is enabled and stopped counts as not running.
         runs: runs.map(|running| running && causes.is_empty()),
         causes,
         not_told: look.not_told(),
@@ -322,7 +322,7 @@ impl Look<'_> {
         Some(self.cause("fault", evidence, at, &remedy))
     }
 
-    /// Points of which the profile says that they keep the motor from running.
+    /// Points that keep the motor from running, by the profile.
     fn blocking_points(&self) -> impl Iterator<Item = Cause> + '_ {
         let points = self.profile.points.enumerate();
         points.filter_map(|(index, point)| {
@@ -341,7 +341,7 @@ impl Look<'_> {
         })
     }
 
-    /// Another control place, where no point of the profile has told which.
+    /// Another control place, where no point of the profile has shown which.
     fn local_control(&self, found: &[Cause]) -> Option<Cause> {
         let (_, at) = self.bit(ModelPoint::Remote).filter(|(remote, _)| !remote)?;
         if found.iter().any(|cause| cause.cause == LOCAL_CONTROL) {
@@ -379,7 +379,7 @@ impl Look<'_> {
         Some(self.cause("not_ready", evidence, at, &remedy))
     }
 
-    /// It takes no order to run, anyone who gives it.
+    /// The drive takes no order to run from any client.
     fn held(&self) -> Option<Cause> {
         let remedy = "wait for its parameter restore to finish; `drivegate params restore` resumes, undoes or \
                       releases an interrupted one";
@@ -403,7 +403,7 @@ impl Look<'_> {
             }
             (reads, _) => {
                 let at = reads.and_then(|(_, at)| at);
-                // A fault takes the run command away, which is no other master's doing.
+                // A fault takes the run command away, so another master is not the cause.
                 let is_fault = found.iter().any(|cause| cause.cause == "fault");
                 if is_fault && taken == Some(RunWish::Run) {
                     return Vec::new();
@@ -417,7 +417,7 @@ impl Look<'_> {
         }
     }
 
-    /// What the last order says; `read_at` is when the drive was last seen without a run command.
+    /// The cause in the last order; `read_at` is when the drive was last seen without a run command.
     fn order_in_the_way(&self, order: Option<RunOrder>, read_at: Option<Instant>) -> Option<Cause> {
         let order = order?;
         let ended = self.situation.now.checked_sub(order.age);

@@ -1,4 +1,4 @@
-//! What contradicts itself in `[control]` of a profile. Pure.
+//! Contradictions within `[control]` of a profile. Pure.
 
 use super::{Control, Run, Setting};
 use crate::codec::Table;
@@ -59,7 +59,7 @@ impl Control {
         found
     }
 
-    /// What is wrong with a word that is to stop by other means.
+    /// The error of a word that is to stop in another way.
     fn wrong_stop(&self, stop: &Setting) -> Option<(&'static str, String, &'static str)> {
         let key = "also_stop";
         let is = format!("{:#06x} in {:#06x}", stop.value, stop.mask);

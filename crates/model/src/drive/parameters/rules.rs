@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 /// PDU addresses of parameters.
 pub type Addresses = Vec<RangeInclusive<u16>>;
 
-/// Rules for writing parameters back; the default knows nothing and leaves nothing out.
+/// Rules for writing parameters back; the default has no rules and leaves nothing out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct WriteRules {
     /// Written only if the user names the parameter; and why.
@@ -15,12 +15,12 @@ pub struct WriteRules {
     pub nameplate: Addresses,
     /// Ratings of what is connected to the drive: supply and motor.
     pub ratings: Addresses,
-    /// Not kept without power, whatever is saved.
+    /// Parameters that are not kept without power, even if saved.
     pub volatile: Addresses,
     /// Parameters that bound one another.
     pub limits: Vec<Limit>,
     /// The write after which the drive keeps the parameters without power: PDU address and value. Without it every write
-    /// is kept at once, as far as the family says anything.
+    /// is kept at once, as far as the family is known.
     pub save: Option<(u16, u16)>,
     /// Parameters that the drive takes in one mode only.
     pub lock: Option<Lock>,
@@ -45,7 +45,7 @@ pub struct Lock {
     /// Point (index in the profile) that is true only while the drive refuses them. While it is false the drive may still
     /// refuse them.
     pub point: PointIndex,
-    /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual says.
+    /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual gives it.
     pub exception: Option<u8>,
     /// The remedy.
     pub remedy: String,

@@ -50,7 +50,7 @@ pub struct Raw {
 pub struct Equals {
     /// The count.
     pub count: i64,
-    /// It means false, any other true.
+    /// Whether the value means false, any other true.
     pub invert: bool,
 }
 
@@ -113,7 +113,7 @@ impl Raw {
         self.equals.is_some() || matches!(self.form, Form::Bit { .. })
     }
 
-    /// Its type, order and what is taken of it, as profiles and output have it.
+    /// Type, order and mask of the value, as in profiles and output.
     pub fn type_text(&self) -> String {
         let mut text = match self.form {
             Form::Text { registers } => format!("string:{registers}"),
@@ -182,7 +182,7 @@ impl Raw {
         }
     }
 
-    /// The same with its count multiplied by a power of ten.
+    /// Decodes a value whose count is multiplied by a power of ten.
     pub fn decode_scaled(&self, words: &[u16], kind: Kind, power: i64) -> Option<Value> {
         let words = words.get(..usize::from(self.form.items()))?;
         if let Form::Text { .. } = self.form {
@@ -307,7 +307,7 @@ impl Raw {
         (0..self.form.items()).filter_map(move |item| start.checked_add(item))
     }
 
-    /// Whether it includes that register or bit.
+    /// Whether the value includes this register or bit.
     pub fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address

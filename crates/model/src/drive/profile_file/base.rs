@@ -24,7 +24,7 @@ const PLACE: [&str; 14] = [
     "scale_from",
     "factor_from",
 ];
-/// Those of them that a bit does not have.
+/// Keys of a register that a bit does not have.
 const REGISTER: [&str; 10] = [
     "type",
     "byte",
@@ -93,7 +93,7 @@ pub(super) fn change_points(document: &mut Document) {
     if let Some((_, line, node)) = removed {
         let names: Vec<String> = texts(&node.value).map(str::to_string).collect();
         remove(points, line, node.value, &mut mistakes);
-        // What the base reads on a fault goes with the point.
+        // Entries in the base's `on_fault` are removed with the point.
         if let Some((.., on_fault)) = entries.iter_mut().find(|(key, ..)| key == "on_fault")
             && let Raw::Array(list) = &mut on_fault.value
         {

@@ -22,7 +22,7 @@ const MOST_STOPS: usize = 16;
 /// The helper that holds the control word.
 const CONTROL_WORD: &str = "control_word";
 
-/// What the table refers to.
+/// Parts of the profile that the table refers to.
 pub(super) struct Around<'p> {
     pub(super) points: &'p PerPoint<Point>,
     pub(super) names: &'p [String],
@@ -484,7 +484,7 @@ fn helper(control: &Control, place: ControlItem) -> Point {
     }
 }
 
-/// What contradicts something else is an error, never mended.
+/// A contradiction is an error, and is never repaired.
 fn check(table: &Reader<'_>, control: &Control) {
     for (key, what, remedy) in control.contradictions() {
         table.problem(key, what, remedy);

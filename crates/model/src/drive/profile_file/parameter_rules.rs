@@ -41,7 +41,7 @@ fn is_inherited(table: &Reader<'_>, key: &str) -> bool {
 struct Rules<'a, 'd> {
     table: &'a Reader<'d>,
     list: &'a ParameterList,
-    /// Those of the base, of its base, and so on.
+    /// Parameters of the base, of its base, and so on.
     bases: &'a [&'a ParameterList],
 }
 
@@ -83,7 +83,7 @@ impl Rules<'_, '_> {
     fn address(&self, key: &str, id: &str) -> Option<u16> {
         let id = id.trim();
         let of_bases = || {
-            // A profile with a list of its own keeps what the base says of the addresses.
+            // A profile with a list of its own keeps the addresses of the base.
             let bases = self.bases.iter().filter(|_| is_inherited(self.table, key));
             bases.filter_map(|base| base.address(id)).next()
         };
@@ -138,7 +138,8 @@ impl Rules<'_, '_> {
 /// A limit of a circle, if there is one.
 fn in_circle(limits: &[Limit]) -> Option<Limit> {
     let mut left = limits.to_vec();
-    // What has nothing below it or nothing above it is in no circle, and neither is what is then left so.
+    // A limit with nothing below it or nothing above it is not part of a circle; removing such limits repeatedly leaves
+    // only circles.
     loop {
         let (uppers, lowers): (Vec<u16>, Vec<u16>) = left.iter().map(|limit| (limit.upper, limit.lower)).unzip();
         let before = left.len();

@@ -47,7 +47,7 @@ pub(super) fn read_raw(
     ranges: &[AddressRange],
     offsets: &Offsets,
 ) -> Option<Source> {
-    // They are keys of a point with an address, whatever is wrong with that.
+    // The keys belong to a point with an address, even if that has an error.
     for key in KEYS {
         reader.raw(key);
     }

@@ -14,7 +14,8 @@ use super::{is_name, read_pair};
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
 
-/// Names that are keys of states and commands, or metrics of their own: a point of that name could not be told from them.
+/// Names that are keys of states and commands, or metrics of their own: a point with such a name could not be
+/// distinguished from them.
 const TAKEN: [&str; 13] = [
     "age_ms",
     "blocked_by",

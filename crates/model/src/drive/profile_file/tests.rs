@@ -97,7 +97,7 @@ x = "y"
     }
 }
 
-/// One mistake each: the keys of a point named `a` in line 11, and the problem.
+/// Rows with one mistake each: the keys of a point named `a` in line 11, and the problem.
 const POINT_MISTAKES: &str = r#"
 at = "holding"                                           -> m:12, point[0].at; write table and PDU address
 at = "holding 70000"                                     -> m:12, point[0].at; write table
@@ -145,7 +145,7 @@ fn each_mistake_of_a_point() {
     }
 }
 
-/// One mistake each: the line above the name, and the problem.
+/// Rows with one mistake each: the line above the name, and the problem.
 const TOP_MISTAKES: &str = r#"
 base = "vacon"                    -> there is no valid profile `vacon`; m:2, base
 addresses = [0, 5]                -> the first address is 0 or above the last; m:2, addresses
@@ -376,7 +376,7 @@ fn enumerations_have_texts() {
     assert_eq!(profile.points[1].text_of(Value::Bool(true)), Some("on"));
 }
 
-/// The page names every key that the loader knows, and no other.
+/// The page lists every key that the loader knows, and no other.
 #[test]
 fn the_page_names_every_key() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/profiles.md")).unwrap();
@@ -467,7 +467,7 @@ fn points_for_faults_are_read_by_their_registers() {
         .map(|i| profile.points.get(*i).unwrap().name.as_str())
         .collect();
     assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
-    // What is polled anyway, or is compared with process data, needs no read of its own.
+    // A point that is polled anyway, or is compared with process data, needs no read of its own.
     let plan = crate::drive::Plan::of(&profile);
     assert_eq!(plan.on_fault, []);
     let monitors: Vec<_> = plan.monitors.iter().map(|read| (read.start, read.count)).collect();

@@ -10,7 +10,7 @@ fn profile(name: &str) -> Arc<Profile> {
     Profiles::built_in().get(name).unwrap().clone()
 }
 
-/// What a drive says, by point; the rest is not known.
+/// Values of a drive, by point; the rest is not known.
 struct Says {
     profile: Arc<Profile>,
     values: BTreeMap<PointIndex, Value>,
@@ -20,7 +20,7 @@ struct Says {
     held: Option<String>,
 }
 
-/// Of each family: online, ready, run ordered at half speed, and the motor stands.
+/// A drive of each family: online, ready, run ordered at half speed, and the motor stands.
 fn stands(family: &str) -> Says {
     let says = Says {
         profile: profile(family),
@@ -39,7 +39,7 @@ fn stands(family: &str) -> Says {
         ("remote", true),
         ("run", true),
         ("reverse", false),
-        // What else a healthy drive says.
+        // Further bits of a healthy drive.
         ("hand_auto", true),
         ("hoa_on", true),
         ("reference_from_bus", true),

@@ -3,7 +3,7 @@
 /// Form of a raw value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// One bit of a register (0 = least significant), or the bit itself in a bit table.
+    /// A bit of a register (0 = least significant), or the bit itself in a bit table.
     Bit {
         /// Number of the bit.
         bit: u8,
@@ -173,7 +173,7 @@ impl Form {
         matches!(self, Form::I8 { .. } | Form::I16 | Form::I32 | Form::I64)
     }
 
-    /// Whether it is a whole number of registers that `mask` may take bits of.
+    /// Whether the form is a whole number of registers, so that `mask` may take bits of it.
     pub fn takes_mask(self) -> bool {
         matches!(self, Form::U16 | Form::U32 | Form::U64)
     }

@@ -1,4 +1,4 @@
-//! What the registers of a simulated drive hold for a value.
+//! Register contents of a simulated drive for a value.
 
 use super::{EXACT, Equals, Form, Raw, low_mask, to_digits};
 
@@ -30,7 +30,7 @@ impl Raw {
         }
     }
 
-    /// The same of some bits of the whole value.
+    /// Register contents for some bits of the whole value.
     pub fn masked(&self, mask: u64, is: u64) -> Vec<Part> {
         let items = self.form.items();
         let words = self
@@ -41,7 +41,7 @@ impl Raw {
         words.map(|(mask, value)| Part { mask, value }).collect()
     }
 
-    /// What its registers hold for a number, as near as the type comes to it, with the count divided by that power of ten.
+    /// Register contents for a number, as near as the type comes to it, with the count divided by this power of ten.
     pub fn number_parts(&self, value: f64, power: i64) -> Vec<Part> {
         let power = i32::try_from(power)
             .unwrap_or(0)
@@ -77,7 +77,7 @@ impl Raw {
         self.masked(mask, bits)
     }
 
-    /// What its registers hold for a text.
+    /// Register contents for a text.
     pub fn text_parts(&self, text: &str) -> Vec<Part> {
         let bytes = |register: u16| {
             let place = 2 * usize::from(register);
@@ -105,7 +105,7 @@ mod tests {
         parts.iter().map(|part| part.value).collect()
     }
 
-    /// What is placed is read as the value, whatever the type and order.
+    /// A placed value reads back as placed, with any type and order.
     #[test]
     fn a_placed_number_is_read_as_it() {
         for form in Form::NAMED {

@@ -55,7 +55,7 @@ fn words_of_other_stops_are_stops_and_what_follows_is_made_from_the_word_of_a_st
     }
 }
 
-/// A run bit that stands beside a bit that stops the drive is no run command, in what is read either.
+/// A run bit together with a bit that stops the drive is not a run command, in reads either.
 #[test]
 fn a_run_bit_beside_another_stop_reads_as_no_run_command() {
     let profile = control(

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// One mistake each of the keys that make a value of registers.
+/// Cases with one mistake each in the keys that make a value of registers.
 #[test]
 fn each_mistake_of_a_value() {
     let cases = [
