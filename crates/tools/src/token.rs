@@ -31,7 +31,7 @@ enum Action {
         /// What it permits: read (status page, JSON), metrics, control (nothing: only users command). Repeatable.
         #[arg(long = "scope", value_name = "SCOPE", required = true)]
         scopes: Vec<Scope>,
-        /// Its name, for the file and the log.
+        /// Name of the token, for the file and the log.
         name: String,
     },
     /// Prints names and scopes.
@@ -45,7 +45,7 @@ enum Action {
     Remove {
         #[command(flatten)]
         file: TokenFile,
-        /// Its name.
+        /// Name of the token.
         name: String,
     },
 }

@@ -31,7 +31,7 @@ enum Action {
     Add {
         #[command(flatten)]
         file: UsersFile,
-        /// Its name, for the login and the audit.
+        /// Name of the user, for the login and the audit.
         name: String,
     },
     /// Prints the user names.
@@ -45,7 +45,7 @@ enum Action {
     Remove {
         #[command(flatten)]
         file: UsersFile,
-        /// Its name.
+        /// Name of the user.
         name: String,
     },
 }

@@ -190,7 +190,7 @@ impl Profile {
         Profile::parse_over(file, source, built_in, &Profiles::built_in())
     }
 
-    /// The same over a base among the `known` profiles.
+    /// Reads a profile file over a base among the `known` profiles.
     ///
     /// # Errors
     /// Every error of the file, with line and key.
@@ -366,7 +366,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
 fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k ParameterList> {
     let first = base.and_then(|base| known.get(base));
     let next = |profile: &&'k Arc<Profile>| {
-        // One that has replaced its own base is the last that is known.
+        // A profile that has replaced its own base is the last known one.
         let base = profile.base.as_deref().filter(|base| *base != profile.name)?;
         known.get(base)
     };

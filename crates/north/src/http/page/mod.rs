@@ -17,7 +17,7 @@ const DOCUMENT: &str = include_str!("index.html");
 /// A file that the document names, or one of its scripts.
 #[derive(Debug)]
 pub(in crate::http) struct Asset {
-    /// Its path is `/assets/NAME`.
+    /// An asset has the path `/assets/NAME`.
     pub(in crate::http) name: &'static str,
     pub(in crate::http) content_type: &'static str,
     pub(in crate::http) body: &'static str,

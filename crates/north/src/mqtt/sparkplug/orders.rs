@@ -298,7 +298,7 @@ impl Request {
             let why = format!("the command has {count} metrics, at most {METRICS} are allowed");
             refused = Some(Refusal::BadValue(why));
         }
-        // Of too many metrics only the stop is evaluated.
+        // When there are too many metrics only the stop is evaluated.
         let run = profile.model_point(ModelPoint::Run).map(|point| point.name.as_str());
         let is_run = |(metric, place): &&(Metric, Option<usize>)| {
             place.and_then(name).as_deref().or(metric.name.as_deref()) == run && run.is_some()
