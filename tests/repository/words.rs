@@ -1,7 +1,7 @@
 //! Documents and messages are in the words that engineers of the field use, and spelled right.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::support::tools::root;
@@ -142,28 +142,39 @@ fn said(literal: &str) -> String {
         .join("`")
 }
 
-/// All Rust files except tests.
-fn code_files(folder: &std::path::Path, found: &mut Vec<PathBuf>) {
-    for entry in fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        let name = path.file_name().unwrap().to_string_lossy().into_owned();
-        let is_test = name == "tests" || name == "tests.rs" || name.ends_with("_tests.rs") || name == "testkit";
-        if path.is_dir() && !is_test {
-            code_files(&path, found);
-        } else if name.ends_with(".rs") && !is_test {
-            found.push(path);
+/// All Rust files below the folders, tests included.
+fn rust_files(folders: &[&str]) -> Vec<PathBuf> {
+    let mut open: Vec<PathBuf> = folders.iter().map(|folder| root().join(folder)).collect();
+    let mut found = Vec::new();
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                found.push(path);
+            }
         }
     }
+    found.sort();
+    found
+}
+
+/// Whether a file, or a folder that it is in, has only tests.
+fn is_test(path: &Path) -> bool {
+    let parts = path.strip_prefix(root()).unwrap().iter();
+    parts
+        .map(|part| part.to_string_lossy())
+        .any(|name| matches!(&*name, "tests" | "tests.rs" | "testkit") || name.ends_with("_tests.rs"))
 }
 
 #[test]
 fn the_messages_are_in_plain_words() {
-    let mut files = Vec::new();
-    for folder in ["src", "crates"] {
-        code_files(&root().join(folder), &mut files);
-    }
     let (mut seen, mut found) = (0, Vec::new());
-    for file in files {
+    for file in rust_files(&["src", "crates"]) {
+        if is_test(&file) {
+            continue;
+        }
         for (number, literal) in literals(&fs::read_to_string(&file).unwrap()) {
             // A single word is a name or a part of a format.
             let text = said(&literal);
@@ -225,6 +236,76 @@ fn the_pages_are_in_plain_words() {
         }
     }
     assert!(found.is_empty(), "{found:#?}");
+}
+
+/// Beginnings of a comment whose subject is somewhere else.
+const WITHOUT_SUBJECT: [&str; 5] = ["It", "Its", "The same", "Of", "Those"];
+
+/// Comments below here are the text of `docs/configuration.md`, which a test of its own compares.
+const KEYS: &str = "crates/gateway/src/config/keys";
+
+/// The first line of each paragraph of comments, with its number.
+fn paragraphs(code: &str) -> Vec<(usize, &str)> {
+    let (mut follows, mut found) = (false, Vec::new());
+    for (number, line) in code.lines().enumerate() {
+        let comment = line.trim_start().strip_prefix("//");
+        let text = comment.map(|comment| comment.trim_start_matches(['/', '!']).trim());
+        let text = text.filter(|text| !text.is_empty() && !text.starts_with('#'));
+        if let Some(text) = text.filter(|_| !follows) {
+            found.push((number + 1, text));
+        }
+        follows = text.is_some();
+    }
+    found
+}
+
+/// The beginning of a comment that cannot be understood alone.
+fn without_subject(text: &str) -> Option<&'static str> {
+    WITHOUT_SUBJECT.into_iter().find(|beginning| {
+        text.strip_prefix(beginning)
+            .is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
+    })
+}
+
+#[test]
+fn comments_name_their_subject() {
+    let (mut seen, mut found) = (0, Vec::new());
+    for file in rust_files(&["benches", "crates", "src", "tests"]) {
+        if file.starts_with(root().join(KEYS)) {
+            continue;
+        }
+        for (number, text) in paragraphs(&fs::read_to_string(&file).unwrap()) {
+            seen += 1;
+            if let Some(beginning) = without_subject(text) {
+                found.push(format!(
+                    "{}:{number}: begins with \"{beginning}\": {text}",
+                    file.display()
+                ));
+            }
+        }
+    }
+    assert!(seen > 10_000, "{seen}");
+    assert!(found.is_empty(), "{found:#?}");
+}
+
+#[test]
+fn comments_without_a_subject_are_noticed() {
+    for text in [
+        "It is set.",
+        "Its name.",
+        "The same, later.",
+        "Of a gauge.",
+        "Those that wait.",
+    ] {
+        assert!(without_subject(text).is_some(), "{text}");
+    }
+    for text in ["Items of a list.", "Offsets.", "Whether it is set.", "The samples."] {
+        assert_eq!(without_subject(text), None, "{text}");
+    }
+    let code =
+        "/// A name.\n/// It goes on.\n///\n/// # Errors\n/// It fails.\nlet it = 1; // Of it.\n    // Its end.\n";
+    let expected = [(1, "A name."), (5, "It fails."), (7, "Its end.")];
+    assert_eq!(paragraphs(code), expected);
 }
 
 /// README and the pages below docs, without the decisions, stay a book that one reads.
