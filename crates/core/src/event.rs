@@ -138,7 +138,7 @@ impl EventKind {
         EventKind::SlotVoid,
     ];
 
-    /// Whether someone should look: the log has it as a warning.
+    /// Whether the event needs attention: the log has it as a warning.
     pub(crate) fn is_trouble(self) -> bool {
         match self {
             EventKind::Offline
@@ -225,7 +225,7 @@ pub struct Event {
     /// The run.
     #[schema(value_type = String)]
     pub boot: Boot,
-    /// When it happened.
+    /// Time of the event.
     #[serde(serialize_with = "rfc3339")]
     #[schema(value_type = String)]
     pub time: SystemTime,
@@ -242,13 +242,13 @@ pub struct Event {
     /// Fault code, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fault_code: Option<i64>,
-    /// Refused commands only: how many of one client it covers.
+    /// Refused commands only: number of refusals of one client that the event covers.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub count: Option<u64>,
     /// Starts and stops only: who commanded it, if a command through this gateway was the cause.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
-    /// For people.
+    /// Description for people.
     pub text: String,
     /// The recording that was made.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -332,7 +332,7 @@ pub struct RefusedCommand<'r> {
     /// The bus and the drive; both empty if it is for none in particular.
     pub bus: &'r str,
     pub drive: &'r str,
-    /// For people.
+    /// Description for people.
     pub text: String,
 }
 
@@ -353,7 +353,7 @@ pub struct Events {
 struct Store {
     /// Number of the last event of this run.
     number: u64,
-    /// Events of earlier runs, all before those of this one.
+    /// Number of events of earlier runs, which precede those of this run.
     earlier: u64,
     kept: FairRing<(EventKind, Arc<str>), Arc<str>>,
     refused: FairRing<Arc<str>, Arc<str>>,
@@ -495,7 +495,7 @@ impl Events {
         lines.filter_map(|(_, line)| from_line(line.as_bytes()).ok()).collect()
     }
 
-    /// The newest events that match, newest first, also those of earlier runs.
+    /// The newest events that match the search, newest first, including those of earlier runs.
     pub fn search(&self, search: &Search) -> Vec<Event> {
         let all = self.store().lines();
         log::newest(all.iter().map(|(_, line)| &**line), search)

@@ -5,7 +5,7 @@ pub fn encode(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The bytes; `None` where there is anything but pairs of digits.
+/// The bytes; `None` where the text is not pairs of hexadecimal digits.
 pub fn decode(text: &str) -> Option<Vec<u8>> {
     let digit = |digit: &u8| char::from(*digit).to_digit(16);
     let byte = |pair: &[u8]| match pair {

@@ -171,7 +171,7 @@ impl DriveHandle {
         Some(until.saturating_duration_since(now))
     }
 
-    /// Which machine it is, whatever its name.
+    /// The machine that is meant, under any name.
     pub fn machine(&self) -> Machine {
         self.bus.image.spec.machine(&self.image.spec)
     }

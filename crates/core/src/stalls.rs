@@ -33,7 +33,7 @@ pub struct Stall {
     /// When the thread ran last. If the machine was suspended, this is moved back by the time of the suspension, during
     /// which the clock did not advance.
     pub began: Instant,
-    /// When it ran again.
+    /// When the thread ran again.
     pub ended: Instant,
     /// Part of the stall during which the machine was suspended and its clock did not advance: dates before it are
     /// older by this time.
@@ -50,7 +50,7 @@ impl Stall {
         }
     }
 
-    /// How long it was.
+    /// Length of the stall.
     pub fn length(&self) -> Duration {
         self.ended.saturating_duration_since(self.began)
     }
@@ -60,12 +60,12 @@ impl Stall {
         self.length() > PAUSE
     }
 
-    /// Until when what came during it is read.
+    /// Until when bytes that came during the stall are read.
     pub fn read_by(&self) -> Instant {
         self.ended + READ_WITHIN
     }
 
-    /// Until when what clients sent before its end may still come.
+    /// Until when bytes that clients sent before the end of the stall may still come.
     pub fn over(&self) -> Instant {
         self.ended + self.length().min(RESENT_WITHIN) + ON_ITS_WAY
     }
@@ -74,9 +74,9 @@ impl Stall {
 /// The date of what was read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Dated {
-    /// No later than it came.
+    /// Earliest time at which the bytes may have come.
     pub asked: Instant,
-    /// The stall during which it may have come.
+    /// The stall during which the bytes may have come.
     pub stall: Option<Stall>,
     /// The last pause, as long as what was sent before its end may still come.
     pub pause: Option<Stall>,
@@ -143,7 +143,7 @@ impl Stalls {
         });
     }
 
-    /// When it ran last.
+    /// When the thread ran last.
     pub fn ran(&self) -> Instant {
         self.ran
     }
@@ -153,12 +153,12 @@ impl Stalls {
         self.last
     }
 
-    /// The last pause, if what was sent before its end may still come.
+    /// The last pause, if bytes sent before its end may still come.
     pub fn pause(&self, now: Instant) -> Option<Stall> {
         self.pause.filter(|pause| now < pause.over())
     }
 
-    /// Until when a stall of before matters for what is read.
+    /// Until when an earlier stall matters for the date of bytes.
     pub fn matters_until(&self) -> Option<Instant> {
         let last = self.last.map(|last| last.read_by());
         last.max(self.pause.map(|pause| pause.over()))

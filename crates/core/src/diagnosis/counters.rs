@@ -132,7 +132,7 @@ pub(super) struct Running {
     /// Transactions and failures in the current slot and in the one before.
     slots: [(f32, f32); 2],
     slot_ends: Option<Instant>,
-    /// Age of the state before it was read again, at most lately.
+    /// Recent maximum of the age of the running state before it was read again.
     pub(super) age: Duration,
     pub(super) contrast: Contrast,
 }

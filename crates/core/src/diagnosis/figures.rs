@@ -57,7 +57,7 @@ pub struct Exchange<'e> {
     pub behind: &'e [u8],
     /// Whether foreign frames or stray bytes are among `seen`.
     pub foreign: bool,
-    /// How it ended.
+    /// How the transaction ended.
     pub end: End,
     /// Silence before the request.
     pub gap: Duration,
@@ -99,7 +99,7 @@ pub struct Figures {
     wrong: Window<1>,
     idle: Vec<u8>,
     last: Option<(DriveIndex, End)>,
-    /// When the transaction before was over.
+    /// When the previous transaction was over.
     last_at: Instant,
     epoch: Instant,
     step_ends: Instant,
@@ -426,7 +426,7 @@ impl Figures {
             return;
         }
         let bytes = std::mem::take(&mut self.idle);
-        // Bytes after a damaged reply may be the rest of it.
+        // Bytes after a damaged reply may be the rest of that reply.
         if !self.answer_of_another(&bytes, now)
             && let Some((drive, End::Answered)) = self.last
             && let Some(drive) = self.drives.get_mut(drive)

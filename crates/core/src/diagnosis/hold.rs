@@ -11,9 +11,9 @@ const MOST_VERDICTS: usize = 24;
 #[derive(Debug, Clone, PartialEq)]
 struct Held {
     finding: Finding,
-    /// Steps in which the rule held, less those in which it did not.
+    /// Steps in which the rule held, minus steps in which it did not.
     holds: u32,
-    /// Steps since it held last.
+    /// Steps since the rule last held.
     missing: u32,
     shown: bool,
 }
@@ -47,7 +47,7 @@ fn patience(cause: Cause) -> u32 {
 }
 
 impl Hold {
-    /// Takes what the rules found in this step; what changed by it.
+    /// Takes the findings of the rules in this step; returns the changes.
     pub fn take(&mut self, found: Vec<Finding>) -> Vec<Change> {
         let mut changes = Vec::new();
         for held in &mut self.held {
@@ -89,7 +89,7 @@ impl Hold {
             return;
         };
         let before = held.finding.certainty;
-        // Less certain in one step than in another: it was seen.
+        // A finding that was shown keeps its certainty in a step with less evidence.
         let certainty = if held.shown {
             before.max(finding.certainty)
         } else {

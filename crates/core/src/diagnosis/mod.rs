@@ -147,7 +147,7 @@ impl Certainty {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     pub cause: Cause,
-    /// The drive, where it is about one.
+    /// The drive, if the cause concerns a single one.
     pub drive: Option<DriveIndex>,
     /// How far the evidence goes.
     pub certainty: Certainty,
@@ -170,7 +170,7 @@ pub struct Verdict {
     /// The cause.
     #[schema(value_type = String)]
     pub verdict: Cause,
-    /// The drive, where it is about one.
+    /// The drive, if the cause concerns a single one.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub drive: Option<String>,
     /// How far the evidence goes.
@@ -185,14 +185,14 @@ pub struct Verdict {
     /// Points to check and set on drives of these families, from their profiles.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub steps: Vec<String>,
-    /// Since when it holds, RFC 3339.
+    /// Since when the verdict holds, RFC 3339.
     pub since: String,
 }
 
 /// The diagnosis of a line at one time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Diagnosis {
-    /// When it was made; none before the first time.
+    /// When the diagnosis was made; none before the first one.
     pub at: Option<SystemTime>,
     /// The present verdicts, most significant first.
     pub verdicts: Vec<Verdict>,
@@ -235,9 +235,9 @@ pub struct CountedByDrive {
     pub messages: u16,
     /// Damaged messages.
     pub damaged: u16,
-    /// Exceptions that it sent.
+    /// Exceptions that the drive sent.
     pub exceptions: u16,
-    /// Messages to it.
+    /// Messages to the drive.
     pub own: u16,
     /// Messages to the drive without an answer; broadcasts are among them [inference].
     pub unanswered: u16,

@@ -14,7 +14,7 @@ use crate::drive::DriveIndex;
 const FEW_OF_LINE: u32 = 10;
 /// Requests after which a drive that never replied is reported.
 const IN_VAIN: u16 = 6;
-/// Most such drives that are reported one by one.
+/// Most silent drives that are reported one by one.
 const NAMED: usize = 6;
 /// Share of transactions below which a drive is good.
 const GOOD: f64 = 0.003;
@@ -33,7 +33,7 @@ pub struct Rules<'f> {
     found: Vec<Finding>,
 }
 
-/// The findings at `now`, most significant first; `names` are those of the drives.
+/// The findings at `now`, most significant first; `names` are the names of the drives.
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let known: Vec<Known> = figures
         .drives

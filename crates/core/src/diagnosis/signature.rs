@@ -24,7 +24,7 @@ pub enum Shape {
     Overlong,
     /// The reply breaks off.
     EndLost,
-    /// Anything else.
+    /// The bytes have any other form.
     Garbled,
 }
 

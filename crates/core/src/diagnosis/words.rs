@@ -107,7 +107,7 @@ impl Cause {
         }
     }
 
-    /// The steps of the commissioning that it questions.
+    /// The commissioning steps to check for this cause.
     pub const fn steps(self) -> &'static [Step] {
         match self {
             Cause::AllSilent | Cause::NeverAnswered => &[Step::Lamps, Step::Settings],

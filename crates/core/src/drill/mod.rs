@@ -44,7 +44,7 @@ pub struct DrillOptions {
 /// Why a drill is not armed, started or ended.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DrillRefusal {
-    /// There is none of that name.
+    /// No drill has this id.
     #[error("there is no drill `{0}`")]
     Unknown(String),
     /// The drill is not possible on this drive.
@@ -100,7 +100,7 @@ impl Drills {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// From now on these options hold; none: no drill is armed.
+    /// Sets the options; none: no drill can be armed.
     pub fn set_options(&self, options: Option<DrillOptions>) {
         self.state().options = options;
     }
@@ -151,7 +151,7 @@ impl Drills {
         Ok(report)
     }
 
-    /// Starts an armed drill, by who armed it.
+    /// Starts an armed drill for the client that armed it.
     ///
     /// # Errors
     /// The drill is not armed, or not by this client; nothing was started.
@@ -227,7 +227,7 @@ impl Drills {
         goes_on
     }
 
-    /// All that are known, the newest first.
+    /// All known reports, the newest first.
     pub fn reports(&self) -> Vec<DrillReport> {
         let state = self.state();
         let current = state.run.iter().map(Run::report).chain(&state.cut_off).cloned();
@@ -324,7 +324,7 @@ impl Drills {
         }
     }
 
-    /// Reports that writing failed: a drill that waits for it does not start.
+    /// Reports that writing failed: a drill that waits for the disk does not start.
     pub fn not_kept(&self, why: &str, time: SystemTime) {
         let mut state = self.state();
         if state.run.as_mut().is_some_and(|run| run.not_kept(why, time)) {
@@ -454,7 +454,7 @@ fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptio
     Ok(())
 }
 
-/// Whether that client may begin now.
+/// Whether the client may start a drill now.
 fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefusal> {
     if let Some((view, own)) = drive.hold_view(Some(who), now)
         && !own

@@ -36,7 +36,7 @@ impl Kind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DrillState {
-    /// Waiting for its start.
+    /// The drill is armed and waits for its start.
     Armed,
     /// Running.
     Running,
@@ -72,9 +72,9 @@ impl DrillState {
 /// The test of one way to stop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillStep {
-    /// Which.
+    /// Way to stop that is tried.
     pub kind: Kind,
-    /// Progress or result; `armed` until its turn.
+    /// Progress or result of the step; `armed` until its turn.
     pub state: DrillState,
     /// Time of the cause: the command, or the last sign of life (RFC 3339).
     #[serde(default)]
@@ -99,11 +99,11 @@ pub struct DrillReport {
     pub drive: String,
     /// Bus of the drive.
     pub bus: String,
-    /// Port, address and profile: whose proof it is, whatever it is called.
+    /// Port of the machine; with address and profile it identifies the machine under any name.
     pub port: String,
     /// Address on the bus.
     pub address: u8,
-    /// Name of its profile.
+    /// Name of the drive's profile.
     pub profile: String,
     /// Client that armed the drill.
     pub who: String,
@@ -117,12 +117,12 @@ pub struct DrillReport {
     pub max_speed: f64,
     /// Maximum time to standstill, ms.
     pub limit_ms: u64,
-    /// When it was armed (RFC 3339).
+    /// When the drill was armed (RFC 3339).
     pub armed_at: String,
     /// When the motor was started.
     #[serde(default)]
     pub started_at: Option<String>,
-    /// When it was over.
+    /// When the drill was over.
     #[serde(default)]
     pub ended_at: Option<String>,
     /// The result of the stop with which every drill ends.
@@ -146,11 +146,11 @@ impl DrillReport {
 /// Result of the last drill for one way to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 pub struct StopProof {
-    /// Which way.
+    /// Way to stop.
     pub kind: Kind,
     /// Whether the motor stopped in time in the last test; `null` if there was none.
     pub passed: Option<bool>,
-    /// How long ago that was, s.
+    /// Age of the last test, s.
     pub age_s: Option<u64>,
     /// The test failed, was never made, or is older than `every` of `[drill]`.
     pub due: bool,
@@ -162,9 +162,9 @@ pub struct Proof {
     /// The machine that was tested.
     #[serde(flatten)]
     pub machine: Machine,
-    /// Which way.
+    /// Way to stop.
     pub kind: Kind,
-    /// When it ended, ms since 1970.
+    /// When the test ended, ms since 1970.
     pub at_ms: u64,
     /// Whether the motor stopped in time.
     pub passed: bool,
@@ -199,7 +199,7 @@ pub struct SavedDrills {
     drivegate_drills: u32,
     /// The last ones, the oldest first.
     pub reports: Vec<DrillReport>,
-    /// By machine and way.
+    /// Last proofs by machine and way to stop.
     pub proofs: Vec<Proof>,
 }
 

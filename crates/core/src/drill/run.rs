@@ -19,7 +19,7 @@ use crate::stop_all::OneStop;
 
 /// Maximum time to write the start of a drill to disk; after that the operator no longer expects the motor to start.
 const KEEP: Duration = Duration::from_secs(5);
-/// Expiry of the start; a guard may delay it.
+/// Time within which the start may be sent; a guard may delay it.
 const START: Duration = Duration::from_secs(60);
 /// How long a start is retried that needs a value not yet read, and the pause between retries.
 const START_AGAIN: Duration = Duration::from_secs(15);
@@ -57,7 +57,7 @@ pub(super) struct Run {
     stops: u64,
     step: Step,
     since: Instant,
-    /// When it was looked at last.
+    /// When the drill was last evaluated.
     looked: Instant,
     /// The longest pause of the gateway since the stop was caused.
     paused: Option<Duration>,
@@ -82,13 +82,13 @@ enum Step {
     SpeedingUp(Option<Instant>),
     /// The motor runs at its speed.
     Steady,
-    /// The stop was caused then; the motor should come to standstill.
+    /// The stop was caused at this time; the motor should come to standstill.
     Caused(Instant, Cause),
     /// The test is over; the motor is stopped in any case.
     Clearing(OneStop),
     /// The gateway was killed during it: the motor is stopped once the drive is online.
     CutOff,
-    /// The drill ended with that result; its last stop is pending.
+    /// The drill ended with this result; its last stop is pending.
     Ending(DrillState, OneStop),
     Over,
 }
@@ -101,7 +101,7 @@ enum Cause {
     Client {
         stopped: bool,
     },
-    /// Nothing is sent to the drive until then.
+    /// The gateway sends nothing to the drive until this time.
     Gateway(Instant),
 }
 
@@ -337,7 +337,7 @@ impl Run {
         self.go(Step::Starting(placed), now);
     }
 
-    /// Somebody ends it: the motor is stopped.
+    /// Ends the drill for another reason: the motor is stopped.
     pub(super) fn abort(&mut self, why: &str, now: Instant, time: SystemTime) {
         match self.step {
             Step::Armed | Step::Keeping(_) => self.finish(DrillState::Aborted, why.to_string(), time),
@@ -347,7 +347,7 @@ impl Run {
         }
     }
 
-    /// The drill ends so, once its last stop is there.
+    /// Ends the drill with this result, once its last stop is acknowledged.
     fn end(&mut self, state: DrillState, why: String, now: Instant) {
         self.lock(None);
         if let Some(step) = self.current().filter(|step| !step.state.is_over()) {
@@ -388,7 +388,7 @@ impl Run {
         self.step = Step::Over;
     }
 
-    /// Looks what became of it. Whether it goes on.
+    /// Evaluates the progress of the drill. Returns whether it goes on.
     pub(super) fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let gap = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
         self.paused = self.paused.max(Some(gap).filter(|gap| *gap > PAUSE));
@@ -582,7 +582,7 @@ pub(super) struct Ended {
 }
 
 impl Ended {
-    /// Adds it to the audit and publishes its event.
+    /// Adds the drill to the audit and publishes its event.
     pub(super) fn publish(&self, plant: &Plant, now: Instant, time: SystemTime) {
         let DrillReport { drive, bus, state, .. } = &self.report;
         let kinds: Vec<&str> = self.report.steps.iter().map(|step| step.kind.name()).collect();

@@ -27,7 +27,7 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
 
     /// Keeps an item of `source`.
     pub fn push(&mut self, source: K, number: u64, item: T) {
-        // The key that is there already: its clones share what it holds.
+        // The existing key is used, since its clones share memory.
         let source = match self.sources.get_key_value(&source) {
             Some((known, _)) => known.clone(),
             None => source,
@@ -69,7 +69,7 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
         }
     }
 
-    /// All that are kept, with their numbers, source by source.
+    /// All kept items with their numbers, source by source.
     pub fn iter(&self) -> impl Iterator<Item = &(u64, T)> {
         self.sources.values().flatten()
     }
@@ -130,7 +130,7 @@ mod tests {
     fn memory_is_for_what_is_kept() {
         let mut ring = FairRing::new(1000);
         for n in 0..40_000 {
-            // Each of twenty sources has a time when it floods.
+            // Each of twenty sources floods the ring in turn.
             ring.push(n / 2000, n, ());
             let places: usize = ring.sources.values().map(VecDeque::capacity).sum();
             assert!(

@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::{Boot, Event, EventKind, RecordingMade};
 
-/// Where a search begins: with what comes before.
+/// Upper limit of a search: only earlier events are found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Before {
     Time(SystemTime),
@@ -21,7 +21,7 @@ pub struct Search {
     pub kinds: Vec<EventKind>,
     pub drive: Option<String>,
     pub bus: Option<String>,
-    /// With these words in any of its texts, upper and lower case alike.
+    /// Words that any text of the event has, in upper or lower case.
     pub text: Option<String>,
     /// Only events before this one.
     pub before: Option<Before>,
@@ -130,7 +130,7 @@ pub fn from_line(line: &[u8]) -> Result<Event, LineError> {
 }
 
 impl Before {
-    /// The event `text` names: `BOOT-ID`, as they stand in it.
+    /// The event that `text` names in the form `BOOT-ID`.
     pub fn event(text: &str) -> Option<Before> {
         let (boot, id) = text.rsplit_once('-')?;
         let is_boot = boot.len() == 16 && boot.bytes().all(|byte| byte.is_ascii_hexdigit());

@@ -8,13 +8,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Clients that are distinguished.
+/// Number of clients that are counted separately.
 const CLIENTS: usize = 64;
 /// Kinds of one client whose first refusal passes at once.
 const KINDS: usize = 16;
 /// Shortest time between two reported refusals of one client, except the first of a kind.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// A client is forgotten when it was refused nothing for so long.
+/// Time without a refusal after which a client is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(60);
 
 /// Limits the refusals per client.
@@ -28,7 +28,7 @@ struct Client<T> {
     kinds: BTreeSet<(&'static str, String)>,
     passed: Instant,
     refused: Instant,
-    /// The last one that has not passed, and how many it stands for.
+    /// The last refusal held back, and the number of refusals that it stands for.
     waiting: Option<(T, u64)>,
 }
 

@@ -30,7 +30,7 @@ impl Keeper {
         Ok(Keeper { dir, end, ended })
     }
 
-    /// The directory it writes to.
+    /// The directory in which the thread writes.
     pub fn dir(&self) -> &Path {
         &self.dir
     }

@@ -19,7 +19,7 @@ pub use keeper::Keeper;
 pub use patience::{DISK, Patience, late};
 pub use rotated::Rotated;
 
-/// Ending of a file that is not written to its end.
+/// Ending of a file that is not completely written.
 pub const PARTIAL: &str = "partial";
 
 /// Renames a file that cannot be used, and returns the result as text for the log.

@@ -1,6 +1,6 @@
 //! The file names in the state directory and in that of the MQTT buffer.
 
-/// Events, and the older ones after it.
+/// File of events; older files have a number behind this name.
 pub const EVENTS: &str = "events.jsonl";
 /// Run hours and starts.
 pub const COUNTERS: &str = "counters.json";

@@ -14,9 +14,9 @@ const NEXT: Duration = Duration::from_millis(100);
 /// The wait for files that are read at a start or a reload. A disk that hangs is waited for once, not once for each file.
 #[derive(Debug, Clone, Default)]
 pub struct Patience {
-    /// How many waits were given up whose work is not done yet.
+    /// Number of waits that were given up while their work is not done yet.
     overdue: Arc<AtomicUsize>,
-    /// The gateway ends: its stops wait for no disk.
+    /// Cancelled when the gateway ends: its stops wait for no disk.
     ended: CancellationToken,
 }
 
@@ -67,7 +67,7 @@ impl Patience {
     }
 }
 
-/// Why there is nothing from a disk that does not answer.
+/// Message when the disk does not answer in time.
 pub fn late() -> String {
     "the disk did not answer in time".to_string()
 }

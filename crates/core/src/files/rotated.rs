@@ -42,14 +42,14 @@ impl Rotated {
         &self.path
     }
 
-    /// An older file; the greater the number, the older it is.
+    /// Path of an older file; the greater the number, the older the file.
     pub fn older(&self, number: u64) -> PathBuf {
         let mut name = self.path.clone().into_os_string();
         name.push(format!(".{number}"));
         name.into()
     }
 
-    /// All files there can be, oldest first.
+    /// All possible files, oldest first.
     pub fn all(&self) -> Vec<PathBuf> {
         let older = (1..self.files).rev().map(|number| self.older(number));
         older.chain([self.path.clone()]).collect()

@@ -31,7 +31,7 @@ impl<T: Copy + Default> Buckets<T> {
         *self = new;
     }
 
-    /// Steps that are kept.
+    /// Number of steps that are kept.
     pub(super) fn steps(&self) -> usize {
         self.slots.len()
     }

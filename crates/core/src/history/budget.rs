@@ -97,13 +97,13 @@ impl Budget {
         }
     }
 
-    /// All of it, bytes.
+    /// Memory of all rings of the bus, bytes.
     pub fn total(&self) -> usize {
         let drives: usize = self.samples.iter().map(|samples| samples + self.notes).sum();
         drives + self.frames
     }
 
-    /// All of it with the room by which rings grow, bytes.
+    /// Memory of all rings with the room by which they grow, bytes.
     pub fn with_growth(&self) -> usize {
         self.total() / packed_ring::STEPS * (packed_ring::STEPS + 1)
     }

@@ -22,7 +22,7 @@ const LONGEST: usize = 1 << 20;
 /// Bytes of a line that arrived together.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Packet {
-    /// Since 1970.
+    /// Time of the packet since 1970.
     pub at: Duration,
     /// Whether the bytes were sent: `at` is then the time when they were given to the port, else the time when the last
     /// of them had arrived.

@@ -34,7 +34,7 @@ impl Totals {
         }
     }
 
-    /// Whether they can have been counted.
+    /// Whether the values are possible counts.
     pub(crate) fn is_sane(&self) -> bool {
         let fine = |figure: f64| figure.is_finite() && figure >= 0.0;
         fine(self.running_seconds) && self.energy_kwh.is_none_or(f64::is_finite)
@@ -50,7 +50,7 @@ pub struct Counters {
 }
 
 impl Counters {
-    /// Counts on from there.
+    /// Counters that start from these totals.
     pub fn from(totals: Totals) -> Counters {
         Counters { totals, ran: None }
     }

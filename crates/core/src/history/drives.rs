@@ -24,14 +24,14 @@ pub struct History {
 struct Known {
     drives: BTreeMap<String, Arc<DriveHistory>>,
     lines: BTreeMap<String, Arc<Mutex<LineHistory>>>,
-    /// Counters of drives that are not there.
+    /// Counters of drives that are not configured now.
     absent: BTreeMap<String, Totals>,
 }
 
 /// The past of a drive.
 #[derive(Debug)]
 pub struct DriveHistory {
-    /// The machine it belongs to: another drive of that name has other trends.
+    /// The machine of the trends: another drive of that name has other trends.
     bus: String,
     address: u8,
     profile: Arc<Profile>,

@@ -64,9 +64,9 @@ impl Serialize for Samples<'_> {
 #[derive(Serialize, utoipa::ToSchema)]
 #[schema(as = RecordedSample)]
 struct SampleObject<'r> {
-    /// When it was read, s from the trigger.
+    /// Time of the read, s from the trigger.
     t: f64,
-    /// The values by point; `null` where it has none.
+    /// The values by point; `null` where the sample has none.
     points: BTreeMap<&'r str, &'r Json>,
 }
 

@@ -112,7 +112,7 @@ impl Writer {
         }
     }
 
-    /// Takes on the counters of earlier runs; their events.
+    /// Takes over the counters of earlier runs; returns their events.
     fn remember(&mut self) -> Vec<Event> {
         let done = self.open();
         let earlier = if done.is_ok() { self.earlier() } else { Vec::new() };
@@ -230,7 +230,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Logs a failure once, and its end.
+    /// Logs the first failure, and the end of failures.
     fn report(&mut self, done: io::Result<()>, end: bool) {
         let path = self.events.path().display();
         let waiting = self.waiting.len();
@@ -268,7 +268,7 @@ fn ends_with_newline(file: &fs::File, bytes: u64) -> io::Result<bool> {
     Ok(last == *b"\n")
 }
 
-/// The counters of a file, or why they are none.
+/// The counters in a file, or why its content is not valid.
 fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
     #[derive(Deserialize)]
     struct Version {

@@ -8,7 +8,7 @@ use super::buckets::Buckets;
 use super::trend::{Bucket, epoch, number};
 use crate::process_image::{BusImage, DriveImage, Outcome};
 
-/// Steps that are kept.
+/// Number of steps that are kept.
 pub const STEPS: usize = 60;
 /// Length of a step.
 pub const STEP: Duration = Duration::from_secs(60);
@@ -21,7 +21,7 @@ pub const BYTES: (usize, usize) = (2 * STEPS * size_of::<Bucket>(), STEPS * size
 /// Transactions of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exchanges {
-    /// All.
+    /// Number of all transactions.
     pub all: u32,
     /// Transactions without a valid reply.
     pub failed: u32,
@@ -40,7 +40,7 @@ pub struct LineHistory {
 #[derive(Debug)]
 struct DriveLine {
     steps: Buckets<Option<Exchanges>>,
-    /// All and failed transactions when they were last looked at.
+    /// All and failed transactions at the end of the previous step.
     before: (u64, u64),
 }
 

@@ -52,9 +52,9 @@ pub use trigger::{Trigger, TriggerKind};
 pub struct RecorderOptions {
     /// Directory of the recordings.
     pub dir: PathBuf,
-    /// Time before the trigger.
+    /// Time recorded before the trigger.
     pub before: Duration,
-    /// Time after it.
+    /// Time recorded after the trigger.
     pub after: Duration,
     /// Size of all recordings on disk at most, bytes.
     pub max_bytes: u64,

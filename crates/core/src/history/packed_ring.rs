@@ -12,18 +12,18 @@ use crate::process_image::{TapedFrame, TapedRead, Verdict};
 
 /// Bytes in front of each entry: its length, and its time.
 const HEAD: usize = 4 + 8;
-/// The memory grows by this part of what it may be.
+/// Number of steps in which the memory grows to its limit.
 pub(super) const STEPS: usize = 16;
 /// The place of no drive.
 const NO_DRIVE: u32 = u32::MAX;
 
 /// Something with a time that can be packed into bytes.
 pub(super) trait Packed: Sized {
-    /// When it was.
+    /// Time of the entry.
     fn at(&self) -> Instant;
     /// Appends all but the time.
     fn pack(&self, bytes: &mut Vec<u8>);
-    /// From what [`Packed::pack`] appended.
+    /// Restores an entry from the bytes that [`Packed::pack`] appended.
     fn unpack(at: Instant, bytes: &[u8]) -> Option<Self>;
 }
 
@@ -172,7 +172,7 @@ impl<T: Packed> PackedRing<T> {
         })
     }
 
-    /// Length and time of the entry there.
+    /// Length and time of the entry at this place.
     fn head(&self, place: usize, start: Instant) -> Option<(usize, Instant)> {
         let head = self.slice(place, HEAD);
         let (length, time) = head.split_first_chunk()?;
@@ -199,7 +199,7 @@ impl<T: Packed> PackedRing<T> {
     }
 }
 
-/// From `start` to `at`, which may be before it.
+/// Nanoseconds from `start` to `at`, which may be before `start`.
 fn nanoseconds(start: Instant, at: Instant) -> i64 {
     let count = |duration: Duration| i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX);
     match at.checked_duration_since(start) {

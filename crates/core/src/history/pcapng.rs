@@ -10,7 +10,7 @@ use crate::process_image::Verdict;
 
 /// LINKTYPE_RTAC_SERIAL.
 const LINK_TYPE: u16 = 250;
-/// Event types of its header.
+/// Event types of the packet header.
 const SENT: u8 = 1;
 const RECEIVED: u8 = 2;
 /// Blocks of pcapng.

@@ -26,7 +26,7 @@ const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 /// An entry for a drive, except its samples.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Note {
-    /// When.
+    /// Time of the entry.
     pub at: Instant,
     /// Content of the note.
     pub body: NoteBody,
@@ -51,7 +51,7 @@ pub enum NoteBody {
         command: String,
         /// The result code.
         result: &'static str,
-        /// From acceptance to result.
+        /// Time from acceptance to result.
         latency: Duration,
     },
 }
@@ -87,12 +87,12 @@ fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
     }
 }
 
-/// How a drive reads at that time, by its samples.
+/// The reading of a drive at this time, by its samples.
 pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Instant) -> Reading<'d> {
     Reading::new(spec, snapshot.clone(), at, ANY_AGE, Duration::ZERO)
 }
 
-/// All that a recording is made of.
+/// The material of a recording.
 #[derive(Debug, Clone)]
 pub struct Capture {
     pub id: String,
@@ -100,9 +100,9 @@ pub struct Capture {
     pub clock: Clock,
     pub bus: Arc<BusImage>,
     pub drive: Arc<DriveImage>,
-    /// Why it was made.
+    /// Trigger of the recording.
     pub trigger: Trigger,
-    /// Further triggers meanwhile.
+    /// Further triggers during the recording.
     pub more: Vec<Trigger>,
     /// First and last time of the recording.
     pub span: (Instant, Instant),
@@ -263,7 +263,7 @@ impl Recorder {
 }
 
 impl LineRing {
-    /// Rings without room, to be given their share by [`LineRing::limit`].
+    /// Rings without memory, which [`LineRing::limit`] gives their share.
     fn new(
         bus: &Arc<BusImage>,
         options: &RecorderOptions,
@@ -417,7 +417,7 @@ impl DriveRing {
             }
             return Some(pending.id.clone());
         }
-        // A drive that was never there is not lost.
+        // A drive that never answered cannot be lost.
         if trigger.kind == TriggerKind::Lost && self.samples.is_empty() {
             return None;
         }

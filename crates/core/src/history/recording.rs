@@ -23,7 +23,7 @@ pub const ENDING: &str = "dgrec";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedHeader)]
 pub struct Header {
-    /// [`VERSION`]; its presence marks the file as a recording.
+    /// [`VERSION`] of the format; this key marks the file as a recording.
     pub drivegate_recording: u32,
     /// Id of the recording: time of the trigger and the drive.
     pub id: String,
@@ -36,7 +36,7 @@ pub struct Header {
     pub summary: String,
     /// Whether the recording is among the first of a storm of recordings, which are kept longer.
     pub first: bool,
-    /// Further triggers meanwhile.
+    /// Further triggers during the recording.
     pub more: Vec<Further>,
     pub drive: Drive,
     pub bus: Bus,
@@ -59,12 +59,12 @@ pub struct Header {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedFurther)]
 pub struct Further {
-    /// When.
+    /// Time of the trigger, s from the first one.
     pub t: f64,
     /// Kind of the further trigger.
     #[schema(value_type = String)]
     pub trigger: TriggerKind,
-    /// In words.
+    /// Description of the trigger.
     pub text: String,
 }
 
@@ -75,7 +75,7 @@ pub struct Drive {
     pub name: String,
     /// Address on the bus.
     pub address: u8,
-    /// Name of its profile.
+    /// Name of the drive's profile.
     pub profile: String,
 }
 
@@ -87,7 +87,7 @@ pub struct Bus {
     pub protocol: String,
     /// Baud rate and character format.
     pub format: String,
-    /// Names of its drives; frames name one by its place here.
+    /// Names of the drives of the bus; a frame refers to a drive by its place here.
     pub drives: Vec<String>,
 }
 
@@ -110,35 +110,35 @@ pub struct Read {
     pub start: u16,
     /// Items.
     pub count: u16,
-    /// The points that it shows, by their places in the header.
+    /// The points of this read, by their places in the header.
     pub points: Vec<usize>,
 }
 
 /// A read of the drive; its values: [`Recording::values`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// When it was read.
+    /// Time of the read, s from the trigger.
     pub t: f64,
     /// Place of the read in the header.
     pub read: usize,
-    /// Where its values stand among those of all samples.
+    /// Places of the sample's values among those of all samples.
     values: Range<usize>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct EventNote {
-    /// When.
+    /// Time of the event, s from the trigger.
     pub t: f64,
     /// Kind.
     pub event: String,
-    /// In words.
+    /// Text of the event.
     pub text: String,
 }
 
 /// A completed command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct CommandNote {
-    /// When it completed.
+    /// When the command completed, s from the trigger.
     pub t: f64,
     /// Kind of the source.
     pub source: String,
@@ -202,14 +202,14 @@ enum Line<'l> {
 struct SampleLine<'l> {
     t: f64,
     read: usize,
-    /// A value for each point of the read; null where it is none.
+    /// A value for each point of the read; null where there is none.
     values: Cow<'l, [Json]>,
 }
 
 /// The last line.
 #[derive(Debug, Serialize, Deserialize)]
 struct End {
-    /// Lines before this one.
+    /// Number of lines before this one.
     lines: usize,
     /// CRC-16 (of Modbus) of all bytes before this line.
     check: String,
@@ -282,7 +282,7 @@ impl Header {
 }
 
 impl Recording {
-    /// An empty one.
+    /// A recording without samples.
     pub fn new(header: Header) -> Recording {
         Recording {
             header,
@@ -307,7 +307,7 @@ impl Recording {
         self.values.get(sample.values.clone()).unwrap_or_default()
     }
 
-    /// The bytes of its file.
+    /// The bytes of the recording's file.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(128 * (self.samples.len() + self.frames.len()) + 4096);
         add(&mut bytes, &self.header);

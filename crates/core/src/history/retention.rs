@@ -30,7 +30,7 @@ impl Storm {
     }
 }
 
-/// A recording, as far as it matters here.
+/// The properties of a recording that decide whether it is kept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Kept {
     /// Size of the file.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 /// Something with a time that takes memory.
 pub(super) trait Timed {
-    /// When it was.
+    /// Time of the entry.
     fn at(&self) -> Instant;
     /// Bytes of memory.
     fn size(&self) -> usize;

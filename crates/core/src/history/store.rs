@@ -36,7 +36,7 @@ pub struct Entry {
     pub trigger: TriggerKind,
     /// Summary of the recording.
     pub summary: String,
-    /// Size of its file.
+    /// Size of the file.
     pub bytes: u64,
     #[serde(skip)]
     first: bool,
@@ -65,7 +65,7 @@ pub enum ReadError {
     File {
         /// The file.
         path: String,
-        /// Why not.
+        /// Reason why the file cannot be read.
         error: io::Error,
     },
     /// The content of the file is not a recording.
@@ -180,7 +180,7 @@ impl Store {
         }
     }
 
-    /// Where they are.
+    /// The directory of the recordings.
     pub fn dir(&self) -> &Path {
         &self.dir
     }

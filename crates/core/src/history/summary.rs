@@ -8,7 +8,7 @@ use super::trigger::TriggerKind;
 use crate::drive::Profile;
 use crate::process_image::Verdict;
 
-/// How long before the trigger errors on the line are mentioned.
+/// Time before the trigger in which errors on the line are mentioned, s.
 const ERRORS_BEFORE: f64 = 5.0;
 /// Time over which a value is seen to rise or fall.
 const TREND: f64 = 2.0;
@@ -76,7 +76,7 @@ fn errors(recording: &Recording) -> Option<String> {
     Some(format!("{:.1} s before: {}", -first, kinds.join(", ")))
 }
 
-/// The last value before the trigger, and where it was going.
+/// The last value before the trigger, and its tendency.
 fn told(recording: &Recording, point: &str, name: &str) -> Option<String> {
     let values = recording.values_of(point);
     let before: Vec<(f64, f64)> = values

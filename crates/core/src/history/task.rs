@@ -222,7 +222,7 @@ struct Taker {
     heard: broadcast::Receiver<Arc<Event>>,
     commands: broadcast::Receiver<Arc<AuditRecord>>,
     captures: SyncSender<Capture>,
-    /// Recordings that the writer had no room for, since it was last reported.
+    /// Recordings that the writer had no room for, since the last report.
     left_out: u64,
 }
 
@@ -349,7 +349,7 @@ fn shortened(text: &str) -> String {
 struct Writer {
     store: Store,
     recordings: Arc<Recordings>,
-    /// The number of its recorder.
+    /// Number of the recorder, which changes with each reload.
     number: u64,
     events: Events,
     /// The last one could not be written.

@@ -12,10 +12,10 @@ use crate::codec::Table;
 use crate::drive::{ModelPoint, PointIndex, Profile, Source};
 use crate::process_image::{Reading, TapedRead};
 
-/// A span of time and the steps it is kept in.
+/// A span of time, and the length of the steps for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Range {
-    /// How far back it reaches.
+    /// Length of the span before now.
     pub span: Duration,
     /// Length of a bucket.
     pub step: Duration,
@@ -70,7 +70,7 @@ pub fn bytes_of(profile: &Profile) -> usize {
 pub struct Reach(u16);
 
 impl Reach {
-    /// As far as [`RANGES`].
+    /// The full reach: all of [`RANGES`].
     pub const FULL: Reach = Reach(1000);
     const LEAST: u16 = 10;
 
@@ -109,7 +109,7 @@ fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, PointIndex)
     POINTS.into_iter().filter_map(index)
 }
 
-/// The values of one step; empty if there were none.
+/// The values of a step; empty if there were none.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bucket {
     pub(super) min: f32,
@@ -174,7 +174,7 @@ struct PointTrend {
     point: ModelPoint,
     /// Index in the profile.
     index: PointIndex,
-    /// Where its value is read from.
+    /// Registers from which the value is read.
     registers: Vec<Registers>,
     /// Whether the point is derived from points that are read elsewhere, too.
     derived: bool,
@@ -375,7 +375,7 @@ fn registers_of(profile: &Profile, index: PointIndex) -> Vec<Registers> {
                 .chain(monitor)
                 .collect()
         }
-        // A point rests on points before it only: the profile is refused otherwise.
+        // A point depends only on earlier points: the profile is refused otherwise.
         Source::Derived(derived) => {
             let sources = derived.sources().filter(|source| *source != index);
             sources.flat_map(|source| registers_of(profile, source)).collect()

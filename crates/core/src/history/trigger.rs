@@ -26,7 +26,7 @@ pub enum TriggerKind {
     Lost,
     /// A lease expired.
     Supervision,
-    /// A stop did not get its acknowledgement.
+    /// A stop was not acknowledged.
     RefusedStop,
     /// An acknowledged command showed no effect.
     NotConfirmed,
@@ -34,7 +34,7 @@ pub enum TriggerKind {
     LineErrors,
     /// A point was beyond its limit for a time.
     Point,
-    /// On request.
+    /// The recording was requested by a client.
     Command,
 }
 
@@ -102,7 +102,7 @@ impl TriggerKind {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trigger {
     pub kind: TriggerKind,
-    /// When.
+    /// Time of the trigger.
     pub at: Instant,
     /// Text of the trigger.
     pub text: String,

@@ -25,7 +25,7 @@ impl Connection {
         }))
     }
 
-    /// When it was opened.
+    /// When the connection was opened.
     pub fn opened_at(&self) -> Instant {
         self.0.opened
     }
@@ -35,7 +35,7 @@ impl Connection {
         self.0.gone.store(true, Ordering::Release);
     }
 
-    /// Whether its client has closed or reset it.
+    /// Whether the client has closed or reset the connection.
     pub fn is_gone(&self) -> bool {
         self.0.gone.load(Ordering::Acquire)
     }
@@ -47,10 +47,10 @@ impl PartialEq for Connection {
     }
 }
 
-/// How an order came.
+/// How and when an order came.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arrival {
-    /// The date of its first byte: no later than that really came.
+    /// Earliest time at which the first byte may have come.
     pub asked: Instant,
     /// Over which connection it came. In what order several connections were written to is not known.
     pub connection: Connection,

@@ -74,7 +74,7 @@ pub struct AuditRecord {
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     #[schema(value_type = f64)]
     pub latency: Duration,
-    /// From acceptance to the read that showed the effect, ms.
+    /// Time from acceptance to the read that showed the effect, ms.
     #[serde(rename = "confirmed_ms", serialize_with = "milliseconds_or_null")]
     #[schema(value_type = Option<f64>)]
     pub confirmed: Option<Duration>,
@@ -128,7 +128,7 @@ impl AuditRecord {
         self.points.iter().any(|change| change.resets)
     }
 
-    /// Writes it to the log under target `audit`, one structured line.
+    /// Writes the record to the log under target `audit`, as one structured line.
     fn log(&self, sent: bool) {
         let points: Vec<String> = self
             .points
@@ -176,7 +176,7 @@ pub struct RunOrdered {
     pub run: bool,
     /// Source and client of the order.
     pub who: String,
-    /// When its result arrived, or the wait was given up.
+    /// When the result of the order arrived, or the wait was given up.
     pub at: Instant,
 }
 
@@ -220,7 +220,7 @@ impl Audit {
         self.file.store(file);
     }
 
-    /// The file, if there is one.
+    /// The audit file, if there is one.
     pub fn file(&self) -> Option<Arc<AuditFile>> {
         self.file.load_full()
     }
@@ -351,7 +351,7 @@ impl Audit {
             .collect()
     }
 
-    /// All that are kept, oldest first.
+    /// All kept records, oldest first.
     #[cfg(test)]
     pub(crate) fn parsed(&self) -> Vec<serde_json::Value> {
         let lines = self.recent(None);

@@ -9,7 +9,7 @@ use crate::process_image::Reading;
 pub(crate) enum Becomes {
     /// The two have nothing to do with each other.
     Untouched,
-    /// The band by which it is converted is not known.
+    /// The band for the conversion is not known.
     Unknown,
     Known(Value),
 }

@@ -164,7 +164,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Effects {
     on: Vec<(DriveIndex, Effect)>,
-    /// The registers that it sets, and on which it rests.
+    /// The registers that the command sets, and those on which it depends.
     pub touches: Touched,
 }
 
@@ -182,7 +182,7 @@ impl Effects {
         Effects { on, touches }
     }
 
-    /// The drives that it reaches.
+    /// The drives that the command reaches.
     pub fn drives(&self) -> impl Iterator<Item = DriveIndex> + '_ {
         self.on.iter().map(|(drive, _)| *drive)
     }
@@ -193,7 +193,7 @@ impl Effects {
         on.map(|(_, effect)| *effect).unwrap_or_default()
     }
 
-    /// Every drive that it reaches, with what it does there.
+    /// Every drive that the command reaches, with the effect there.
     pub fn iter(&self) -> impl Iterator<Item = (DriveIndex, Effect)> + '_ {
         self.on.iter().copied()
     }

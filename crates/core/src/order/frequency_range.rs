@@ -31,7 +31,7 @@ impl FrequencyRange {
         !self.ends().any(read_before) && drive.band(self.minimum, self.maximum) == Some(self.was)
     }
 
-    /// The points of the drive with the ends of its range.
+    /// The points of the drive with the limits of its range.
     pub(crate) fn ends(&self) -> impl Iterator<Item = PointIndex> {
         ends((self.minimum, self.maximum))
     }

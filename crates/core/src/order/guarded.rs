@@ -18,7 +18,7 @@ pub enum Reason {
 }
 
 impl Reason {
-    /// All of them.
+    /// All reasons.
     pub const ALL: [Reason; 5] = [
         Reason::StartsPerHour,
         Reason::MinOff,
@@ -42,11 +42,11 @@ impl Reason {
 /// A start that must wait.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Guarded {
-    /// By which rule.
+    /// Rule that refused the start.
     pub reason: Reason,
-    /// For people.
+    /// Description for people.
     pub why: String,
-    /// After which it may be tried again.
+    /// Time after which the start may be retried.
     pub retry_after: Duration,
 }
 

@@ -22,7 +22,7 @@ impl LastStops {
         }
     }
 
-    /// When the last one was taken in.
+    /// When the last stop was accepted.
     pub fn at(&self) -> Option<Instant> {
         self.last.as_ref().map(|(_, at)| *at)
     }

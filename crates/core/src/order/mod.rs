@@ -79,7 +79,7 @@ pub enum Order {
 pub enum Urgency {
     /// Takes a run command away.
     Stop,
-    /// Any other command.
+    /// Any command that is not a stop.
     Command,
     /// Forwarded read.
     Read,
@@ -88,22 +88,22 @@ pub enum Urgency {
 /// A command that was checked and converted, and may wait for its turn.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Admitted {
-    /// The order, derived points replaced by the points they rest on.
+    /// The order, with derived points replaced by their sources.
     pub order: Order,
     /// Rank of the order.
     pub urgency: Urgency,
     /// Whether the order sets references only.
     pub reference_only: bool,
-    /// Frequency ranges on which it rests.
+    /// Frequency ranges on which the order depends.
     pub ranges: Vec<FrequencyRange>,
 }
 
 /// Whether `min_run` of its drive may delay a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Haste {
-    /// Never: the stop of a person, of the gateway itself, a second one.
+    /// No delay: the stop of a person, of the gateway itself, or a second one.
     AtOnce,
-    /// Where it is the first stop of the client that started the motor.
+    /// A delay is possible if this is the first stop of the client that started the motor.
     Usual,
     /// The stop waits until the motor has run for the minimum time.
     Delayed,
@@ -112,7 +112,7 @@ pub enum Haste {
 /// A command that takes the run command away.
 #[derive(Debug)]
 pub struct Stop {
-    /// Whether it may be delayed.
+    /// Whether `min_run` may delay the stop.
     pub haste: Haste,
     /// Clients that wait for the same stop, and until when.
     pub joined: Vec<(Ticket, Instant)>,
@@ -158,11 +158,11 @@ pub enum Work {
 /// When a command came, and until when it may be sent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Window {
-    /// When its first byte came.
+    /// When the first byte of the command came.
     pub arrival: Arrival,
     /// The command is not sent after this time.
     pub expires: Instant,
-    /// A start that must wait does so until then; else it is refused.
+    /// Whether a start may wait until the command expires; else it is refused.
     pub waits: bool,
 }
 
@@ -177,11 +177,11 @@ pub struct Intent {
     pub order: Order,
     /// Effects on each drive that the order reaches.
     pub effects: Effects,
-    /// Frequency ranges on which its values rest.
+    /// Frequency ranges on which the values depend.
     pub ranges: Vec<FrequencyRange>,
-    /// When it came, and until when it may be sent.
+    /// When the order came, and until when it may be sent.
     pub window: Window,
-    /// The write to a BACnet slot from which it follows.
+    /// The write to a BACnet slot that caused the order.
     pub slot: Option<SlotWrite>,
 }
 
@@ -194,7 +194,7 @@ pub struct Command {
     pub work: Work,
     /// Ticket of the command.
     pub ticket: Ticket,
-    /// Younger commands that went before it.
+    /// Number of younger commands that were sent first.
     pub(crate) overtaken: usize,
 }
 
@@ -288,7 +288,7 @@ impl Command {
         }
     }
 
-    /// The drives that it reaches.
+    /// The drives that the command reaches.
     pub fn reach(&self) -> impl Iterator<Item = DriveIndex> + '_ {
         self.intent.effects.drives()
     }
@@ -363,7 +363,7 @@ impl Command {
         std::iter::once(&self.ticket).chain(joined).map(Ticket::origin)
     }
 
-    /// Until when a client waits for it; none for the gateway's own.
+    /// Until when a client waits for the command; none for the gateway's own.
     pub(crate) fn client_waits_until(&self) -> Option<Instant> {
         let joined = match &self.work {
             Work::Stop(stop) => stop.joined.as_slice(),
@@ -375,7 +375,7 @@ impl Command {
         of_clients.map(|(_, expires)| expires).max()
     }
 
-    /// Reports the outcome to its client and all that joined.
+    /// Reports the outcome to the client and to all that joined.
     pub fn answer(self, outcome: &Outcome, now: Instant) {
         let (was_begun, joined) = match self.work {
             Work::Stop(stop) => (stop.was_begun, stop.joined),

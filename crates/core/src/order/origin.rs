@@ -16,7 +16,7 @@ pub enum SourceKind {
     Sparkplug,
     /// HTTP: the status page, or a program.
     Http,
-    /// Lease that expired.
+    /// The lease of a drive that expired.
     Supervision,
     /// The gateway stops.
     Shutdown,
@@ -37,7 +37,7 @@ pub enum SourceKind {
 }
 
 impl SourceKind {
-    /// All kinds.
+    /// All kinds of sources.
     pub const ALL: [SourceKind; 13] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
@@ -102,12 +102,12 @@ pub enum Authority {
 /// Facts that a client's connection proves about it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Proof {
-    /// Nothing.
+    /// The connection proves nothing.
     #[default]
     Nothing,
     /// The address of a Modbus TCP client, or of a tool at a TCP slot.
     Address(IpAddr),
-    /// The name in its certificate, and its address.
+    /// The name in the client's certificate, and its address.
     Certificate(Arc<str>, IpAddr),
     /// A user of HTTP.
     User(Arc<str>),
@@ -126,12 +126,12 @@ pub enum Proof {
 /// In which part a client acts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Acting {
-    /// As itself.
+    /// The client acts as itself.
     #[default]
     Usual,
     /// Each stop of this client is a new one, even if the client repeats its command word continuously.
     Insisting,
-    /// The drill that it armed gives the order.
+    /// The drill that the client armed gives the order.
     Drill,
 }
 
@@ -225,7 +225,7 @@ impl Origin {
         &self.right
     }
 
-    /// The proof from its connection.
+    /// The proof of the client's connection.
     pub fn proof(&self) -> &Proof {
         &self.proof
     }
@@ -246,7 +246,7 @@ impl Origin {
         self.kind == SourceKind::Supervision && self.who == Origin::LEASE
     }
 
-    /// The client, whatever connection or topic it uses.
+    /// The client, under any connection or topic.
     pub fn client(&self) -> &Arc<str> {
         &self.client
     }

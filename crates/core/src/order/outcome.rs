@@ -22,20 +22,20 @@ pub enum Interruption {
     ShuttingDown,
     /// Another client took the drive.
     Taken,
-    /// A reload took the right of its client away.
+    /// A reload took the right of the client away.
     RightLost,
 }
 
 /// How a command ended.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
-    /// The drive acknowledged it (a read: its reply).
+    /// The drive acknowledged the command (a read: its reply).
     Acknowledged(Reply),
-    /// The drive refused it.
+    /// The drive refused the command.
     Exception(Exception),
     /// The reply leaves the outcome open: 05, or a gateway's 0A or 0B.
     Unknown(Exception),
-    /// Refused before it reached the bus.
+    /// The command was refused before it reached the bus.
     Refused(Refusal),
     /// The drive did not reply.
     TimedOut,
@@ -43,13 +43,13 @@ pub enum Outcome {
     Garbled,
     /// The command expired before its turn; not sent.
     Expired,
-    /// A newer reference took its place; not sent.
+    /// A newer reference replaced the command; not sent.
     Replaced,
-    /// A stop removed it; not sent.
+    /// A stop removed the command; not sent.
     Purged,
     /// A supervision action withdrawn because a client returned; not sent.
     Withdrawn,
-    /// The drive acknowledged it and shows another value.
+    /// The drive acknowledged the value and shows another one.
     NotTaken(String),
     /// The command was started and interrupted: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
@@ -125,7 +125,7 @@ impl Outcome {
         }
     }
 
-    /// Whether the drive took it.
+    /// Whether the drive took the command.
     pub fn is_ok(&self) -> bool {
         matches!(self, Outcome::Acknowledged(_))
     }
@@ -256,11 +256,11 @@ pub enum Refusal {
 pub struct Holder {
     /// Client that holds the drive.
     pub who: String,
-    /// By which right.
+    /// Rank of the holder.
     pub rank: String,
     /// The point that is held, and how the hold ends.
     pub keeps: String,
-    /// Seconds until it ends by itself, if it does.
+    /// Seconds until the hold ends by itself, if it does.
     pub left_s: Option<u64>,
 }
 
@@ -313,9 +313,9 @@ impl Refusal {
 /// The one result of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
-    /// How it ended.
+    /// How the command ended.
     pub outcome: Outcome,
-    /// From acceptance to result.
+    /// Time from acceptance to result.
     pub latency: Duration,
 }
 

@@ -10,7 +10,7 @@ use crate::drive::parameters::RawValue;
 pub struct ParameterOrder {
     /// Id of the parameter in its family.
     pub id: String,
-    /// PDU address of its (first) holding register.
+    /// PDU address of the parameter's (first) holding register.
     pub address: u16,
     /// The value the drive must have before, unless it has `to`; none for a write-only register, which is written once
     /// and not read back.
@@ -20,7 +20,7 @@ pub struct ParameterOrder {
 }
 
 impl ParameterOrder {
-    /// The read of its value.
+    /// The read of the parameter's value.
     pub fn read(&self) -> RequestPdu {
         RequestPdu::Read {
             table: Table::Holding,
@@ -43,7 +43,7 @@ impl ParameterOrder {
         }
     }
 
-    /// In one line, for the audit.
+    /// The order in one line of text, for the audit.
     pub fn what(&self) -> String {
         let (id, to) = (&self.id, self.to.number());
         match self.from {

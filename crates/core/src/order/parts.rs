@@ -7,7 +7,7 @@ use super::{Order, Outcome, written};
 use crate::codec::{RequestPdu, Table};
 use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 
-/// A command, its stop taken out.
+/// A command, split into its stop and the rest.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Parts {
     /// The order stops nothing, or does nothing else.
@@ -73,7 +73,7 @@ fn of_points(values: Vec<(PointIndex, Value)>, profile: &Profile) -> Parts {
 }
 
 fn role(profile: &Profile, index: PointIndex, value: Value) -> Role {
-    // A point may take its commands at another one.
+    // A point may take its commands at another point's address.
     let place = profile
         .points
         .get(index)

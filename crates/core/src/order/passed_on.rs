@@ -19,7 +19,7 @@ pub enum Pace {
 }
 
 impl Pace {
-    /// All, in the order in which they have their turn.
+    /// All paces, in the order in which they have their turn.
     pub const ALL: [Pace; 2] = [Pace::Brisk, Pace::Slow];
 
     /// The share of a busy line.
@@ -54,7 +54,7 @@ pub struct BackgroundRequest {
     pub drive: DriveIndex,
     /// The request.
     pub pdu: RequestPdu,
-    /// How much of a busy line it may take.
+    /// Share of a busy line that the request may take.
     pub pace: Pace,
     /// The request is not sent after this time.
     pub expires: Instant,
@@ -70,7 +70,7 @@ impl BackgroundRequest {
         self.ticket.origin().kind == SourceKind::Schedule
     }
 
-    /// Whether the tool that sent it has disconnected, or has sent another request.
+    /// Whether the tool of the request has disconnected, or has sent another request.
     pub fn is_unwanted(&self) -> bool {
         self.passed_on
             .as_ref()

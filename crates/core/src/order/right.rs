@@ -34,7 +34,7 @@ impl Right {
         Right(None)
     }
 
-    /// Whether its client may write to drives of that bus now.
+    /// Whether the client may write to drives of this bus now.
     pub fn allows(&self, bus: &str) -> bool {
         self.0.as_ref().is_none_or(|grants| grants.may_write(bus))
     }

@@ -20,7 +20,7 @@ pub enum Commanded {
 }
 
 impl Commanded {
-    /// All.
+    /// All points with a priority array.
     pub const ALL: [Commanded; 4] = [
         Commanded::Run,
         Commanded::Reverse,
@@ -57,7 +57,7 @@ pub struct Entry {
     pub value: Value,
     /// The client that wrote the entry.
     pub origin: Origin,
-    /// When.
+    /// Time of the entry.
     pub at: Instant,
     pub(crate) number: u64,
 }
@@ -83,9 +83,9 @@ fn number() -> u64 {
 /// A write to a slot; the order that follows from it carries it, so that both are accepted at once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SlotWrite {
-    /// Names it.
+    /// Number that identifies the write.
     pub id: u64,
-    /// Whose array.
+    /// Point of the priority array.
     pub what: Commanded,
     /// 1..=16.
     pub priority: u8,

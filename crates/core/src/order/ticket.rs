@@ -37,7 +37,7 @@ impl WriteStats {
     fn note(&self, source: SourceKind, answer: &Answer) {
         let mut results = self.results.lock().unwrap_or_else(PoisonError::into_inner);
         *results.entry((source, answer.outcome.code())).or_default() += 1;
-        // How long another master waits is not the gateway's doing.
+        // The wait of another master is not a delay of the gateway.
         if source != SourceKind::OtherMaster {
             self.seconds.observe(answer.latency);
         }
@@ -52,7 +52,7 @@ pub struct Ticket {
     drive: String,
     what: String,
     changes: Vec<Change>,
-    /// The other drives that it starts or stops, by name.
+    /// The other drives that the command starts or stops, by name.
     runs: Vec<(String, bool)>,
     write: bool,
     accepted: Instant,
@@ -61,11 +61,11 @@ pub struct Ticket {
     confirmation: Option<oneshot::Sender<Result<Duration, String>>>,
     answered: Option<(Outcome, Duration)>,
     confirmed: Option<Duration>,
-    /// Why no read can show its effect.
+    /// Why no read can show the effect.
     unseen: Option<String>,
-    /// Nothing of it was written.
+    /// Whether nothing of the command was written yet.
     waits: bool,
-    /// For the rest of the order whose stop this is.
+    /// Reports the end of this stop to the rest of its order.
     stop: Option<StopEnd>,
 }
 
@@ -107,13 +107,13 @@ impl Ticket {
         self
     }
 
-    /// The drives that it starts or stops, where it goes to several.
+    /// Sets the drives that a command to several drives starts or stops.
     pub(crate) fn with_runs(mut self, runs: Vec<(String, bool)>) -> Ticket {
         self.runs = runs;
         self
     }
 
-    /// For the stop of a command whose rest depends on it.
+    /// Sets where a stop reports its end, for the rest that depends on it.
     pub(crate) fn with_rest(mut self, end: StopEnd) -> Ticket {
         self.stop = Some(end);
         self
@@ -237,7 +237,7 @@ impl Receipt {
         }
     }
 
-    /// No read can show the effect, for that reason.
+    /// No read can show the effect, for this reason.
     pub fn cannot_be_seen(mut self, why: &str) {
         self.0.unseen = Some(why.to_string());
         if let Some(sender) = self.0.confirmation.take() {
@@ -251,7 +251,7 @@ impl Receipt {
         self.cannot_be_seen(why);
     }
 
-    /// Whether no client gave it, but the gateway itself.
+    /// Whether the command came from the gateway itself, not from a client.
     pub fn is_of_gateway(&self) -> bool {
         !self.0.origin.kind.is_client()
     }

@@ -10,14 +10,14 @@ type Item = (Table, u16);
 /// The registers of a command.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Touched {
-    /// Which ones is not known.
+    /// The registers are not known.
     #[default]
     Anything,
     /// The known registers.
     These {
         /// Registers that the command sets.
         sets: Vec<Item>,
-        /// By them its values were converted or limited.
+        /// Registers by which the values were converted or limited.
         rests_on: Vec<Item>,
     },
 }

@@ -6,15 +6,15 @@ use crate::drive::parameters::RawValue;
 /// A parameter that differs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Difference {
-    /// Which.
+    /// Id of the parameter.
     pub id: Id,
-    /// There; nothing where it is missing or was not read.
+    /// Value before; none where it is missing or was not read.
     pub before: Option<RawValue>,
-    /// Here, likewise.
+    /// Value after; none where it is missing or was not read.
     pub after: Option<RawValue>,
-    /// For people, of there.
+    /// The value before with its unit, for people.
     pub note_before: String,
-    /// For people, of here.
+    /// The value after with its unit, for people.
     pub note_after: String,
 }
 

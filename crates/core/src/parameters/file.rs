@@ -26,7 +26,7 @@ use crate::hex;
 
 /// The first line of every file.
 const HEAD: &str = "# drivegate parameters 1";
-/// Longest file that is read, bytes.
+/// Largest file that is read, bytes.
 pub(super) const MOST_BYTES: u64 = 4 * 1024 * 1024;
 /// Bytes of the checksum that are written.
 pub(super) const CHECKSUM: usize = 16;
@@ -87,7 +87,7 @@ impl fmt::Display for Id {
 pub struct Entry {
     /// Value of the parameter, or why it was not read.
     pub value: Result<RawValue, String>,
-    /// As text: value in its unit, and name.
+    /// Value in its unit, and name, as text.
     pub note: String,
 }
 
@@ -96,22 +96,22 @@ pub struct Entry {
 pub struct ParameterFile {
     /// Name of the drive.
     pub drive: String,
-    /// Name of its profile.
+    /// Name of the drive's profile.
     pub family: String,
     /// The drive's identification.
     pub identification: String,
-    /// When it was read, RFC 3339.
+    /// When the parameters were read, RFC 3339.
     pub time: String,
-    /// The drive's own counters of its line; empty if its family has none.
+    /// The drive's own counters of the line; empty if its family has none.
     pub counters: String,
-    /// By name.
+    /// Values by parameter.
     pub values: BTreeMap<Id, Entry>,
 }
 
 /// Reason why a text is not a file of parameters.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FileError {
-    /// Something else.
+    /// The text is not a parameter file.
     #[error("it is not a parameter file: its first line is not `{HEAD}`")]
     Other,
     /// A line is not understood.

@@ -48,7 +48,7 @@ const RELEASED: &str = "restore.released";
 pub enum Phase {
     /// The restore writes the new values.
     Writing,
-    /// All are written; the drive is being made to save them.
+    /// All new values are written; the drive is being made to save them.
     Saving,
     /// The restore writes the former values.
     TakingBack,
@@ -64,7 +64,7 @@ impl Phase {
         (Phase::SavingBack, "saving the former values"),
     ];
 
-    /// In words.
+    /// Name of the phase.
     pub fn name(self) -> &'static str {
         Phase::ALL
             .iter()
@@ -78,9 +78,9 @@ impl Phase {
 pub struct Owner {
     /// Name of the drive.
     pub drive: String,
-    /// Name of its bus; empty in journals of earlier versions.
+    /// Name of the drive's bus; empty in journals of earlier versions.
     pub bus: String,
-    /// Name of its profile.
+    /// Name of the drive's profile.
     pub family: String,
     /// The machine; none in journals of earlier versions, which know a name only.
     pub machine: Option<Machine>,
@@ -97,7 +97,7 @@ impl Owner {
         owner(&mut body_of(text)?.lines())
     }
 
-    /// Where it is, as text.
+    /// Place of the machine, as text.
     pub fn place(&self) -> String {
         match &self.machine {
             Some(machine) => format!("`{}` at {machine}", self.drive),
@@ -106,7 +106,7 @@ impl Owner {
     }
 }
 
-/// The text of a journal without its checksum, which fits.
+/// The text of a journal without its checksum, after checking that.
 fn body_of(text: &str) -> Result<String, String> {
     let body = text.trim_end_matches('\n');
     let (body, sum) = body.rsplit_once('\n').ok_or("it is empty, or its end is missing")?;
@@ -165,7 +165,7 @@ pub const NO_IDENTIFICATION: &str = "none";
 /// The journal of a restore.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Journal {
-    /// To which machine it belongs.
+    /// The machine of the journal.
     pub of: Owner,
     /// When the restore began, RFC 3339.
     pub begun: String,

@@ -14,9 +14,9 @@ pub use making::NOT_KNOWN;
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterWrite {
-    /// Which.
+    /// Id of the parameter.
     pub id: Id,
-    /// PDU address of its (first) holding register.
+    /// PDU address of the parameter's (first) holding register.
     pub address: u16,
     /// The present value.
     pub from: RawValue,
@@ -24,14 +24,14 @@ pub struct ParameterWrite {
     pub to: RawValue,
     /// For people, with the counts on the bus: `102 Maximum frequency: 50.00 Hz → 100.00 Hz (5000 → 10000)`.
     pub line: String,
-    /// The drive does not keep it without power.
+    /// Whether the drive loses the value without power.
     pub volatile: bool,
 }
 
 /// A condition that the drive requires for some of the writes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Need {
-    /// Point of the profile (index) that shows it.
+    /// Point of the profile (index) that shows the condition.
     pub point: PointIndex,
     /// The required reading of the point. Even then the drive may still refuse.
     pub value: bool,
@@ -57,7 +57,7 @@ pub struct Handling {
 pub struct Plan {
     /// The writes, in a command in which every step keeps the limits between parameters.
     pub writes: Vec<ParameterWrite>,
-    /// How the drive takes and keeps them.
+    /// How the drive takes and keeps the parameters.
     pub handling: Handling,
     /// Parameters that differ and are left out; how they differ and why they are left out, as text.
     pub left_out: Vec<(Id, String)>,

@@ -39,7 +39,7 @@ pub enum Next {
 #[derive(Debug, Clone, Copy)]
 struct Block {
     start: u16,
-    /// Parameters in it.
+    /// Number of parameters in the block.
     count: u16,
     tries: u32,
 }
@@ -59,7 +59,7 @@ pub struct Reading {
 /// The counters that the drive keeps of its line, read behind the parameters where its family has them (function 08).
 #[derive(Debug)]
 enum Counters {
-    /// The family has none, or the drive does not give them.
+    /// The family has no counters, or the drive does not report them.
     Absent,
     /// Counters read so far, and the tries of the next one.
     Reading(Vec<u16>, u32),

@@ -27,13 +27,13 @@ const MOST_SAVES: u32 = 3;
 /// The next step.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Wanted {
-    /// The journal as it is now must be on disk before anything else.
+    /// The present state of the journal must be on disk before anything else.
     Record,
     /// The next order for the bus.
     Set(ParameterOrder),
     /// The journal is removed.
     Remove,
-    /// Nothing: it has ended.
+    /// Nothing is wanted, as the restore has ended.
     Nothing,
 }
 
@@ -82,7 +82,7 @@ pub struct Restoration {
     /// Something was written that is not saved.
     wrote: bool,
     saves: u32,
-    /// Since when it cannot continue.
+    /// Since when the restore cannot continue.
     waits_since: Option<Instant>,
     noted: Instant,
 }
@@ -92,7 +92,7 @@ impl Restoration {
         Restoration::of(journal, false, now)
     }
 
-    /// Resumes an interrupted one.
+    /// Resumes an interrupted restore.
     pub fn resume(mut journal: Journal, now: Instant) -> Restoration {
         journal.phase = Phase::Writing;
         Restoration::of(journal, true, now)
@@ -148,7 +148,7 @@ impl Restoration {
         }
     }
 
-    /// The journal as it must be on disk.
+    /// The journal in the state that must be on disk.
     pub fn journal(&self) -> &Journal {
         &self.journal
     }
@@ -158,7 +158,7 @@ impl Restoration {
         (self.journal.done, self.writes.len())
     }
 
-    /// How it ended, once it has ended.
+    /// How the restore ended, once it has.
     pub fn end(&self) -> Option<&End> {
         match &self.state {
             State::Over(end) => Some(end),
@@ -305,7 +305,7 @@ impl Restoration {
         });
     }
 
-    /// The drive refused it.
+    /// The drive refused the order.
     fn refused(&mut self, code: Exception, now: Instant) -> Then {
         let need = self.journal.plan.handling.needs.clone();
         match need.filter(|need| need.exception == Some(code.0)) {

@@ -21,7 +21,7 @@ pub struct Status {
     pub progress: (usize, usize),
     /// Estimated remaining time.
     pub remaining: Option<Duration>,
-    /// Why it waits.
+    /// Why the reading waits.
     pub waits: Option<String>,
     /// Result of the reading; none while it is in progress.
     pub result: Option<Result<Arc<ParameterFile>, String>>,
@@ -62,7 +62,7 @@ pub struct RestoreStatus {
     pub stage: RestoreStage,
     /// Addresses that were read, or parameters that were written, and all.
     pub progress: (usize, usize),
-    /// Why it waits.
+    /// Why the restore waits.
     pub waits: Option<String>,
     /// Plan of the restore, once known.
     pub prepared: Arc<Prepared>,
@@ -121,12 +121,12 @@ impl Vault {
         self.lock().others.clone()
     }
 
-    /// Where readings are kept.
+    /// The store in which readings are kept.
     pub fn store(&self) -> Option<Store> {
         self.lock().store.clone()
     }
 
-    /// Names that go before those of a profile.
+    /// Names that take precedence over those of a profile.
     pub fn names(&self, profile: &str) -> Arc<Names> {
         self.lock().names.get(profile).cloned().unwrap_or_default()
     }
@@ -231,7 +231,7 @@ impl Vault {
         self.lock().restores.get(drive).cloned()
     }
 
-    /// A restore of that drive begins, at that stage; its number.
+    /// Starts a restore of the drive, at this stage; returns its number.
     ///
     /// # Errors Another one is in progress.
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {

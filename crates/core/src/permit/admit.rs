@@ -115,7 +115,7 @@ pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
     Ok(())
 }
 
-/// Why nothing goes out on a line that another master owns.
+/// Why nothing is sent on a line that another master owns.
 fn listens(drive: &Reading<'_>) -> String {
     format!(
         "bus `{}` only listens (mode = \"listen\"), another master owns its line; nothing is sent to `{}`",

@@ -34,7 +34,7 @@ pub struct DrillLock {
 /// State of one drive that decides about its orders.
 #[derive(Debug, Default)]
 pub(super) struct DriveGate {
-    /// Stops accepted so far.
+    /// Number of stops accepted so far.
     stops: u64,
     /// The last ones, as far as they decide on orders that were given before.
     pub(super) last_stops: LastStops,
@@ -44,7 +44,7 @@ pub(super) struct DriveGate {
     last_starter: u64,
     /// The login of the last client command; none if there was none, or its client has no login.
     commander: Option<Arc<str>>,
-    /// The clients that commanded it, the last one last.
+    /// The clients that commanded the drive, the last one last.
     clients: Vec<Arc<str>>,
     /// Clients that commanded another machine under the name or unit that this one has since a reload: their standing run command
     /// does not start its motor.
@@ -59,7 +59,7 @@ pub(super) struct DriveGate {
 /// State of the drives of a bus that decides about their orders.
 #[derive(Debug, Default)]
 pub struct Gate {
-    /// `[authority]`, where it is on.
+    /// Rules of `[authority]`, where it is on.
     pub(super) rules: Option<Arc<Rules>>,
     drives: BTreeMap<DriveIndex, DriveGate>,
     /// The last pause of the bus.
@@ -131,7 +131,7 @@ impl Gate {
         verdict
     }
 
-    /// Judges one question. A refusal is noted where it counts.
+    /// Judges an order for one drive. A refusal is recorded where that matters.
     pub fn ask(&mut self, ask: &Ask<'_>) -> Verdict {
         let nothing_known = DriveGate::default();
         let drive = self.drives.get(&ask.drive).unwrap_or(&nothing_known);
@@ -264,7 +264,7 @@ impl Gate {
         starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
     }
 
-    /// Until when an ordinary stop of that drive waits.
+    /// Until when an ordinary stop of the drive waits.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         self.starts.as_ref()?.stop_waits(drive, now)
     }
@@ -312,7 +312,7 @@ impl Gate {
         self.starts.as_ref()
     }
 
-    /// From now on starts are guarded so.
+    /// Sets the start guards of the bus.
     pub(crate) fn set_starts(&mut self, starts: Option<Arc<BusGuards>>) {
         self.starts = starts;
     }

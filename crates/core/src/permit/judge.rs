@@ -14,7 +14,7 @@ use crate::process_image::Reading;
 pub enum Stage {
     /// The order is complete and takes its place in the queue.
     Accept,
-    /// The line is free for it.
+    /// The line is free for the order.
     Turn,
     /// The next frame of the order is about to be sent.
     Write,
@@ -74,7 +74,7 @@ pub struct Ask<'a> {
     pub stage: Stage,
     /// Now.
     pub now: Instant,
-    /// The drive, one of those that the order reaches.
+    /// The drive that the rule looks at, one of those that the order reaches.
     pub drive: DriveIndex,
     /// The order.
     pub intent: &'a Intent,
@@ -105,7 +105,7 @@ impl Ask<'_> {
 pub(super) struct Rule {
     /// The moments at which the rule is evaluated; the rule's file explains why not at others.
     pub(super) stages: &'static [Stage],
-    /// Whether stops are judged by it, too.
+    /// Whether the rule applies to stops, too.
     pub(super) binds_stops: bool,
     /// The judgement.
     pub(super) judge: fn(&Ask<'_>, &DriveGate, &Gate) -> Verdict,

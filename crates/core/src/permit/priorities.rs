@@ -23,7 +23,7 @@ pub const PROTECTING: u8 = 5;
 /// The consequence of a write to a slot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Follows {
-    /// Nothing: it does not govern, or the drive stays as it is.
+    /// No command follows: the write does not govern, or the drive stays as it is.
     Nothing,
     /// The value of this point becomes an order of the client that wrote it.
     Order(Commanded, Box<Entry>),
@@ -36,7 +36,7 @@ pub enum Follows {
 pub enum Settled {
     /// The entry is in force.
     Done,
-    /// Nothing was done: the slot is as it was.
+    /// The write was not carried out: the slot is unchanged.
     Failed,
     /// The result is not known: the next reading shows it.
     Unknown,
@@ -69,10 +69,10 @@ impl Settled {
 #[derive(Debug, Clone, Default)]
 struct Slot {
     stands: Option<Entry>,
-    /// The write that set it.
+    /// Number of the write that set the slot.
     by: u64,
     asked: Vec<(u64, Option<Entry>)>,
-    /// An entry that may be in force, since then.
+    /// An entry that may be in force, and since when.
     uncertain: Option<(Entry, Instant)>,
 }
 
@@ -124,7 +124,7 @@ pub struct Protects {
     pub client: String,
     /// Priority of the slot.
     pub priority: u8,
-    /// The point it blocks.
+    /// The point that the slot blocks.
     pub what: ModelPoint,
 }
 
@@ -171,7 +171,7 @@ impl Priorities {
         self.slot(what, priority)?.stands.as_ref()
     }
 
-    /// The governing slot, if it belongs to that array.
+    /// The governing slot, if it belongs to the array of this point.
     pub fn shown(&self, what: Commanded) -> Option<(u8, &Entry)> {
         let (of, priority, entry) = self.lowest(what, |slot| slot.stands.as_ref())?;
         (of == what).then_some((priority, entry))
@@ -265,7 +265,7 @@ impl Priorities {
         }
     }
 
-    /// How a write that was accepted ended, at `now`.
+    /// Sets how an accepted write ended, at `now`.
     pub fn settle(&mut self, id: u64, settled: Settled, now: Instant) {
         for (.., slot) in self.slots_mut() {
             let Some(place) = slot.asked.iter().position(|(asked, _)| *asked == id) else {
@@ -310,7 +310,7 @@ impl Priorities {
         slots.into_iter().any(|slot| slot.uncertain.is_some())
     }
 
-    /// Puts something into a slot as it was before a restart.
+    /// Sets a slot to its entry from before a restart.
     pub fn restore(&mut self, what: Commanded, priority: u8, entry: Entry) {
         if let Some(slot) = self.slot_mut(what, priority) {
             slot.by = entry.number;

@@ -37,7 +37,7 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether the request may change anything: then it is counted and audited as a command.
     pub may_write: bool,
-    /// How it came.
+    /// How the request came.
     pub arrival: Arrival,
     /// The request is not sent after this time.
     pub expires: Instant,
@@ -67,7 +67,7 @@ pub struct Exchange {
 }
 
 impl Exchange {
-    /// How it ended, and the frame of the reply where there was one.
+    /// How the transaction ended, and the frame of the reply where there was one.
     pub fn poll(&mut self, cx: &mut Context<'_>) -> Poll<(Outcome, Option<Vec<u8>>)> {
         // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
         let answer = ready!(Pin::new(&mut self.answer).poll(cx));

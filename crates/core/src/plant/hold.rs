@@ -46,7 +46,7 @@ impl BusHandle {
                 drive: Some(image.spec.name.clone()),
                 ..Event::new(kind, time, text)
             });
-            // Anyone who shows the drive shows its hold.
+            // An update of the image makes the interfaces show the hold again.
             image.update(|_| {});
         }
     }

@@ -21,7 +21,7 @@ const MOST: usize = 8;
 enum By {
     /// By the name of the drive.
     Name,
-    /// By its unit id, or by the BACnet device that follows from that.
+    /// By the unit id, or by the BACnet device that follows from the unit id.
     Unit,
 }
 
@@ -56,7 +56,7 @@ struct Served {
 struct Former {
     by: By,
     until: Instant,
-    /// The machine that it meant, where that is served now.
+    /// The machine that was meant, where it is served now.
     machine: Option<Served>,
 }
 

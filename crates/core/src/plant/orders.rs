@@ -18,7 +18,7 @@ use crate::order::{
 use crate::permit::{Facts, Seen, Stage, Verdict, admit, meant_another};
 use crate::process_image::{BusImage, Reading};
 
-/// An order as a way in gives it to a drive.
+/// An order as an interface gives it to a drive.
 #[derive(Debug, Clone)]
 pub struct OrderRequest {
     order: Order,
@@ -89,7 +89,7 @@ impl OrderRequest {
         OrderRequest { waits, ..self }
     }
 
-    /// No guard delays its stop.
+    /// Excludes a delay of the stop by a guard.
     #[must_use]
     pub fn at_once(self) -> OrderRequest {
         OrderRequest { at_once: true, ..self }
@@ -264,7 +264,7 @@ impl DriveHandle {
         placed
     }
 
-    /// As [`DriveHandle::place`], of an order that means this machine.
+    /// As [`DriveHandle::place`], for an order that means this machine.
     fn place_here(&self, request: OrderRequest, now: Instant) -> Placed {
         let reading = self.reading(now);
         let OrderRequest { order, rest, .. } = request.clone();
@@ -340,7 +340,7 @@ impl DriveHandle {
         let (ticket, answer) = self.ticket(&of_stop, sets, request.origin.clone(), true, now);
         let mut ticket = ticket.with_rest(end.clone());
         let placed = Placed::new(now, answer, ticket.confirmation());
-        // The stop is the other part's, also where a block repeats it.
+        // The stop belongs to the other part, even where a block repeats it.
         let mut sets = rest
             .as_ref()
             .map_or_else(|_| Vec::new(), |order| changes(reading, order));

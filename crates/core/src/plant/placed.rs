@@ -12,9 +12,9 @@ use crate::order::{Answer, Outcome, joined};
 /// Effect of an acknowledged command as shown by reads; empty for any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Shown {
-    /// Time from acceptance to the read that showed its effect.
+    /// Time from acceptance to the read that showed the effect.
     pub after: Option<Duration>,
-    /// Why no read can show it.
+    /// Why no read can show the effect.
     pub unseen: Option<String>,
 }
 
@@ -68,7 +68,7 @@ impl Placed {
         self.accepted
     }
 
-    /// The one answer, if it is there.
+    /// The answer, if it has arrived.
     pub fn answer(&mut self) -> Option<Answer> {
         now(|cx| self.poll_answer(cx))
     }
@@ -156,7 +156,7 @@ fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answ
 #[derive(Debug)]
 enum Arriving<T> {
     Awaited(oneshot::Receiver<T>),
-    /// `None`: it will never arrive.
+    /// The result; `None`: it will never arrive.
     Known(Option<T>),
 }
 

@@ -39,11 +39,11 @@ use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, Profile, Value
 
 #[derive(Debug)]
 pub struct DriveImage {
-    /// As configured.
+    /// Configuration of the drive.
     pub spec: DriveSpec,
-    /// The requests that read it.
+    /// The requests that read the drive.
     pub plan: Plan,
-    /// Why it accepts only stops, if so.
+    /// Why the drive accepts only stops, if so.
     pub hold: Arc<Hold>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
@@ -134,7 +134,7 @@ impl DriveImage {
         self
     }
 
-    /// As [`DriveImage::with_stale_floor`], for a drive that is read already.
+    /// As [`DriveImage::with_stale_floor`], for a drive that is being read already.
     pub fn set_stale_floor(&self, stale_floor: Duration) {
         let nanos = u64::try_from(stale_floor.as_nanos()).unwrap_or(u64::MAX);
         self.stale_floor.store(nanos, Ordering::Relaxed);
@@ -177,7 +177,7 @@ impl DriveImage {
         Reading::new(&self.spec, self.snapshot(), now, stale_after, self.slow_cycle).held(&self.hold)
     }
 
-    /// Counts one transaction.
+    /// Counts a transaction.
     pub fn count(&self, outcome: Outcome) {
         if let Some(counter) = self.outcomes.get(outcome as usize) {
             counter.fetch_add(1, Ordering::Relaxed);
@@ -208,7 +208,7 @@ impl DriveImage {
         }
     }
 
-    /// Turnarounds so far.
+    /// Histogram of turnarounds so far.
     pub fn turnarounds(&self) -> HistogramSnapshot {
         self.turnarounds.snapshot()
     }
@@ -284,7 +284,7 @@ impl DriveImage {
 /// The image of one bus and its drives.
 #[derive(Debug)]
 pub struct BusImage {
-    /// As configured.
+    /// Configuration of the bus.
     pub spec: BusSpec,
     /// The drives of the bus, in the order of the file.
     pub drives: PerDrive<Arc<DriveImage>>,
@@ -324,7 +324,7 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Whether its port is open.
+    /// Whether the port is open.
     pub fn is_up(&self) -> bool {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).up
     }
@@ -349,7 +349,7 @@ impl BusImage {
         self.counted(Outcome::Timeout) + self.counted(Outcome::Corrupt)
     }
 
-    /// Drives that answer.
+    /// Number of drives that answer.
     pub fn online(&self) -> usize {
         self.drives.iter().filter(|d| d.snapshot().link.is_online()).count()
     }

@@ -16,13 +16,13 @@ const PARAMETER_AGE: Duration = Duration::from_secs(5);
 /// A drive as a reader sees it at one time.
 #[derive(Debug, Clone)]
 pub struct Reading<'d> {
-    /// As configured.
+    /// Configuration of the drive.
     pub spec: &'d DriveSpec,
-    /// Why it accepts only stops, if so; none for a past state.
+    /// Why the drive accepts only stops, if so; none for a past state.
     pub hold: Option<&'d Hold>,
     /// The snapshot.
     pub snapshot: Arc<Snapshot>,
-    /// When the reader looks.
+    /// Time of the reading.
     pub now: Instant,
     /// Age from which a sample of the fast class is stale.
     pub stale_after: Duration,

@@ -11,9 +11,9 @@ use crate::drive::{Plan, PointIndex, PollClass};
 pub enum Link {
     /// No request was sent yet.
     Untried,
-    /// Answers since.
+    /// The drive answers since this time.
     Online(SystemTime),
-    /// Does not answer since.
+    /// The drive does not answer since this time.
     Offline(SystemTime),
 }
 
@@ -35,7 +35,7 @@ impl Link {
 pub struct Cadence(u16);
 
 impl Cadence {
-    /// Longest interval that counts as one.
+    /// Longest interval between two reads that counts as a cadence.
     pub const LONGEST: Duration = Duration::from_secs(600);
 
     /// Records that a value was seen again after `interval`. A longer interval than so far is learned at four times the last
@@ -62,7 +62,7 @@ pub(super) struct Cell {
     pub(super) refused: Option<Exception>,
     /// Read before the drive went away, and not since.
     pub(super) outlived: bool,
-    /// How often another master reads it, where one does.
+    /// Cadence at which another master reads the register, where one does.
     pub(super) cadence: Cadence,
 }
 
@@ -97,12 +97,12 @@ pub struct Snapshot {
     pub link: Link,
     /// When the process data (fast class) was last read.
     pub fast_at: Option<Instant>,
-    /// Filled by what another master reads: how often it reads process data.
+    /// How often another master reads process data, where its traffic fills the snapshot.
     pub heard: Option<Cadence>,
     /// Points whose value is that of their monitoring register, because a selector of the drive gives them another content
     /// than the profile states: see [`crate::drive::Point::monitor`].
     pub monitored: Vec<PointIndex>,
-    /// Shared with the snapshots before, as far as nothing in them changed.
+    /// Spans of registers, shared with earlier snapshots as far as nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
 
@@ -151,7 +151,7 @@ impl Snapshot {
         });
     }
 
-    /// Words that the drive answered another master. Whether process data was among them.
+    /// Stores words that the drive answered to another master. Returns whether process data was among them.
     pub fn hear(&mut self, table: Table, start: u16, words: &[u16], now: Instant) -> bool {
         let (mut fast, mut before) = (false, None::<Instant>);
         for span in self.spans.iter().filter(|span| span.class == PollClass::Fast) {

@@ -32,7 +32,7 @@ pub enum Verdict {
 }
 
 impl Verdict {
-    /// All.
+    /// All verdicts.
     pub const ALL: [Verdict; 6] = [
         Verdict::Sent,
         Verdict::Ok,
@@ -51,7 +51,7 @@ impl Verdict {
 /// Words that a drive answered to a read of its plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TapedRead {
-    /// When they were read.
+    /// When the words were read.
     pub at: Instant,
     pub table: Table,
     /// First PDU address.
@@ -83,7 +83,7 @@ pub enum Taped {
 }
 
 impl Taped {
-    /// Bytes of memory it takes.
+    /// Size of the entry in memory, bytes.
     pub fn size(&self) -> usize {
         match self {
             Taped::Read(_, read) => read.size(),
@@ -96,14 +96,14 @@ impl Taped {
 const SHARED: usize = 16;
 
 impl TapedRead {
-    /// Bytes of memory it takes.
+    /// Size of the read in memory, bytes.
     pub fn size(&self) -> usize {
         size_of::<TapedRead>() + SHARED + 2 * self.words.len()
     }
 }
 
 impl TapedFrame {
-    /// Bytes of memory it takes.
+    /// Size of the frame in memory, bytes.
     pub fn size(&self) -> usize {
         size_of::<TapedFrame>() + SHARED + self.bytes.len()
     }
@@ -120,7 +120,7 @@ struct Waiting {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum Taping {
-    /// Nothing.
+    /// The tape records nothing.
     Off,
     /// Readings: for trends and counters.
     Reads,
@@ -145,7 +145,7 @@ impl Tape {
         }
     }
 
-    /// Whether that is taken.
+    /// Whether the tape records this kind.
     pub fn takes(&self, taping: Taping) -> bool {
         self.taping.load(Ordering::Relaxed) >= taping as u8
     }
@@ -176,7 +176,7 @@ impl Tape {
         }
     }
 
-    /// All entries since the last call, oldest first, and how many were dropped.
+    /// All entries since the last call, oldest first, and the number of dropped ones.
     pub fn take(&self) -> (Vec<Taped>, u64) {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         let next = Waiting {

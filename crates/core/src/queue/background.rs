@@ -44,7 +44,7 @@ impl Background {
         self.waiting.iter().position(|r| r.pace == pace && may(r))
     }
 
-    /// The request of that number, as [`Background::next`] gave it.
+    /// The request with this number from [`Background::next`].
     pub fn get(&self, number: usize) -> Option<&BackgroundRequest> {
         self.waiting.get(number)
     }

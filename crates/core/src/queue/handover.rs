@@ -60,7 +60,7 @@ impl Pending {
         }
     }
 
-    /// A stop that was given to the bus before; it was counted there.
+    /// Takes over a stop that was given to another bus, where it was counted.
     fn inherit(&mut self, mut stop: Command, now: Instant) {
         if let Work::Stop(work) = &mut stop.work {
             work.is_inherited = true;
@@ -73,7 +73,7 @@ impl Pending {
 }
 
 impl Command {
-    /// Another bus serves its drive, at that place.
+    /// Changes the place of its drive to the one on the bus that serves it now.
     pub(super) fn move_to(&mut self, place: DriveIndex) {
         let effect = self.effect(self.intent.drive);
         self.intent.drive = place;

@@ -72,13 +72,13 @@ pub struct Chosen {
 /// An accepted command that was refused later, to be reported as one that was refused at once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Denied {
-    /// The drive, or one of those that it was to reach.
+    /// The drive, or one of the drives of the order.
     pub drive: DriveIndex,
     /// Origin of the order.
     pub origin: Origin,
     /// The order, as text.
     pub what: String,
-    /// Why.
+    /// Reason of the refusal.
     pub refusal: Refusal,
 }
 
@@ -96,9 +96,9 @@ pub enum Ready {
 /// The commands that may go, and when to look again.
 #[derive(Debug, Default)]
 pub struct Choice {
-    /// The next one.
+    /// The next command.
     pub chosen: Option<Chosen>,
-    /// When another one may go.
+    /// When another command may go.
     pub wake_at: Option<Instant>,
 }
 
@@ -242,7 +242,7 @@ impl Pending {
                     passed_over.push(number);
                 }
                 Verdict::LookFirst => passed_over.push(number),
-                // Others may go in its place.
+                // Another command may go in place of the refused one.
                 Verdict::Refuse(_) => choice.wait(now),
             }
         }
@@ -422,7 +422,7 @@ impl Pending {
         }
     }
 
-    /// Commands that wait.
+    /// Number of waiting commands.
     pub fn len(&self) -> usize {
         self.waiting.len()
     }

@@ -54,7 +54,7 @@ impl CommandQueue {
         self
     }
 
-    /// The start guards of its drives, if any.
+    /// The start guards of the bus, if any.
     pub fn guards(&self) -> Option<&Arc<BusGuards>> {
         self.guards.as_ref()
     }
@@ -184,7 +184,7 @@ impl CommandQueue {
         }
         let pending = self.lock();
         let quiet = pending.gate.quiet(now);
-        // Under the lock, so that one that begins now is not lost.
+        // The flag is set under the lock, so that a drill that starts now is not lost.
         self.has_quiet.store(quiet.is_some(), Ordering::Release);
         quiet
     }

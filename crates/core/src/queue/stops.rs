@@ -32,7 +32,7 @@ impl std::fmt::Display for NotStopped {
 }
 
 impl Stopping {
-    /// When the gateway ends all the same.
+    /// When the gateway ends even without all stops.
     pub fn deadline(&self) -> Instant {
         self.deadline
     }
@@ -56,7 +56,7 @@ impl Pending {
         }
     }
 
-    /// Whether a cyclic client gives its waiting delayed stop again.
+    /// Whether a cyclic client repeats its waiting delayed stop.
     fn repeats(&self, stop: &Command) -> bool {
         let origin = stop.ticket.origin();
         let alike = |c: &Command| c.intent.drive == stop.intent.drive && c.intent.order == stop.intent.order;
@@ -65,7 +65,7 @@ impl Pending {
         self.waiting.iter().any(waits) && self.gate.is_cyclic(origin)
     }
 
-    /// Until when the stop that waits for that drive does so by `min_run`.
+    /// Until when `min_run` delays the waiting stop of the drive.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         let delayed = |c: &Command| c.is_delayed_stop() && c.intent.drive == drive;
         self.waiting
@@ -107,7 +107,7 @@ impl Pending {
         self.waiting.push_back(stop);
     }
 
-    /// A stop ends what waits for its drive, and what has started.
+    /// A stop removes the waiting commands of its drive, and ends the started ones.
     fn purge(&mut self, drive: DriveIndex, now: Instant) {
         self.remove(now, &Outcome::Purged, |c| is_purged(c, drive));
         if !self.stopped.contains(&drive) {

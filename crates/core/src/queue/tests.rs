@@ -32,7 +32,7 @@ fn points(points: &[usize]) -> Order {
     )
 }
 
-/// Each point is a register of its own.
+/// Registers of an order whose points each have a register of their own.
 fn touched(order: &Order) -> Touched {
     match order {
         Order::Points(values) => Touched::These {
@@ -96,7 +96,7 @@ impl Clients {
         self.give((SourceKind::Mqtt, who), drive, Urgency::Command, points(of), false)
     }
 
-    /// When something that waits now may go.
+    /// When a waiting command may go.
     fn wakes(&mut self) -> Option<Instant> {
         let now = self.now;
         self.pending
@@ -141,7 +141,7 @@ fn outcome(receiver: &mut Receiver<Answer>) -> Option<Outcome> {
 fn no_number_of_a_command_is_used_twice_in_the_process() {
     let mut numbers = std::collections::BTreeSet::new();
     for _ in 0..3 {
-        // The queue of a bus that a reload starts anew.
+        // A reload that restarts the bus gives it a new queue.
         let mut clients = Clients::new();
         for drive in 0..2 {
             clients.give((SourceKind::Mqtt, "a"), drive, Urgency::Command, points(&[1]), false);
@@ -337,7 +337,7 @@ fn nobody_is_overtaken_without_a_bound() {
     let _served = rig.push_from("old", 1, &[0]);
     assert!(rig.take().is_some());
     let _old = rig.push_from("old", 1, &[1]);
-    // Clients that were never served come before it, one after the other.
+    // New clients go before this order, one after the other, up to the limit.
     let mut turns = 0;
     loop {
         let _new = rig.push_from(&format!("new {turns}"), 2, &[2]);

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// Most starts an hour that can be configured.
+/// Highest configurable number of starts per hour.
 pub const MOST_STARTS: u32 = 120;
 
 /// `guard` of a drive.
@@ -10,7 +10,7 @@ pub const MOST_STARTS: u32 = 120;
 pub struct Guard {
     /// Starts within any hour.
     pub starts_per_hour: Option<u32>,
-    /// Time that the motor stands before it is started again.
+    /// Least time that the motor stands before another start.
     pub min_off: Duration,
     /// Time that the motor runs before an ordinary stop.
     pub min_run: Duration,
@@ -21,12 +21,12 @@ pub struct Guard {
 /// A condition for starting a motor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interlock {
-    /// The drive that shows it.
+    /// The drive with the point.
     pub drive: String,
-    /// A point of it that is true or false.
+    /// Name of the point, which is true or false.
     pub point: String,
     /// Value that the point must have.
     pub is: bool,
-    /// Whether the running motor is stopped where it does not hold.
+    /// Whether the running motor is stopped when the interlock no longer holds.
     pub trip: bool,
 }

@@ -17,7 +17,7 @@ use crate::drive::{PointIndex, Profile, RawWrites};
 /// Whether a drive may be commanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Access {
-    /// Every write is refused.
+    /// The drive is monitored: every write is refused.
     #[default]
     Monitor,
     /// Writes are passed on.
@@ -51,7 +51,7 @@ pub enum LeaseAction {
 pub struct Supervision {
     /// Time without renewal after which the lease expires.
     pub timeout: Duration,
-    /// The action then.
+    /// Action when the lease expires.
     pub action: LeaseAction,
     /// A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.
     pub adopt: bool,
@@ -60,10 +60,10 @@ pub struct Supervision {
 /// The action for a drive at shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnShutdown {
-    /// Nothing is written.
+    /// At shutdown nothing is written.
     #[default]
     Hold,
-    /// The stop is written and its acknowledgement awaited.
+    /// At shutdown the stop is written and its acknowledgement awaited.
     Stop,
 }
 
@@ -72,7 +72,7 @@ pub enum OnShutdown {
 pub struct DriveSpec {
     /// Name, unique in the gateway.
     pub name: String,
-    /// Name of its bus.
+    /// Name of the drive's bus.
     pub bus: String,
     /// Address on the bus, 1..=247.
     pub address: u8,
@@ -82,7 +82,7 @@ pub struct DriveSpec {
     pub profile: Arc<Profile>,
     /// Group of drives that are stopped together, and started one after the other.
     pub group: Option<String>,
-    /// How often and how soon it may be started.
+    /// Limits of the drive's starts.
     pub guard: Option<Guard>,
     /// The interlocks of its starts.
     pub interlocks: Vec<Interlock>,
@@ -92,7 +92,7 @@ pub struct DriveSpec {
     pub access: Access,
     /// Limits of commands in engineering units, by point name.
     pub limits: BTreeMap<String, RangeInclusive<f64>>,
-    /// Lease, if there is one.
+    /// Lease of the drive, if there is one.
     pub supervision: Option<Supervision>,
     /// The action at shutdown.
     pub on_shutdown: OnShutdown,
@@ -104,7 +104,7 @@ pub struct DriveSpec {
     pub triggers: Vec<PointTrigger>,
     /// The permitted raw writes in addition to writable points.
     pub raw_writes: RawWrites,
-    /// The permitted access to its parameters.
+    /// The permitted access to the drive's parameters.
     pub params: ParamsAccess,
     /// How often what was ordered last is written again, for its own timeout; none where it is not.
     pub refresh: Option<Duration>,
@@ -115,7 +115,7 @@ pub struct DriveSpec {
 /// The times of one drive, where they are not those of its bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Timing {
-    /// Time for the first byte of its reply; wire time is added.
+    /// Time limit for the first byte of a reply; wire time is added.
     pub response_timeout: Option<Duration>,
     /// Silence before each request to it, and after its reply before a request to any other drive.
     pub silence: Option<Duration>,
@@ -145,9 +145,9 @@ pub struct PointTrigger {
 /// The side of a limit that triggers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TriggerLimit {
-    /// Values above it.
+    /// The trigger is a value above this one.
     Above(f64),
-    /// Values below it.
+    /// The trigger is a value below this one.
     Below(f64),
 }
 
@@ -172,11 +172,11 @@ pub struct BusSpec {
 /// drive, and that of its bus, may come to mean another machine.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Machine {
-    /// The port of its bus.
+    /// The port of the bus.
     pub port: String,
     /// Address of the drive on the bus.
     pub address: u8,
-    /// The name of its profile.
+    /// Name of the drive's profile.
     pub profile: String,
 }
 
@@ -210,7 +210,7 @@ impl BusSpec {
     }
 }
 
-/// Whether that is a port of Modbus TCP.
+/// Whether the port is one of Modbus TCP.
 pub fn is_modbus_tcp(port: &str) -> bool {
     port.starts_with("modbus-tcp://")
 }
@@ -242,7 +242,7 @@ impl DriveSpec {
         }
     }
 
-    /// Whether its starts count: for itself or for others.
+    /// Whether starts of the drive count: for itself or for others.
     pub fn is_guarded(&self) -> bool {
         self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
     }

@@ -34,7 +34,7 @@ pub struct Heartbeat(Arc<Beat>);
 #[derive(Debug)]
 struct Beat {
     base: Instant,
-    /// Nanoseconds after that.
+    /// When the thread last ran, in nanoseconds after `base`.
     ran: AtomicU64,
 }
 
@@ -44,7 +44,7 @@ impl Heartbeat {
         self.0.ran.store(self.since_base(now), Ordering::Relaxed);
     }
 
-    /// When it ran last.
+    /// When the thread ran last.
     pub fn last(&self) -> Instant {
         self.0.last()
     }
@@ -92,7 +92,7 @@ impl Pauses {
         last.is_none()
     }
 
-    /// How many there were, and how long they were together.
+    /// Number of pauses, and their total length.
     pub fn total(&self) -> (u64, Duration) {
         let state = self.state();
         (state.count, state.time)

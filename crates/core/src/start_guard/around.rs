@@ -24,10 +24,10 @@ pub(super) struct Watched {
     anew: Option<Anew>,
 }
 
-/// The last beginning of its bus.
+/// The last restart of the drive's bus.
 #[derive(Debug, Clone)]
 pub(super) struct Anew {
-    /// When the bus before it had ended.
+    /// When the previous bus had ended.
     pub(super) since: Instant,
     /// The machine as it was until then; none if it was not there.
     pub(super) before: Option<Arc<Watched>>,
@@ -85,7 +85,7 @@ impl Watched {
         }
     }
 
-    /// The end of its bus, where another one is to take its place.
+    /// The announced end of the drive's bus, where another one will replace it.
     fn expected(&self) -> Option<&Anew> {
         let is_same = |before: &Arc<Watched>| Arc::ptr_eq(&before.image, &self.image);
         self.anew
@@ -93,7 +93,7 @@ impl Watched {
             .filter(|anew| anew.before.as_ref().is_some_and(is_same))
     }
 
-    /// Whether another bus is to take the place of its own.
+    /// Whether another bus will replace the drive's bus.
     pub(super) fn is_leaving(&self) -> bool {
         self.expected().is_some()
     }

@@ -25,7 +25,7 @@ pub struct Saved {
 struct SavedMotor {
     #[serde(flatten)]
     machine: Machine,
-    /// Milliseconds since 1970.
+    /// Times of the starts, milliseconds since 1970.
     starts: Vec<u64>,
 }
 
@@ -66,7 +66,7 @@ impl Saved {
         })
     }
 
-    /// As it is written.
+    /// The file as JSON.
     pub fn to_json(&self) -> Vec<u8> {
         // Numbers and strings can always be serialized.
         serde_json::to_vec(self).unwrap_or_default()

@@ -12,9 +12,9 @@ use super::{Guards, Saved};
 use crate::files::names::STARTS;
 use crate::files::{self, Keeper};
 
-/// Longest wait for a change: the thread ends within that time.
+/// Longest wait for a change, so the longest delay at the end of the thread.
 const BEAT: Duration = Duration::from_millis(100);
-/// Longest file that is read.
+/// Largest file that is read, bytes.
 const LONGEST: u64 = 64 << 20;
 
 /// Keeps starts in this directory from now on; those of earlier runs are read from there. Until that is done, which the end
@@ -53,7 +53,7 @@ fn run(path: &Path, guards: &Guards, end: &Receiver<()>) {
     }
 }
 
-/// Logs a failure once, and its end.
+/// Logs the first failure, and the end of failures.
 fn report(path: &Path, done: &io::Result<()>, failing: &mut bool) {
     match done {
         Ok(()) if std::mem::take(failing) => {

@@ -44,14 +44,14 @@ pub(super) struct Entry {
 /// Whether starts are kept.
 #[derive(Debug, Default)]
 enum Disk {
-    /// In memory only.
+    /// Starts are kept in memory only.
     #[default]
     None,
-    /// In a file that is not read yet.
+    /// Starts will be kept in a file that is not read yet.
     Unread(PathBuf),
-    /// In a file.
+    /// Starts are kept in a file.
     File {
-        /// Newest generation that is in it.
+        /// Newest generation that is in the file.
         written: u64,
         /// Newest one that could not be written, and why.
         failed: Option<(u64, String)>,
@@ -75,7 +75,7 @@ impl Guards {
         self.around.load()
     }
 
-    /// From now on interlocks look at these drives.
+    /// Sets the drives that interlocks look at.
     pub fn watch(
         &self,
         drives: impl IntoIterator<Item = (Machine, Arc<DriveImage>)>,
@@ -86,7 +86,7 @@ impl Guards {
         self.around.store(Arc::new(next));
     }
 
-    /// The buses of these drives are about to be started anew.
+    /// The buses of these drives are about to be restarted.
     pub fn expect(&self, drives: &[Arc<DriveImage>], now: Instant) {
         let next = self.around.load().expecting(drives, now);
         self.around.store(Arc::new(next));
@@ -149,7 +149,7 @@ impl Guards {
 }
 
 impl Ledger {
-    /// From now on the starts of a drive count, in that group.
+    /// Counts the starts of a drive from now on, in this group.
     pub(super) fn register(&mut self, machine: &Machine, group: &Arc<str>) {
         self.entry(machine.clone()).group = group.clone();
     }

@@ -24,9 +24,9 @@ pub struct Seen {
     pub commanded: Option<(bool, Instant)>,
     /// Whether the motor stands.
     pub stands: bool,
-    /// Why it does not run and cannot start, and when that was read.
+    /// Why the motor does not run and cannot start, and when that was read.
     pub unable: Option<(Unable, Instant)>,
-    /// When it was read.
+    /// When the state was read.
     pub at: Instant,
 }
 
@@ -46,7 +46,7 @@ pub(super) struct Reserved {
 #[derive(Debug, Clone)]
 struct Started {
     at: Instant,
-    /// The client that commanded it.
+    /// The client that commanded the start.
     by: Option<Arc<str>>,
 }
 
@@ -64,7 +64,7 @@ pub(super) struct Motor {
     ran: Option<bool>,
     /// Run command as the drive had it last, and when that was read.
     commanded: Option<(bool, Instant)>,
-    /// By the last reading it does not run, and cannot start.
+    /// Whether the motor, by its last reading, does not run and cannot start.
     unable: bool,
     stands_since: Option<Instant>,
     stop_written: Option<Instant>,
@@ -127,7 +127,7 @@ impl Motor {
         reserved || self.passage.as_ref().is_some_and(|passage| passage.number == number)
     }
 
-    /// Why it may not be started now, apart from its group.
+    /// Why the motor may not be started now, apart from its group.
     pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         self.too_often(guard, now)
             .into_iter()
@@ -247,7 +247,7 @@ impl Motor {
         self.stop_written = Some(now);
     }
 
-    /// The drive acknowledged it, likewise.
+    /// The drive acknowledged the stop, so the motor counts as stopped.
     pub(super) fn stop_acknowledged(&mut self, now: Instant) {
         (self.running, self.ran, self.started) = (Some((false, now)), Some(false), None);
         self.stands_since.get_or_insert(now);
@@ -272,7 +272,7 @@ impl Motor {
             .flatten()
             .any(|write| at <= write)
         {
-            // From before what was written last.
+            // The reading is from before the last write.
             return false;
         }
         let came = running && self.ran == Some(false);
@@ -340,7 +340,7 @@ impl Motor {
         (self.running, self.unable) = (None, false);
     }
 
-    /// The drive is away: it may run and stand again unseen.
+    /// The drive is away: the motor may run and stand again unseen.
     pub(super) fn away(&mut self) {
         (self.running, self.unable, self.stands_since) = (None, false, None);
         if let Some(passage) = &mut self.passage {
@@ -348,7 +348,7 @@ impl Motor {
         }
     }
 
-    /// Nothing shows whether it runs; it is taken to stand from now on.
+    /// No reading shows whether the motor runs; it is taken to stand from now on.
     pub(super) fn begin_untold(&mut self, now: Instant) {
         if self.running.is_none() {
             self.stands_since.get_or_insert(now);
@@ -382,7 +382,7 @@ impl Motor {
         self.starts = all.into_iter().skip(spare).collect();
     }
 
-    /// Whether nothing of the last hour is known of it.
+    /// Whether the motor has no starts in the last hour.
     pub(super) fn is_forgotten(&self, now: Instant) -> bool {
         self.starts().all(|at| at + HOUR <= now)
     }

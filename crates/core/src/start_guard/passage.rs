@@ -36,7 +36,7 @@ pub enum ByRun {
 /// How far a start has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Progress {
-    /// Nothing shows it yet.
+    /// No reading shows the start yet.
     Awaited,
     /// The motor turns, and does not count as running yet.
     Turns,
@@ -51,13 +51,13 @@ pub(super) enum Progress {
 /// A start by an order, from its last word on.
 #[derive(Debug, Clone)]
 pub(super) struct Passage {
-    /// The number of its command.
+    /// Number of the start's command.
     pub(super) number: u64,
     pub(super) client: Arc<str>,
     pub(super) progress: Progress,
-    /// When its word was written.
+    /// When the word of the start was written.
     pub(super) written: Instant,
-    /// When a run command was written last, its own or a repetition.
+    /// When a run command was last written: the start's own word or a repetition.
     pub(super) last: Instant,
     /// Date under which the start counts.
     pub(super) counted: Instant,
@@ -72,7 +72,7 @@ pub(super) struct Passage {
 /// Effect of a reading of the running motor on the starts that count.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Shown {
-    /// Nothing new.
+    /// The reading has no effect.
     Nothing,
     /// The awaited start was made.
     Started,

@@ -68,10 +68,10 @@ impl GuardedDrives {
         self.start + Duration::from_secs_f64(seconds)
     }
 
-    /// The drive is read: it runs, or stands.
+    /// Reads the drive: the motor runs, or stands.
     fn read(&self, drive: usize, running: bool, seconds: f64) {
         let (image, at) = (&self.images[drive], self.at(seconds));
-        // The status word: running, or at zero speed; then the output frequency.
+        // Words of the image: the status word (running, or at zero speed), and the output frequency.
         let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
         read(image, 2100, &words, at);
         self.guards.look(DriveIndex::new(drive), &image.reading(at, SECOND));
@@ -96,12 +96,12 @@ impl GuardedDrives {
         self.asked(Stage::Write, &[drive], (number, None), seconds) == Verdict::Go
     }
 
-    /// A command that starts these drives has its turn.
+    /// The verdict on a command that starts these drives, at its turn.
     fn clear(&self, drives: &[usize], number: u64, seconds: f64) -> Verdict {
         self.asked(Stage::Turn, drives, (number, None), seconds)
     }
 
-    /// Likewise of one that waits for its start until then.
+    /// The verdict on a command that may wait for its start until `until`.
     fn clear_waiting(&self, drives: &[usize], number: u64, until: f64, seconds: f64) -> Verdict {
         self.asked(Stage::Turn, drives, (number, Some(until)), seconds)
     }
@@ -232,7 +232,7 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     // The motor coasts down: it may stand by the time that the order reaches it.
     rig.read(0, true, 2.1);
     assert_eq!(rig.refused(0, 2.2), Some("starts_per_hour"));
-    // The drive did not take the stop, or somebody else started it again.
+    // The drive did not take the stop, or was started again from elsewhere.
     rig.images[0].update(|snapshot| snapshot.store(Table::Holding, 2000, &[1, 0, 0], rig.at(2.3)));
     rig.read(0, true, 2.4);
     assert_eq!(rig.refused(0, 2.5), None);
@@ -285,7 +285,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     rig.guards.stop_written(DriveIndex::new(0), rig.at(102.6));
     rig.read(0, false, 102.7);
     assert_eq!(rig.refused(0, 102.8), None);
-    // Away, it may have run meanwhile.
+    // While the drive was away, its motor may have run.
     rig.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
     rig.guards
         .look(DriveIndex::new(0), &rig.images[0].reading(rig.at(180.0), SECOND));
@@ -311,7 +311,7 @@ fn drives_of_a_group_start_one_after_the_other() {
     (0..3).for_each(|drive| rig.read(drive, false, 0.0));
     assert_eq!(reason(rig.clear(&[0, 1], 1, 1.0)), "stagger", "never two by one order");
     assert_eq!(rig.clear(&[0], 2, 2.0), Verdict::Go);
-    // Cleared and not written: it may be at any time.
+    // A start that was cleared but not written may be written at any time.
     assert_eq!(reason(rig.clear(&[1], 3, 7.5)), "stagger");
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(8.0));
@@ -426,7 +426,7 @@ fn a_start_waits_a_second_for_a_file_that_is_not_read_and_is_refused_then() {
         None,
         "nothing replaces what is there"
     );
-    // The disk answers: it is counted with what was there.
+    // The disk answers: the start is counted together with those in the file.
     rig.shared.keep(&Saved::default(), rig.at(3.0), SystemTime::now());
     assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "wait");
     let (generation, _) = rig.shared.to_write(rig.at(3.0), SystemTime::now()).unwrap();
@@ -475,7 +475,7 @@ fn counters_belong_to_the_machine_over_a_reload() {
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
     assert_eq!(starts(&after, 2), "starts_per_hour");
     assert_eq!(starts(&after, 1), "go");
-    // Another machine at its address has none.
+    // Another machine at that address has no starts.
     specs[2].profile = profile("vacon-cx");
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
     assert_eq!(starts(&after, 2), "go");

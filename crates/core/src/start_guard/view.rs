@@ -19,7 +19,7 @@ const LOOK: Duration = Duration::from_millis(2);
 #[derive(Debug)]
 pub struct BusGuards {
     shared: Arc<Guards>,
-    /// By their place on the bus; none for a drive without guards.
+    /// Guards by place on the bus; none for a drive without guards.
     drives: PerDrive<Option<Guarding>>,
 }
 
@@ -37,11 +37,11 @@ struct Guarding {
 /// Whether a start may be written.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Clearance {
-    /// Yes: it is counted, and on disk.
+    /// The start is permitted: counted, and on disk.
     Go,
     /// The start is not cleared before this time.
     Wait(Instant),
-    /// No: it cannot be counted.
+    /// The start is refused, as it cannot be counted.
     Refused(Guarded),
 }
 
@@ -130,7 +130,7 @@ impl BusGuards {
         self.shared.lock().hindered(&of.machine, &of.guard, now)
     }
 
-    /// Why the interlocks of the drive let its motor not start now.
+    /// Why interlocks keep the motor of the drive from starting now.
     pub fn interlocked(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         self.interlocked_of(self.of_drive(drive)?, now)
     }
@@ -191,7 +191,7 @@ impl BusGuards {
             .collect()
     }
 
-    /// Whether an interlock of that drive stops its motor.
+    /// Whether an interlock of the drive stops its motor.
     pub fn trips(&self, drive: DriveIndex) -> bool {
         let of = self.of_drive(drive);
         of.is_some_and(|of| of.interlocks.iter().any(|interlock| interlock.trip))
@@ -253,7 +253,7 @@ impl BusGuards {
         clearance
     }
 
-    /// A start of that drive was refused by its guard or an interlock.
+    /// Counts a start of the drive that its guard or an interlock refused.
     pub fn count_refused(&self, drive: DriveIndex, refusal: &Refusal) {
         let reason = match refusal {
             Refusal::Guarded(guarded) => guarded.reason,
@@ -331,7 +331,7 @@ impl BusGuards {
         })
     }
 
-    /// Until when an ordinary stop of that drive waits.
+    /// Until when an ordinary stop of the drive waits.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         let of = self.of_drive(drive)?;
         self.shared.lock().motor(&of.machine)?.stop_waits(&of.guard, now)

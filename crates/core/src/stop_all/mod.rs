@@ -26,7 +26,7 @@ use crate::process_image::{Access, Machine, Standstill};
 
 /// Default time after which a command is answered even if not every drive stands.
 pub const WAIT: Duration = Duration::from_secs(10);
-/// Longest such time.
+/// Longest time that a command may set for its answer.
 pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
 /// Time between two looks at a command that is in progress.
 pub const LOOK: Duration = Duration::from_millis(20);
@@ -54,7 +54,7 @@ pub struct StoppedDrive {
     pub drive: String,
     /// The result.
     pub outcome: Stopped,
-    /// Why it is not known to stand.
+    /// Why the drive is not known to stand.
     #[serde(default)]
     pub reason: Option<String>,
 }
@@ -62,7 +62,7 @@ pub struct StoppedDrive {
 /// The one answer to a command.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StopReport {
-    /// Every drive stands.
+    /// Whether every drive stands.
     pub ok: bool,
     /// All drives that were to be stopped, in the order of the configuration.
     pub drives: Vec<StoppedDrive>,
@@ -93,10 +93,10 @@ pub struct StopAll {
 
 #[derive(Debug, Default)]
 struct State {
-    /// Each machine once, for all commands that concern it.
+    /// The stops in progress; each machine once, for all commands that include it.
     stops: Vec<OneStop>,
     orders: Vec<UnderWay>,
-    /// Dropped, they are taken back where they were not sent.
+    /// Broadcasts in progress; dropping one withdraws it if it was not sent.
     broadcasts: Vec<(Exchange, Instant)>,
 }
 
@@ -251,7 +251,7 @@ fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> O
     Some(bus.ask_first(question, &plant.writes, now))
 }
 
-/// How many of these drives are controlled and not known to stand.
+/// Number of controlled drives among these that are not known to stand.
 pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: Instant) -> usize {
     let controlled = drives
         .into_iter()

@@ -10,7 +10,7 @@ use crate::process_image::{Machine, Standstill};
 
 /// Wait before a stop that failed is placed again; twice as long each time.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Longest such wait.
+/// Longest pause before a failed stop is placed again.
 const LONGEST_AGAIN: Duration = Duration::from_secs(1);
 
 /// The stop of one drive.
@@ -20,7 +20,7 @@ pub(crate) struct OneStop {
     drive: String,
     origin: Origin,
     step: Step,
-    /// The result the last time that it failed.
+    /// The result of the last failure.
     failed: Option<String>,
     /// Wait before the next try.
     pause: Duration,
@@ -28,7 +28,7 @@ pub(crate) struct OneStop {
     stood: bool,
     /// Whether the motor was seen to turn after it had stood.
     restarted: bool,
-    /// The last command that may start the drive before it was placed.
+    /// Number of the last command before the stop that may start the drive.
     last_starter: u64,
 }
 
@@ -38,7 +38,7 @@ enum Step {
     Placed(Placed),
     /// The stop failed, and is placed again at this time.
     Again(Instant),
-    /// The drive acknowledged it then.
+    /// The drive acknowledged the stop at this time.
     Acknowledged(Instant),
     /// The stop cannot be given to the drive.
     Refused,
@@ -65,7 +65,7 @@ impl OneStop {
 
     fn try_at(&mut self, drive: &DriveHandle, now: Instant) {
         let profile = &drive.image.spec.profile;
-        // Before it: what comes in meanwhile may be sent after it.
+        // The number is taken before the stop is placed: a later command may be sent after the stop.
         self.last_starter = drive.last_starter();
         self.step = match profile.model_index(ModelPoint::Run) {
             Some(run) => {
@@ -106,7 +106,7 @@ impl OneStop {
         matches!(self.step, Step::Refused)
     }
 
-    /// Why it is not acknowledged.
+    /// Why the stop is not acknowledged.
     pub(crate) fn why_not(&self) -> String {
         let why = self.failed.as_deref().unwrap_or("it got no reply");
         format!("not acknowledged: {why}")

@@ -3,10 +3,10 @@
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::Access;
 
-/// Which drives a command stops; of them those that are controlled.
+/// The drives that a command stops; only controlled ones are included.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Scope {
-    /// All of the gateway.
+    /// All drives of the gateway.
     Gateway,
     /// All drives of the bus with this name.
     Bus(String),
@@ -29,7 +29,7 @@ pub enum NothingToStop {
         /// The known names.
         known: Vec<String>,
     },
-    /// No drive of it is controlled.
+    /// No drive of the bus or group is controlled.
     #[error("none of these drives has access = \"control\", so no stop was sent")]
     NotControlled,
 }

@@ -11,7 +11,7 @@ pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 /// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be
 /// stopped, and it means that to each of them. It gets no reply, so a separate stop must follow for every drive.
 pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
-    // Address 0 is a device like any other there.
+    // With these protocols address 0 is an ordinary device.
     if bus.protocol == Protocol::N2 || bus.is_modbus_tcp() {
         return None;
     }

@@ -10,9 +10,9 @@ use crate::diagnosis::counters::{InPhase, Window};
 pub enum Sign {
     /// Sound replies.
     Answered,
-    /// Requests without a reply, of a drive that is there.
+    /// Requests without a reply, while the drive is present.
     Silent,
-    /// Requests without a reply, all of them.
+    /// All requests without a reply, whether the drive is present or not.
     Tried,
     /// Replies that are damaged anywhere.
     Damaged,
@@ -49,7 +49,7 @@ pub struct Drive {
     pub(super) window: Window<SIGNS>,
     /// Slowest beginning of a reply in each step, tenths of a millisecond.
     pub(super) slowest: Window<1>,
-    /// Time for the first byte of its reply.
+    /// Time limit for the first byte of a reply of the drive.
     pub response_timeout: Duration,
     /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
     pub(super) run: u16,
@@ -65,7 +65,7 @@ impl Drive {
         self.window.add(sign as usize, 1);
     }
 
-    /// In the last minute.
+    /// Count of a sign in the last minute.
     pub fn sum(&self, sign: Sign) -> u32 {
         self.window.sum(sign as usize)
     }
@@ -92,7 +92,7 @@ impl Drive {
         self.replied_after(self.response_timeout + over.unwrap_or_default());
     }
 
-    /// A reply began so long after its request.
+    /// Adds a turnaround: time from a request to the beginning of its reply.
     pub(super) fn replied_after(&mut self, time: Duration) {
         let tenths = u16::try_from(time.as_micros() / 100).unwrap_or(u16::MAX);
         self.slowest.most(0, tenths);

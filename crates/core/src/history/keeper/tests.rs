@@ -180,7 +180,7 @@ fn a_directory_that_comes_later_gets_what_was_counted_meanwhile() {
     let mut before = Run::new(&dir.path().join("state"));
     before.history.count_on(totals(3, 10.0));
     before.work().unwrap();
-    // The other process still has it.
+    // The other process still has the directory locked.
     let mut run = Run::new(&dir.path().join("state"));
     assert!(run.writer.failing);
     assert_eq!(run.history.all_totals(), BTreeMap::new());

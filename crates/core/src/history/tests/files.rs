@@ -48,7 +48,7 @@ fn what_is_broken_is_told_of_with_its_place() {
         assert!(what.contains("truncated"), "{what} of {length}");
         assert!(offset <= length);
     }
-    // Any other byte at any place.
+    // Any byte may be damaged, at any place.
     for place in (0..bytes.len()).step_by(997) {
         let mut broken = bytes.clone();
         broken[place] = if broken[place] == b'7' { b'8' } else { b'7' };
@@ -116,7 +116,7 @@ fn exports() {
         (&json["trigger"], &json["values"]["dc_link_voltage"]),
         (&"fault".into(), &655.0.into())
     );
-    // Blocks of pcapng, walked by their lengths at both ends.
+    // The file is a chain of pcapng blocks, checked by the lengths at both ends of each.
     let capture = pcapng::pcapng(&recording);
     let word = |at: usize| u32::from_le_bytes(capture[at..at + 4].try_into().unwrap());
     let (mut at, mut kinds) = (0, Vec::new());
@@ -207,7 +207,7 @@ fn after_the_clock_was_set_back_what_is_yet_to_come_goes_and_what_was_made_stays
     assert_eq!(made("b1", 18), "b1 r18 r20");
     assert_eq!(made("b2", 19), "b1 r18 b2");
     assert_eq!(made("b3", 20), "r18 b2 b3");
-    // Back before all of them.
+    // The clock is set back to before all of them.
     assert_eq!(made("c1", 1), "c1 b2 b3");
     assert_eq!(made("c2", 2), "c1 c2 b3");
 }
@@ -260,7 +260,7 @@ fn a_process_that_is_killed_leaves_only_whole_recordings() {
             assert!(std::time::Instant::now() < deadline, "it writes nothing");
             std::thread::sleep(Duration::from_millis(1));
         }
-        // At another moment of a write each time.
+        // The kill comes at another moment of a write each time.
         std::thread::sleep(Duration::from_micros(700 * round));
         child.kill().unwrap();
         assert_eq!(child.wait().unwrap().signal(), Some(9));

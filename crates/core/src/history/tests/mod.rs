@@ -213,7 +213,7 @@ fn a_point_beyond_its_limit_for_its_time_makes_one_recording() {
     };
     let mut rig = Rig::new(options(), 1, &[above]);
     let made = rig.polls(60 * SECOND, |rig, n| {
-        // 1.9 s beyond it, back for one poll, then for long.
+        // The value is beyond its limit for 1.9 s, back for one poll, then beyond it for long.
         let high = (1000..3000).contains(&n) && n != 1190;
         rig.poll(0, RUNS, if high { 1201 } else { 1200 }, 0);
     });

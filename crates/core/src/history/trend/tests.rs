@@ -113,7 +113,7 @@ proptest! {
     ) {
         let mut rig = Rig::new();
         for (scale, time, value, good_for) in reads {
-            // From one poll to the next, to a weekend.
+            // Pauses range from one poll to a weekend.
             let time = Duration::from_millis(time) * [1, 3, 10, 300, 3000, 30_000][scale as usize];
             rig.pass(time);
             rig.feed(value, Duration::from_secs(good_for));
@@ -224,7 +224,7 @@ fn labels_are_whole_steps_and_what_is_asked_for_is_what_comes() {
         let length = part.to.duration_since(part.from).unwrap();
         assert_eq!(length, part.step * part.steps.len() as u32);
     }
-    // More than there is, and what is to come.
+    // The requested span is longer than the kept one, and reaches into the future.
     let all = part(rig.clock.now - 100 * 86_400 * SECOND, rig.clock.now + 86_400 * SECOND);
     assert_eq!(all.steps.iter().flatten().count(), all.steps.len());
     assert!(

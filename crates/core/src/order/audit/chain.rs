@@ -68,7 +68,7 @@ pub enum Entry<'e> {
     NotSent(&'e AuditRecord),
     /// Records that could not be written.
     Lost {
-        /// When that was noticed.
+        /// When the loss was noticed.
         #[serde(serialize_with = "crate::event::rfc3339")]
         time: SystemTime,
         /// Records of commands that were sent.
@@ -78,12 +78,12 @@ pub enum Entry<'e> {
     },
     /// The bytes between the last entry and this one are the rest of a line that a crash cut.
     Fragment {
-        /// When they were found.
+        /// When the bytes were found.
         #[serde(serialize_with = "crate::event::rfc3339")]
         time: SystemTime,
-        /// Their number, without the line end.
+        /// Number of the bytes, without the line end.
         bytes: u64,
-        /// Their hash.
+        /// Hash of the bytes.
         sha256: Hash,
     },
 }
@@ -91,7 +91,7 @@ pub enum Entry<'e> {
 /// The end of a chain: number and hash of its last line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Chain {
-    /// Number of the last line, from 1; 0 if there is none.
+    /// Number of the last line, from 1; 0 if the file is empty.
     pub seq: u64,
     /// Hash of the last line; zero if the file is empty.
     pub last: Hash,
@@ -143,9 +143,9 @@ pub fn seq(line: &[u8]) -> Option<u64> {
 /// The end of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tail {
-    /// After the last entry.
+    /// Chain after the last entry.
     pub chain: Chain,
-    /// Number and hash of the bytes after it, if there are any.
+    /// Number and hash of the bytes after the last entry, if there are any.
     pub fragment: Option<(u64, Hash)>,
     /// Whether the file ends with a line end.
     pub ended: bool,
@@ -195,7 +195,7 @@ pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
     (found, ended)
 }
 
-/// Something that was changed.
+/// A place where the file was changed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fault {
     /// Whether the line before is meant.
@@ -208,7 +208,7 @@ pub struct Fault {
 #[derive(Default)]
 pub struct Verifier {
     chain: Option<Chain>,
-    /// Lines that are no entries: bytes so far, and their hash.
+    /// Bytes so far of lines that are not entries, and their hash.
     fragment: Option<(u64, Context)>,
     wanted: Option<Hash>,
 }

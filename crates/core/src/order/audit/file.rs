@@ -30,9 +30,9 @@ const LONGEST_TAIL: u64 = 64 << 20;
 /// Where the audit is written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AuditFileOptions {
-    /// The current file; older ones have `.1` to `.7` after its name.
+    /// Path of the current file; older ones have `.1` to `.7` after that name.
     pub path: PathBuf,
-    /// Size of all of them, bytes.
+    /// Size of all files, bytes.
     pub max_bytes: u64,
 }
 
@@ -41,7 +41,7 @@ impl AuditFileOptions {
         Rotated::new(self.path.clone(), self.max_bytes, FILES)
     }
 
-    /// All files there can be, oldest first.
+    /// All possible files, oldest first.
     pub fn files(&self) -> Vec<PathBuf> {
         self.rotated().all()
     }
@@ -52,7 +52,7 @@ impl AuditFileOptions {
 pub struct AuditFile {
     options: AuditFileOptions,
     shared: Arc<Shared>,
-    /// Until a successor waits for it.
+    /// Closes when the thread has ended; a successor waits for that.
     ended: watch::Receiver<()>,
 }
 
@@ -69,7 +69,7 @@ struct Shared {
 struct Queues {
     sent: VecDeque<Arc<AuditRecord>>,
     unsent: VecDeque<Arc<AuditRecord>>,
-    /// Since the start: sent, unsent.
+    /// Records lost since the start: sent, unsent.
     lost: (u64, u64),
     /// Losses that the file has.
     recorded: (u64, u64),
@@ -89,7 +89,7 @@ impl Shared {
         files.entry(path.to_path_buf()).or_default().clone()
     }
 
-    /// The record that is written next; those of commands that were sent first.
+    /// The record to write next; records of sent commands go first.
     fn next(&self) -> Option<(Arc<AuditRecord>, bool)> {
         let mut queues = self.queues();
         let sent = queues.sent.pop_front().map(|record| (record, true));
@@ -202,7 +202,7 @@ struct Writer {
     chain: Option<Chain>,
     /// Logged once, until a write succeeds.
     failing: bool,
-    /// Which of the threads it is.
+    /// Number of this thread among the writers.
     thread: u64,
     logged: (Option<Hash>, Instant),
 }
@@ -366,7 +366,7 @@ impl Writer {
     }
 }
 
-/// The end of the chain in a file that may not be there.
+/// The end of the chain in a file, which may not exist.
 fn last_of(path: &Path) -> io::Result<Option<Chain>> {
     match File::open(path) {
         Ok(mut file) => {

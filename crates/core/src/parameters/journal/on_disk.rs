@@ -8,7 +8,7 @@ use super::super::file::MOST_BYTES;
 use super::{NAME, Owner, RELEASED};
 use crate::files;
 
-/// Where the journal of one drive is kept.
+/// Path of the journal of one drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct JournalFile {
     dir: PathBuf,
@@ -22,7 +22,7 @@ impl JournalFile {
         }
     }
 
-    /// All that are below that directory, in the order of their names.
+    /// All journals below the directory, in the order of their names.
     ///
     /// # Errors
     /// The directory cannot be read.
@@ -43,7 +43,7 @@ impl JournalFile {
         Ok(all)
     }
 
-    /// Name of its directory: that of the drive when the restore began.
+    /// Name of the journal's directory: that of the drive when the restore began.
     pub fn drive(&self) -> String {
         let name = self.dir.file_name().unwrap_or_default();
         name.to_string_lossy().into_owned()
@@ -80,7 +80,7 @@ impl JournalFile {
     pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
         self.is_free(of)?;
         files::replace(&self.path(), text.as_bytes())?;
-        // The entry of the file, and those of directories that may be new.
+        // Syncs the entry of the file, and those of directories that may be new.
         self.dir.ancestors().take(3).try_for_each(sync)
     }
 
@@ -113,7 +113,7 @@ impl JournalFile {
         }
     }
 
-    /// Sets the journal aside, with the former values in it; where.
+    /// Sets the journal aside, with the former values in it; returns the new path.
     ///
     /// # Errors
     /// The journal is still where it was.
@@ -126,7 +126,7 @@ impl JournalFile {
 }
 
 fn sync(dir: &Path) -> io::Result<()> {
-    // A relative path of one part has the working directory above it.
+    // A relative path of a single part is in the working directory.
     let dir = if dir.as_os_str().is_empty() {
         Path::new(".")
     } else {

@@ -30,7 +30,7 @@ struct End {
     value: Option<RawValue>,
 }
 
-/// The value that was read, if it was.
+/// The value that was read, if any.
 fn value_of(file: &ParameterFile, id: &Id) -> Option<RawValue> {
     file.values.get(id).and_then(|entry| entry.value.as_ref().ok().copied())
 }
@@ -78,7 +78,7 @@ impl<'a> Making<'a> {
         self.finish()
     }
 
-    /// There is an objection that the user may override.
+    /// Adds an objection that the user may override.
     fn doubt(&mut self, what: String, remedy: &str) {
         if self.wishes.force {
             self.risks.push(Risk(what));
@@ -197,7 +197,7 @@ impl<'a> Making<'a> {
         self.plan.left_out.push((id.clone(), format!("{line}; {why}")));
     }
 
-    /// Why a parameter that differs is not written.
+    /// Why a parameter is not written although it differs.
     fn leaves_out(&self, id: &Id, address: u16) -> Option<String> {
         if !self.profile.parameter_is_writable(address) {
             return Some("it can only be read".to_string());
@@ -294,7 +294,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// Ratings of supply and motor: those of another drive may not fit.
+    /// Objects to ratings of supply and motor, as those of another drive may not fit.
     fn check_ratings(&mut self) {
         let ratings = &self.profile.parameters.rules.ratings;
         let changed = self.plan.writes.iter().filter(|write| has(ratings, write.address));

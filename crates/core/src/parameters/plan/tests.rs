@@ -187,7 +187,7 @@ proptest! {
                 prop_assert_eq!(state, former);
             }
             prop_assert_eq!(&back[back.len() - 1], &present);
-            // On from anywhere.
+            // The plan can be resumed from any step.
             let rest = forced(&profile, &wanted, &states[done]);
             prop_assert_eq!(rest.writes.len(), plan.writes.len() - done);
             let on = states_of(&rest, &states[done]);
@@ -353,7 +353,7 @@ fn drives_that_are_not_alike() {
         reasons[0].starts_with("whether the drives are of the same kind is unknown"),
         "{reasons:?}"
     );
-    // The file of the drive itself: the motor behind it is the same.
+    // The file comes from the drive itself, so the motor behind it is the same.
     let own = words(&teco, "fan-1", &[("Sn-01", 3), ("Cn-09", 44), ("Bn-01", 30)]);
     let (plan_of_own, risks) = plan(&teco, &own, &here, &ALL).unwrap();
     assert_eq!(

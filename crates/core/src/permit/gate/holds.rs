@@ -30,7 +30,7 @@ pub(super) struct HoldNews {
 pub struct Unheld {
     /// Client that gave the order.
     pub client: Arc<str>,
-    /// Why exclusive mode would have refused it.
+    /// Why exclusive mode would have refused the order.
     pub why: String,
 }
 
@@ -240,7 +240,7 @@ impl Gate {
         Some(acted.map_err(|denial: Denial| denial.refusal(&rules)))
     }
 
-    /// The client stopped, though nothing is sent for it.
+    /// The client stopped the drive, though nothing is sent for that.
     pub(crate) fn hold_said_stop(&mut self, drive: DriveIndex, origin: &Origin) {
         self.needs_no_stop(drive, origin);
         let Some(who) = self.claim(origin) else { return };
@@ -254,7 +254,7 @@ impl Gate {
             .retain(|client| client != origin.client());
     }
 
-    /// Whether the local control place of a drive has it now.
+    /// Sets whether the drive is under local control now.
     pub fn set_local(&mut self, drive: DriveIndex, local: bool) {
         self.with_hold(drive, |holding, _, told| holding.set_local(local, told));
     }
@@ -286,7 +286,7 @@ impl Gate {
         self.claim(origin).is_some_and(|who| drive.holding.repeats(&who))
     }
 
-    /// The published state of a hold, and whether that client has it.
+    /// The published state of a hold, and whether the client has it.
     pub fn hold_view(&self, drive: DriveIndex, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         let rules = self.rules.as_ref()?;
         let free = Holding::default();

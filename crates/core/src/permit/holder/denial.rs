@@ -12,11 +12,11 @@ pub enum Denial {
     Nobody,
     /// Another one holds the drive.
     Held(Claim, Duration),
-    /// The stop of another one reserved it.
+    /// The stop of another client reserved the drive.
     Reserved(Claim, Duration),
     /// The stop of another one refused its run: it does not start the motor by going on with that.
     NeedsTake(Claim),
-    /// The drive's own local control place has it.
+    /// The drive is under local control.
     Local,
     /// The client repeats an acknowledged stop of its own while another client holds the drive, or, with no time left, started
     /// the motor.

@@ -19,19 +19,19 @@ const MOST_STOOD: usize = 256;
 pub enum Verb {
     /// Takes a free drive, or renews.
     Take,
-    /// Renews its hold.
+    /// Renews the client's hold.
     Renew,
-    /// Gives it back; of one who does not hold it without effect.
+    /// Releases the drive; without effect for a client that does not hold it.
     Release,
-    /// Takes it from a lower rank.
+    /// Takes the drive from a lower rank.
     Break,
 }
 
 impl Verb {
-    /// All.
+    /// All actions.
     pub const ALL: [Verb; 4] = [Verb::Take, Verb::Renew, Verb::Release, Verb::Break];
 
-    /// The word for it.
+    /// Name of the action.
     pub fn name(self) -> &'static str {
         match self {
             Verb::Take => "take",
@@ -50,18 +50,18 @@ impl Verb {
 /// Kind of holder of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HoldState {
-    /// No holder.
+    /// The drive has no holder.
     Free,
     /// A client.
     Held,
-    /// A stop reserved it.
+    /// A stop reserved the drive.
     Reserved,
     /// The drive is under local control.
     Local,
 }
 
 impl HoldState {
-    /// The word for it.
+    /// Name of the state.
     pub fn name(self) -> &'static str {
         match self {
             HoldState::Free => "free",
@@ -77,9 +77,9 @@ impl HoldState {
 pub struct HoldView {
     /// Kind of holder.
     pub state: HoldState,
-    /// The holder, or who stopped it.
+    /// The holder, or the client whose stop reserved the drive.
     pub holder: Option<Arc<str>>,
-    /// The name of its rank.
+    /// Name of the holder's rank.
     pub rank: Option<Arc<str>>,
     /// Seconds left, rounded up; 0 if free, none for local control.
     pub left_s: Option<u64>,
@@ -101,7 +101,7 @@ pub enum What {
     Held,
     /// The hold ended, for this reason.
     Released(String),
-    /// Another one broke it.
+    /// Another client broke the hold.
     Broken(Claim),
 }
 
@@ -117,9 +117,9 @@ enum State {
 #[derive(Debug, Clone)]
 struct Waiting {
     who: Claim,
-    /// Whose stop it was.
+    /// Client whose stop is in the way.
     stopper: Claim,
-    /// When it last tried.
+    /// When the client last tried to run.
     tried: Instant,
 }
 
@@ -127,7 +127,7 @@ struct Waiting {
 #[derive(Debug, Clone)]
 struct Stood {
     name: Arc<str>,
-    /// The drive acknowledged it.
+    /// Whether the drive acknowledged the stop.
     acknowledged: bool,
 }
 
@@ -138,11 +138,11 @@ pub struct Holding {
     local: bool,
     /// The last holder: its silence is the one that counts.
     last: Option<Claim>,
-    /// No more of them than principals.
+    /// Clients that must take the drive; at most as many as principals.
     waiting: Vec<Waiting>,
     /// The clients whose last command word was a stop.
     stood: Vec<Stood>,
-    /// Whose run command was accepted last.
+    /// Client whose run command was accepted last.
     starter: Option<Claim>,
     /// A client that is not configured as cyclic but ended the hold of another by repeating its last stop, over an interface
     /// that programs use cyclically.
@@ -150,7 +150,7 @@ pub struct Holding {
 }
 
 impl Holding {
-    /// Ends what has expired.
+    /// Ends the hold or reservation if it has expired.
     pub fn settle(&mut self, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         match &self.state {
             State::Held(_, until) if *until <= now => self.ends("its lease ended", told),
@@ -213,7 +213,7 @@ impl Holding {
         }
         let waits = self.waiting.iter().find(|waiting| waiting.who.is(who));
         let is_due = |waiting: &&Waiting| now.saturating_duration_since(waiting.tried) < rules.lease * FORGOTTEN_AFTER;
-        // Also where it holds the drive by a reference.
+        // The take is required even of a client that holds the drive by a reference.
         match waits.filter(is_due).filter(|_| asks == Asks::Run) {
             Some(waiting) => Err(Denial::NeedsTake(waiting.stopper.clone())),
             None => Ok(()),
@@ -451,7 +451,7 @@ impl Holding {
         }
     }
 
-    /// The holder, unless its hold was seen to end.
+    /// The holder, as long as its hold is not known to have ended.
     pub fn holder(&self) -> Option<&Arc<str>> {
         match &self.state {
             State::Held(by, _) => Some(&by.name),
@@ -479,7 +479,7 @@ impl Holding {
         }
     }
 
-    /// Whether that client holds the drive.
+    /// Whether the client holds the drive.
     pub(crate) fn is_held_by(&self, who: &Claim, now: Instant) -> bool {
         self.held(now).is_some_and(|(by, _)| by.is(who))
     }
@@ -521,7 +521,7 @@ impl Holding {
         self.stood.iter().any(|stood| stood.name == who.name)
     }
 
-    /// Whether that cyclic client's last word was a stop, too.
+    /// Whether the last word of this cyclic client was a stop, too.
     pub(crate) fn repeats(&self, who: &Claim) -> bool {
         who.cyclic && self.has_stood(who)
     }

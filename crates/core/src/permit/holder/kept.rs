@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::{Claim, Rules};
 use crate::process_image::Machine;
 
-/// A reservation as it is kept.
+/// A reservation as kept on disk.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeptReservation {
     /// The machine.
@@ -15,11 +15,11 @@ pub struct KeptReservation {
     pub machine: Machine,
     /// Name of the client that stopped the drive.
     pub who: String,
-    /// The name of its rank then.
+    /// Name of the client's rank at that time.
     pub rank: String,
-    /// When, by the clock of the day, ms since 1970.
+    /// Time of the stop, ms since 1970.
     pub stopped_ms: u64,
-    /// For how long.
+    /// Duration of the reservation, ms.
     pub lease_ms: u64,
 }
 

@@ -17,19 +17,19 @@ pub enum Mode {
     Exclusive,
 }
 
-/// A client by the name that it has for all north sides.
+/// A client with one name for all north sides.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Principal {
     /// Name of the principal.
     pub name: Arc<str>,
-    /// Place of its rank; 0 is the highest.
+    /// Place of the rank; 0 is the highest.
     pub rank: usize,
     /// Whether the client writes its command word continuously: a word that repeats its last stop is not a new stop. Stops over
     /// HTTP and the local socket are always new ones.
     pub cyclic: bool,
     /// Addresses over Modbus TCP and TCP slots.
     pub modbus_tcp: Vec<IpNet>,
-    /// The name in its certificate.
+    /// Name in the client's certificate.
     pub certificate: Option<String>,
     /// User name over HTTP.
     pub http_user: Option<String>,
@@ -66,9 +66,9 @@ impl Principal {
 pub struct Claim {
     /// Name of the principal: two claims of one name are one principal.
     pub name: Arc<str>,
-    /// Place of its rank; 0 is the highest.
+    /// Place of the rank; 0 is the highest.
     pub rank: usize,
-    /// See [`Principal::cyclic`]; never where it may not repeat itself.
+    /// See [`Principal::cyclic`]; never set where the interface excludes repetitions.
     pub cyclic: bool,
     /// Whether the client uses an interface that programs use cyclically, so that a stop may be a repetition.
     pub may_repeat: bool,
@@ -191,7 +191,7 @@ impl Rules {
         self.ranks.get(rank).cloned().unwrap_or_else(|| "?".into())
     }
 
-    /// Whether that principal is still known.
+    /// Whether the principal is still configured.
     pub fn knows(&self, claim: &Claim) -> bool {
         // Names of principals have no colon.
         claim.name.contains(':') || self.principals.iter().any(|p| p.name == claim.name)

@@ -283,7 +283,7 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
         assert_eq!(drive.order("plc", Asks::Run), "held_by_other");
         drive
     };
-    // Time alone does not start the motor, as long as it goes on.
+    // Time alone does not permit a start, as long as the client repeats its run.
     let mut drive = stopped();
     for _ in 0..40 {
         drive.wait(29);
@@ -466,7 +466,7 @@ fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
             assert_eq!(drive.state(), before, "{about}: it neither ends a hold nor reserves");
         }
     }
-    // Nothing is left of a hold: the refusal names who started the motor.
+    // The hold has ended: the refusal names the client that started the motor.
     let mut drive = Drive::new();
     drive.order("cycle", Asks::Stop);
     drive.acknowledged("cycle");
@@ -567,7 +567,7 @@ fn the_local_control_place_comes_first() {
     drive.holding.set_local(false, &mut drive.told);
     assert_eq!(drive.state(), "free - 0");
     assert_eq!(drive.told().len(), 2);
-    // A reservation runs on behind it.
+    // A reservation continues during local control.
     drive.order("op", Asks::Stop);
     drive.holding.set_local(true, &mut drive.told);
     drive.wait(10);

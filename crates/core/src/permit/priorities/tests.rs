@@ -224,7 +224,7 @@ fn what_nobody_may_release_is_void() {
     let (_, under_way) = asked(&mut all, Reverse, "gone", 9, Some(1.0));
     let (_, uncertain) = asked(&mut all, FrequencyReference, "gone", 16, Some(5.0));
     all.settle(uncertain.id, Settled::Unknown, now);
-    // A slot that its client is about to give back is given back.
+    // A slot with a pending release by its client counts as released.
     write(&mut all, Run, "gone", 12, Some(0.0));
     let (_, null) = asked(&mut all, Run, "gone", 12, NULL);
     let keeps = |what: Commanded, entry: &Entry| what == Run && entry.origin.who == "stays";

@@ -5,7 +5,7 @@ use super::{Commanded, Entry, Priorities, Slot};
 /// An entry that a slot no longer has.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VoidSlot {
-    /// Whose array.
+    /// Point of the slot's array.
     pub what: Commanded,
     /// 1..=16.
     pub priority: u8,
@@ -30,7 +30,7 @@ impl Priorities {
 }
 
 impl Slot {
-    /// All that it has or may get, the latest first.
+    /// All entries that the slot has or may get, the latest first.
     fn entries(&self) -> impl Iterator<Item = &Entry> {
         let asked = self.asked.iter().rev().filter_map(|(_, entry)| entry.as_ref());
         let uncertain = self.uncertain.iter().map(|(entry, _)| entry);

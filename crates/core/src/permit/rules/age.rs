@@ -32,15 +32,15 @@ enum Does {
 /// The facts that decide about the age of an order.
 #[derive(Debug, Clone, Copy)]
 struct Age<'a> {
-    /// How it came.
+    /// How the order came.
     arrival: &'a Arrival,
     /// Effect of the order.
     does: Does,
     /// The order is not sent after this time.
     expires: Option<Instant>,
-    /// The last stops of its machine.
+    /// The last stops of the machine.
     stops: &'a LastStops,
-    /// The last pause of the thread that sends it.
+    /// The last pause of the thread that sends the order.
     waited: Option<Stall>,
 }
 

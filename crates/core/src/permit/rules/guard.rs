@@ -19,7 +19,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
     match (ask.stage, starts.by_run(ask.drive)) {
         // A repeated run command is not a new start until the motor was seen to stand again.
         (_, ByRun::Runs | ByRun::Repeats) => Verdict::Go,
-        // The order before this one starts the motor, if it does.
+        // The earlier cleared order starts the motor, if it does start.
         (Stage::Accept, _) if starts.has_cleared(ask.drive) => Verdict::Go,
         (Stage::Accept | Stage::Turn, _) => may_begin(ask, starts),
         (Stage::Write, ByRun::Starts) if !starts.is_cleared(ask.drive, ask.intent.number) => {

@@ -78,7 +78,7 @@ fn a_state_is_known_only_when_what_decides_it_is() {
     );
 }
 
-/// Somebody may have changed them while it was away.
+/// Parameters may have been changed while the drive was away.
 #[test]
 fn parameters_from_before_a_drive_went_away_are_not_believed() {
     let cx = profile("vacon-cx");
@@ -121,7 +121,7 @@ fn what_a_family_lacks_decides_nothing() {
     }
 }
 
-/// Another master that reads register after register, then other drives for six seconds.
+/// Another master polls register after register, then other drives for six seconds.
 #[test]
 fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     let nx = nx();

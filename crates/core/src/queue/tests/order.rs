@@ -80,7 +80,7 @@ fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
     let _both = give(&mut rig, both.clone(), false);
     let mut second = give(&mut rig, reference(30.0), true);
     assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));
-    // Behind that order the newest takes the place of the one before.
+    // Behind the other order the newest reference replaces the previous one.
     let _third = give(&mut rig, reference(40.0), true);
     assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
     // An order for other points changes nothing.
@@ -141,7 +141,7 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
         "{order:?}"
     );
     assert_eq!(order.len(), 4);
-    // Where nothing waits behind it, it waits for time that is left over.
+    // A broadcast with no order waiting behind it waits for idle time.
     let _broadcast = rig.broadcast(STOP);
     assert_eq!(rig.pop(), None);
     assert!(rig.passes_on());
@@ -197,7 +197,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     old.begin_handover(Vec::new(), now);
     assert_eq!(outcome(&mut run), Some(Outcome::ShuttingDown));
     let (mut late, mut gone) = (give(&old, 2, Urgency::Stop), give(&old, 4, Urgency::Stop));
-    // The port may go, and come, in its last moments.
+    // The port may be lost and opened again in the last moments of the bus.
     old.close(Outcome::BusDown, now);
     old.open();
     old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);

@@ -12,7 +12,7 @@ impl Clients {
         self.give((SourceKind::Mqtt, "t"), drive, Urgency::Stop, order, false)
     }
 
-    /// Takes the only stop that waits and answers it.
+    /// Takes the only waiting stop and answers it.
     fn sent(&mut self) -> Order {
         let stop = self.take().expect("a stop");
         assert!(self.pending.is_empty());

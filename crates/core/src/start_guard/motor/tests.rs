@@ -20,7 +20,7 @@ impl Play {
         self.began + Duration::from_secs_f64(seconds)
     }
 
-    /// An order to run has its turn, and is written; what it is.
+    /// Gives an order to run its turn, and writes it; returns its effect.
     fn run(&mut self, now: Instant) -> ByRun {
         let by_run = self.motor.by_run();
         self.number += 1;

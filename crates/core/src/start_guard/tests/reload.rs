@@ -46,7 +46,7 @@ impl GuardedDrives {
 fn a_prepared_bus_changes_nothing_until_it_begins() {
     let rig = GuardedDrives::of(STAGGERED, Vec::new());
     (0..3).for_each(|drive| rig.read(drive, false, 0.0));
-    // Each drive in a group of its own.
+    // In the prepared bus each drive is in a group of its own.
     let prepared = rig.prepared(|spec| spec.group = Some(spec.name.clone()));
     rig.start_and_stop(0, 1, 1.0);
     assert_eq!(rig.refused(1, 2.0), Some("stagger"), "guarded as before");
@@ -81,12 +81,12 @@ fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
     // The first reading decides.
     rig.read(2, false, 24.0);
     assert!(rig.tripped(0, 24.1).is_some_and(|why| why.contains("but is false")));
-    // Restarted once more: it did not hold.
+    // The bus restarts again while the interlock does not hold.
     rig.restart(&[2], 24.5, 24.6);
     assert!(rig.tripped(0, 24.7).is_some_and(|why| why.contains("but is false")));
     rig.read(2, true, 25.0);
     assert_eq!(rig.tripped(0, 25.1), None);
-    // Twice before it was read.
+    // The bus restarts twice before the drive is read.
     rig.restart(&[2], 25.5, 25.6);
     rig.restart(&[2], 27.0, 27.1);
     assert_eq!(rig.tripped(0, 35.4), None);
@@ -97,7 +97,7 @@ fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
 fn a_drive_that_was_not_there_stops_no_motor_before_it_was_read() {
     let mut rig = GuardedDrives::of(Guard::default(), vec![trip("d3")]);
     rig.read(2, true, 0.0);
-    // Another machine has its name.
+    // Another machine has the name of the drive.
     let mut spec = rig.images[2].spec.clone();
     spec.address = 9;
     rig.images[2] = image(spec);

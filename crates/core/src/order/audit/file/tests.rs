@@ -82,7 +82,7 @@ fn records_become_a_chain_that_a_restart_continues() {
 #[tokio::test]
 async fn a_reload_loses_no_record() {
     let (one, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    // Another size each time, then another file as well.
+    // Each reload sets another size, then another file as well.
     for dirs in [[&one, &one], [&one, &other]] {
         let at = |round: usize| AuditFileOptions {
             max_bytes: (1 << 20) + round as u64,
@@ -182,7 +182,7 @@ fn a_crash_inside_a_line_is_named() {
     for bytes in torn {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("audit.jsonl"), &bytes).unwrap();
-        // A crash during the repair, then two starts.
+        // A crash during the repair is followed by two starts.
         for _ in 0..2 {
             let mut writer = self::writer(dir.path());
             writer.push(0..1, true);
@@ -262,7 +262,7 @@ fn a_disk_that_is_full_gets_no_half_line() {
     fs::remove_file(&path).unwrap();
     writer.work(true).unwrap();
     assert_eq!(values(dir.path(), "seq"), [1, 2]);
-    // The file is removed while it is written.
+    // The file is removed while the thread writes it.
     fs::remove_file(&path).unwrap();
     writer.work(true).unwrap();
     writer.push(0..1, true);
