@@ -33,7 +33,7 @@ impl ClosingServer {
         (self.replies, self.last) = (0, None);
     }
 
-    /// The port was lost: whatever is there next is another one.
+    /// The port was lost: the next server is another one.
     pub(super) fn lost(&mut self) {
         *self = ClosingServer::default();
     }

@@ -38,7 +38,7 @@ const MOST_STOPS: u32 = 8;
 pub enum Next {
     /// The next request for the line.
     Send(Step),
-    /// Nothing before then.
+    /// Nothing is sent before this time.
     Wait(Instant),
     Done,
 }
@@ -60,7 +60,7 @@ enum OnWire {
     Nothing,
     /// Only reads that prepare a write were sent.
     Reads,
-    /// A write; of a command that reads, its read.
+    /// A write was sent, or the read of a command that reads.
     Command,
 }
 
@@ -114,7 +114,7 @@ pub struct CommandRun {
     tickets: Vec<Ticket>,
     effects: Vec<Effect>,
     tries: Tries,
-    /// The outcome where it ends before all was sent.
+    /// The outcome of a command that ends before all was sent.
     cut: Option<Outcome>,
     phase: Phase,
     reply: Reply,
@@ -126,19 +126,19 @@ pub struct CommandRun {
     control: Option<(Table, u16)>,
     /// The drive is being read to see whether its motor runs.
     look: Option<Look>,
-    /// The direction that it orders, and that waits for the next start.
+    /// The ordered direction, where it waits for the next start.
     next_start: Option<bool>,
     /// Whether the command sets the direction, or starts the motor.
     turns: bool,
     /// Whether the command waited for a late reply since its last step was chosen.
     held_up: bool,
-    /// Stops that were done since it was last written.
+    /// Stops that were done since the command's last write.
     overtaken: u32,
     /// The command as it was ordered.
     intent: Intent,
-    /// The start that it causes, of a motor whose starts are counted.
+    /// The start that the command causes, of a motor whose starts are counted.
     pub(super) start: Option<Start>,
-    /// Supervision follows the client that sent it.
+    /// Whether supervision follows the client of the command.
     pub renews: bool,
 }
 
@@ -254,7 +254,7 @@ impl CommandRun {
         &self.intent
     }
 
-    /// The ticket of the client that sent it.
+    /// The ticket of the client that gave the command.
     pub fn first_ticket(&self) -> Option<&Ticket> {
         self.tickets.first()
     }
@@ -269,7 +269,7 @@ impl CommandRun {
         self.scope.reference_only
     }
 
-    /// When its time expires.
+    /// When the time of the command expires.
     pub fn expires(&self) -> Instant {
         self.expires
     }
@@ -285,7 +285,7 @@ impl CommandRun {
         };
     }
 
-    /// Whether a client sent it, not the gateway itself.
+    /// Whether a client gave the command, not the gateway itself.
     pub fn is_of_client(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
@@ -323,12 +323,12 @@ impl CommandRun {
         self.on_wire == OnWire::Command
     }
 
-    /// Whether any step of it was on the wire.
+    /// Whether any step of the command was on the wire.
     pub fn reached_the_wire(&self) -> bool {
         self.on_wire != OnWire::Nothing
     }
 
-    /// The parameter that it sets, if it sets one.
+    /// The parameter that the command sets, if it sets one.
     fn parameter(&mut self) -> Option<&mut ParameterRun> {
         match self.actions.front_mut() {
             Some(Action::Parameter(run)) => Some(run),
@@ -364,12 +364,12 @@ impl CommandRun {
         (raw.table == Table::Holding && self.control != Some(place)).then_some(place)
     }
 
-    /// Whether the drive showed its effect before it was acknowledged.
+    /// Whether the drive showed the effect before the command was acknowledged.
     pub fn was_read_back(&self) -> bool {
         self.scope.reads_back
     }
 
-    /// A step of it is on the wire.
+    /// Records that a step of the command is on the wire.
     pub fn sent(&mut self, step: &Step) {
         if let Some(run) = self.parameter().filter(|_| step.purpose == StepPurpose::Execute) {
             run.written();
@@ -386,7 +386,7 @@ impl CommandRun {
         }
     }
 
-    /// A stop to its drive was done before it.
+    /// Records that a stop to the drive was done first.
     pub fn overtaken(&mut self) {
         self.overtaken = self.overtaken.saturating_add(1);
     }

@@ -25,7 +25,7 @@ pub enum Effect {
     Stops,
     /// No fault is active.
     NoFault,
-    /// The point (index in the profile) reads as it was written.
+    /// The point (index in the profile) reads back as written.
     ReadBack(PointIndex, Value),
 }
 
@@ -130,7 +130,7 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
             let raw = reading.spec.profile.points.get(index)?.raw()?;
             Some(match raw.form {
                 Form::Bit { .. } => read.as_bool() == value.as_bool(),
-                // Compared as the register holds them.
+                // Values are compared as the register holds them.
                 _ => raw.encode(read, 0).ok() == raw.encode(value, 0).ok(),
             })
         }
@@ -177,14 +177,14 @@ struct Watch {
     effects: Vec<Awaited>,
     since: Instant,
     within: Duration,
-    /// Least speed since the acknowledgement, and when it last fell.
+    /// Lowest speed since the acknowledgement, and when it last fell.
     slowest: Option<Speed>,
     fell_at: Instant,
     /// The command, as text.
     what: String,
-    /// Why its effect cannot be seen, as it was last.
+    /// The latest reason why the effect cannot be seen.
     unseen: Option<String>,
-    /// Supervision wanted it, or the gateway that stops.
+    /// Whether supervision, or the shutdown of the gateway, gave the command.
     own: bool,
     /// Receipts of clients that wait for confirmation; empty once the time has passed without a conclusion.
     receipts: Vec<Receipt>,
@@ -247,7 +247,7 @@ impl Watch {
         format!("acknowledged {what} but did not show it within {within:?}: {missing}")
     }
 
-    /// Ends the wait at `now`: those waiting are given the reason, if known.
+    /// Ends the wait at `now`: waiting clients get the reason, if known.
     fn let_go(&mut self, now: Instant) {
         let falling = self.slowest.filter(|_| self.slows_down(now));
         let slows = falling.map(|speed| format!("the motor is still slowing down, {:.0} {}", speed.value, speed.unit));
@@ -338,7 +338,7 @@ impl Confirmations {
                 });
             }
             if watch.is_over(now) {
-                // Shown too late for those who waited.
+                // The effect was shown too late for the waiting clients.
                 watch.let_go(now);
             }
             if watch.effects.is_empty() {

@@ -26,7 +26,7 @@ use crate::stalls::Stalls;
 pub enum Action {
     /// Read the received bytes; if there are none, write what [`BusCore::sending`] returns to the port.
     Send,
-    /// Wait for bytes, or until then.
+    /// Wait for bytes, or until this time.
     Wait {
         /// When to come back at the latest.
         until: Instant,
@@ -57,7 +57,7 @@ struct Connection {
     to_ask: bool,
     asked: bool,
     answered: bool,
-    /// How many connections before it ended during a transaction, with no reply since.
+    /// Number of previous connections that ended during a transaction, with no reply since.
     vain: u32,
 }
 
@@ -91,11 +91,11 @@ pub struct BusCore {
     tap: Option<Tap>,
     counters: DriveCounters,
     writes: Arc<WriteStats>,
-    /// Empty; kept for its memory.
+    /// Empty list, kept for its memory.
     news: Vec<News>,
     /// Stalls of the bus's thread; none before it runs.
     stalls: Option<Stalls>,
-    /// There was one since the request on the line was sent.
+    /// Whether the thread was stalled since the request on the line was sent.
     stood: bool,
 }
 
@@ -430,7 +430,7 @@ impl BusCore {
         self.report_all(news, now);
     }
 
-    /// The drive of a turn, unless no entry names it.
+    /// The drive of a turn, if the bus has such a drive.
     fn known(&self, turn: &Turn) -> Option<DriveIndex> {
         Some(turn.drive).filter(|drive| self.bus.image.drives.get(*drive).is_some())
     }

@@ -31,7 +31,7 @@ pub(super) struct DriveCounters {
 
 #[derive(Debug)]
 enum State {
-    /// Looked at again then, with the counters read so far.
+    /// Idle until this time, with the counters read so far.
     Idle(Instant, Vec<u16>),
     /// The counters read so far, and the answer that is waited for.
     Reading(Vec<u16>, Receiver<Answer>),

@@ -28,7 +28,7 @@ pub(super) struct DriveState {
     pub(super) words: KnownWords,
     /// The places of what orders write, and of the command word where the drive shows its own: they are kept from every read.
     pub(super) commanded: Vec<(Table, u16)>,
-    /// Replies that it may still send.
+    /// Replies that the drive may still send.
     pub(super) late: LateReplies,
     pub(super) repeated_stops: RepeatedStops,
     /// Lease of the drive.
@@ -37,7 +37,7 @@ pub(super) struct DriveState {
     pub(super) refresh: Refresh,
     /// Why the refresh ended, until that is reported.
     pub(super) refresh_ended: Option<End>,
-    /// Commands that it acknowledged and has not shown yet.
+    /// Commands that the drive acknowledged and has not shown yet.
     pub(super) confirmations: Confirmations,
     /// Started commands: one of each rank, so that they keep their order.
     runs: [Option<CommandRun>; 3],
@@ -56,7 +56,7 @@ pub(super) struct DriveState {
     /// Whether `[authority]` is on: then the senders of executed commands are kept, and whether these were stops.
     pub(super) has_authority: bool,
     pub(super) carried_out: Vec<(Origin, bool)>,
-    /// Whether its local control place has it; none while that is not known.
+    /// Whether the drive is under local control; none while that is not known.
     pub(super) local: Option<bool>,
 }
 
@@ -65,7 +65,7 @@ pub(super) struct DriveState {
 pub(super) enum Wanted {
     /// A step of the command of that rank.
     Step(Urgency, Step),
-    /// Nothing before then.
+    /// Nothing is sent before this time.
     Wait(Instant),
     Nothing,
 }

@@ -27,7 +27,7 @@ use std::time::{Duration, Instant};
 
 use crate::codec::RequestPdu;
 
-/// A reply that has not arrived by then will not arrive.
+/// Time after which a missing reply is no longer expected.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
 /// How long a look-alike waits before the request whose reply is late is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -46,7 +46,7 @@ struct LateReply {
     /// When the first of the transactions that were given up in a row began; `None` once the request was answered.
     since: Option<Instant>,
     until: Instant,
-    /// How late the reply was, if it was the older one.
+    /// Lateness of the reply, if it was the older one.
     late: Duration,
     /// When the last answered request was sent: if its reply was the older one, the next reply belongs to this request.
     before: Option<Instant>,
@@ -54,7 +54,7 @@ struct LateReply {
     newer: Option<Instant>,
     /// Each reply belongs to its own request: the drive has replied to another request since.
     settled: bool,
-    /// Since when a look-alike waits.
+    /// Since when a request of equal form waits.
     wanted: Option<Instant>,
     /// Replies that may still come.
     count: u32,
@@ -190,7 +190,7 @@ impl LateReplies {
         self.expected.iter().map(LateReply::ends).max()
     }
 
-    /// How many requests have replies that may still come.
+    /// Number of requests whose replies may still come.
     pub(super) fn owed(&self, now: Instant) -> usize {
         self.expected.iter().filter(|late| late.ends() > now).count()
     }
@@ -220,7 +220,7 @@ pub fn look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
     Look::of(a) == Look::of(b)
 }
 
-/// All that a reply shows of its request.
+/// The part of a request that its reply shows.
 #[derive(Debug, PartialEq, Eq)]
 enum Look<'r> {
     /// Function and length of a read.

@@ -85,13 +85,13 @@ pub struct BusOptions {
     pub silence: Silence,
     /// How the port is set up and waited for.
     pub line: LineOptions,
-    /// Whose line it is.
+    /// Role of the gateway on the line.
     pub mode: Mode,
     /// From where the device of the bus may dial in.
     pub allow: Vec<IpNet>,
 }
 
-/// Whose line it is.
+/// Role of the gateway on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Mode {
     /// The gateway is the master.

@@ -283,7 +283,7 @@ impl LineDiagnosis {
     }
 }
 
-/// The commissioning steps that a finding questions, from the profiles of its drives.
+/// The commissioning steps to check for a finding, from the profiles of its drives.
 fn steps_of(image: &BusImage, finding: &Finding) -> Vec<String> {
     let about = (0..)
         .zip(&image.drives)

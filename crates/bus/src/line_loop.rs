@@ -27,7 +27,7 @@ const LAST_EXCHANGE: Duration = Duration::from_secs(1);
 /// The thread shows that it is alive at least this often, also while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
 
-/// A bus that runs.
+/// A running bus.
 #[derive(Debug)]
 pub struct BusTask {
     handle: BusHandle,
@@ -75,7 +75,7 @@ impl BusTask {
         let name = format!("bus-{}", handle.image.spec.name);
         let (begin, begun) = sync_channel::<Handover>(1);
         let thread = std::thread::Builder::new().name(name).spawn(move || {
-            // A bus that is given up before it began has nothing to end.
+            // A bus that is dropped before it began has nothing to end.
             let Ok(before) = begun.recv() else {
                 return Handover::default();
             };
@@ -96,7 +96,7 @@ impl BusTask {
     /// Lets a prepared bus open its port; nothing further can fail. `before` is the handover of the previous bus.
     pub fn begin(&mut self, before: Handover) {
         if let Some(begin) = self.begin.take() {
-            // Room for one; the thread waits for it.
+            // The channel has room for the value, and the thread waits for it.
             let _ = begin.send(before);
         }
     }
@@ -150,7 +150,7 @@ impl Drop for BusTask {
 
 /// The time for the stops of drives that no bus serves any more.
 const LAST_STOPS: Duration = Duration::from_secs(2);
-/// The time between two looks at them.
+/// Pause between two checks of the last stops.
 const LOOK_AGAIN: Duration = Duration::from_millis(5);
 
 /// Time for the log to be written before the process ends.
@@ -165,7 +165,7 @@ fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
             target: "drivegate::bus::line_loop", "the thread {bus} panicked, which is a bug in drivegate; the process \
                                                   exits to be restarted"
         );
-        // Log lines are written by a thread of their own.
+        // Log lines are written by another thread, which gets time to finish.
         std::thread::sleep(LAST_WORDS);
         std::process::abort();
     })
@@ -234,7 +234,7 @@ impl Worker {
         while !self.stopping() {
             let spec = &self.handle.image.spec;
             let go_on = || !self.stopping();
-            // Before the try, so that nothing is missed after it.
+            // The watch starts before the try, so that no change is missed after it.
             let watching = Arrival::of(&spec.port);
             let arrival = match C::open(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
                 Ok((line, warnings)) => {
@@ -279,7 +279,7 @@ impl Worker {
                 true => core.closed(Instant::now()),
                 false => Closed::Lost,
             };
-            // Some servers have but one connection.
+            // Some servers accept a single connection, so the old one is closed first.
             drop(line);
             match closed {
                 Closed::Lost => return Err(lost.to_string()),
@@ -408,7 +408,7 @@ impl Worker {
     fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut stalls = Stalls::new(Instant::now(), line::since_boot());
-        // Since when what is read next may have been there.
+        // Earliest time at which the bytes that are read next may have come.
         let mut since = None;
         while !self.stopping() {
             let now = Instant::now();
@@ -538,7 +538,7 @@ mod tests {
 
     use super::*;
 
-    /// Set in the process that the test below starts to see it die.
+    /// Environment variable of the child process that the test below starts to see it die.
     const DIES: &str = "DRIVEGATE_TEST_DIES";
 
     #[test]

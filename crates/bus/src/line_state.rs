@@ -51,13 +51,13 @@ pub struct Sending {
 /// A completed transaction.
 #[derive(Debug)]
 pub struct Exchanged {
-    /// How it ended, and all received bytes.
+    /// A transaction with its end, and all received bytes.
     pub transaction: Transaction,
-    /// How it ended.
+    /// How the transaction ended.
     pub ended: Ended,
     /// When the request was given to the line.
     pub began: Instant,
-    /// When the drive knew that the request was over.
+    /// When the drive detected the end of the request.
     pub sent: Instant,
     /// When the last bytes arrived, as far as they can be the drive's; the end of the request if none did.
     pub heard_at: Instant,
@@ -65,7 +65,7 @@ pub struct Exchanged {
     pub at: Instant,
     /// Time on the wire of the received bytes.
     pub reply_time: Duration,
-    /// How long the line was in use, including the silence after it.
+    /// How long the line was in use, including the silence after the transaction.
     pub took: Duration,
     /// The reply was whole before the line could have carried it: the lowest baud rate at which it could have been.
     pub beats: Option<u32>,
@@ -76,7 +76,7 @@ pub struct Exchanged {
 pub struct Learned {
     protocol: Protocol,
     format: LineFormat,
-    /// The adapter echoes what it sends.
+    /// Whether the adapter echoes the bytes it sends.
     echo: bool,
     /// Weight of the replies that arrived faster than the wire could carry them.
     early_weight: u32,
@@ -88,11 +88,11 @@ pub struct LineState {
     protocol: Protocol,
     format: LineFormat,
     silence: Duration,
-    /// Silence after the last exchange, as the drive of it needs.
+    /// Silence after the last transaction, as its drive needs.
     owed: Duration,
     /// End of the last character on the line, either direction.
     quiet_since: Instant,
-    /// Nothing is sent before then: a reply to the previous master may arrive.
+    /// Time before which nothing is sent: a reply to the previous master may arrive.
     left_alone: Instant,
     learned: Learned,
     underway: Option<Underway>,
@@ -189,7 +189,7 @@ impl LineState {
         self.left_alone = until;
     }
 
-    /// Whether the line babbled until then.
+    /// Whether the line was never silent from `since` on for too long.
     pub(crate) fn babbles(&self, since: Instant) -> bool {
         self.quiet_since > since + BABBLE
     }
@@ -255,7 +255,7 @@ impl LineState {
         self.underway.as_ref().map(|underway| underway.transaction.deadline())
     }
 
-    /// Bytes were received at `now`. Returns the transaction if they complete it.
+    /// Adds bytes received at `now`. Returns the transaction if they complete it.
     pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
             self.begin_silence(now);

@@ -81,7 +81,7 @@ pub enum Purpose {
     Command {
         /// Which of the drive's started commands.
         slot: Urgency,
-        /// With which rank it competes for the line.
+        /// Rank with which the command competes for the line.
         rank: Urgency,
         /// The purpose of the step.
         step: StepPurpose,
@@ -109,7 +109,7 @@ impl Turn {
         &self.pdu
     }
 
-    /// The rank of its command; none for a poll or a background transaction.
+    /// The rank of the turn's command; none for a poll or a background transaction.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
             Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
@@ -130,9 +130,9 @@ impl Turn {
 pub struct TurnEnd {
     /// How the transaction ended.
     pub ended: Ended,
-    /// When its request was given to the line.
+    /// When the request was given to the line.
     pub began: Instant,
-    /// When it ended: no later than a reply can have left the drive.
+    /// When the transaction ended: no later than a reply can have left the drive.
     pub at: Instant,
     /// Whether the thread was stalled meanwhile: the missing reply may be due to that.
     pub stood: bool,
@@ -142,7 +142,7 @@ pub struct TurnEnd {
     pub mangled: bool,
     /// A whole reply came, and was not believed because the line could not have carried it so soon.
     pub doubted: bool,
-    /// The frame of the reply, as the drive sent it, to [`Purpose::Background`].
+    /// The reply frame as the drive sent it, for [`Purpose::Background`].
     pub frame: Vec<u8>,
 }
 
@@ -194,7 +194,7 @@ pub struct Master {
     bus: BusHandle,
     retries: u32,
     response_timeout: Duration,
-    /// Kept before each request.
+    /// Silence that is kept before each request.
     silence: Duration,
     schedule: Schedule,
     drives: PerDrive<DriveState>,
@@ -533,7 +533,7 @@ impl Master {
         timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
     }
 
-    /// The times of its own that the drive has.
+    /// The drive's own times, where it has any.
     fn timing_of(&self, drive: DriveIndex) -> Timing {
         let image = self.bus.image.drives.get(drive);
         image.map_or_else(Timing::default, |image| image.spec.timing)
@@ -574,7 +574,7 @@ impl Master {
         std::mem::take(&mut self.waits.n2_late)
     }
 
-    /// Puts back what that transaction left of them.
+    /// Stores the late replies of N2 that a transaction has left.
     pub(crate) fn put_late(&mut self, late: N2LateReplies) {
         self.waits.n2_late = late;
     }

@@ -32,7 +32,7 @@ pub struct Asked<'r> {
     pub address: u8,
     /// The request.
     pub pdu: &'r RequestPdu,
-    /// The device type by which it identifies itself.
+    /// The device type with which the drive identifies itself.
     pub device: u8,
     /// When the request was sent.
     pub at: Instant,
@@ -45,7 +45,7 @@ struct Late {
     form: Form,
     /// The device type that an identity would show.
     device: u8,
-    /// When the first of the requests was sent that may be answered late.
+    /// When the first request was sent whose reply may come late.
     asked: Instant,
     until: Instant,
     /// Replies that may still come: the request was sent so often without success.
@@ -57,7 +57,7 @@ struct Late {
 /// The meaning of a valid frame in a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Taken {
-    /// As far as late replies are concerned it may be the reply.
+    /// The frame may be the reply: no late reply has its form.
     Reply,
     /// The frame is a late reply: this many bytes are to be dropped.
     Late(usize),
@@ -158,7 +158,7 @@ impl N2LateReplies {
         };
         let mut alike = self.0.iter().filter(|late| late.could_be(&answer));
         let is_own = match &answer {
-            // Whichever request it refuses so, the drive waits for Identify.
+            // Any request may be refused in this way, as the drive waits for Identify.
             Answer::Nak(code) if Exception::n2(*code) == Exception::N2_RESTARTED => {
                 alike.all(|late| late.address == address)
             }

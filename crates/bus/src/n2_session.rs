@@ -14,12 +14,12 @@ use crate::codec::{Exception, Reply};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::order::Urgency;
 
-/// Polls in which a drive has to report all its changes.
+/// Number of polls in which a drive must report all its changes.
 pub const MOST_POLLS: u8 = 16;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// Identified never, or not since it went away.
+    /// The drive was never identified, or not since it went away.
     Unknown,
     /// The drive has reported that it waits for Identify.
     Waiting,
@@ -153,7 +153,7 @@ impl N2Sessions {
         drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)
     }
 
-    /// The drive no longer replies: it is identified again.
+    /// The drive no longer replies, so it must be identified again.
     pub fn gone(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);
@@ -222,7 +222,7 @@ impl Drive {
         }
         self.phase = Phase::Ready;
         self.polled = Some(now);
-        // The last poll of a series stands for all of it.
+        // A whole series of polls counts as changed only once.
         if left + 1 < MOST_POLLS {
             Progress::Changed
         } else {

@@ -17,7 +17,7 @@ pub enum News {
     SlowRound(Option<Duration>),
     /// The drive replied to a read of the plan.
     Read {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
         /// The read.
         read: PlannedRead,
@@ -42,43 +42,43 @@ pub enum News {
     LeaseRanOut(DriveIndex),
     /// The action of a lease that expired cannot be written.
     ActionRefused {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
         /// The command in one line.
         what: String,
-        /// Why not.
+        /// Reason of the refusal.
         refusal: Refusal,
     },
     /// An attempt at the action of an expired lease failed; with the reason, unless reported before.
     ActionFailed {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
-        /// Why, as text.
+        /// Reason of the failure, as text.
         why: Option<String>,
     },
     /// The action of a lease that expired was acknowledged after so many tries that failed.
     ActionTaken {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
-        /// How many.
+        /// Number of failures before.
         failures: u32,
     },
     /// A drive whose lease expired does not report whether it runs.
     RunningUnknown(DriveIndex),
     /// The refresh for the drive's own timeout has ended.
     RefreshEnded {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
-        /// Why, as text.
+        /// Reason of the end, as text.
         why: String,
     },
     /// A waiting or started command was refused.
     Denied(Denied),
     /// An interlock does not hold, and the motor is stopped by that.
     Tripped {
-        /// Which drive.
+        /// Place of the drive.
         drive: DriveIndex,
-        /// Which interlock, and why it does not hold.
+        /// The interlock, and why it does not hold.
         why: String,
     },
     /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.

@@ -72,7 +72,7 @@ pub struct Shortage {
     pub fast: Option<Missed>,
     /// The slow class, if it is missed.
     pub slow: Option<Missed>,
-    /// Each of these would carry all cadences, best first.
+    /// Changes that would each carry all cadences, best first.
     pub remedies: Vec<Remedy>,
 }
 
@@ -83,7 +83,7 @@ pub struct Missed {
     pub wanted: Duration,
     /// Cadence that the line carries.
     pub achieved: Duration,
-    /// Requests of one round.
+    /// Number of requests in one round.
     pub requests: usize,
     /// Wire time of one round.
     pub round: Duration,
@@ -144,7 +144,7 @@ impl Prediction {
 struct Rounds {
     fast: f64,
     slow: f64,
-    /// Requests of a slow round, and the longest of them.
+    /// Number of requests in a slow round, and the longest of them.
     slow_requests: f64,
     longest_slow: f64,
     /// Share of the line that refreshes take.
@@ -377,7 +377,7 @@ impl<'a> Line<'a> {
         Some(buses.len())
     }
 
-    /// The longer cadences with which the line as it is carries both classes.
+    /// The longer cadences with which the line carries both classes at its present settings.
     fn longer(&self, fast_missed: bool, rounds: &Rounds) -> Vec<Remedy> {
         let cycle = |cycle| Remedy::Cycle { cycle, baud: None };
         if fast_missed {
@@ -428,7 +428,7 @@ fn whole_milliseconds(seconds: f64) -> Duration {
 }
 
 impl Shortage {
-    /// The shortage and its remedies.
+    /// The shortage and its remedies as a finding.
     pub fn finding(&self) -> Finding {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
         let mut cadences = Vec::new();

@@ -30,7 +30,7 @@ pub struct Answer {
     pub echoed: bool,
     /// Received bytes, without such an echo.
     pub bytes: usize,
-    /// Their shape.
+    /// Form of the received bytes.
     pub shape: Shape,
     /// A gateway in between reported that nothing answers at the address, which counts as silence.
     pub no_way: bool,

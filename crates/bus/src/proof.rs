@@ -29,9 +29,9 @@ const LONGEST: Duration = Duration::from_secs(600);
 /// The extent of a proof without a counterexample.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Proof {
-    /// Commands that were run to their end.
+    /// Number of commands that were run to their end.
     pub commands: usize,
-    /// Requests that they sent.
+    /// Number of requests that the commands sent.
     pub frames: usize,
 }
 
@@ -40,7 +40,7 @@ pub struct Proof {
 pub struct Counterexample {
     /// The fault.
     pub what: String,
-    /// The drive before.
+    /// State of the drive before the command.
     pub state: String,
     pub command: String,
     /// The requests, with their words in hex, and their results.
@@ -274,7 +274,7 @@ impl<'p> Case<'p> {
         CommandRun::new(command, self.profile)
     }
 
-    /// Runs the command to its end with that event; its requests.
+    /// Runs the command to its end with this event; returns its requests.
     fn run(&self, event: Event) -> Result<Vec<Frame>, Box<Counterexample>> {
         let now = Instant::now();
         let Some(drive) = Drive::new(self.profile, self.control, self.start) else {
@@ -407,7 +407,7 @@ impl<'p> Case<'p> {
         })
     }
 
-    /// Keeps the frame; checks whether a pulse had its time.
+    /// Keeps the frame, and checks whether a pulse lasted long enough.
     fn note(&self, step: &Step, fate: Option<Fate>, progress: &mut Progress<'p>) -> Result<(), Box<Counterexample>> {
         progress.frames.push(Frame::Request(step.pdu.clone(), fate));
         let Some(reset) = self.control.fault_reset else {
@@ -465,7 +465,7 @@ impl<'p> Case<'p> {
     }
 
     fn keeps_always(&self, word: u16) -> bool {
-        // A whole word that the profile writes as it stands.
+        // A whole word of the profile is exempt, as the profile writes it unchanged.
         let wholes = self.control.runs().into_iter().chain([self.control.stop]);
         let mut wholes = wholes.chain(self.control.fault_reset.map(|reset| reset.setting));
         self.control.always.holds(word) || wholes.any(|setting| setting.mask == u16::MAX && setting.value == word)

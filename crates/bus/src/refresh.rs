@@ -24,14 +24,14 @@ use crate::process_image::{Hold, Reading};
 /// Periods in which a drive that does not answer may come back.
 const PERIODS: u32 = 3;
 
-/// Whose order began a refresh.
+/// Origin of the order that started a refresh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Beginner {
-    /// A client's, whose lease it needs.
+    /// The order of a client, whose lease the refresh needs.
     Client,
-    /// A drill's, which feeds the timeout until it falls silent to try it.
+    /// The order of a drill, which feeds the timeout until it goes silent to try it.
     Drill,
-    /// The action of a lease that expired: it needs none.
+    /// The action of a lease that expired: it needs no lease.
     Action,
 }
 
@@ -48,7 +48,7 @@ struct Going {
     seen: bool,
     /// The drive has not answered since.
     lost: Option<Instant>,
-    /// Whose order began it.
+    /// Origin of the order that started the refresh.
     by: Beginner,
 }
 
@@ -59,7 +59,7 @@ pub struct Repeated {
     going: Option<Going>,
 }
 
-/// How an order ended, as far as a refresh depends on it.
+/// Result of an order, as far as a refresh depends on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OrderEnd {
     /// A client's order was acknowledged.
@@ -68,7 +68,7 @@ pub(super) enum OrderEnd {
     Drill,
     /// The speed reference of a lease that expired was.
     Action,
-    /// The drive refused a step of it.
+    /// The drive refused a step of the order.
     Refused,
     /// Which part of the order the drive took is unknown.
     Unknown,
@@ -90,7 +90,7 @@ pub(super) struct Around {
 /// The refresh of one drive.
 #[derive(Debug, Default)]
 pub(super) struct Refresh {
-    /// How often, and what is repeated; none where nothing is.
+    /// Interval of the refresh, and its parts; none where nothing is refreshed.
     settings: Option<(Duration, Repeats)>,
     repeated: Repeated,
     round: Option<Round>,
@@ -299,12 +299,12 @@ impl Refresh {
         self.repeated.going.is_some_and(|going| going.does == Does::Run)
     }
 
-    /// Whether a drill's order began it.
+    /// Whether a drill's order started the refresh.
     pub(super) fn is_of_drill(&self) -> bool {
         self.repeated.going.is_some_and(|going| going.by == Beginner::Drill)
     }
 
-    /// Stops that were accepted before the order that began it.
+    /// Stops that were accepted before the order that started the refresh.
     pub(super) fn stops_before(&self) -> u64 {
         self.repeated.going.map_or(0, |going| going.stops)
     }

@@ -7,7 +7,7 @@ use crate::codec::RequestPdu;
 use crate::drive::Profile;
 use crate::order::written;
 
-/// After the stop.
+/// Times after the stop at which it is written again.
 const AGAIN: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(3)];
 /// A write that was not answered may still arrive for so long.
 const MAY_ARRIVE: Duration = Duration::from_secs(30);
@@ -36,7 +36,7 @@ impl RepeatedStops {
         }
     }
 
-    /// A request is sent. A start is newer than the stop before it.
+    /// Notes that a request is sent: a start supersedes the stop before it.
     pub(super) fn sending(&mut self, profile: &Profile, pdu: &RequestPdu, now: Instant) {
         match runs_by(profile, pdu) {
             Some(true) => self.due = [None; AGAIN.len()],

@@ -65,7 +65,7 @@ pub(super) struct Wanted {
 /// The known response of a drive to a silent master.
 #[derive(Debug, Clone, Copy, Default)]
 struct Response {
-    /// Since it came online.
+    /// Whether the response was evaluated since the drive came online.
     looked_at: bool,
     /// Whether the missing response was reported.
     told: bool,

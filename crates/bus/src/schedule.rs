@@ -28,7 +28,7 @@ use crate::order::Urgency;
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
 pub const SLOW_SHARE: f64 = 0.05;
-/// Share that they get at most, however much they ask for.
+/// Largest share that slow polls get, however many they are.
 const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
 /// Share of what commands leave that slow polls get while something was never read: what is not known yet is worth more than what is known.
 const FIRST_SHARE: f64 = 0.5;
@@ -60,18 +60,18 @@ pub enum Decision {
     Command(Urgency),
     /// Read.
     Poll(Poll),
-    /// Nothing is due before then.
+    /// No request is due before this time.
     Idle(Instant),
 }
 
-/// How a poll went.
+/// Result of a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Polled {
     /// The drive replied.
     Ok,
-    /// The drive refused it.
+    /// The drive refused the read.
     Refused(Exception),
-    /// No answer.
+    /// The drive gave no answer.
     Failed,
     /// An invalid reply: retried, but the drive does not count as absent so soon.
     Garbled,
@@ -80,7 +80,7 @@ pub enum Polled {
 /// The change caused by a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
-    /// Nothing.
+    /// The poll changes nothing.
     None,
     /// The drive replies (again).
     Online,
@@ -104,7 +104,7 @@ pub struct Cadence {
 /// A round of the fast class that was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoundStart {
-    /// When.
+    /// When the round started.
     pub at: Instant,
     /// Time since the start of the round before.
     pub cycle: Option<Duration>,
@@ -143,7 +143,7 @@ pub struct Schedule {
     earned_until: Instant,
     /// Time on the line taken by commands, and by reads they caused, since then.
     commanded: Duration,
-    /// Time on the line that slow polls took since then.
+    /// Time on the line that slow polls took since the start of the round.
     slow_took: Duration,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
     /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
@@ -303,7 +303,7 @@ impl Schedule {
             self.slow_credit = match turn {
                 Turn::OnCredit => self.slow_credit.saturating_sub(took),
                 Turn::Asked => self.slow_credit,
-                // There was room for it, so the others will find room too.
+                // There was room for this poll, so the others will find room too.
                 Turn::Due => Duration::ZERO,
             };
             if turn != Turn::Asked {
@@ -375,7 +375,7 @@ impl Schedule {
         self.drives.get(drive).is_some_and(|drive| drive.is_trial(read))
     }
 
-    /// A reply to that read showed more than its first item.
+    /// Records that a reply to this read showed more than its first item.
     pub fn proved(&mut self, drive: DriveIndex, read: &PlannedRead) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.unproved.retain(|block| !block.covers(read.table, read.start));
@@ -389,7 +389,7 @@ impl Schedule {
         }
     }
 
-    /// A poll may not go before then.
+    /// Postpones a poll until this time.
     pub(crate) fn postpone(&mut self, poll: &Poll, until: Instant) {
         self.round.retain(|waiting| *waiting != (poll.drive, poll.read));
         let Some(drive) = self.drives.get_mut(poll.drive) else {
@@ -433,7 +433,7 @@ impl Schedule {
         }
     }
 
-    /// Reads that cover an address are due at once: a command changed it.
+    /// Makes the reads of an address due at once, since a command changed it.
     pub fn read_soon(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;

@@ -31,7 +31,7 @@ pub(super) struct Selections {
 #[derive(Debug)]
 struct DriveSelections {
     points: Vec<Compared>,
-    /// An event has reported that its selection differs.
+    /// Whether an event has reported that the selection differs.
     reported: bool,
 }
 
@@ -130,7 +130,7 @@ impl Selections {
         self.findings(drive, reading, Vec::new(), Vec::new(), Vec::new())
     }
 
-    /// The drive answered that read, and reads as `reading` right after it.
+    /// The drive answered this read, and has the values of `reading` after it.
     pub(super) fn read(&mut self, drive: DriveIndex, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
         let now = reading.now;
         let profile = &reading.spec.profile;

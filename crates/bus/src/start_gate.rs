@@ -40,7 +40,7 @@ pub(super) struct StartGate {
 pub(crate) struct Start {
     /// The number of the command.
     pub number: u64,
-    /// The client that gave it.
+    /// The client that gave the start.
     pub client: Arc<str>,
 }
 
@@ -168,7 +168,7 @@ impl Trip {
         match answer.try_recv() {
             Err(TryRecvError::Empty) => return,
             Ok(answer) if answer.outcome.is_ok() => {
-                // The motor may take its time.
+                // The motor may need time to stop.
                 self.next = Some(now + self.pause);
                 self.pause = AGAIN.1.min(2 * self.pause);
             }

@@ -31,7 +31,7 @@ const MOST_REASONS: usize = 8;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lease {
     state: State,
-    /// By how much it was prolonged since it was renewed last.
+    /// Time by which the lease was prolonged since it was last renewed.
     prolonged: Duration,
 }
 
@@ -98,7 +98,7 @@ pub(super) struct Orders {
 /// Request of supervision.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Demand {
-    /// Nothing.
+    /// Supervision requests nothing.
     None,
     /// Write this point of the model; the result goes to [`Supervision::ordered`].
     Write(ModelPoint, Value),
@@ -113,7 +113,7 @@ pub(super) struct Supervision {
     /// The pending result of the action.
     answer: Option<Receiver<Answer>>,
     next_try: Option<Instant>,
-    /// Why it could not be written, as it was reported.
+    /// The reported reason why the action could not be written.
     refused: Option<Refusal>,
     /// Whether it was reported that the drive does not show whether it runs.
     blind_reported: bool,
@@ -360,7 +360,7 @@ impl Supervision {
         }
     }
 
-    /// Writes the action, for a silent drive when it is back.
+    /// Writes the action; for a silent drive, when it is back.
     fn act(&mut self, reading: &Reading<'_>, now: Instant) -> Demand {
         let waits = self.answer.is_some();
         let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
@@ -389,7 +389,7 @@ impl Supervision {
         }
     }
 
-    /// Withdraws the action, unless it was sent: then it still gets its result.
+    /// Withdraws the action, unless it was sent and will still get its result.
     pub(super) fn withdrawn(&mut self, now: Instant) {
         match self.lease.state {
             State::RanOut => {

@@ -160,7 +160,7 @@ struct Hearing {
     /// End of the request on the wire.
     sent: Instant,
     bytes: Vec<u8>,
-    /// Bytes that were there at each arrival.
+    /// Number of bytes present at each arrival.
     arrivals: Vec<(usize, Instant)>,
 }
 

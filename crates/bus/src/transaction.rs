@@ -15,9 +15,9 @@ use super::n2_late_replies::{N2LateReplies, Taken};
 use crate::codec::n2::Session;
 use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
-/// Most bytes considered in one transaction: more is noise, whatever it contains.
+/// Most bytes considered in one transaction: further bytes are noise.
 const MOST_BYTES: usize = 1024;
-/// Silence, in characters, after garbage, after which no more of it is expected.
+/// Silence, in characters, after which no more garbage is expected.
 const GARBAGE_GAP: u32 = 4;
 
 /// Silence after a reply of unknown length that makes it complete: longer than a USB adapter buffers bytes.
@@ -34,7 +34,7 @@ pub const CONNECTION_CLOSED: &str = "the device server closed the connection, an
 pub enum Ended {
     /// The drive replied, perhaps with an exception: it is alive.
     Reply(Reply),
-    /// Nothing valid arrived before the deadline: towards offline.
+    /// Nothing valid arrived before the deadline: the drive is on its way to offline.
     Silent,
     /// An invalid reply: retried once the line is silent.
     Corrupt(&'static str),
@@ -43,7 +43,7 @@ pub enum Ended {
 /// Next action of the transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
-    /// Wait for bytes until then.
+    /// Wait for bytes until this time.
     Wait(Instant),
     /// The transaction has ended.
     Done(Ended),
@@ -69,12 +69,12 @@ pub struct Transaction {
     foreign: u32,
     echo: bool,
     echo_seen: bool,
-    /// A reply that is whole before then was not made for this request.
+    /// A reply complete before this instant cannot answer this request.
     doubted_before: Option<Instant>,
     doubted: bool,
-    /// More bytes followed such a reply.
+    /// Whether more bytes followed a reply that was too early.
     behind_doubted: bool,
-    /// Bytes before then, other than an echo, arrived before the request ended.
+    /// Bytes before this instant, other than an echo, arrived before the request ended.
     ignored_before: Option<Instant>,
     /// Late replies that may still arrive on an N2 line.
     late: N2LateReplies,
@@ -155,7 +155,7 @@ impl Transaction {
         self.protocol.begins_reply(&self.request, &self.received)
     }
 
-    /// When it ends at the latest.
+    /// When the transaction ends at the latest.
     pub fn deadline(&self) -> Instant {
         self.deadline
     }
@@ -328,7 +328,7 @@ impl Transaction {
         Some(self.replied(at, used, reply))
     }
 
-    /// How long characters that belong to the garbage may still come.
+    /// How long more characters of the garbage may still come.
     fn rest_time(&self) -> Duration {
         let expected = self.protocol.reply_chars(&self.request.pdu).max(1);
         let missing = expected.saturating_sub(self.received.len()) as u32 + GARBAGE_GAP;

@@ -14,7 +14,7 @@ const PAUSE: u32 = 10;
 /// The unanswered stops of one drive.
 #[derive(Debug, Default)]
 pub(super) struct VainStops {
-    /// How many in a row; one less for each pause.
+    /// Number of useless stops in a row; one less for each pause.
     count: f64,
     /// Duration of the transactions of the present one so far.
     took: Duration,
@@ -50,7 +50,7 @@ impl VainStops {
         *self = VainStops::default();
     }
 
-    /// Until when the next one waits.
+    /// Until when the next stop waits.
     pub(super) fn waits_until(&self, now: Instant) -> Option<Instant> {
         self.until.filter(|until| *until > now)
     }

@@ -37,14 +37,14 @@ pub(super) enum Word {
     ResetLow(Setting),
     /// The pulse.
     ResetHigh(Setting),
-    /// After it.
+    /// The word after a reset pulse.
     ResetEnd(Setting),
     /// Bits that are no command of `[control]`.
     Others(Setting),
 }
 
 impl Word {
-    /// The bits of a pulse that it begins, sets or ends.
+    /// The bits of a pulse that the word begins, sets or ends.
     fn pulsed(self) -> Option<Setting> {
         match self {
             Word::ResetLow(setting) | Word::ResetHigh(setting) | Word::ResetEnd(setting) => Some(setting),
@@ -71,11 +71,11 @@ impl Word {
 pub(super) enum Made {
     /// The request to send.
     Send(Step),
-    /// Nothing: the drive has it.
+    /// Nothing is sent, as the drive has the word.
     Nothing,
-    /// Nothing before it was seen whether the motor runs.
+    /// The running state must be read before the word is made.
     Look,
-    /// Nothing: this direction is kept for the next start.
+    /// Nothing is sent: this direction is kept for the next start.
     AtNextStart(bool),
     /// The order is refused, as its effect would be unknown.
     Refused(Refusal),
@@ -90,7 +90,7 @@ pub(super) struct AwaitedState {
     mask: Mask,
     /// After which the sequence is given up.
     pub(super) timeout: Duration,
-    /// As text: the step, with its word.
+    /// The step with its word, as text.
     step: String,
     /// When the wait began.
     pub(super) since: Option<Instant>,
@@ -116,7 +116,7 @@ impl AwaitedState {
         })
     }
 
-    /// The read of it.
+    /// The read of the awaited state.
     pub(super) fn look(&self) -> Step {
         let pdu = RequestPdu::Read {
             table: self.raw.table,
@@ -126,7 +126,7 @@ impl AwaitedState {
         Step::new(StepPurpose::AskState, pdu)
     }
 
-    /// Whether the reply shows it.
+    /// Whether the reply shows the awaited state.
     pub(super) fn is_shown(&mut self, reply: &Reply) -> bool {
         let words = reply.words();
         let value = words.and_then(|words| self.raw.decode(&words, Kind::Integer));
@@ -135,7 +135,7 @@ impl AwaitedState {
         value.is_some() && self.seen.is_some_and(|seen| self.mask.holds(seen))
     }
 
-    /// As text: what was not seen in time.
+    /// The state that was not seen in time, as text.
     pub(super) fn not_reached(&self) -> String {
         let AwaitedState {
             name,
@@ -304,7 +304,7 @@ pub(super) fn pulse(setting: Setting, hold: Duration) -> [Action; 5] {
     ]
 }
 
-/// The word of a place of its own between two resets.
+/// The word at a place of its own between two resets.
 fn low_of(setting: &Setting) -> u16 {
     match setting.value {
         0 => setting.mask,
@@ -563,7 +563,7 @@ fn read_of(place: ControlItem) -> Step {
     Step::new(StepPurpose::ReadWord, RequestPdu::Read { table, start, count })
 }
 
-/// Whether that word of a sequence is its last, which starts the motor.
+/// Whether the word of this number is the last of the sequence, which starts the motor.
 pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
     let run = profile.control.as_ref().map(|control| &control.run);
     matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())

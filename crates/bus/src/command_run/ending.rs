@@ -62,7 +62,7 @@ impl CommandRun {
     /// A stop arrived: remaining steps are cancelled, except clearing a reset bit that is set. Returns the outcome if
     /// that ends the command.
     pub fn purge(&mut self) -> Option<Outcome> {
-        // The stop that came in is on its way.
+        // The stop in the queue stops the motor, so no separate stop is needed.
         self.leave_motor();
         self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
         self.actions.is_empty().then(|| self.success())
@@ -73,7 +73,7 @@ impl CommandRun {
         self.known.stopped = true;
     }
 
-    /// Ending it then sends no separate stop to the motor that it started.
+    /// Leaves the started motor running: the end of the command sends no separate stop.
     fn leave_motor(&mut self) {
         if self.phase == Phase::MotorStarted {
             self.phase = Phase::Steps;
@@ -89,7 +89,7 @@ impl CommandRun {
         let high = self.actions.iter().any(Action::is_reset);
         self.actions
             .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
-        // A hold without the end of a pulse after it holds nothing.
+        // Without the end of a pulse behind them the remaining holds are pointless.
         if !self.actions.iter().any(Action::ends_reset) {
             self.actions.clear();
         }

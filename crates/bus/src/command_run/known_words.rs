@@ -17,17 +17,17 @@ pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
     /// The bits that a write took away last, and when, of each word.
     fell: BTreeMap<(Table, u16), (u16, Instant)>,
-    /// When the reply that is applied came.
+    /// Arrival time of the reply that is being applied.
     now: Option<Instant>,
     /// The stop word by each of the control words that the drive may have, where they are two.
     stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
-    /// The word at the drive has another one: the next start has it.
+    /// Whether the ordered direction differs from the drive's word: the next start uses it.
     waits_for_start: bool,
     /// Words that were read successfully at least once.
     reported: BTreeSet<(Table, u16)>,
-    /// The functions that it takes, which it keeps when it restarts.
+    /// The functions that the drive takes, which it keeps over a restart.
     pub(super) functions: TakenFunctions,
 }
 
@@ -41,7 +41,7 @@ impl KnownWords {
         }
     }
 
-    /// Acknowledged words are known from then on.
+    /// Stores acknowledged words as known.
     pub fn written(&mut self, sent: &RequestPdu) {
         self.stop = None;
         if let RequestPdu::MaskWrite { address, .. } = sent {
@@ -100,7 +100,7 @@ impl KnownWords {
         self.reported.contains(&(table, address))
     }
 
-    /// The word, if it is known.
+    /// The word at an address, if it is known.
     pub fn get(&self, table: Table, address: u16) -> Option<u16> {
         self.words.get(&(table, address)).copied()
     }

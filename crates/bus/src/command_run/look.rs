@@ -20,7 +20,7 @@ struct Shown {
 }
 
 impl Shown {
-    /// None where the profile does not have it.
+    /// The bits that show a point; none where the profile does not have it.
     fn of(profile: &Profile, point: ModelPoint) -> Option<Shown> {
         let index = profile.model_index(point)?;
         let derived = match &profile.points.get(index)?.source {
@@ -59,7 +59,7 @@ pub(crate) struct Look {
     remote: Option<Shown>,
     first: RequestPdu,
     more: Vec<RequestPdu>,
-    /// How many of them were answered.
+    /// Number of requests that were answered.
     answered: usize,
     words: BTreeMap<(Table, u16), u16>,
 }
@@ -107,7 +107,7 @@ impl Look {
         more.unwrap_or(&self.first).clone()
     }
 
-    /// All of them.
+    /// All requests of the look.
     pub(crate) fn requests(&self) -> impl Iterator<Item = &RequestPdu> {
         [&self.first].into_iter().chain(&self.more)
     }
@@ -134,7 +134,7 @@ impl Look {
         self.running.value(&self.words)
     }
 
-    /// How the motor stands to the gateway's word.
+    /// State of the motor in relation to the gateway's word.
     pub(crate) fn motor(&self) -> Motor {
         let is = |shown: &Option<Shown>| shown.as_ref().and_then(|shown| shown.value(&self.words));
         match (self.runs(), is(&self.fault), is(&self.remote)) {

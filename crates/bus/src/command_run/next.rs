@@ -63,7 +63,7 @@ impl CommandRun {
         self.cut_off(outcome);
     }
 
-    /// Until when nothing is sent, if that is not over.
+    /// Until when the command sends nothing, if that time is not over.
     fn pauses_until(&mut self, now: Instant) -> Option<Instant> {
         if let Some(pause) = self.tries.pause.take() {
             let end = if self.may_write_on() { self.expires } else { now + pause };
@@ -73,7 +73,7 @@ impl CommandRun {
         self.not_before
     }
 
-    /// The first action is a pause, which ends then.
+    /// Removes the pause at the front, which ends at `until`.
     fn hold_until(&mut self, until: Instant) -> Next {
         self.actions.pop_front();
         self.not_before = Some(until);

@@ -13,7 +13,7 @@ use crate::order::{Outcome, ParameterOrder, Refusal};
 /// Reads of a value that was acknowledged until it counts as not taken.
 const LOOKS: u32 = 3;
 
-/// How far it is.
+/// Stage of setting the parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     /// The value is read from the drive.
@@ -73,7 +73,7 @@ impl ParameterRun {
         }
     }
 
-    /// The request of its present stage.
+    /// The request of the present stage.
     pub(super) fn step(&self) -> Step {
         let (purpose, pdu) = match self.stage {
             Stage::Value => (StepPurpose::Compare, self.order.read()),
@@ -189,7 +189,7 @@ impl ParameterRun {
         }
         let before = self.order.from;
         if value.zip(before).is_some_and(|(value, from)| from.is_shown_by(value)) {
-            // A write of before, if there was one, was not taken.
+            // The drive has the former value, so an earlier write was not taken.
             self.in_doubt = false;
             return self.asks_running();
         }

@@ -32,7 +32,7 @@ impl CommandRun {
         if self.parameter().is_some() {
             return self.parameter_answered(step, &reply, words);
         }
-        // A read between the tries of a write does not make them more.
+        // A successful read between the tries of a write does not allow more tries.
         let is_read = matches!(step.purpose, StepPurpose::ReadWord | StepPurpose::Look);
         if !self.in_doubt() || !is_read {
             self.tries.failures = 0;
@@ -133,7 +133,7 @@ impl CommandRun {
         self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
         self.tries.busy = self.tries.busy.saturating_add(1);
         if self.known.check == Check::Read {
-            // By the next try it may have changed again.
+            // The word may have changed again by the next try.
             self.known.check = Check::NotYet;
         }
         true
@@ -250,7 +250,7 @@ impl CommandRun {
             _ => {}
         }
         if step.pdu.is_write() && self.known.check == Check::Read {
-            // By the next try it may have changed again.
+            // The word may have changed again by the next try.
             self.known.check = Check::NotYet;
         }
         if over && self.phase == Phase::MotorStarted {

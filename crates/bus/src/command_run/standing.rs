@@ -33,11 +33,11 @@ pub(super) enum Holds {
 pub(super) enum Wants {
     /// The direction, within the control word.
     Direction,
-    /// The direction, at a place of its own.
+    /// The direction, where it is written to a place of its own.
     DirectionElsewhere,
     /// A reset within the control word.
     Reset,
-    /// The control word before a reset that has a place of its own.
+    /// The control word before a reset that is written to a place of its own.
     ResetElsewhere,
     /// The end of a reset, which is sent whatever happens.
     ResetEnd,
@@ -85,7 +85,7 @@ pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Ver
     }
 }
 
-/// Whether that depends on how the motor stands.
+/// Whether the verdict depends on the state of the motor.
 pub(super) fn depends_on_motor(wants: Wants, holds: Holds, told: bool) -> bool {
     match (wants, holds) {
         (Wants::ResetEnd, Holds::Other | Holds::Unknown) => false,

@@ -16,7 +16,7 @@ use crate::order::{Refusal, written};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Action {
-    /// A raw request, or a register of its own.
+    /// A raw request, or a write of a whole register.
     Send(RequestPdu),
     /// A write of a value that the drive stores: left out where a read shows that the drive already has it.
     Change {
@@ -26,13 +26,13 @@ pub(super) enum Action {
     },
     /// Gives what was overridden before back to the drive's own control; that it fails changes nothing.
     Release(RequestPdu),
-    /// Bits of one word; its other bits stay as they are known.
+    /// Bits of one word; its other bits keep their known values.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
     /// Takes a bit away that is written as a pulse and is not in the control word, if set.
     PulseLow { raw: Raw, bit: u8, invert: bool },
-    /// Sets it.
+    /// Sets the bit of a pulse.
     PulseHigh { raw: Raw, bit: u8, invert: bool },
-    /// Takes it away again.
+    /// Takes the bit of a pulse away again.
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// Two update periods of the drive, as a rule.
     Hold(Duration),
@@ -40,11 +40,11 @@ pub(super) enum Action {
     Word(Word),
     /// Waits for the state that ends a step of a sequence.
     Await(Box<AwaitedState>),
-    /// Sets a reset that has a place of its own.
+    /// Sets a reset at a place of its own.
     ResetElsewhere(RequestPdu),
-    /// Takes it away again.
+    /// Takes the reset away again.
     ResetOver(RequestPdu),
-    /// A parameter, which has steps of its own.
+    /// A parameter, with several steps.
     Parameter(Box<ParameterRun>),
 }
 
@@ -55,7 +55,7 @@ pub enum StepPurpose {
     ReadWord,
     /// Reads whether the drive has the value already, which would spare its memory a write.
     Compare,
-    /// Does what was ordered.
+    /// Carries out the order.
     Execute,
     /// Gives an overridden output back to the drive's own control.
     Release,

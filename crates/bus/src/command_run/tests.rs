@@ -20,7 +20,7 @@ struct ObedientDrive {
     profile: Arc<Profile>,
     words: KnownWords,
     now: Instant,
-    /// Control word and reference as the drive has them.
+    /// Control word and reference of the drive.
     drive: BTreeMap<u16, u16>,
     running: bool,
 }

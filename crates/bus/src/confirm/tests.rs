@@ -84,7 +84,7 @@ impl CommandedDrive {
         late.into_iter().map(|late| late.text).collect()
     }
 
-    /// The motor runs, at that speed; all of it is 50 Hz.
+    /// Sets the motor running at this speed; 100 % is 50 Hz.
     fn speed(&mut self, percent: f64) {
         let hundredths = |value: f64| (value * 100.0) as i16 as u16;
         self.read(2100, &[2, 0, hundredths(percent), hundredths(percent / 2.0)]);
@@ -112,7 +112,7 @@ fn a_stop_is_confirmed_when_the_motor_does_not_run_or_stands() {
         (&[2, 0, 4900, 2450][..], false),
         (&[2, 0, 99, 49], false),
         (&[2, 0, 0, 0], true),
-        // Between 10 and 50 Hz, at its minimum, in either direction.
+        // The band is 10 to 50 Hz; the motor runs at its minimum, in either direction.
         (&[2, 0, 0, 1000], false),
         (&[2, 0, 0, 0_u16.wrapping_sub(1000)], false),
         (&[0, 0, 4000, 2000], true),

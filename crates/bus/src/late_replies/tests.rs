@@ -132,7 +132,7 @@ fn the_first_acknowledgement_of_a_stop_that_was_overtaken_proves_nothing() {
     assert!(!late.proves_nothing(&stop, now, now), "the second one counts");
     late.answered(&stop, now, now);
     assert_eq!(late.blocks(&run, now), None);
-    // Forgotten: it will not come any more.
+    // The late reply is no longer expected after this time.
     late.given_up(&stop, now - DEADLINE, now);
     late.answered(&run, now, now);
     let later = now + FORGOTTEN_AFTER;

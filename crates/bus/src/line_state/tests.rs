@@ -27,7 +27,7 @@ impl DoublingLine {
         }
     }
 
-    /// Whether a reply is believed that is whole so long after its request.
+    /// Whether a reply is accepted that is complete this long after its request.
     fn believes(&mut self, after: Duration) -> bool {
         let reply = match self.protocol {
             Protocol::N2 => b"A1061\r".to_vec(),

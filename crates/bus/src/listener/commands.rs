@@ -26,9 +26,9 @@ pub struct Commanded {
     pub changes: Vec<Change>,
     /// The result.
     pub outcome: Outcome,
-    /// When it began.
+    /// When the command began.
     pub began: Instant,
-    /// When its outcome was known.
+    /// When the outcome of the command was known.
     pub at: Instant,
 }
 
@@ -96,7 +96,7 @@ impl Commands {
         Some(waiting)
     }
 
-    /// When something is due.
+    /// When the next report is due.
     pub(crate) fn due_at(&self) -> Option<Instant> {
         self.waiting.as_ref().and(self.told).map(|told| told + PAUSE)
     }

@@ -30,7 +30,7 @@ struct Known {
     address: u8,
     /// Requests in a row that got no reply.
     unanswered: u32,
-    /// When it was last received; the opening of the port, before that.
+    /// When the drive was last received; before the first time, the opening of the port.
     heard: Instant,
     /// Longest recent pause between two replies of the drive: a whole round of the other master, where that polls drive
     /// after drive.
@@ -247,7 +247,7 @@ impl ListenCore {
         self.report.diagnosis.overheard(index, exchange);
         let no_answer = matches!(&exchange.ended, Some(Ended::Reply(Reply::Exception(code))) if code.is_no_answer());
         let answered = matches!(exchange.ended, Some(Ended::Reply(_))) && !no_answer;
-        // Bytes behind a command that is not known may be its reply.
+        // Bytes behind an unknown command may be its reply.
         let is_known = exchange.request.is_some();
         if let Some(ended) = exchange.ended.as_ref().filter(|_| is_known) {
             image.count(match ended {
@@ -258,7 +258,7 @@ impl ListenCore {
                 Ended::Corrupt(_) => Counted::Corrupt,
             });
         }
-        // A Modbus reply names its drive, whatever it answers.
+        // A Modbus reply carries the address of its drive, so any answer proves that the drive is alive.
         let is_alive = exchange.doubt.is_none() || self.bus.image.spec.protocol != Protocol::N2;
         if answered && is_alive {
             let interval = exchange.at.saturating_duration_since(known.heard);
@@ -413,7 +413,7 @@ mod tests {
     fn the_pause_of_a_round_outlasts_the_reads_of_one_drive() {
         let seconds = Duration::from_secs;
         let mut pause = Duration::ZERO;
-        // Forty reads of this drive, then forty seconds of the other drives.
+        // The other master makes forty reads of this drive, then forty seconds of reads of others.
         for _ in 0..4 {
             pause = pause_after(pause, seconds(40));
             pause = (0..40).fold(pause, |pause, _| pause_after(pause, Duration::from_millis(30)));

@@ -37,7 +37,7 @@ const NO_REPLY_IN_FRONT: &str = "invalid bytes came between request and reply";
 const AMBIGUOUS: &str = "it could be a request as well";
 const BEHIND_MANGLED: &str = "it may be the late reply to a damaged request";
 
-/// Something that was received.
+/// A piece of received traffic.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Heard {
     /// A request, and the result.
@@ -45,7 +45,7 @@ pub enum Heard {
     /// Bytes that belong to no transaction.
     Stray {
         bytes: Vec<u8>,
-        /// When they had come.
+        /// When the bytes had come.
         at: Instant,
         /// Since when the line had been silent.
         quiet_since: Instant,
@@ -61,13 +61,13 @@ pub struct Exchange {
     pub request: Option<Request>,
     /// The frame of the request.
     pub frame: Vec<u8>,
-    /// Since when the line had been silent before it.
+    /// Since when the line had been silent before the request.
     pub quiet_since: Instant,
     /// When the request began.
     pub began: Instant,
-    /// When it was over.
+    /// When the request was complete.
     pub sent: Instant,
-    /// All that came after it.
+    /// All bytes that came after the request.
     pub heard: Vec<u8>,
     /// When the first byte of the reply began; none where nothing came.
     pub replied: Option<Instant>,
@@ -75,7 +75,7 @@ pub struct Exchange {
     pub at: Instant,
     /// The latest time the replied request was sent: earlier than `at`, if the reply may belong to an earlier attempt.
     pub asked_by: Instant,
-    /// How it ended; `None` for a broadcast, which gets no reply.
+    /// How the transaction ended; `None` for a broadcast, which gets no reply.
     pub ended: Option<Ended>,
     /// Why a reply is not accepted.
     pub doubt: Option<&'static str>,
@@ -100,7 +100,7 @@ struct Open {
     quiet_since: Instant,
     began: Instant,
     sent: Instant,
-    /// Bytes after it that are not a frame.
+    /// Bytes after the request that are not a frame.
     garbage: Vec<u8>,
     /// The request could be a reply: in which case the next request looks like its reply.
     ambiguous: bool,
@@ -119,7 +119,7 @@ pub struct Decoder {
     quiet_since: Option<Instant>,
     late: BTreeMap<u8, LateReplies>,
     n2_late: N2LateReplies,
-    /// Until when the reply to a request that was mangled may come.
+    /// Until when the reply to a damaged request may come.
     mangled_until: Option<Instant>,
 }
 
@@ -145,7 +145,7 @@ impl Decoder {
         over.into_iter().chain(self.frames.patience()).min()
     }
 
-    /// Bytes arrived at `now`, the last of them just then.
+    /// Adds bytes; the last of them arrived at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Heard>) {
         // A frame whose time for its rest has ended is cut before the new bytes are added.
         self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);

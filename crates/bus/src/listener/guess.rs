@@ -10,7 +10,7 @@ use std::time::Instant;
 use super::decoder::{Decoder, Exchange, Heard};
 use crate::codec::{LineFormat, Parity, Protocol};
 
-/// Requests that decide.
+/// Number of requests that decide the guess.
 const ENOUGH: u64 = 3;
 
 /// A protocol that is tried.
@@ -70,7 +70,7 @@ impl Guess {
         }
     }
 
-    /// Bytes so far.
+    /// Number of bytes so far.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }

@@ -46,7 +46,7 @@ pub struct N2Survey {
     /// Objects of number 0, and the others.
     numbers: [u64; 2],
     times: u64,
-    /// Other commands.
+    /// Number of other commands.
     others: u64,
 }
 
@@ -139,7 +139,7 @@ impl N2Survey {
         }
     }
 
-    /// `>aa72` or `>aa73`, then the region: a 0 in front shows two digits.
+    /// Counts the width of a region behind `>aa72` or `>aa73`: a leading 0 shows two digits.
     fn width(&mut self, frame: &[u8]) {
         let begin = frame.iter().rposition(|byte| *byte == b'>').unwrap_or(0);
         let two = frame.get(begin + 5) == Some(&b'0');
@@ -180,7 +180,7 @@ impl N2Survey {
         }
     }
 
-    /// A line for each assumption: what was seen of it.
+    /// A line for each assumption, with the observations about it.
     pub fn report(&self) -> String {
         let mut out = String::new();
         let mut line = |what: &str, seen: String| {

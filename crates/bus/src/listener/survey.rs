@@ -19,18 +19,18 @@ pub struct Asked {
     pub what: String,
     /// Table, first address and count of a read.
     pub read: Option<(Table, u16, u16)>,
-    /// Times it was received.
+    /// Number of times that the request was received.
     pub count: u64,
-    /// Times it was answered with values or an acknowledgement.
+    /// Number of answers with values or an acknowledgement.
     pub answered: u64,
-    /// Times it was refused.
+    /// Number of refusals.
     pub refused: u64,
     first: Instant,
     last: Instant,
 }
 
 impl Asked {
-    /// Mean time from one to the next, once it was received twice.
+    /// Mean time between two of these requests, once it was received twice.
     pub fn cycle(&self) -> Option<Duration> {
         let intervals = u32::try_from(self.count.checked_sub(1)?).ok().filter(|n| *n > 0)?;
         Some(self.last.saturating_duration_since(self.first) / intervals)

@@ -34,7 +34,7 @@ pub(super) enum Sending {
 #[derive(Debug)]
 pub(super) struct Begun {
     pub(super) sending: Sending,
-    /// Whose time it takes; none where it goes as a command.
+    /// Whose share of the time the transaction takes; none where it goes as a command.
     pub(super) admission: Option<Admission>,
     /// Whether its transaction is, or was, on the line.
     pub(super) sent: bool,
@@ -292,7 +292,7 @@ impl Master {
         begun.is_some_and(|begun| begun.origin().kind == SourceKind::Shutdown)
     }
 
-    /// A background transaction has ended: it is answered, whatever came of it.
+    /// Answers a background transaction that has ended, whatever its result.
     pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         let index = turn.drive;
         let heard = self.waits.sessions.heard(index, &end.ended);
@@ -427,14 +427,14 @@ impl Master {
         let RequestPdu::Other(_) = &turn.pdu else { return None };
         let spec = &self.bus.image.spec;
         let wire = WireTime::of(spec.protocol, &spec.format, &turn.pdu);
-        // How long the reply is shows only when it is there.
+        // The length of an unchecked reply is known only when it has arrived.
         let patient = self.response_timeout_of(turn.drive) + spec.format.chars(LONGEST);
         Some(patient.min(LONGEST_UNCHECKED.saturating_sub(wire.request + wire.reply)))
     }
 
     fn background_outcome(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Outcome {
         let reply = match end.ended {
-            // The drive did not look at it.
+            // The drive ignored the request.
             Ended::Silent
             | Ended::Corrupt(CONNECTION_CLOSED)
             | Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => return Outcome::TimedOut,

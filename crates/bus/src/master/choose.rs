@@ -21,7 +21,7 @@ const MOST_DECISIONS: usize = 1000;
 /// The ranks, the highest first.
 const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
 
-/// How often ranks went before lower ones that waited.
+/// How often each rank went before waiting lower ones.
 #[derive(Debug, Default)]
 pub(super) struct Turns([u32; 3]);
 
@@ -58,13 +58,13 @@ struct NextStep {
     step: Step,
 }
 
-/// All that commands want at one time.
+/// The wants of all commands at one time.
 #[derive(Default)]
 struct Commands {
-    /// By rank.
+    /// Next steps by rank.
     ready: [Option<NextStep>; 3],
     queued: [Option<Chosen>; 3],
-    /// When more of them may go.
+    /// When further commands may go.
     wake_at: Option<Instant>,
 }
 
@@ -418,7 +418,7 @@ fn begin_time(stop: &mut Command, now: Instant) {
     window.expires = window.expires.max(now + DEFAULT_EXPIRY);
 }
 
-/// Behind a stop that has started nothing goes before the stop has ended.
+/// While a started stop is in progress, no other command goes to its drive.
 fn waits_for_stop(drive: &DriveState, command: &Command) -> bool {
     command.urgency() == Urgency::Command && drive.is_busy(Urgency::Stop)
 }

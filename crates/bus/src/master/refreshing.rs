@@ -13,7 +13,7 @@ use crate::permit::{Ask, Facts, Stage, Verdict};
 use crate::refresh::{Around, End};
 use crate::transaction::Ended;
 
-/// Most of the time of refreshes that polls make up for.
+/// Most of the time of refreshes that polls get back.
 const MOST_DEBT: Duration = Duration::from_secs(2);
 
 /// Whether a refresh may write.
@@ -193,7 +193,7 @@ impl Master {
         }
     }
 
-    /// A frame goes out: rounds of other drives read again before they write.
+    /// A frame is sent: rounds of other drives must read again before they write.
     pub(super) fn others_before_refresh(&mut self, turn: &Turn) {
         for ((index, drive), image) in self.drives.enumerate_mut().zip(&self.bus.image.drives) {
             if drive.refresh.is_under_way() && !(turn.purpose == Purpose::Refresh && turn.drive == index) {

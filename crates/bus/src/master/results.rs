@@ -50,7 +50,7 @@ impl Master {
         self.schedule.fault_came(drive, covers, now);
     }
 
-    /// Monitoring points are to be read then.
+    /// Schedules the read of monitoring points for this time.
     pub fn monitor(&mut self, drive: DriveIndex, point: PointIndex, at: Instant) {
         let Some(image) = self.bus.image.drives.get(drive) else {
             return;
@@ -350,7 +350,7 @@ impl Master {
             self.restarted(index, now, news);
         }
         let reply = match end.ended {
-            // The drive ignored it: it is sent again once the drive is identified.
+            // The drive ignored the step, which is repeated once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
                 let how = (end.took, end.stood);
                 self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, how, now);

@@ -25,7 +25,7 @@ const AGAIN: Duration = Duration::from_millis(20);
 /// The stops of a shutdown.
 #[derive(Debug)]
 pub(super) struct Shutdown {
-    /// None once it is reported.
+    /// The request of the shutdown; none once its end is reported.
     stopping: Option<Stopping>,
     /// The broadcast that goes before all stops, and until when they wait for it.
     broadcast: Option<(Exchange, Instant)>,
@@ -38,7 +38,7 @@ struct Stop {
     state: State,
     /// Whether the stop was ordered, and not acknowledged.
     in_vain: bool,
-    /// The result then, as text.
+    /// Result of the last try, as text.
     last: Option<String>,
 }
 
@@ -112,7 +112,7 @@ impl Shutdown {
         };
         let over = exchange.poll(&mut Context::from_waker(Waker::noop())).is_ready();
         if over || now >= *until {
-            // Dropped, it is taken back where it was not sent.
+            // Dropping the broadcast withdraws it if it was not sent.
             self.broadcast = None;
         }
         self.broadcast.is_some()
@@ -140,7 +140,7 @@ impl Shutdown {
 impl Master {
     /// Starts a requested shutdown; orders due stops, and ends when all are done or the time has ended.
     pub(super) fn look_at_shutdown(&mut self, now: Instant) {
-        // The queue is free again when the broadcast is put into it.
+        // The lock on the queue must be free again when the broadcast is added.
         let stopping = self.bus.queue.lock().take_stopping();
         if let Some(stopping) = stopping {
             self.shutdown = Some(Shutdown::new(stopping, &self.bus, &self.writes, now));

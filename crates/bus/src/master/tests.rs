@@ -28,7 +28,7 @@ mod shutdown;
 mod stop_all;
 mod timing;
 
-/// Kept before each request.
+/// Silence before each request.
 const SILENCE: Duration = Duration::from_micros(1750);
 /// Time of a transaction.
 const COST: Duration = Duration::from_millis(20);
@@ -40,7 +40,7 @@ const TIMEOUT: Duration = Duration::from_millis(110);
 struct Registers {
     holding: BTreeMap<u16, u16>,
     silent: bool,
-    /// How its next write ends.
+    /// How the next write ends.
     next_write: Option<Ended>,
     /// Number of writes that get this exception.
     to_writes: Option<(u32, Exception)>,
@@ -123,7 +123,7 @@ struct Rig {
     /// Whether the drives do not receive a broadcast.
     deaf: bool,
     news: Vec<News>,
-    /// All that went onto the line.
+    /// All turns that went onto the line.
     wire: Vec<(Instant, Turn)>,
     now: Instant,
 }
@@ -153,7 +153,7 @@ impl Rig {
         rig
     }
 
-    /// Nothing was sent yet.
+    /// A rig without any request sent.
     fn empty(
         drives: u8,
         profile: &str,
@@ -299,7 +299,7 @@ impl Rig {
         self.order(drive, who, ModelPoint::Run, Value::Bool(run))
     }
 
-    /// The gateway shuts down: the drives that did not acknowledge their stop.
+    /// Shuts the gateway down; returns the drives that did not acknowledge their stop.
     fn shut_down(&mut self) -> Vec<String> {
         let deadline = self.now + Duration::from_secs(5);
         let mut missing = self.bus.queue.begin_shutdown(deadline, self.now);

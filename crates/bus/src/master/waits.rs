@@ -29,7 +29,7 @@ pub(super) struct Waits {
 }
 
 impl Waits {
-    /// Until when the transaction cannot go, if it cannot now.
+    /// Until when a transaction is blocked, if it is.
     pub(super) fn blocks(
         &mut self,
         (drive, pdu): (DriveIndex, &RequestPdu),

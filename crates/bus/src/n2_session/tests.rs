@@ -44,7 +44,7 @@ impl N2Drive {
         self.sessions.done(DriveIndex::new(0), step, ended, self.now)
     }
 
-    /// Identified, its report taken, and read once.
+    /// A drive that was identified, has reported, and was read once.
     fn ready() -> N2Drive {
         let mut rig = rig();
         rig.done(IDENTIFY, &identity());

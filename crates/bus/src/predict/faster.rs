@@ -15,7 +15,7 @@ pub fn faster_points(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> 
 
 /// The drives with these points in the fast class, whatever the line carries.
 pub(super) fn with_faster_points(drives: &[DriveSpec]) -> Option<Vec<DriveSpec>> {
-    // Drives of a family share their profile.
+    // Drives of a family share their changed profile, as they share the original.
     let mut made: Vec<(Arc<Profile>, Arc<Profile>)> = Vec::new();
     let mut faster = drives.to_vec();
     for drive in &mut faster {

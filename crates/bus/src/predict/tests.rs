@@ -162,7 +162,7 @@ fn else_the_bus_is_split() {
             .to_string()
             .contains("split the bus into 4 buses")
     );
-    // At 19200 one drive takes 22.4 ms: seven buses there, four at 38400.
+    // At 19200 baud one drive takes 22.4 ms: that needs seven buses, at 38400 four.
     let p = predict(&spec(19_200, 25, 1000), Silence::Chars, &drives);
     let split = Remedy::Split {
         buses: 4,

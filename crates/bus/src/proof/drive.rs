@@ -20,7 +20,7 @@ pub(super) enum Start {
     Running {
         reverse: bool,
     },
-    /// A fault came while it ran: the run command stands.
+    /// A fault came while the motor ran: the run command is still set.
     FaultedRunning,
     FaultedStopped,
     /// Stopped by another of its own means: that one of the words of the profile.
@@ -41,7 +41,7 @@ pub(super) enum Start {
 }
 
 impl Start {
-    /// Every state of a drive with that profile.
+    /// Every state of a drive of this profile.
     pub(super) fn all(control: &Control) -> Vec<Start> {
         let mut all = vec![
             Start::PoweredUp,
@@ -62,7 +62,7 @@ impl Start {
         all
     }
 
-    /// Whether the last poll showed it running, and it has ceased since.
+    /// Whether the last poll showed the motor running, and it has stopped since.
     pub(super) fn ran(self) -> bool {
         matches!(self, Start::FaultedSince | Start::RestartedSince | Start::StoppedSince)
     }
@@ -92,9 +92,9 @@ pub(super) struct Drive<'p> {
     profile: &'p Profile,
     control: &'p Control,
     words: BTreeMap<(u8, u16), u16>,
-    /// Steps of the sequence that it has taken.
+    /// Number of steps of the sequence that the drive has taken.
     prepared: usize,
-    /// The direction in which it runs: true is reverse.
+    /// The direction in which the motor runs: true is reverse.
     pub(super) running: Option<bool>,
     pub(super) fault: bool,
     local: bool,
@@ -105,7 +105,7 @@ fn key(place: ControlItem) -> (u8, u16) {
 }
 
 impl<'p> Drive<'p> {
-    /// None where the profile cannot be in that state.
+    /// A drive in this state; none where the profile cannot be in it.
     pub(super) fn new(profile: &'p Profile, control: &'p Control, start: Start) -> Option<Drive<'p>> {
         let mut drive = Drive {
             profile,
@@ -190,7 +190,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    /// The word that stands there.
+    /// The word at this place.
     pub(super) fn word(&self, place: ControlItem) -> u16 {
         self.words.get(&key(place)).copied().unwrap_or(0)
     }

@@ -19,7 +19,7 @@ pub(super) enum Fate {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Frame {
     Request(RequestPdu, Option<Fate>),
-    /// A stop, as a command of its own.
+    /// A stop, given as a separate command.
     Stop,
 }
 

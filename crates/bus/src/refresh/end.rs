@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-/// Why a refresh ended.
+/// Reason for the end of a refresh.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum End {
     Stop,

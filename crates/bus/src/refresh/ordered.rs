@@ -9,7 +9,7 @@ use crate::process_image::Reading;
 /// Registers of the longest reference.
 const LONGEST: usize = 2;
 
-/// Which command stands.
+/// The command that is in force.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Does {
     Run,

@@ -16,7 +16,7 @@ enum Stage {
     Reference,
     /// The control word of the drive, and the reference adjacent to it.
     Own,
-    /// How the motor stands.
+    /// The state of the motor is read.
     Look,
     Write,
 }
@@ -32,12 +32,12 @@ pub(super) struct Round {
 enum Fits {
     Yes,
     No,
-    /// A reset stands in it.
+    /// A reset is set in the word.
     NotNow,
 }
 
 impl Refresh {
-    /// The next round is not due before then.
+    /// Puts the next round off until this time.
     pub(crate) fn put_off(&mut self, until: Instant) {
         self.round = None;
         if let Some(going) = &mut self.repeated.going {

@@ -42,13 +42,13 @@ const EVERY: Duration = Duration::from_secs(10);
 /// A bit whose changes are reported.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Watched {
-    /// As last reported; `None` before the first read.
+    /// Value as last reported; `None` before the first read.
     reported: Option<bool>,
-    /// As last read, and when it came to be so.
+    /// Value as last read, and when it changed to that.
     seen: Option<(bool, Option<Instant>)>,
     /// Changes since the last report.
     changes: u64,
-    /// Reports of late, and since when they are counted.
+    /// Recent reports, and since when they are counted.
     spent: Option<(u32, Instant)>,
 }
 
@@ -57,9 +57,9 @@ pub(super) struct Watched {
 pub(super) struct Change {
     /// Present value of the bit.
     pub(super) value: bool,
-    /// When it changed before, if it was seen to.
+    /// When the bit changed the last time before, if that was seen.
     pub(super) before: Option<Instant>,
-    /// Changes before it that were not reported.
+    /// Number of earlier changes that were not reported.
     pub(super) left_out: u64,
 }
 
@@ -106,7 +106,7 @@ impl Watched {
     }
 }
 
-/// Why a motor started or stopped, by who gave the command.
+/// Text with the cause of a start or stop: the client that gave the command.
 fn cause(who: &str) -> String {
     match who.split_once(' ') {
         Some(("supervision", Origin::LOCAL)) => ": its local control place took it over".to_string(),

@@ -12,7 +12,7 @@ use crate::process_image::{LeaseAction, Snapshot};
 use crate::queue::Denied;
 
 impl Report {
-    /// Reports an event of a drive; `text` makes the words from its name.
+    /// Publishes an event of a drive; `text` makes the message from the drive's name.
     pub(crate) fn drive_event(
         &self,
         index: DriveIndex,
@@ -43,7 +43,7 @@ impl Report {
         });
     }
 
-    /// A command was refused at its turn, as others are when they come.
+    /// Reports a command that was refused at its turn, as other refusals are reported.
     pub(super) fn denied(&self, denied: &Denied, now: Instant) {
         let Denied {
             drive,
@@ -64,7 +64,7 @@ impl Report {
         self.events.publish_refusal(refused, now);
     }
 
-    /// An action of supervision failed: counted, and reported if there is a `text`.
+    /// Counts an action of supervision that failed, and reports it if there is a `text`.
     pub(super) fn action_failed(&self, index: DriveIndex, text: impl FnOnce(&str) -> Option<String>) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
@@ -148,7 +148,7 @@ impl Report {
         });
     }
 
-    /// Shows a drive as offline for a reason of its own.
+    /// Shows a drive as offline for this reason.
     pub(crate) fn gone(&self, index: DriveIndex, why: &str) {
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
             self.drive_event(index, EventKind::Offline, None, |name| {

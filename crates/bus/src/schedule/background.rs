@@ -19,9 +19,9 @@ pub(super) struct BackgroundShare {
 /// Whether a background transaction may go now.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Admission {
-    /// In idle time: its share pays for any excess over the calculated time.
+    /// The request goes in idle time: its share pays for any excess over the calculated time.
     InIdleTime(Duration),
-    /// Instead of a poll that is due: its share pays for it.
+    /// The request goes instead of a due poll: its share pays for it.
     InShare,
     /// The request is not admitted before this time, unless the line rests earlier.
     NotBefore(Instant),
@@ -93,7 +93,7 @@ impl Schedule {
             share.overrun = over.max(share.overrun.mul_f64(0.9));
         }
         if let Some(balance) = share.balance.get_mut(pace as usize) {
-            // There was room for it, so the next one will find room too.
+            // There was room for this request, so the next one will find room too.
             let before = match admission {
                 Admission::InIdleTime(_) => balance.min(0.0),
                 Admission::InShare | Admission::NotBefore(_) => *balance,

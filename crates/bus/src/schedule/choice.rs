@@ -82,7 +82,7 @@ impl Schedule {
             return Some(probe);
         }
         let slow = self.due_slow(now);
-        // A whole round went by without room for it: the line is saturated.
+        // A whole round had no room for the slow poll: the line is saturated.
         let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
         let yields = self.round.front().is_some_and(|front| self.state_first.contains(front));
         let on_credit =

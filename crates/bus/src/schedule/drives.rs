@@ -61,7 +61,7 @@ pub(super) struct Item {
     pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one for a fault, that is still to be done.
     pub(super) wanted: bool,
-    /// Never answered so far.
+    /// Whether the read was never answered so far.
     pub(super) unread: bool,
     /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
     pub(super) asked: Option<Instant>,
@@ -81,7 +81,7 @@ pub(super) struct DriveSchedule {
     /// Tries after the first.
     pub(super) retries: u32,
     pub(super) presence: Presence,
-    /// A drill sends it nothing until then.
+    /// Until when a drill sends the drive nothing.
     pub(super) quiet_until: Option<Instant>,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
@@ -94,7 +94,7 @@ pub(super) struct DriveSchedule {
     pub(super) garbled: u32,
     /// Whether the last request got no answer.
     pub(super) unanswered: bool,
-    /// The read without a reply that took it away, and the probes since.
+    /// The unanswered read after which the drive counted as away, and the probes since.
     pub(super) away_by: Option<PlannedRead>,
     pub(super) probes: usize,
     /// The last failed poll of process data.
@@ -114,11 +114,11 @@ pub(super) struct DriveSchedule {
 pub(super) struct EarlyProbes {
     /// Probes that it may have at any cost: all of them again once it answered for [`SOUND_FOR`].
     free: usize,
-    /// Time on the line that it has saved up for more of them.
+    /// Time on the line that the drive has saved up for more early probes.
     saved: Duration,
-    /// Online since; saves up.
+    /// Since when the drive is online, which saves up time.
     online_since: Option<Instant>,
-    /// When it went away, and how many of them it had since.
+    /// When the drive went away, and the number of early probes since.
     outage: Option<(Instant, usize)>,
 }
 
@@ -214,7 +214,7 @@ impl Item {
 }
 
 impl DriveSchedule {
-    /// Whether a drill sends it nothing now.
+    /// Whether a drill sends the drive nothing now.
     pub(super) fn is_quiet(&self, now: Instant) -> bool {
         self.quiet_until.is_some_and(|until| now < until)
     }
@@ -320,7 +320,7 @@ impl DriveSchedule {
         self.presence == Presence::Online && self.items.iter().any(unread)
     }
 
-    /// Whether slow reads wait until process data shows that it still answers.
+    /// Whether slow reads wait until process data shows that the drive still answers.
     pub(super) fn waits_for_fast(&self) -> bool {
         self.unanswered && self.items.iter().any(Item::is_process_data)
     }

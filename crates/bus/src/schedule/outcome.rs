@@ -26,7 +26,7 @@ impl Schedule {
             drive.presence = Presence::Online;
             drive.early.came(now);
             drive.probes = 0;
-            // The drive answers, but not what took it away.
+            // The drive answers again, but not the read after which it counted as away.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
                 drive.in_vain(vain, Duration::ZERO, now);
                 drive.set_apart(poll.read, now);
@@ -51,7 +51,7 @@ impl Schedule {
             item.refusals = 0;
             let was_in_vain = [&mut item.refused, &mut item.mute].map(std::mem::take);
             if was_in_vain.contains(&true) {
-                // The bad point is readable again: it is read with its neighbours.
+                // The bad point is readable again, so it is read together with its neighbours.
                 item.whole_again = Some(now);
             }
             item.wanted = matches!(item.read.class, PollClass::Fast | PollClass::Slow);

@@ -49,7 +49,7 @@ pub(super) struct CommandShare {
     stops_in_a_row: u32,
     /// Commands since the last read that one of them caused.
     unread: u32,
-    /// No poll since such a read.
+    /// Whether no poll went since the last read for a command.
     asked_last: bool,
 }
 

@@ -123,7 +123,7 @@ fn a_saturated_line_is_never_idle_and_fair() {
     let fast = rig.polls(PollClass::Fast);
     let (least, most) = (fast.values().min().unwrap(), fast.values().max().unwrap());
     assert!(most - least <= 1, "{fast:?}");
-    // Ten slow polls a second would be 12 %; they get 5 %.
+    // Ten slow polls a second would need 12 %; they get 5 %.
     let slow: usize = rig.polls(PollClass::Slow).values().sum();
     let share = slow as f64 * COST.as_secs_f64() / 20.0;
     assert!((0.045..0.07).contains(&share), "{share}");

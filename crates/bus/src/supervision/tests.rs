@@ -102,12 +102,12 @@ impl SupervisedDrive {
         self.supervise();
     }
 
-    /// The command that has its turn.
+    /// The next command of the queue.
     fn take(&self) -> Option<Command> {
         next_command(&mut self.bus.queue.lock(), Urgency::Read, self.now)
     }
 
-    /// As [`SupervisedDrive::look`]: the action that is written then, and where its answer goes.
+    /// As [`SupervisedDrive::look`]; returns the action that is written then, and the receiver of its answer.
     fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
         self.look(ms, runs);
         assert!(self.bus.queue.lock().len() <= 1, "one at a time");
@@ -125,7 +125,7 @@ impl SupervisedDrive {
         let drive = self.image();
         let profile = &drive.spec.profile;
         let point = &profile.points.get(profile.point_index(point).unwrap()).unwrap();
-        // A state of a register that has a point of its own.
+        // The state is a bit of a register that is also a point.
         let (raw, value) = match &point.source {
             Source::Derived(Derived::State { any }) => {
                 let held = if value.as_bool() {
@@ -144,7 +144,7 @@ impl SupervisedDrive {
         drive.update(|s| s.store(raw.table, raw.address, &words, self.now));
     }
 
-    /// The bus starts anew with these settings, as in a reload.
+    /// Restarts the bus with these settings, as a reload does.
     fn reload(&mut self, spec: DriveSpec) {
         self.drive
             .close(&Outcome::ShuttingDown, Interruption::ShuttingDown, self.now);
@@ -319,7 +319,7 @@ fn every_family_is_written_its_action() {
             let wanted: &[(&str, Value)] = if stop {
                 &[("run", Value::Bool(false))]
             } else {
-                // Whichever of them the drive takes.
+                // A drive takes one of these two references.
                 &[
                     ("speed_reference", Value::Number(20.0)),
                     ("frequency_reference", Value::Number(10.0)),
@@ -328,7 +328,7 @@ fn every_family_is_written_its_action() {
             };
             let is_wanted = |set: &(String, Value)| {
                 wanted.iter().any(|(name, value)| {
-                    // As near as the register holds it.
+                    // Values are compared within the resolution of the register.
                     set.0 == *name && (set.1.as_f64() - value.as_f64()).abs() < 0.02
                 })
             };
@@ -407,7 +407,7 @@ fn an_action_that_is_due_outlives_the_bus() {
     rig.reload(rig.spec());
     let command = rig.after(10, true).expect("the stop is due still");
     assert_eq!(command.urgency(), Urgency::Stop);
-    // The bus ends while the stop is on its way.
+    // The bus ends while the stop is being sent.
     drop(command);
     rig.reload(rig.spec());
     let command = rig.after(10, false).expect("the stop is due still");
@@ -469,7 +469,7 @@ fn a_motor_that_may_start_by_itself_gets_its_action() {
     rig.shows(ModelPoint::Run, Value::Bool(true));
     assert!(rig.after(100, false).is_some(), "it may start by it, or run");
     assert_eq!(rig.reported(), 1);
-    // A family that does not report it: as it was written.
+    // For a family that does not report its run command, the written one counts.
     let profiles = Profiles::built_in();
     for (word, acts) in [(Some(1), true), (Some(0), false), (None, false)] {
         let mut rig = SupervisedDrive::of(profiles.get("eaton-hvx").unwrap(), LeaseAction::Stop);

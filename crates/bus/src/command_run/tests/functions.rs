@@ -87,7 +87,7 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
     let run = stop(&bench);
     let (asked, _) = drive.carries_out(&mut bench, run);
     assert!(matches!(asked.last(), Some((16, word)) if word & 1 == 0), "{asked:?}");
-    // Another one in its place takes function 06 again.
+    // Another drive in its place takes function 06 again.
     let mut drive = Drive::new(&[6]);
     let run = stop(&bench);
     let (asked, outcome) = drive.carries_out(&mut bench, run);
@@ -133,7 +133,7 @@ fn settings(more: &str) -> ObedientDrive {
     let point =
         format!("[[point]]\nname = \"restarts\"\nat = \"holding {SETTINGS}.2\"\nclass = \"once\"\nwrite = true\n");
     bench.profile = profile(&format!("{more}\n{point}"));
-    // As it was when the drive came online.
+    // The known value is from when the drive came online.
     bench.words.learn(Table::Holding, SETTINGS, 0x0001);
     bench
 }
@@ -152,7 +152,7 @@ fn a_settings_register_is_read_before_one_bit_of_it_is_written() {
     let reply = drive.answer(&read.pdu);
     assert_eq!(run.answered(&read, reply, &mut bench.words), None);
     assert!(run.is_checked(), "the write goes next on the line");
-    // Something else went first after all: it is read again.
+    // Another request went first: the register is read again.
     run.others_go_first();
     drive.word = 0x0230;
     let (asked, outcome) = drive.carries_out(&mut bench, run);
@@ -162,7 +162,7 @@ fn a_settings_register_is_read_before_one_bit_of_it_is_written() {
     drive.word = 0x0004;
     let run = sets(&bench, 0.0);
     assert_eq!(drive.carries_out(&mut bench, run).0, [(3, 0x0004), (6, 0)]);
-    // Bits of the control word come from what is known of it.
+    // Other bits of the control word come from the known word.
     bench.words.learn(Table::Holding, 2000, 0x0100);
     let run = bench.begin(&[("run", 1.0)], Urgency::Command).0;
     assert_eq!(drive.carries_out(&mut bench, run).0, [(6, 0x0101)]);

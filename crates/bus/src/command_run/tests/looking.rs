@@ -247,7 +247,7 @@ fn a_motor_that_is_seen_to_run_is_turned() {
                 "{}: {outcome:?}",
                 profile.name
             );
-            // On N2 what the drive has is not written.
+            // On N2 a value that the drive already has is not written.
             let is_there = reverse == 0.0 && written.is_empty();
             assert!(written.len() == 1 || is_there, "{}: {written:x?}", profile.name);
         }
@@ -338,7 +338,7 @@ fn an_order_whose_look_is_lost_is_not_sent() {
     }
 }
 
-/// Another transaction between the look and the write: it is looked again.
+/// After another transaction between the look and the write, the look is repeated.
 #[test]
 fn nothing_goes_between_the_look_and_the_write() {
     let mut bench = ObedientDrive::new(1);

@@ -36,7 +36,7 @@ fn coil(address: u16, on: bool) -> Step {
     execute(RequestPdu::WriteCoil { address, on })
 }
 
-/// AO 1 was something else when it was read last.
+/// The last read of AO 1 showed another value.
 fn changed(bench: &mut ObedientDrive) {
     bench.words.learn(Table::Holding, 0, 0);
     bench.words.learn(Table::Holding, 1, HALF[1]);

@@ -91,7 +91,7 @@ fn a_drive_that_goes_on_turning_fails() {
 enum Meanwhile {
     /// The first replies behind a silence are lost; the motor stands before any comes.
     Lost,
-    /// The process stands still.
+    /// The process is stalled.
     Pause,
     /// The task that looks at drills stands still, and the bus goes on.
     PauseOfDrills,
@@ -262,7 +262,7 @@ fn time(seconds: u64) -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_secs(1_800_000_000 + seconds)
 }
 
-/// Looks for that long; whether a drill is under way at its end.
+/// Evaluates the drill for this span; returns whether it is still in progress.
 fn look(rig: &mut Rig, (plant, drills): &(Plant, Drills), at: SystemTime, span: Duration) -> bool {
     let until = rig.now + span;
     let mut goes_on = true;

@@ -73,7 +73,7 @@ impl FamilyDrive {
                     *word & !(1 << bit)
                 };
             }
-            // Anything but 0 in its low byte.
+            // Any low byte other than 0 has this meaning.
             (Form::Bits { first: 0, .. }, Some(_)) => *word = u16::from(on),
             _ => panic!("{raw:?}"),
         }
@@ -86,7 +86,7 @@ impl FamilyDrive {
         self.show(ModelPoint::Running, true);
     }
 
-    /// The motor stands.
+    /// Stops the motor.
     pub(super) fn stand(&mut self) {
         self.runs = false;
         self.show(ModelPoint::Running, false);
@@ -103,7 +103,7 @@ impl FamilyDrive {
         self.items.get(&(at.table, at.address)).copied().unwrap_or(0)
     }
 
-    /// Another master writes its control word.
+    /// Writes the control word as another master.
     pub(super) fn write_word(&mut self, word: u16) {
         let at = self.control().at;
         self.takes(at.table, at.address, word);

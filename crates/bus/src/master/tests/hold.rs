@@ -92,7 +92,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
     let mut stop = place(&rig, &plant, "cloud", ModelPoint::Run, Value::Bool(false));
     rig.run(Time::from_millis(200));
     assert_eq!((code(&mut stop), rig.runs(0)), ("acknowledged", false));
-    // The stopper ranks below: the PLC takes it by an order.
+    // The stopper has a lower rank: the PLC takes the drive with an order.
     let mut run = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
     rig.run(Time::from_millis(200));
     assert_eq!((code(&mut run), rig.runs(0)), ("acknowledged", true));

@@ -100,7 +100,7 @@ fn no_reply(rig: &mut Rig, doubted: bool) -> TurnEnd {
     }
 }
 
-/// Sends the next request and ends it without a reply that is believed.
+/// Sends the next request and ends it without an accepted reply.
 fn fail(rig: &mut Rig, doubted: bool) {
     let turn = loop {
         match rig.master.next(rig.now, &mut Vec::new()) {

@@ -16,7 +16,7 @@ impl Rig {
         stall
     }
 
-    /// The next transaction for which `is_it` holds; those before have ended.
+    /// The next transaction for which `is_it` holds; earlier ones are ended.
     fn next_turn(&mut self, is_it: impl Fn(&Turn) -> bool) -> Turn {
         loop {
             match self.master.next(self.now, &mut Vec::new()) {

@@ -175,7 +175,7 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
         }
         let counted = plant.rig.bus.image.drives[0].refresh_writes();
         assert_eq!(counted, refreshes.len() as u64, "{name}");
-        // Behind a stop its word.
+        // After a stop the word of the stop is refreshed.
         plant.stops();
         let stop = plant.drive().word();
         let refreshes = plant.refreshes(10);
@@ -277,7 +277,7 @@ fn from_the_acceptance_of_a_stop_no_run_word_is_repeated() {
         let mut plant = Plant::new(name);
         plant.starts();
         plant.rig.run(Duration::from_secs(5));
-        // The drive refuses the stop as long as it is busy.
+        // The drive refuses the stop while it is busy.
         let from = plant.rig.wire.len();
         let _stop = plant.rig.switch(0, "client", false);
         plant.rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));

@@ -19,7 +19,7 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
     assert_eq!(running, [7]);
     let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
     assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
-    // All but the silent one are stopped before that is tried for long.
+    // All other drives are stopped before the silent one gets further tries.
     let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
         let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
         rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)

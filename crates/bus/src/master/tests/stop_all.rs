@@ -51,7 +51,7 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
         rig.deaf = deaf;
         let (plant, stop_all) = (plant(&rig), StopAll::default());
         assert_eq!(not_standing(&plant.drives().collect::<Vec<_>>(), rig.now), 20);
-        // A busy line: what waits there does not hold the broadcast up.
+        // A busy line: waiting orders do not delay the broadcast.
         let _flood: Vec<_> = (0..20)
             .map(|k| rig.order(k, "plc", ModelPoint::SpeedReference, Value::Number(10.0)))
             .collect();
@@ -149,7 +149,7 @@ fn a_silent_drive_is_named_and_stopped_once_it_is_back() {
             .is_some_and(|why| why.contains("did not acknowledge"))
     );
     assert!(rig.runs(1));
-    // Back within the time of the next order: tried again, it stops.
+    // The drive is back in the time of the next order: the stop is repeated and works.
     let mut second = order(&rig, &plant, &stop_all, &Scope::Gateway);
     let begin = rig.now;
     while rig.now < begin + Duration::from_secs(3) {

@@ -9,7 +9,7 @@ const SLOW: Timing = Timing {
     retries: Some(4),
 };
 
-/// The second of two drives has times of its own.
+/// A rig whose second drive has times of its own.
 fn rig() -> Rig {
     Rig::with(2, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
         DriveSpec {

@@ -126,7 +126,7 @@ const FAULTS: [(&str, Fault); 16] = [
     }),
 ];
 
-/// As when the file is read, then by the proof.
+/// Whether the profile is refused: by the checks of a file, or by the proof.
 fn is_refused(profile: &Profile) -> bool {
     let control = profile.control.as_ref();
     control.is_some_and(|control| !control.contradictions().is_empty()) || prove(profile).is_err()

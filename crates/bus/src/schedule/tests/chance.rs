@@ -48,7 +48,7 @@ fn plan_of(reads: &[(u8, u16)]) -> Plan {
             read(class(*n), at, *count)
         })
         .collect();
-    // As the planner puts them: the fast ones first. Each drive has one.
+    // Fast reads come first, as in the planner's order. Each drive has one.
     reads.push(read(PollClass::Fast, 0, 11));
     reads.sort();
     Plan {
@@ -85,7 +85,7 @@ impl Seen {
                 self.slow_time += took;
                 self.longest(key, PollClass::Slow, gap);
             }
-            // On a line that is full of commands the start takes long.
+            // On a line full of commands the start takes long, so first reads are counted apart.
             _ => self.slow_time += took,
         }
     }
@@ -143,7 +143,7 @@ impl Commands {
         self.waiting.iter().min().copied()
     }
 
-    /// When the next one arrives, if any does.
+    /// When the next command arrives, if any does.
     fn next(&self) -> Option<Instant> {
         self.every.map(|_| self.next)
     }

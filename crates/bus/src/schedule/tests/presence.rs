@@ -284,7 +284,7 @@ fn a_command_in_vain_is_as_good_as_a_probe() {
     assert!(probed_after(false).unwrap() < Duration::from_millis(150));
     let after = probed_after(true).unwrap();
     assert!((COST * 10..COST * 15).contains(&after), "{after:?}");
-    // A drive that answers is not sent away by it.
+    // An answering drive does not go away by a failed command.
     let mut rig = PolledLine::new(1, Duration::from_millis(10));
     rig.run(Duration::from_secs(1));
     rig.schedule.probed_in_vain(DriveIndex::new(0), COST * 10, rig.now);

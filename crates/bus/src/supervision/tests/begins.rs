@@ -80,7 +80,7 @@ fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
     rig.begin();
     rig.end(&Outcome::Expired);
     assert_eq!(rig.drive.supervision.lease(), Lease::default());
-    // Replaced and purged while it waited.
+    // The orders are replaced and purged while they wait.
     let _older = rig.order();
     let _newer = rig.order();
     let _stop = rig.order_of(ModelPoint::Run, Value::Bool(false));

@@ -4,7 +4,7 @@ use super::*;
 
 const ACTIONS: [LeaseAction; 2] = [LeaseAction::Stop, LeaseAction::SpeedReference(20.0)];
 
-/// The lease of a drive has run out, and its action waits.
+/// A drive whose lease has expired, with its action waiting.
 fn ran_out(action: LeaseAction) -> SupervisedDrive {
     let mut rig = SupervisedDrive::new(action);
     rig.heartbeat();

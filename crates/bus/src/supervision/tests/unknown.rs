@@ -21,7 +21,7 @@ impl SupervisedDrive {
         image.update(|s| s.refuse(raw.table, raw.address, 1, Exception::ADDRESS));
     }
 
-    /// `ms` later its lease is looked at; the action.
+    /// Evaluates the lease `ms` later; returns the action.
     fn later(&mut self, ms: u64) -> Option<Command> {
         self.now += Duration::from_millis(ms);
         self.supervise();

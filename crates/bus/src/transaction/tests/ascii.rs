@@ -75,7 +75,7 @@ fn a_broken_ascii_reply_says_why_and_does_not_wait_for_the_deadline() {
         assert_eq!(transaction.on_time(until), Step::Done(Ended::Corrupt(why)));
         assert!(transaction.is_mangled_reply(), "it begins as the reply does");
     }
-    // A frame that begins anew has its time, whatever was before it.
+    // A frame that starts again has its full time, whatever came before it.
     let mut transaction = start_ascii(&request, &frame, now, false);
     assert!(matches!(transaction.on_bytes(now, b":!"), Step::Wait(until) if until < deadline));
     assert_eq!(transaction.on_bytes(now, b":01"), Step::Wait(deadline));

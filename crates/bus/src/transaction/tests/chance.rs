@@ -39,7 +39,7 @@ fn mutated() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// How it ends when the bytes come in pieces of `chunk`, `gap_us` apart.
+/// How the transaction ends when the bytes come in pieces of `chunk`, `gap_us` apart.
 fn fed(
     mut transaction: Transaction,
     begun: Instant,
