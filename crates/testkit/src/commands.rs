@@ -27,7 +27,7 @@ pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Opt
     pending.take(chosen)
 }
 
-/// Takes the next command of a queue, whatever its rank.
+/// Takes the next command of a queue, of any rank.
 pub fn take_next(queue: &CommandQueue, now: Instant) -> Option<Command> {
     next_command(&mut queue.lock(), Urgency::Read, now)
 }

@@ -16,7 +16,7 @@ pub enum Order {
 }
 
 impl Order {
-    /// The request of it.
+    /// The request of the order.
     pub fn pdu(self) -> RequestPdu {
         match self {
             Order::Word(address, value) => RequestPdu::write_register(address, value),
@@ -65,15 +65,15 @@ pub fn rows<const CELLS: usize>(table: &'static str) -> Vec<[&'static str; CELLS
 
 /// How a family is commanded.
 pub struct Family {
-    /// The name of its profile.
+    /// Name of the family's profile.
     pub profile: &'static str,
     /// Half the maximum forward: 10000 of 20000, 0x2000 of 0x4000, 25 Hz of 50 Hz.
     pub reference: Vec<Order>,
-    /// Starts it forward.
+    /// Orders that start the motor forward.
     pub start: Vec<Order>,
-    /// Stops it.
+    /// Orders that stop the motor.
     pub stop: Vec<Order>,
-    /// Has it turn the other way; empty where its profile cannot say that.
+    /// Orders that reverse the motor; empty where the profile cannot do that.
     pub reverse: Vec<Order>,
 }
 
@@ -98,7 +98,7 @@ ls-g100            | 4=2500       | 5=2            | 5=1           | 5=4
 teco-f510          | 0x2502=2500  | 0x2501=1       | 0x2501=0      | 0x2501=3
 vacon-10           | 2002=5000    | 2000=1         | 2000=0        | 2000=3";
 
-/// All of them.
+/// All families with built-in profiles and their orders.
 pub fn families() -> Vec<Family> {
     let family = |[profile, reference, start, stop, reverse]: [&'static str; 5]| Family {
         profile,

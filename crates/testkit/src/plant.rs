@@ -10,7 +10,7 @@ use drivegate_model::drive::Profile;
 use drivegate_model::drive::profile::Profiles;
 use drivegate_proto::{LineFormat, Protocol, Table};
 
-/// How long a sample is good; slow points are read that often too.
+/// Time for which a sample is good, and cadence of slow points.
 pub const STALE_AFTER: Duration = Duration::from_secs(1);
 
 /// The built-in profile of that name.
