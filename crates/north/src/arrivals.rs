@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 
 use crate::order::Arrival;
 
-/// Most chunks with separate dates; later ones count as the last.
+/// Most chunks whose arrival times are kept apart; later chunks count with the last one.
 const MOST_PIECES: usize = 64;
 
-/// How the bytes came, the first ones first.
+/// How and when the unread bytes arrived, the first bytes first.
 #[derive(Debug, Default)]
 pub(super) struct Arrivals(VecDeque<(usize, Arrival)>);
 

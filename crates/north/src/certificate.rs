@@ -12,7 +12,7 @@ use crate::hex;
 /// The role of a client (Modbus/TCP Security protocol specification, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
 const COMMON_NAME: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.3");
-/// Longest role, bytes.
+/// Longest role in a certificate, bytes.
 const MAX_ROLE: usize = 256;
 /// Longest name in the log, characters.
 const MAX_NAME: usize = 64;
@@ -22,9 +22,9 @@ const MAX_NAME: usize = 64;
 pub(super) struct CertificateSummary {
     /// Common name of the subject, or the serial number; printable, at most 64 characters.
     pub(super) name: String,
-    /// Seconds since 1970.
+    /// Begin of the certificate's validity, seconds since 1970.
     pub(super) not_before: u64,
-    /// Seconds since 1970.
+    /// End of the certificate's validity, seconds since 1970.
     pub(super) not_after: u64,
     /// Role of a Modbus client.
     pub(super) role: Result<Option<String>, RoleError>,

@@ -58,9 +58,9 @@ pub(super) struct Kind {
     pub(super) key: KeyKind,
     /// Names of hosts and addresses (subjectAltName).
     pub(super) names: Vec<String>,
-    /// The common name as it stands, for a certificate without `names`.
+    /// The common name as written, in a certificate without `names`.
     common_name: Option<String>,
-    /// Whether a server may use it (extended key usage).
+    /// Whether a server may use the certificate (extended key usage).
     pub(super) serves: bool,
 }
 
@@ -69,14 +69,14 @@ pub(super) struct Kind {
 pub(super) struct KeyKind {
     /// Name of the key type, such as `P-521`, `RSA with 1024 bits`.
     pub(super) name: String,
-    /// Whether a peer with it can be verified.
+    /// Whether the gateway can verify a peer with such a key.
     pub(super) verifies: bool,
-    /// Whether the gateway can use it as its own.
+    /// Whether the gateway can use such a key as its own.
     pub(super) signs: bool,
 }
 
 impl Kind {
-    /// Reads a certificate; `None` if it is none.
+    /// Reads a certificate; `None` if the bytes are no certificate.
     pub(super) fn of(certificate: &[u8]) -> Option<Kind> {
         let certificate = Certificate::from_der(certificate).ok()?;
         let content = certificate.tbs_certificate();
@@ -122,7 +122,7 @@ impl Kind {
         self.is_commonly_named(&host_name) || self.names.iter().any(fits)
     }
 
-    /// The names it is valid for, as text.
+    /// The names that the certificate is valid for, as text.
     pub(super) fn shown_names(&self) -> String {
         match (self.names.as_slice(), &self.common_name) {
             ([], Some(common)) => format!("only the common name `{}`", printable(common)),

@@ -18,9 +18,9 @@ const MAX_CLOSING: usize = 32;
 /// How many connections a server may have open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Limits {
-    /// For all clients together.
+    /// Most connections of all clients together.
     pub(super) total: usize,
-    /// How many of them only clients that may write can have.
+    /// How many of all connections are kept for clients that may write.
     pub(super) reserved: usize,
     pub(super) per_address: usize,
 }
@@ -52,14 +52,14 @@ impl Limits {
     }
 }
 
-/// An open connection, as far as [`decide`] needs to know it.
+/// An open connection, with what [`decide`] needs to know about it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Open {
     address: IpAddr,
     authority: Authority,
     /// Whether the connection keeps its place against another one of its address. See [`ConnectionPlace::use_at`].
     in_use: bool,
-    /// Time of its last use, ms.
+    /// Time of the connection's last use, ms.
     used: u64,
 }
 
@@ -75,9 +75,9 @@ enum Decision {
 /// The limit that keeps a connection out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LimitReached {
-    /// For all clients together.
+    /// The limit for all clients together.
     Total(usize),
-    /// For the address of this client.
+    /// The limit for the address of this client.
     Address(usize),
 }
 
@@ -136,7 +136,7 @@ where
 pub(super) struct Rights(Arc<AtomicBool>);
 
 impl Rights {
-    /// As of now.
+    /// The rights of the client now.
     pub(super) fn authority(&self) -> Authority {
         match self.0.load(Ordering::Relaxed) {
             true => Authority::Write,
@@ -144,7 +144,7 @@ impl Rights {
         }
     }
 
-    /// From now on.
+    /// Changes the rights of the client from now on.
     pub(super) fn set(&self, authority: Authority) {
         self.0.store(authority == Authority::Write, Ordering::Relaxed);
     }
@@ -174,7 +174,7 @@ pub(super) enum CloseReason {
 #[derive(Debug)]
 pub(super) struct ConnectionPlace {
     address: IpAddr,
-    /// The listener that accepted it.
+    /// The listener that accepted the connection.
     listener: usize,
     rights: Rights,
     in_use: AtomicBool,
@@ -215,7 +215,7 @@ impl ConnectionPlace {
         self.closing.cancel();
     }
 
-    /// The connection did something at `now` and is `in_use` from then on.
+    /// Notes that the connection was used at `now`, and whether it is `in_use` from then on.
     pub(super) fn use_at(&self, now: Instant, in_use: bool) {
         let used = now.saturating_duration_since(self.start).as_millis();
         self.used
@@ -271,7 +271,7 @@ impl ConnectionPermit {
 pub(super) struct Newcomer<'c> {
     /// Address of the client.
     pub(super) address: IpAddr,
-    /// The listener that accepted it, for [`ConnectionLimit::review`].
+    /// The listener that accepted the connection, for [`ConnectionLimit::review`].
     pub(super) listener: usize,
     /// Ends the connection together with its server.
     pub(super) cancel: &'c CancellationToken,

@@ -15,7 +15,7 @@ use super::certificate_kind::{Kind, SUPPORTED_KEYS};
 use super::pem::{self, PemError};
 use super::server_trust::ServerTrust;
 
-/// How long before its end a certificate or a CRL causes a warning.
+/// Time before the end of a certificate or a CRL at which a warning begins.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
 /// Last second of the year 9999, which a certificate without an end states.
 const LAST_DATE: u64 = 253_402_300_799;
@@ -344,7 +344,7 @@ pub(super) fn validity(file: &Path, der: &CertificateDer<'_>, now: SystemTime) -
     soon.then_some(FileProblem::ExpiresSoon { name, file, end })
 }
 
-/// Seconds since 1970.
+/// A time as seconds since 1970.
 pub(super) fn seconds(time: SystemTime) -> u64 {
     time.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()
 }

@@ -86,7 +86,7 @@ pub enum ServerError {
     /// The local socket cannot be opened.
     #[error("cannot listen on {}: {cause}", .path.display())]
     Local {
-        /// The first path that it could have.
+        /// The first path that the socket could have.
         path: PathBuf,
         /// The system's error.
         cause: io::Error,

@@ -26,7 +26,7 @@ pub use self::state::ListenerStates;
 
 /// Handles the connections to one of a server's listeners.
 pub(crate) trait ConnectionHandler: Send + Sync + 'static {
-    /// The place of a connection; it is given back when this is dropped.
+    /// The place of a connection; dropping it gives the place back.
     type Permit: Send;
 
     /// A place for a connection of this client. `None` refuses it; the handler counts and logs that.
@@ -81,24 +81,24 @@ pub(crate) struct Listeners<H> {
 #[derive(Debug)]
 struct OpenListener<H> {
     spec: ListenerSpec,
-    /// With the port that the system chose if port 0 was configured.
+    /// The bound address; if port 0 was configured, with the port that the system chose.
     bound: SocketAddr,
     handler: Arc<H>,
     runtime: Handle,
-    /// Ends its connections.
+    /// Cancelling this ends the connections of the listener.
     cancel: CancellationToken,
-    /// Closes its socket.
+    /// Cancelling this closes the socket of the listener.
     stop: CancellationToken,
     stopped: Option<JoinHandle<()>>,
 }
 
-/// Where a listener of a new configuration has its socket from.
+/// Where a listener of a new configuration gets its socket.
 #[derive(Debug)]
 enum Socket {
     /// The socket of the open listener is kept.
     Open,
     New(std::net::TcpListener),
-    /// There is none yet: the machine does not have the address.
+    /// The listener has no socket yet: the machine does not have the address.
     Missing(io::Error),
 }
 
@@ -121,7 +121,7 @@ pub(crate) struct NewSockets {
 }
 
 impl<H: ConnectionHandler> Listeners<H> {
-    /// None yet; they run until `cancel`.
+    /// A server without listeners yet; listeners added later run until `cancel`.
     pub(super) fn new(
         server: ServerKind,
         stats: Arc<NorthState>,
@@ -202,7 +202,7 @@ impl<H: ConnectionHandler> Listeners<H> {
             if !kept && listener.spec.overlaps(address) && !released.contains(&index) {
                 listener.stop.cancel();
                 if let Some(stopped) = listener.stopped.take() {
-                    // A task that panicked has closed its socket too.
+                    // If the task panicked, its socket is closed as well.
                     let _ = stopped.await;
                 }
                 released.push(index);
@@ -295,7 +295,7 @@ impl<H: ConnectionHandler> Listeners<H> {
             listener.stop.cancel();
             listener.cancel.cancel();
             if let Some(stopped) = listener.stopped.take() {
-                // A task that panicked has closed its socket too.
+                // If the task panicked, its socket is closed as well.
                 let _ = stopped.await;
             }
         }

@@ -143,7 +143,7 @@ pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, 
 pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
     let bytes = content(file)?;
     PrivateKeyDer::from_pem_slice(&bytes).map_err(|error| match Found::of(&bytes) {
-        // In its old form its content passes for one that is broken.
+        // An encrypted key in the old form would otherwise pass for a broken key.
         Found::EncryptedKey => pem_error(file, PRIVATE_KEY, &bytes, &pem::Error::NoItemsFound),
         _ => pem_error(file, PRIVATE_KEY, &bytes, &error),
     })

@@ -3,7 +3,7 @@
 use super::NorthState;
 use crate::plant::Plant;
 
-/// Why the gateway is not ready; empty if it is.
+/// Why the gateway is not ready; empty if it is ready.
 pub(crate) fn reasons(plant: &Plant, stats: &NorthState) -> Vec<String> {
     let mut reasons = Vec::new();
     for bus in &plant.buses {

@@ -36,7 +36,7 @@ pub(crate) const HOLD: u16 = 0x8104;
 const NO_I16: u16 = 0x8000;
 /// "Not available" of an unsigned register.
 const NO_U16: u16 = 0xFFFF;
-/// Maximum age in its register, ms.
+/// Maximum age that its register can show, ms.
 const MAX_AGE_MS: u128 = 65_534;
 
 const RUN: u16 = 1 << 0;
@@ -132,13 +132,13 @@ pub enum Content {
     Age,
     /// A point of the common model.
     Point(ModelPoint),
-    /// The command bits; they read as the drive has them.
+    /// The command bits; they read as the drive has them now.
     Command,
     /// Any write renews the supervision; reads 0.
     Heartbeat,
     /// The holder of the drive.
     Holder,
-    /// For how long.
+    /// Time for which the hold still lasts.
     HoldLeft,
     /// Whether the client holds it; takes, renews, releases or breaks the hold. Only where `[authority]` is on.
     Hold,
@@ -151,7 +151,7 @@ pub struct Entry {
     pub address: u16,
     /// Content of the value.
     pub content: Content,
-    /// How it is encoded.
+    /// How the value is encoded.
     pub form: Form,
     /// Counts for one unit of the point.
     pub per_unit: f64,
@@ -223,7 +223,7 @@ const FLOAT: [Entry; 13] = [
 pub const BLOCKS: [&[Entry]; 3] = [&COMMON, &COMMAND, &FLOAT];
 
 impl Entry {
-    /// First address after it.
+    /// First address after this entry.
     fn end(&self) -> u32 {
         u32::from(self.address) + u32::from(self.form.registers())
     }

@@ -16,12 +16,12 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 pub trait Server: Sized + std::fmt::Debug {
     /// Name in messages.
     const NAME: &'static str;
-    /// Time limit for it to stop.
+    /// Time limit for the server to stop.
     const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
     /// Configuration of the server.
     type Options: Clone + PartialEq + std::fmt::Debug;
 
-    /// Starts it; it runs until `cancel`.
+    /// Starts the server, which runs until `cancel`.
     ///
     /// # Errors
     /// The server cannot run with these options: an address, a certificate or a thread is not available.
@@ -36,7 +36,7 @@ pub trait Server: Sized + std::fmt::Debug {
     /// then end now.
     fn end_rights(&self, _next: Option<&Self::Options>) {}
 
-    /// Waits until it has stopped, after the cancellation.
+    /// Waits until the cancelled server has stopped.
     async fn stopped(self);
 }
 
@@ -58,9 +58,9 @@ pub trait Reconfigure: Server {
     /// Discards a prepared change.
     fn abort(&mut self, change: Self::Change);
 
-    /// Accepts no more requests; those in progress complete.
+    /// Accepts no more requests; requests in progress complete.
     async fn retire(&mut self);
 
-    /// Whether all requests have completed and all clients are gone, after it retired.
+    /// Whether all requests have completed and all clients are gone after the server retired.
     fn is_drained(&self) -> bool;
 }

@@ -38,7 +38,7 @@ pub(super) struct UnknownIssuer {
 }
 
 impl ServerTrust {
-    /// Trusts certificates signed by the CAs in `roots`, and those in `named`.
+    /// Trusts the certificates in `named` and all certificates signed by the CAs in `roots`.
     ///
     /// # Errors
     /// There is no usable CA.
@@ -133,7 +133,7 @@ fn check_named(certificate: &CertificateDer<'_>, host: &ServerName<'_>, now: Uni
     if !kind.serves {
         return Err(CertificateError::InvalidPurpose.into());
     }
-    // Without names in it, the common name is what other programs compare, too.
+    // In a certificate without other names, other programs compare the common name as well.
     if kind.is_commonly_named(host) {
         return Ok(());
     }

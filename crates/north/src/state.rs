@@ -57,7 +57,7 @@ pub struct NorthState {
 /// The recent commands of all ways that recognise a repetition. They outlive the servers that a reload replaces.
 #[derive(Debug, Default)]
 pub(super) struct RememberedCommands {
-    /// From the broker.
+    /// Commands that came from the broker.
     pub(super) mqtt: SharedMemory,
     pub(super) http: SharedMemory<SharedReply>,
 }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
-/// How the last reload ended; the start counts as one.
+/// How the last reload ended; the start of the gateway counts as a reload.
 #[derive(Debug)]
 pub struct ReloadStats(Mutex<(bool, SystemTime)>);
 
@@ -21,7 +21,7 @@ impl ReloadStats {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (applied, at);
     }
 
-    /// Whether the last one was applied, and when it ended.
+    /// Whether the last reload was applied, and when it ended.
     pub fn last(&self) -> (bool, SystemTime) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -81,12 +81,12 @@ impl ServerKind {
     }
 }
 
-/// Why a connection was refused, or closed in favour of another one.
+/// Why a connection was refused, or closed in favour of another connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConnectionRefusal {
     /// The address of the client is not in `allow`.
     NotAllowed,
-    /// The server has as many connections as it may have.
+    /// The server has the most connections that it may have.
     Full,
     /// The address of the client has its maximum number of connections.
     AddressFull,
@@ -195,27 +195,27 @@ impl ModbusTcpStats {
 #[derive(Debug, Default)]
 pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
 
-/// Counters of the BACnet server and the result of its registration.
+/// Counters of the BACnet server, and the result of its registration.
 #[derive(Debug, Clone)]
 pub struct BacnetFigures {
-    /// Since it was started.
+    /// Counters since the server was started.
     pub counters: drivegate_bacnet::Counters,
-    /// The BBMD as configured, and whether it passes broadcasts on.
+    /// The configured BBMD, and whether it passes broadcasts on.
     pub bbmd: Option<(String, drivegate_bacnet::Registration)>,
 }
 
 impl BacnetStats {
-    /// Sets the server's figures; none when it ends.
+    /// Sets the server's figures; `None` when the server ends.
     pub(crate) fn set(&self, figures: Option<BacnetFigures>) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = figures;
     }
 
-    /// The last of it.
+    /// The last figures of the server.
     pub fn get(&self) -> Option<BacnetFigures> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Why the gateway is not ready for its sake.
+    /// Why the BACnet server makes the gateway not ready.
     pub(crate) fn reason(&self) -> Option<String> {
         use drivegate_bacnet::Registration;
         let (bbmd, registration) = self.get()?.bbmd?;
@@ -234,9 +234,9 @@ impl BacnetStats {
 pub enum SlotOutcome {
     /// The drive's reply was passed on; a broadcast was sent.
     Answered,
-    /// The drive refused it.
+    /// The drive refused the request.
     Exception,
-    /// The gateway refused it.
+    /// The gateway refused the request.
     Refused,
     /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
     NoAnswer,
@@ -328,7 +328,7 @@ pub enum MqttKind {
 }
 
 impl MqttKind {
-    /// All kinds.
+    /// All kinds of messages.
     pub const ALL: [MqttKind; 3] = [MqttKind::Event, MqttKind::Result, MqttKind::History];
 
     /// Name in the metrics.

@@ -88,7 +88,7 @@ impl<S: TcpService<O>, O> TcpServer<S, O> {
         self.listeners.addresses(false)
     }
 
-    /// Likewise, those with TLS.
+    /// The addresses of the listeners with TLS.
     pub fn tls_addresses(&self) -> Vec<SocketAddr> {
         self.listeners.addresses(true)
     }

@@ -14,9 +14,9 @@ use super::server_trust::UnknownIssuer;
 pub enum Peer {
     /// A server that the gateway or one of its commands connects to.
     Server {
-        /// The setting with the certificates that it is verified by.
+        /// Name of the setting with the certificates that verify the server.
         ca: &'static str,
-        /// The setting for a client certificate; empty if there is none.
+        /// Name of the setting for a client certificate; empty if there is no such setting.
         own: &'static str,
     },
     /// A client of the gateway.
@@ -72,7 +72,7 @@ pub(crate) fn is_handshake_end(error: &(dyn StdError + 'static)) -> bool {
     false
 }
 
-/// The error of the library in what carries it.
+/// The library's error inside the given error.
 fn found<'a>(error: &'a (dyn StdError + 'static)) -> Option<&'a Error> {
     let mut next = Some(error);
     while let Some(error) = next {
@@ -97,7 +97,7 @@ fn not_tls(peer: Peer) -> &'static str {
     }
 }
 
-/// Where the certificates are named that the other end is verified by.
+/// Name of the setting with the certificates that verify the other end.
 fn trusted(peer: Peer) -> &'static str {
     match peer {
         Peer::Server { ca, .. } => ca,

@@ -25,7 +25,7 @@ const VENDOR: &str = "drivegate";
 /// The address of a server, and the bits of the mask of its network.
 pub(super) type At = (SocketAddrV4, u8);
 
-/// How a write ended.
+/// How a write to a drive ended.
 pub(super) struct Ended {
     token: u64,
     machine: Machine,
@@ -45,13 +45,13 @@ impl Ended {
     }
 }
 
-/// The protocol, its objects and its pending requests.
+/// The BACnet protocol, the objects of the plant and the requests that wait for a drive.
 #[derive(Debug)]
 pub(super) struct Desk {
     plant: SharedPlant,
     pub(super) view: View,
     pub(super) server: Server,
-    /// Drives that answered when they were looked at last.
+    /// Drives that answered at the last look.
     present: HashSet<u32>,
     /// Leases that expired so far, by device.
     leases: HashMap<u32, u64>,
@@ -112,7 +112,7 @@ impl Desk {
         !Arc::ptr_eq(&self.plant.load(), &self.view.plant)
     }
 
-    /// Shows the plant as it is now, with these options.
+    /// Shows the present plant with these options.
     pub(super) fn see(&mut self, options: Arc<Options>) {
         self.view = View::new(self.plant.load_full(), options, self.view.rights.clone());
         self.server.set_devices(self.view.devices());
@@ -146,7 +146,7 @@ impl Desk {
         self.server.changed(device, &self.view, now);
     }
 
-    /// Takes up what clients wrote until something waits for its drive.
+    /// Processes the writes of clients until one of them must wait for its drive.
     pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
         self.view.look(now);
         while let Some(job) = self.server.take_job() {
@@ -175,7 +175,7 @@ impl Desk {
         self.server.written(ended.token, result, &self.view, now);
     }
 
-    /// Does what is due.
+    /// Does all that is due at `now`.
     pub(super) fn poll(&mut self, now: Instant) {
         self.view.look(now);
         self.note_leases();

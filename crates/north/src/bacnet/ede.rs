@@ -17,7 +17,7 @@ pub struct Ede {
     pub units: String,
 }
 
-/// A field: quoted where it has to be.
+/// A field of the EDE file, in quotes where the format requires them.
 fn field(text: &str) -> String {
     let text = text.replace(['\n', '\r'], " ");
     match text.contains([';', '"']) {

@@ -22,7 +22,7 @@ use crate::process_image::{Access, Machine};
 
 /// The name of the file in `state_dir`.
 pub(super) const FILE: &str = "bacnet-priorities.json";
-/// Longest file that is read.
+/// Longest file that the gateway reads.
 const LONGEST: u64 = 4 << 20;
 /// Time between two tries to write the file.
 const AGAIN: Duration = Duration::from_secs(10);
@@ -90,7 +90,7 @@ impl KeptSlot {
     }
 }
 
-/// Reads the file; one that is not there holds nothing.
+/// Reads the file with the kept slots; a missing file holds no slots.
 ///
 /// # Errors
 /// The file cannot be read, or is not a list of slots.
@@ -132,11 +132,11 @@ pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
             );
         }
     };
-    // On a slow disk it is done later.
+    // On a slow disk the file is discarded after this function returns.
     let _ = stats.patience.read(discard).await;
 }
 
-/// Slots, and the file that has them.
+/// Kept slots, and the file that holds them.
 type Kept = (PathBuf, Vec<KeptSlot>);
 
 /// The file as a server keeps it up to date, one write behind the other.
@@ -145,7 +145,7 @@ pub(super) struct KeptFile {
     /// Slots known to be on disk, and their file.
     written: Option<Kept>,
     writing: Option<JoinHandle<Result<Option<Kept>, String>>>,
-    /// When a write that failed is tried again.
+    /// When a failed write is tried again.
     again: Option<Instant>,
 }
 
@@ -239,7 +239,7 @@ mod tests {
         assert!(load(&file).is_err());
     }
 
-    /// Looks after the write that is under way until it has ended.
+    /// Waits until the write in progress has ended.
     async fn until_ended(kept: &mut KeptFile, path: &Path, plant: &Plant, now: Instant) {
         while kept.writing.is_some() {
             tokio::time::sleep(Duration::from_millis(1)).await;
@@ -251,7 +251,7 @@ mod tests {
     async fn what_a_full_disk_refused_is_written_when_there_is_room_unasked() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join(FILE);
-        // No file can be made in that place.
+        // A folder of this name makes it impossible to create the file.
         let aside = file.with_extension(files::PARTIAL);
         std::fs::create_dir(&aside).unwrap();
         let plant = Plant::new("test", Duration::from_secs(1), Vec::new());

@@ -9,17 +9,17 @@ use crate::process_image::{BusSpec, DriveSpec};
 /// An object in the list.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Line {
-    /// Instance of its device.
+    /// Instance of the device that has this object.
     pub device: u32,
     pub device_name: String,
-    /// As it is usually written, such as `AI 2`.
+    /// The object as it is usually written, such as `AI 2`.
     pub object: String,
     pub name: String,
-    /// The kind of its values.
+    /// The kind of the object's values.
     pub kind: String,
     /// The unit; empty without one.
     pub unit: String,
-    /// How it is written.
+    /// How clients can write the object.
     pub access: &'static str,
 }
 

@@ -56,11 +56,11 @@ pub enum WhenOffline {
 pub struct Options {
     /// Address of the server.
     pub listen: SocketAddrV4,
-    /// Instance of the gateway; that of a drive is greater by its unit.
+    /// Device instance of the gateway; the instance of a drive is this one plus its unit.
     pub device: u32,
     /// Number of the virtual network of the drives; none where all objects belong to the gateway's device (`layout = "flat"`).
     pub network: Option<u16>,
-    /// Most foreign devices that it serves as a BBMD.
+    /// Most foreign devices that the gateway serves as a BBMD.
     pub foreign_devices: usize,
     /// The behaviour of an offline drive.
     pub offline: WhenOffline,
@@ -72,7 +72,7 @@ pub struct Options {
     pub write: Vec<IpNet>,
     /// Whether inactives that protect people outlive a restart.
     pub keep_priorities: bool,
-    /// The BBMD at which it registers.
+    /// The BBMD at which the gateway registers.
     pub bbmd: Option<(String, u16)>,
     /// Identifier of the vendor.
     pub vendor: u16,
@@ -116,13 +116,13 @@ impl Options {
             .is_none_or(|buses| buses.iter().any(|name| name == bus))
     }
 
-    /// Whether that host may ask.
+    /// Whether this host may send requests.
     fn admits(&self, host: Ipv4Addr) -> bool {
         let host = IpAddr::V4(host);
         self.allow.iter().any(|network| network.contains(&host))
     }
 
-    /// Whether that host may write.
+    /// Whether this host may write.
     fn may_write(&self, host: Ipv4Addr) -> bool {
         let writes = || self.write.iter().any(|network| network.contains(&IpAddr::V4(host)));
         self.commands && self.admits(host) && writes()
@@ -171,7 +171,7 @@ pub struct Change {
 }
 
 impl Server {
-    /// The address on which it listens.
+    /// The address on which the server listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -257,13 +257,13 @@ impl Reconfigure for Server {
         let _ = self.to_task.send(ToTask::Apply(Box::new(options), sockets));
     }
 
-    /// Accepts no more requests; those in progress complete.
+    /// Accepts no more requests; requests in progress complete.
     async fn retire(&mut self) {
         self.rights.set(None);
         let _ = self.to_task.send(ToTask::Retire);
     }
 
-    /// Whether all requests have completed, after it retired.
+    /// Whether all requests have completed after the server retired.
     fn is_drained(&self) -> bool {
         !self.busy.load(Ordering::Relaxed)
     }

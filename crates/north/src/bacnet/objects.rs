@@ -47,18 +47,18 @@ pub enum Meaning {
     State,
     /// The text of the active fault.
     FaultText,
-    /// A command with priorities, and its point.
+    /// A command with a priority array, and its point.
     Slot(Commanded, PointIndex),
-    /// A pulse, and its point.
+    /// A pulse that resets, and its point.
     Reset(PointIndex),
     BusUp(usize),
     BusLoad(usize),
 }
 
-/// A device with the meaning of its objects, place by place.
+/// A device, with the meaning of each of its objects in the same order.
 #[derive(Debug, Clone)]
 pub struct Shown {
-    /// The device as BACnet sees it.
+    /// The device as BACnet clients see it.
     pub device: Arc<Device>,
     /// The meaning of each object.
     pub meanings: Vec<Meaning>,
@@ -146,7 +146,7 @@ const PER_DRIVE: u32 = 1000;
 /// The objects of one device for all drives, with the unit of the drive of each; none for those of the gateway.
 #[derive(Debug, Clone)]
 pub struct Flat {
-    /// The device as BACnet sees it.
+    /// The device as BACnet clients see it.
     pub device: Arc<Device>,
     /// The unit and the meaning of each object.
     pub places: Vec<(Option<u8>, Meaning)>,
@@ -158,7 +158,7 @@ pub fn flat((name, instance): (&str, u32), gateway: Shown, drives: impl Iterator
     let mut places: Vec<(Option<u8>, Meaning)> = gateway.meanings.iter().map(|meaning| (None, *meaning)).collect();
     for (drive, unit, shown) in drives {
         for (object, meaning) in shown.device.objects().iter().zip(&shown.meanings) {
-            // Beyond that they would be those of the next unit.
+            // Instances from there on belong to the next unit.
             if object.id.instance >= PER_DRIVE {
                 continue;
             }

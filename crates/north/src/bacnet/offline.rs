@@ -54,7 +54,7 @@ impl Offline {
         self.take_up(now);
     }
 
-    /// Does what is due; call it ten times a second.
+    /// Does all that is due; the caller repeats this ten times a second.
     pub fn poll(&mut self, now: Instant) {
         if self.desk.is_outdated() {
             self.desk.see(self.options.clone());
@@ -69,7 +69,7 @@ impl Offline {
         }
     }
 
-    /// The next datagram that it sends.
+    /// The next datagram that the server sends.
     pub fn transmit(&mut self) -> Option<(To, Vec<u8>)> {
         self.desk.server.transmit()
     }

@@ -15,12 +15,12 @@ pub(super) struct Sockets {
     pub(super) prefix: u8,
     pub(super) broadcast_to: SocketAddrV4,
     pub(super) unicast: UdpSocket,
-    /// For broadcasts; none where the first socket receives them itself.
+    /// Sockets for broadcasts; empty where the first socket receives broadcasts itself.
     pub(super) broadcasts: Vec<UdpSocket>,
 }
 
 impl Sockets {
-    /// Binds them.
+    /// Binds all sockets of the server.
     ///
     /// # Errors
     /// The address cannot be used.

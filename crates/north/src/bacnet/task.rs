@@ -39,7 +39,7 @@ const TICK: Duration = Duration::from_millis(100);
 const LOOK: Duration = Duration::from_millis(5);
 /// Datagrams that are taken up before anything else is.
 const BATCH: usize = 64;
-/// How often a BBMD whose name is not found is looked up again.
+/// Time between two look-ups of a BBMD whose name was not found.
 const RESOLVE: Duration = Duration::from_secs(30);
 /// Longest wait for requests in progress at the end.
 const LAST_ANSWERS: Duration = Duration::from_millis(1500);
@@ -351,7 +351,7 @@ impl Task {
         }
     }
 
-    /// Looks up the BBMD, and again while its name is not found.
+    /// Looks up the address of the BBMD, and repeats this while its name is not found.
     fn find_bbmd(&mut self, now: Instant) {
         use drivegate_bacnet::Registration;
         let Some((host, port)) = self.options.bbmd.clone() else {
@@ -403,10 +403,10 @@ fn waiting_reader() -> Reader {
     reader
 }
 
-/// Waits for a broadcast; which of these sockets has it.
+/// Waits for a broadcast; returns the index of the socket that received one.
 async fn heard(sockets: &[UdpSocket]) -> usize {
     std::future::poll_fn(|cx| {
-        // Whatever is wrong shows when it is read.
+        // Any error of the socket shows when the socket is read.
         let ready = sockets.iter().position(|socket| socket.poll_recv_ready(cx).is_ready());
         ready.map_or(Poll::Pending, Poll::Ready)
     })

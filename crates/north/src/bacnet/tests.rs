@@ -165,7 +165,7 @@ impl ControlledDrive {
         self.view.sample(DEVICE, self.place(object)).value.unwrap()
     }
 
-    /// An order of an MQTT client; the refusal, if it is refused.
+    /// Gives the drive an order as an MQTT client would; returns the refusal, if any.
     fn elsewhere(&self, point: ModelPoint, value: Value) -> Option<Refusal> {
         let drive = self.drive();
         let index = drive.image.spec.profile.model_index(point).unwrap();

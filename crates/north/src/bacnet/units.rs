@@ -1,6 +1,6 @@
 //! Units as BACnet numbers them (BACnetEngineeringUnits).
 
-/// No unit.
+/// BACnet's number for "no unit".
 pub(super) const NONE: u32 = 95;
 
 const UNITS: [(&str, u32); 30] = [
@@ -50,7 +50,7 @@ pub(super) fn name(number: u32) -> &'static str {
         .map_or("", |(name, _)| name)
 }
 
-/// The numbers that are used, with their units.
+/// The unit numbers in use, each with its unit.
 pub(super) fn all() -> impl Iterator<Item = (u32, &'static str)> {
     UNITS.iter().map(|(name, number)| (*number, *name)).chain([(NONE, "")])
 }

@@ -32,19 +32,19 @@ pub(super) struct ShownDrive {
     pub(super) shown: Shown,
 }
 
-/// The plant and how it is shown.
+/// The plant, and how BACnet clients see it.
 #[derive(Debug)]
 pub(super) struct View {
     pub(super) plant: Arc<Plant>,
     pub(super) options: Arc<Options>,
     pub(super) rights: HostRights,
     gateway: Shown,
-    /// All objects as those of one device.
+    /// All objects of the plant as objects of one device.
     flat: Option<Flat>,
     /// By the instance of the gateway plus the unit, which is that of the drive's device where it has one.
     pub(super) drives: HashMap<u32, ShownDrive>,
     buses: Vec<BusHandle>,
-    /// When it is looked at, by both clocks.
+    /// The time of this look, by the monotonic clock and by the wall clock.
     now: Cell<(Instant, SystemTime)>,
 }
 
@@ -111,7 +111,7 @@ impl View {
         }
     }
 
-    /// The drive to which an object belongs, and its number there.
+    /// The drive that an object belongs to, and the object's number in that drive.
     fn owner(&self, device: u32, object: ObjectId) -> Option<(&ShownDrive, ObjectId)> {
         if self.flat.is_none() {
             return Some((self.drives.get(&device)?, object));
@@ -192,7 +192,7 @@ impl View {
                     ..sample
                 }
             }
-            // A pulse has ended when it can be read.
+            // A pulse has always ended by the time that a client reads it.
             Meaning::Reset(index) => Sample {
                 value: Some(Datum::Bool(false)),
                 ..self.point(&reading, index, |value| Datum::Bool(value.as_bool()))
@@ -268,7 +268,7 @@ impl View {
     }
 }
 
-/// An object that is not there.
+/// The sample of an object that does not exist.
 const NOTHING: Sample = Sample {
     value: None,
     reliability: Reliability::CommunicationFailure,

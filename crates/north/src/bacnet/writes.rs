@@ -38,7 +38,7 @@ pub(super) struct Waiting {
     pub(super) slot: Option<u64>,
 }
 
-/// The client, whatever port it uses.
+/// The origin of a client's writes; the client's port does not matter.
 pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) -> Origin {
     let client = match &from.remote {
         None => format!("bacnet {}", from.ip()),
@@ -133,7 +133,7 @@ fn described(job: &Job) -> String {
     }
 }
 
-/// A write to a slot, and the order that follows from it.
+/// A write to a slot of the priority array, and the order that follows from it.
 fn slot(
     handle: &DriveHandle,
     (what, index): (Commanded, PointIndex),

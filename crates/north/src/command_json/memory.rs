@@ -9,29 +9,29 @@ use std::time::{Duration, Instant};
 const RECENT: usize = 1024;
 /// Least time for which a command with an `id` is remembered.
 pub(crate) const REMEMBERED: Duration = Duration::from_secs(600);
-/// Longest time, whatever the expiry of its message.
+/// Longest time that a command is remembered, whatever the expiry of its message.
 const LONGEST: Duration = Duration::from_secs(86_400);
 /// Maximum number of commands with an `id` that are remembered.
 const MOST_COMMANDS: usize = 1 << 18;
 
-/// A command, as far as its repetition is recognised by it.
+/// The parts of a command by which its repetition is recognised.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Taken<'t> {
-    /// Where it came in: its topic, or the user and the drive.
+    /// Where the command came in: its topic, or the user and the drive.
     pub(crate) topic: &'t str,
     /// Payload of the command.
     pub(crate) payload: &'t [u8],
-    /// Where its result goes: response topic and correlation data.
+    /// Where the command's result goes: response topic and correlation data.
     pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
-    /// The broker marks it as a repetition.
+    /// Whether the broker marks the command as a repetition.
     pub(crate) dup: bool,
     /// Packet id, which identifies that repetition.
     pub(crate) packet: u16,
-    /// Remaining life of its message, s.
+    /// Remaining life of the command's message, s.
     pub(crate) expiry: Option<u32>,
 }
 
-/// The commands that were taken, and their results `R`.
+/// The commands taken so far, and their results `R`.
 #[derive(Debug)]
 pub(crate) struct Memory<R> {
     hasher: RandomState,
@@ -94,7 +94,7 @@ struct Recent<R> {
     fingerprint: u64,
     stops: u64,
     answer_to: u64,
-    /// `None` until it is finished.
+    /// The result; `None` until the command is finished.
     result: Option<R>,
 }
 
@@ -104,7 +104,7 @@ struct Known {
     stops: u64,
     /// Hash of topic and `id`.
     identity: u64,
-    /// Hash of where its result goes.
+    /// Hash of where the command's result goes.
     answer_to: u64,
 }
 
@@ -113,7 +113,7 @@ struct Known {
 pub(crate) struct Fingerprint {
     /// Fingerprint of everything except the packet id.
     whole: u64,
-    /// Hash of topic and `id`, if it has one; and with the payload.
+    /// Hash of topic and `id`, if the command has an `id`; and hash with the payload.
     identity: Option<(u64, u64)>,
     answer_to: u64,
 }
@@ -204,7 +204,7 @@ impl<R: Clone> Memory<R> {
         }
     }
 
-    /// Remembers a command that is taken at `now`; returns its number.
+    /// Remembers a command taken at `now`; returns the command's number.
     pub(crate) fn remember(&mut self, taken: &Taken<'_>, print: Fingerprint, stops: u64, now: Instant) -> u64 {
         self.taken += 1;
         let number = self.taken;

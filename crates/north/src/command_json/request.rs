@@ -35,7 +35,7 @@ pub(crate) type Points = Vec<(PointIndex, Value)>;
 pub(crate) struct Id(Box<RawValue>);
 
 impl Id {
-    /// As it was written.
+    /// The `id` exactly as the client wrote it.
     pub(crate) fn text(&self) -> &str {
         self.0.get()
     }
@@ -84,7 +84,7 @@ pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
 pub(crate) struct Asked {
     pub(crate) points: Points,
     pub(crate) expiry: Duration,
-    /// Why all else is refused; `points` are those of its stop then.
+    /// Why all but a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
     /// A start that must wait does so.
     pub(crate) wait: bool,

@@ -30,7 +30,7 @@ pub(crate) struct CommandResult<'r> {
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     #[schema(value_type = f64)]
     latency: Duration,
-    /// From acceptance to the read that showed the effect.
+    /// Time from acceptance to the read that showed the command's effect.
     #[serde(
         rename = "confirmed_ms",
         serialize_with = "milliseconds_or_null",
@@ -111,7 +111,7 @@ impl<'r> CommandResult<'r> {
         }
     }
 
-    /// As it is sent.
+    /// The result as JSON, as it is sent to the client.
     pub(crate) fn to_json(&self) -> Vec<u8> {
         // Strings, numbers and previous JSON can always be serialized.
         serde_json::to_vec(self).unwrap_or_default()

@@ -6,7 +6,7 @@ fn host(n: u8) -> IpAddr {
     IpAddr::from([10, 0, 0, n])
 }
 
-/// LimitedPlaces as a test opens and closes them.
+/// Connection places as a test opens and closes them.
 struct LimitedPlaces {
     limit: Arc<ConnectionLimit>,
     cancel: CancellationToken,

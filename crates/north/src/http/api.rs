@@ -52,7 +52,7 @@ pub(super) struct Drive<'d> {
     #[serde(skip_serializing_if = "Clone::clone")]
     profile_verified: bool,
     access: &'static str,
-    /// `null` while it is not known.
+    /// State of the drive; `null` while it is unknown.
     #[schema(value_type = Option<String>)]
     state: Option<State>,
     #[schema(value_type = String)]
@@ -63,11 +63,11 @@ pub(super) struct Drive<'d> {
     since: Option<Time>,
     age_ms: Option<u64>,
     fault_text: String,
-    /// Why it does not run, in one word each.
+    /// Why the drive does not run, in one word each.
     blocked_by: Vec<String>,
     /// The causes with evidence and remedy.
     why: Vec<Cause>,
-    /// Why it takes no commands but stops.
+    /// Why the drive accepts no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
     /// For how long an ordinary stop still waits.
@@ -84,10 +84,10 @@ pub(super) struct Drive<'d> {
     stops: Option<Vec<StopProof>>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
-    /// `null` where the drive does not say whether it runs.
+    /// Number of starts; `null` where the drive does not say whether it runs.
     starts: Option<u64>,
     running_seconds: Option<f64>,
-    /// `null` where the drive does not count it.
+    /// Energy; `null` where the drive does not count it.
     energy_kwh: Option<f64>,
     #[schema(value_type = std::collections::HashMap<String, Point<'d>>)]
     points: Points<'d>,
@@ -142,7 +142,7 @@ impl<'d> Drive<'d> {
         }
     }
 
-    /// With what drills have proven.
+    /// Adds what drills have proven about the stops of the drive.
     pub(super) fn proven(mut self, stops: Option<Vec<StopProof>>) -> Drive<'d> {
         self.stops = stops;
         self
@@ -155,7 +155,7 @@ impl<'d> Drive<'d> {
     }
 }
 
-/// Transactions by their outcome.
+/// Number of transactions by their outcome.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Outcomes {
     ok: u64,
@@ -271,7 +271,7 @@ pub(super) struct Bus<'b> {
 /// Cadence of a poll class.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Cycle {
-    /// As configured.
+    /// Configured time of a round, ms.
     aim_ms: f64,
     /// Time of the last round.
     cycle_ms: Option<f64>,

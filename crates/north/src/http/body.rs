@@ -11,7 +11,7 @@ use super::reached::Reached;
 use super::replies::{Refused, Replied, refused};
 use crate::command_json::MAX_PAYLOAD;
 
-/// Time limit for the body of a request, from its head on.
+/// Time limit for the body of a request, counted from the end of its head.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A body, as an argument of a handler.

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-/// A token or a user. Displayed as its line of the file.
+/// A token or a user. Its display form is its line of the file.
 pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
     /// `token` or `user`.
     const KIND: &'static str;
@@ -16,7 +16,7 @@ pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
 /// Why a line is not a token or a user, or none can be made.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CredentialError {
-    /// Other words than those of the form.
+    /// The words do not have the required form.
     #[error("not `{0}`")]
     Form(&'static str),
     /// A name of other characters, or a long one.
@@ -41,7 +41,7 @@ pub enum CredentialError {
         super::MAX_PASSWORD
     )]
     Password,
-    /// The system does not provide them.
+    /// The system does not provide random bytes.
     #[error("the system provides no random numbers")]
     Random,
 }
@@ -77,7 +77,7 @@ impl<C: Credential> Credentials<C> {
         Ok(all)
     }
 
-    /// All of them, in the order of the file.
+    /// All tokens or users, in the order of the file.
     pub fn list(&self) -> &[C] {
         &self.0
     }

@@ -71,12 +71,12 @@ pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQu
 pub(super) struct Shown<'e> {
     #[serde(flatten)]
     event: &'e Event,
-    /// Absent in events that have it themselves.
+    /// The recording; absent in events that name a recording themselves.
     #[serde(rename = "recording", skip_serializing_if = "Option::is_none")]
     shown_in: Option<RecordingMade>,
 }
 
-/// The kept recordings, by the time that they cover.
+/// The recordings on disk, by the time that they cover.
 struct Recorded {
     before: Duration,
     after: Duration,

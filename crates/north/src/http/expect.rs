@@ -10,7 +10,7 @@ use super::reached::Reached;
 use crate::local::absolute;
 use crate::plant::Plant;
 
-/// Why a request is not for this gateway, with its status.
+/// Why a request is not meant for this gateway, with the status of the reply.
 type Unmet = (StatusCode, String);
 
 /// Whether the gateway is the one of the header [`EXPECT`], if there is one.

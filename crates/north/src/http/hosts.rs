@@ -8,7 +8,7 @@ const LOOPBACK: [&str; 4] = ["localhost", "localhost.localdomain", "ip6-localhos
 /// Longest name of a host.
 const LONGEST_NAME: usize = 255;
 
-/// A host without its port.
+/// A host name or address without a port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Host {
     Address(IpAddr),
@@ -63,7 +63,7 @@ impl Host {
 pub(super) struct Hosts(Vec<Host>);
 
 impl Hosts {
-    /// The loopback, this machine by its name `own_name`, and those of the configuration.
+    /// The loopback, this machine by its name `own_name`, and the hosts of the configuration.
     pub(super) fn new(own_name: &str, configured: &[String]) -> Hosts {
         let short = own_name.split('.').next().unwrap_or_default();
         let own = [own_name, short].into_iter().filter_map(Host::parse);

@@ -63,7 +63,7 @@ struct DriveLine<'b> {
     errors: Vec<Option<u32>>,
 }
 
-/// How often the drive took how long until its reply began.
+/// Number of replies of the drive, by the time until each reply began.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Turnarounds {
     /// Upper bound of each count; the last has none.

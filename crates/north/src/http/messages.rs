@@ -16,7 +16,7 @@ use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 /// An error reply.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ErrorReply {
-    /// The error and its remedy.
+    /// The error, and what to do about it.
     pub error: String,
     /// The known names, if one was unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -114,7 +114,7 @@ pub struct Why {
     /// Whether the drive runs, and why not.
     #[serde(flatten)]
     pub explanation: Explanation,
-    /// Name of its profile.
+    /// Name of the drive's profile.
     pub profile: String,
     /// Whether the profile was verified on hardware.
     pub profile_verified: bool,
@@ -138,7 +138,7 @@ pub enum RestoreAct {
     Prepare(RestoreWish),
     /// Writes the prepared restore of that number.
     CarryOut(PreparedRestore),
-    /// Resumes an interrupted one.
+    /// Resumes an interrupted restore.
     Resume,
     /// An interrupted restore is undone.
     Undo,
@@ -168,7 +168,7 @@ pub struct PreparedRestore {
     pub number: u64,
 }
 
-/// The configuration was read again; it applies unless there are errors.
+/// Result of reading the configuration again; the configuration applies unless there are errors.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ReloadOutcome {
     /// The errors; the gateway runs as before.
@@ -187,7 +187,7 @@ pub struct ReloadOutcome {
 pub struct Health {
     /// Ready state as in `/readyz`.
     pub ready: bool,
-    /// Why it is not.
+    /// Why the gateway is not healthy.
     pub reasons: Vec<String>,
 }
 
@@ -196,7 +196,7 @@ pub struct Health {
 pub struct Recorded {
     /// Id of the recording.
     pub id: String,
-    /// Time until it is complete, s.
+    /// Time until the recording is complete, s.
     pub after_s: f64,
 }
 
@@ -205,7 +205,7 @@ pub struct Recorded {
 pub struct StoredReading {
     /// Name of the drive.
     pub drive: String,
-    /// Path of the file, or its name where it is on another machine.
+    /// Path of the file, or only its name if the file is on another machine.
     pub file: String,
     /// When it was made, RFC 3339; this and what follows is `null` where the file cannot be read.
     pub time: Option<String>,
@@ -251,13 +251,13 @@ pub struct ParameterReading {
     /// Estimated remaining time, s.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub remaining_s: Option<f64>,
-    /// Why it waits.
+    /// Why the reading waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// The file, once it has ended.
+    /// The file of the reading, once the reading has ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
-    /// Why it failed.
+    /// Why the reading failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
 }
@@ -290,9 +290,9 @@ pub struct Restore {
     pub stage: Stage,
     /// Addresses that were read, or parameters that are done.
     pub done: usize,
-    /// All of them.
+    /// Number of all parameters to restore.
     pub total: usize,
-    /// Why it waits.
+    /// Why the restore waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
     /// The plan, as text; once that is known.
@@ -301,10 +301,10 @@ pub struct Restore {
     /// The risks the user accepts.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub risks: Vec<String>,
-    /// Why it may not be done.
+    /// Reasons why the restore may not be carried out.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub reasons: Vec<String>,
-    /// How it ended.
+    /// How the restore ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text: Option<String>,
 }
@@ -412,7 +412,7 @@ impl Word {
         }
     }
 
-    /// The points that it comes from.
+    /// The points that the word is made from.
     pub fn sources(self) -> &'static [ModelPoint] {
         match self {
             Word::State => &[ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready],

@@ -182,7 +182,7 @@ pub(crate) struct HttpConnections {
     stopping: CancellationToken,
 }
 
-/// The place of a connection, and its coverage.
+/// The place of a connection, and which requests the connection may make.
 pub(crate) struct HttpPermit {
     permit: ConnectionPermit,
     coverage: Coverage,
@@ -327,7 +327,7 @@ impl HttpConnections {
                     commands.close();
                     let last = async {
                         let answered = timeout(ANSWERED_WITHIN, commands.wait());
-                        // Whichever it was that ended the wait.
+                        // This runs for either cause that ended the wait.
                         let _ = self.stopping.run_until_cancelled(answered).await;
                         tokio::time::sleep(GRACE).await;
                     };

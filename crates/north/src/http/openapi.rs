@@ -19,7 +19,7 @@ use utoipa::openapi::{
 use super::app_state::AppState;
 use super::messages::ErrorReply;
 
-/// Where the description is.
+/// Path of the API description.
 pub(super) const PATH: &str = "/api/v1/openapi.json";
 
 const JSON: &str = "application/json";
@@ -35,7 +35,7 @@ const FAILURES: [(&str, &str); 4] = [
     ("504", "what became of it is not known, or not all of it is"),
 ];
 
-/// The routes so far.
+/// The routes added so far, with their description.
 pub(super) struct Api {
     router: Router<Arc<AppState>>,
     paths: Paths,
@@ -56,7 +56,7 @@ pub(super) struct Doc {
     schemas: Vec<(String, RefOr<Schema>)>,
 }
 
-/// A reference to the schema of a type, and all that it needs.
+/// A reference to the schema of a type; adds that schema and all schemas it needs.
 fn schema_of<T: ToSchema>(schemas: &mut Vec<(String, RefOr<Schema>)>) -> RefOr<Schema> {
     let name = T::name().into_owned();
     schemas.push((name.clone(), T::schema()));
@@ -138,7 +138,7 @@ impl Doc {
         self
     }
 
-    /// With an object as its body whose fields depend on the drive.
+    /// Describes a body that is an object whose fields depend on the drive.
     pub(super) fn any_body(self) -> Doc {
         Doc {
             body: Some(any()),
@@ -146,12 +146,12 @@ impl Doc {
         }
     }
 
-    /// With these parameters, each optional.
+    /// Describes these parameters of the query, each optional.
     pub(super) fn query(self, query: &'static [(&'static str, &'static str)]) -> Doc {
         Doc { query, ..self }
     }
 
-    /// With an object as its body.
+    /// Describes a body that is an object of type `T`.
     pub(super) fn body<T: ToSchema>(mut self) -> Doc {
         self.body = Some(schema_of::<T>(&mut self.schemas));
         self
@@ -237,7 +237,7 @@ impl Api {
         self
     }
 
-    /// The routes, with that of their description.
+    /// All routes, with the route of their description.
     pub(super) fn finished(self) -> Router<Arc<AppState>> {
         let document = Arc::new(OnceLock::new());
         let text: Arc<OnceLock<String>> = document.clone();

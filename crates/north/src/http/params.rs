@@ -9,7 +9,7 @@ use crate::parameters::{ParameterFile, RestoreStatus, Status};
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Parameters<'a> {
     drive: &'a str,
-    /// The last reading; `null` where there is none.
+    /// The last reading of the parameters; `null` if there is none.
     last: Option<LastReading<'a>>,
     /// The reading in progress; `null` if none.
     reading: Option<RunningReading<'a>>,
@@ -37,9 +37,9 @@ struct LastReading<'a> {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct ParameterRow<'a> {
     id: &'a str,
-    /// The raw value; `null` if it was not read.
+    /// The raw value; `null` if the parameter was not read.
     raw: Option<f64>,
-    /// Value in its unit and name, as text.
+    /// Value with its unit or name, as text.
     text: &'a str,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<&'a str>,

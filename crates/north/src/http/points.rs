@@ -17,7 +17,7 @@ use crate::order::{self, Authority, Order, Origin};
 use crate::plant::{DriveHandle, OrderRequest};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
-/// Most points of one request; a profile has some hundred.
+/// Most points in one request; a profile has some hundred points.
 const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);
@@ -69,7 +69,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
 /// The value that a name requests.
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
-    /// A point, by its index.
+    /// A point, by its index in the profile.
     Point(PointIndex),
     Word(Word),
 }
@@ -122,7 +122,7 @@ fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     names.iter().map(of).collect()
 }
 
-/// A point that is not polled: it is read from the drive.
+/// Reads a point that is not polled from the drive.
 async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin, deadline: Instant) -> PointValue {
     let pdu = RequestPdu::Read {
         table: raw.table,
@@ -192,7 +192,7 @@ fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: PointIndex) -
         })
 }
 
-/// Why the words of a register are not good, if they are not.
+/// Why the words of a register are not good; `None` if they are.
 fn why_no_words(reading: &Reading<'_>, raw: &Raw) -> Option<String> {
     match reading.words(raw.table, raw.address, raw.form.items()).err()? {
         Unavailable::Refused(code) => Some(format!("the drive refused it with {code}")),

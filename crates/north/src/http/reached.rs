@@ -43,11 +43,11 @@ pub(super) struct Client {
 /// A user of the local socket: anyone who may open it may do everything.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalUser {
-    /// The interface, as the audit shows it.
+    /// The interface that the user came by, as the audit shows it.
     pub(crate) kind: SourceKind,
     /// Likewise, the user.
     pub(crate) who: Arc<str>,
-    /// The proof from its connection.
+    /// The proof of the user, from the connection.
     pub(crate) proof: Proof,
     /// Right of the user to write.
     pub(crate) right: Right,
@@ -55,7 +55,7 @@ pub(crate) struct LocalUser {
     pub(crate) control: Option<Control>,
 }
 
-/// How a request arrived, as its extension.
+/// How a request arrived; stored with the request as an extension.
 #[derive(Debug, Clone)]
 pub(super) struct Reached {
     /// The address of this machine that the client connected to.
@@ -73,7 +73,7 @@ pub(super) struct Reached {
 }
 
 impl Reached {
-    /// How the request with this head came.
+    /// How the request with this head arrived.
     ///
     /// # Errors No server has reported it.
     pub(super) fn of(head: &request::Parts) -> Replied<Reached> {

@@ -33,7 +33,7 @@ use crate::stop_all::StopReport;
 /// The route exists only at the socket.
 const RELOAD: &str = "/api/v1/reload";
 
-/// All routes.
+/// All routes of the HTTP server.
 pub(super) fn router(
     plant: SharedPlant,
     north: Arc<NorthState>,
@@ -48,7 +48,7 @@ pub(super) fn router(
         .layer(middleware::from_fn_with_state(app, guard))
 }
 
-/// The routes, with their description.
+/// The routes of the API, with their description.
 fn described() -> Api {
     const TEXT: &str = "text/plain";
     const EVENTS: &str = "text/event-stream";

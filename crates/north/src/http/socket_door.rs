@@ -84,7 +84,7 @@ impl SocketDoor {
                 connection.as_mut().graceful_shutdown();
                 commands.close();
                 let last = async {
-                    // Whichever it was that ended the wait.
+                    // This runs for either cause that ended the wait.
                     let _ = timeout(ANSWERED_WITHIN, commands.wait()).await;
                     tokio::time::sleep(GRACE).await;
                 };
@@ -109,12 +109,12 @@ pub struct InProcess {
     cancel: CancellationToken,
 }
 
-/// Connections of a command, and bytes on their way to it.
+/// Most connections of a command, and the size of the buffer of each connection.
 const CONNECTIONS: usize = 4;
 const BUFFER: usize = 64 * 1024;
 
 impl InProcess {
-    /// For `who` started the command.
+    /// An in-process server for a command started by `who`.
     pub fn new(plant: &SharedPlant, stats: &Arc<NorthState>, who: &str) -> InProcess {
         let cancel = CancellationToken::new();
         let user = LocalUser {
@@ -133,7 +133,7 @@ impl InProcess {
         }
     }
 
-    /// A connection; `None` while there are too many.
+    /// A new connection; `None` while there are too many.
     pub fn connect(&self) -> Option<DuplexStream> {
         let newcomer = Newcomer {
             address: IpAddr::V4(Ipv4Addr::LOCALHOST),

@@ -70,7 +70,7 @@ pub(super) async fn events(
         Ok(permit) => permit,
         Err(refused) => return full(&refused),
     };
-    // A message is made when the client takes it.
+    // Each message is made at the time when the client takes it.
     let kept = stream::iter(kept).map(|(id, line)| Message::default().id(event_id(id)).data(line));
     let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
     respond(kept.chain(live), permit)
@@ -131,7 +131,7 @@ fn full(why: &str) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, retry, Json(problem)).into_response()
 }
 
-/// The received items as messages; a loss becomes a message of its own.
+/// Turns received items into messages; lost items become a message of their own.
 fn messages_of<T: Clone + Send + 'static>(
     receiver: broadcast::Receiver<T>,
     message: impl Fn(T) -> Option<Message> + Send + 'static,
@@ -156,7 +156,7 @@ fn respond(messages: impl Stream<Item = Message> + Send + 'static, permit: Conne
             Ok::<_, Infallible>(message)
         });
     let keep_alive = KeepAlive::new().interval(KEEP_ALIVE).text("alive");
-    // Proxies such as nginx would otherwise buffer the reply until it ends.
+    // Without this header, proxies such as nginx would buffer the reply until it ends.
     let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
     (unbuffered, Sse::new(messages).keep_alive(keep_alive)).into_response()
 }

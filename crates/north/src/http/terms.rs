@@ -11,12 +11,12 @@ use super::hosts::Hosts;
 use super::options::Options;
 use crate::{ServerError, ServerKind};
 
-/// The present terms; a reload can replace them.
+/// The present terms of the server; a reload can replace them.
 #[derive(Debug)]
 pub(crate) struct Terms {
     pub(super) access: Arc<Access>,
     pub(super) tls: Option<Tls>,
-    /// Cancelled when others have taken their place.
+    /// Cancelled when a reload has replaced these terms.
     pub(super) replaced: CancellationToken,
 }
 

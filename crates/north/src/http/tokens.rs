@@ -13,7 +13,7 @@ use subtle::ConstantTimeEq;
 use super::credentials::{Credential, CredentialError, Credentials, checked_name};
 use crate::hex;
 
-/// Bytes of a token and of its hash.
+/// Length of a token and of its hash, bytes.
 const BYTES: usize = 32;
 /// Prefix of a hash in the file.
 const ALGORITHM: &str = "sha256:";
@@ -28,7 +28,7 @@ pub enum Scope {
     Read,
     /// `/metrics`.
     Metrics,
-    /// Nothing yet: commands are given by users, who have names.
+    /// Grants nothing yet: only users, who have names, can give commands.
     Control,
 }
 
@@ -59,7 +59,7 @@ impl FromStr for Scope {
 pub struct Token {
     /// Unique in the file.
     pub name: String,
-    /// At least one.
+    /// Scopes of the token, at least one.
     pub scopes: Vec<Scope>,
     hash: [u8; BYTES],
 }

@@ -23,7 +23,7 @@ const SHOWN: Duration = Duration::from_secs(600);
 /// The request of a client.
 #[derive(Debug, PartialEq)]
 struct Wanted {
-    /// None: only which points there are.
+    /// Names of the points; empty if the request only asks which points exist.
     points: Vec<String>,
     from: SystemTime,
     to: SystemTime,
@@ -39,7 +39,7 @@ impl Wanted {
         let to_text = to.clone().unwrap_or_default();
         let to = time("to", to, now)?.min(now);
         let from = time("from", from, to.checked_sub(SHOWN).unwrap_or(to))?;
-        // There is nothing older.
+        // No trend goes back further than this.
         let [.., Range { span, .. }] = RANGES;
         let from = now.checked_sub(span).map_or(from, |oldest| from.max(oldest));
         if from > to {
@@ -125,7 +125,7 @@ pub(super) async fn trend(
     })
 }
 
-/// Which trends there are.
+/// The trends that a drive has.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct Kept<'d> {
     drive: &'d str,
@@ -143,7 +143,7 @@ struct KeptRange {
 struct KeptPoint {
     point: &'static str,
     unit: &'static str,
-    /// Memory it takes.
+    /// Memory that the trend takes, bytes.
     bytes: usize,
 }
 

@@ -13,7 +13,7 @@ use super::credentials::{Credential, CredentialError, Credentials, checked_name}
 
 /// Memory of a hash, KiB: 12 MiB are there on a small board too, once at a time.
 const MEMORY: u32 = 12 * 1024;
-/// Passes over it. With this memory, the least that OWASP recommends for Argon2id.
+/// Passes of Argon2id over its memory. With this memory, three is the least that OWASP recommends.
 const PASSES: u32 = 3;
 /// Most that a hash in the file may cost: memory in KiB, passes and lanes. More would let a file stall the gateway.
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
@@ -110,7 +110,7 @@ fn cost(hash: &str) -> &str {
     end.and_then(|end| hash.get(..=end)).unwrap_or_default()
 }
 
-/// Whether that is a hash that may be computed.
+/// Whether the gateway can afford to compute this hash.
 fn is_affordable(hash: &str) -> bool {
     let Ok(hash) = PasswordHash::new(hash) else {
         return false;

@@ -93,7 +93,7 @@ pub(super) async fn reload(Extension(reached): Extension<Reached>, uri: Uri, req
     }
 }
 
-/// All drives; with `points=` only these points of each.
+/// All drives; with `points=`, only these points of each drive.
 pub(super) async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
     let shown = query::names(query.as_deref(), "points");
     let _turn = app.turn().await;
@@ -217,7 +217,7 @@ pub(super) async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path
     Ok(Json(api::Diagnosis::new(&name, &diagnosis)).into_response())
 }
 
-/// The last commands, newest last; with `drive` those to one drive.
+/// The last commands, the newest last; with `drive`, only the commands to one drive.
 pub(super) async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Replied {
     let [drive] = query::parameters(query.as_deref(), &["drive"])?;
     let plant = app.plant.load();

@@ -38,7 +38,7 @@ pub(super) struct AcceptLoop<H> {
     pub(super) address: SocketAddr,
     pub(super) handler: Arc<H>,
     pub(super) state: ListenerState,
-    /// Where the connections run.
+    /// The tracker in which the tasks of the connections run.
     pub(super) tasks: TaskTracker,
     pub(super) stop: CancellationToken,
 }
@@ -131,7 +131,7 @@ pub(super) trait Accept: Send {
     fn has_client(&self) -> bool;
 }
 
-/// Listens until it is dropped.
+/// A socket that listens until this value is dropped.
 pub(super) struct ListeningSocket(TcpListener);
 
 impl ListeningSocket {
@@ -156,7 +156,7 @@ impl Accept for ListeningSocket {
     }
 }
 
-/// Errors of a connection that ended before it was accepted (accept(2)).
+/// Whether the error is one of a connection that ended before it was accepted (accept(2)).
 fn concerns_one_client(error: &io::Error) -> bool {
     matches!(
         error.kind(),

@@ -20,11 +20,11 @@ struct All {
 struct Entry {
     server: ServerKind,
     pub address: SocketAddr,
-    /// Why it does not listen.
+    /// Why the listener does not listen.
     why: Option<String>,
 }
 
-/// A listener among all; it is one of them until this is dropped.
+/// The state of one listener; dropping it removes the listener from all states.
 #[derive(Debug)]
 pub(crate) struct ListenerState {
     all: Arc<ListenerStates>,

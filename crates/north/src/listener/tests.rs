@@ -10,7 +10,7 @@ use tokio::sync::mpsc;
 use super::accept::Accept;
 use super::*;
 
-/// Fails a number of times, then accepts.
+/// A listener that fails a number of times and then accepts.
 struct Failing(Vec<io::Error>, TcpListener);
 
 impl Accept for Failing {
@@ -26,7 +26,7 @@ impl Accept for Failing {
     }
 }
 
-/// Has one place.
+/// A handler with one place, which records what happens.
 struct Recorder {
     events: mpsc::UnboundedSender<&'static str>,
     taken: Mutex<bool>,
@@ -46,7 +46,7 @@ impl ConnectionHandler for Recorder {
 
     async fn serve(self: Arc<Self>, mut stream: Dated<TcpStream>, _: SocketAddr, (): ()) {
         self.events.send("served").unwrap();
-        // Until the client closes.
+        // The connection lasts until the client closes it.
         let _ = stream.read(&mut [0]).await;
         *self.taken.lock().unwrap() = false;
         self.events.send("ended").unwrap();

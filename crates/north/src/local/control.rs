@@ -6,18 +6,18 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::http::messages::ReloadOutcome;
 
-/// Most waiting commands; there are no more clients than that.
+/// Most waiting commands; no more than this many clients can exist.
 const WAITING: usize = super::MAX_CLIENTS;
 
 /// A request to reload the configuration.
 #[derive(Debug)]
 pub struct ReloadOrder {
     pub who: String,
-    /// Where the outcome goes.
+    /// Receives the outcome of the reload.
     pub answer: oneshot::Sender<ReloadOutcome>,
 }
 
-/// How the local socket reaches the gateway that it belongs to.
+/// What the local socket needs to reach its gateway.
 #[derive(Debug, Clone)]
 pub struct Control {
     config: PathBuf,

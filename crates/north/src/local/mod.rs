@@ -34,9 +34,9 @@ use crate::{NorthState, ServerError};
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
 
-/// Clients at one time.
+/// Most clients at one time.
 const MAX_CLIENTS: usize = 32;
-/// All clients are of this machine and share one limit.
+/// The address that all local clients count under, so that they share one limit.
 const THIS_MACHINE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// Time for the first byte of a client.
 const FIRST_BYTE: Duration = Duration::from_secs(10);
@@ -48,11 +48,11 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 pub struct Options {
     /// The path of the socket.
     pub socket: SocketPath,
-    /// The gateway that it belongs to, where that has a configuration file.
+    /// The gateway of this socket, if that gateway has a configuration file.
     pub control: Option<Control>,
 }
 
-/// The HTTP API for local clients, and the gateway that they reach.
+/// What local clients reach: the HTTP API and the gateway.
 #[derive(Debug)]
 struct Door {
     http: SocketDoor,
@@ -64,7 +64,7 @@ struct Door {
 #[derive(Debug)]
 pub struct Local {
     path: PathBuf,
-    /// Whether those who reached it may still write.
+    /// Whether local users may still write.
     right: Arc<AtomicBool>,
     task: JoinHandle<()>,
     connections: TaskTracker,

@@ -24,10 +24,10 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Where the socket is to be.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum SocketPath {
-    /// In the runtime directory.
+    /// The default name in the runtime directory.
     #[default]
     Default,
-    /// There.
+    /// This path.
     At(PathBuf),
     /// Nowhere.
     Off,
@@ -60,7 +60,7 @@ impl RuntimeDirectories {
         }
     }
 
-    /// Most specific first.
+    /// All runtime directories, the most specific first.
     fn all(&self) -> impl Iterator<Item = PathBuf> {
         let given = [self.service.clone(), self.session.clone()].into_iter().flatten();
         given.chain([PathBuf::from(SYSTEM_DIRECTORY)])
@@ -95,7 +95,7 @@ fn numbered(directory: PathBuf) -> Vec<PathBuf> {
     (1..=MAX_GATEWAYS).map(|number| directory.join(name(number))).collect()
 }
 
-/// A socket that this process listens on; its file goes with it.
+/// A socket that this process listens on; dropping it removes the file of the socket.
 #[derive(Debug)]
 pub(super) struct Bound {
     pub(super) listener: UnixListener,
@@ -179,7 +179,7 @@ async fn remove_if_dead(path: &Path) -> io::Result<()> {
     match UnixStream::connect(path).await {
         Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => std::fs::remove_file(path),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        // As many clients wait there as may.
+        // As many clients wait at that socket as can wait.
         Err(error) if error.kind() == io::ErrorKind::WouldBlock => in_use("another gateway listens there"),
         Err(error) => Err(error),
         Ok(_) => in_use("another gateway listens there"),
@@ -224,7 +224,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let paths = numbered(folder.path().to_path_buf());
         let path = &paths[0];
-        // As a process leaves it that was killed.
+        // A process that was killed leaves such a file.
         drop(std::os::unix::net::UnixListener::bind(path).unwrap());
         assert!(path.exists());
         let first = bind(path).await.unwrap();
@@ -241,7 +241,7 @@ mod tests {
         assert!(!path.exists() && paths[1].exists(), "each removes its own");
         let third = bind_first(&paths).await.unwrap();
         assert_eq!(&third.path, path);
-        // Someone put another file in its place.
+        // Another program puts a file of its own in the socket's place.
         std::fs::remove_file(path).unwrap();
         std::fs::write(path, "mine").unwrap();
         drop(third);

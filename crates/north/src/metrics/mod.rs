@@ -89,7 +89,7 @@ fn weight<'r>(range: &'r str, wanted: &[&str]) -> Option<(Option<&'r str>, f64)>
     Some((version, weight))
 }
 
-/// All metrics as text.
+/// All metrics of the gateway as text.
 ///
 /// # Errors
 /// The encoder fails, which it does not when it writes to a string.

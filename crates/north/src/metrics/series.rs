@@ -8,7 +8,7 @@ use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
 use crate::process_image::HistogramSnapshot;
 
-/// Label of a series: its name and value.
+/// A label of a series: name and value.
 pub(super) type Label = (&'static str, Cow<'static, str>);
 
 /// Labels of a series. A plant has thousands of them, so that those of a drive share what they have in common.
@@ -147,7 +147,7 @@ impl Families {
         self.add(family, Labels::default(), figure);
     }
 
-    /// Brings the series of a family together, as they were added.
+    /// Brings together the series of each family without changing their order.
     pub(super) fn sort(&mut self) {
         self.series.sort_by_key(|(family, ..)| *family);
     }

@@ -37,7 +37,7 @@ const KEEPALIVE_PROBES: u32 = 3;
 pub(super) enum WriteAccess {
     /// The address decides: these networks may write.
     ByAddress(Vec<IpNet>),
-    /// The role in its certificate.
+    /// Clients may write by the role in their certificate.
     ByCertificate(Arc<TlsAuthenticator>),
 }
 

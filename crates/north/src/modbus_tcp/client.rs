@@ -61,7 +61,7 @@ impl Client {
         self
     }
 
-    /// The origin of its commands.
+    /// The origin of this client's commands.
     pub(super) fn origin(&self) -> Origin {
         let origin = Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str());
         origin.proven(self.proof.clone()).with_right(self.right.clone())

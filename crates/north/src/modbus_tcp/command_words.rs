@@ -42,7 +42,7 @@ mod tests {
         assert_eq!(write(2, 1, 1), None);
         assert_eq!(write(2, 1, 5), Some(1));
         assert_eq!(write(3, 2, 1), None, "another unit");
-        // A reload swaps the two, and swaps them back.
+        // A reload swaps the two machines, and swaps them back.
         assert_eq!(write(2, 2, 5), None);
         assert_eq!(write(2, 1, 5), None);
         assert_eq!(write(2, 1, 1), Some(5));

@@ -21,7 +21,7 @@ use crate::reading::Reader;
 
 /// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time limit for the client to accept part of its answers.
+/// Time limit for the client to accept a part of its answers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for pending requests when the gateway stops, and for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
@@ -124,7 +124,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         loop {
             let consumed = self.process(&mut input_end);
             self.dialogue.collect(self.now.into_std());
-            // Before the responses are sent: a client with a response is in use.
+            // Noted before the responses are sent: a client with a response is in use.
             if consumed.frames > 0 {
                 self.used();
             }
@@ -246,7 +246,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     /// Pending requests are answered: each was accepted, and its answer comes within its expiry. When the server stops they have
     /// half a second.
     async fn finish_pending(&mut self, stopping: &CancellationToken) {
-        // A client that is too slow for its answers is not waited for.
+        // A client that reads its answers too slowly is not waited for.
         let within = |flushed: Result<Result<(), End>, _>| flushed.unwrap_or(Err(End::NotReading));
         let answered = async {
             within(tokio::time::timeout(CLOSE_TIMEOUT, flush(&mut self.stream, &mut self.dialogue)).await)?;
@@ -272,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reading {
     On,
-    /// The client has finished, or too many of its requests wait.
+    /// No more input is read: the client has finished, or too many of its requests wait.
     Paused,
 }
 

@@ -16,7 +16,7 @@ use crate::order::Arrival;
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
 /// Maximum input buffer.
 const INPUT_MOST: usize = 32 * MAX_FRAME;
-/// Maximum output collected before it is written.
+/// Maximum output collected before it is written, bytes.
 const OUTPUT: usize = 32 * 1024;
 /// Maximum number of requests of one connection that wait for the bus; beyond it no input is processed.
 pub(super) const MOST_WAITING: usize = 16;
@@ -39,7 +39,7 @@ pub(super) struct Dialogue {
     filled: usize,
     /// Whether any frame arrived.
     begun: bool,
-    /// How they came.
+    /// How and when the bytes of the input arrived.
     arrivals: Arrivals,
     pub(super) output: Vec<u8>,
 }
@@ -132,7 +132,7 @@ impl Dialogue {
             )
     }
 
-    /// Whether there is any input.
+    /// Whether the input holds any bytes.
     pub(super) fn has_input(&self) -> bool {
         self.filled > 0
     }
@@ -147,7 +147,7 @@ impl Dialogue {
         !self.waiting.is_empty()
     }
 
-    /// Appends the answers that have arrived, so that they are sent together.
+    /// Appends all answers that have arrived, so that they are sent together.
     pub(super) fn collect(&mut self, now: Instant) {
         while let Some(Some(answered)) = self.waiting.next().now_or_never() {
             self.finish(answered, now);

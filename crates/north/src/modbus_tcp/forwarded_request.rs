@@ -34,7 +34,7 @@ pub(super) struct ForwardedRequest {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct ReadBehind {
     pub(super) at: At,
-    /// In the drive.
+    /// First address in the registers of the drive.
     pub(super) start: u16,
     pub(super) count: u16,
 }
@@ -45,9 +45,9 @@ pub(super) enum BusWork {
     Order(Order),
     /// The stop of a request whose rest is refused; the refusal is audited.
     Stop(Order, Refusal),
-    /// Nothing: it is done, and only the read behind it is left.
+    /// No work: the write is done, and only the read behind it is left.
     Written,
-    /// Nothing, because it is refused; the refusal is audited.
+    /// No work, because the request is refused; the refusal is audited.
     Refused(Refusal),
     /// A read that is split by object.
     Parts(Vec<ReadPart>),
@@ -83,7 +83,7 @@ impl PartialRead {
 /// State of a forwarded request.
 #[derive(Debug)]
 pub(super) enum Progress {
-    /// A command of it is in the queue.
+    /// A command of the request is in the queue.
     Pending(PendingRequest),
     /// The outcome of the request is known.
     Done(Box<ForwardedRequest>, Outcome),
@@ -103,7 +103,7 @@ pub(super) enum PendingRequest {
 #[derive(Debug)]
 pub(super) enum AnsweredRequest {
     Forwarded(Box<ForwardedRequest>, Outcome),
-    /// A stop of all drives, and whether every drive acknowledged it.
+    /// A stop of all drives, with whether every drive acknowledged it.
     StopAll(Header, RequestPdu, bool),
 }
 
@@ -146,7 +146,7 @@ impl ForwardedRequest {
         }
     }
 
-    /// Queues its command, or the first one of several, before this returns.
+    /// Queues the command of the request, or the first of several commands, before it returns.
     pub(super) fn send(self, work: BusWork, client: &Client, arrival: Arrival, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
@@ -247,7 +247,7 @@ impl ForwardedRequest {
     }
 }
 
-/// The registers of the common model from there on.
+/// The registers of the common model from this address on.
 ///
 /// # Errors
 /// Exception 02 where there are none.

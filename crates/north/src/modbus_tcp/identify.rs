@@ -23,7 +23,7 @@ const VENDOR: &str = "drivegate";
 pub(super) struct Identity<'t> {
     /// ProductCode: name of the profile, or `gateway`.
     pub(super) product: &'t str,
-    /// ProductName: title of the profile, with what is doubtful of it.
+    /// ProductName: the title of the profile, with a note where the profile is doubtful.
     pub(super) title: &'t str,
     /// ModelName: name of the drive or of the gateway.
     pub(super) name: &'t str,

@@ -102,7 +102,7 @@ impl Options {
         }
     }
 
-    /// Connections, with some kept for those who may write if there are any.
+    /// Limits of connections; some places are kept for clients that may write, if any may.
     fn limits(&self) -> Limits {
         let limits = Limits::new(self.max_connections, self.max_connections_per_address);
         let by_address = self.listeners.iter().any(|listener| !listener.write.is_empty());
@@ -126,9 +126,9 @@ pub struct Listener {
     pub section: String,
     /// Addresses to listen on.
     pub listen: Vec<SocketAddr>,
-    /// Networks that may connect.
+    /// Networks whose clients may connect.
     pub allow: Vec<IpNet>,
-    /// Networks that may write.
+    /// Networks whose clients may write.
     pub write: Vec<IpNet>,
     /// The register view that clients see.
     pub view: View,
@@ -155,7 +155,7 @@ pub struct ModbusTcp {
     plant: SharedPlant,
     /// Where clients without TLS are served.
     own: Handle,
-    /// Listeners opened so far.
+    /// Number of listeners opened so far.
     opened: usize,
 }
 
@@ -176,7 +176,7 @@ impl TcpService<Options> for ModbusTcp {
         Ok(ModbusTcp {
             authenticator: None,
             state: Arc::new(ServerState::new(options.clone(), stats, cancel)),
-            // With its tasks the thread ends.
+            // The thread ends when its tasks have ended.
             own: start_thread(tasks, plant.load().events.clone())?,
             plant,
             opened: 0,
@@ -288,12 +288,12 @@ struct ServerState {
     stats: Arc<NorthState>,
     command_words: CommandWords,
     connections: Arc<ConnectionLimit>,
-    /// TLS connections before they are admitted.
+    /// Limit of TLS connections that are not admitted yet.
     handshakes: Arc<ConnectionLimit>,
     refusals: Refusals,
     /// Log lines about clients that send RTU frames over TCP.
     serial_clients: LogThrottle,
-    /// Cancelled when the server ends: its clients are not waited for any longer.
+    /// Cancelled when the server ends: from then on it does not wait for its clients.
     stopping: CancellationToken,
 }
 

@@ -21,7 +21,7 @@ use crate::reading::{Reader, Watch};
 pub struct Offline {
     dialogue: Dialogue,
     watch: Arc<Watch>,
-    /// Since the connection was opened.
+    /// The reader, from the opening of the connection on.
     reader: Option<Reader>,
     /// Input that the dialogue has no room for yet.
     backlog: Vec<u8>,
@@ -75,7 +75,7 @@ impl Offline {
         self.take(bytes, false, now)
     }
 
-    /// As [`Offline::receive`], from a client that has closed the connection behind `bytes`.
+    /// Takes bytes like [`Offline::receive`], from a client that closed the connection behind `bytes`.
     pub fn receive_last(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let answers = self.take(bytes, true, now);
         if let Some(reader) = &self.reader {

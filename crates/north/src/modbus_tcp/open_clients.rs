@@ -34,7 +34,7 @@ struct OpenClient {
     chain: Vec<CertificateDer<'static>>,
     role_name: Option<String>,
     role: Role,
-    /// For the log.
+    /// The client's name in the log.
     who: String,
     refused: CancellationToken,
     /// Rights of the client, once it has a place.
@@ -42,7 +42,7 @@ struct OpenClient {
 }
 
 impl OpenClient {
-    /// Why the client may not stay, if so.
+    /// Why the client may not stay; `None` if it may.
     fn objection(&self, requirements: &Requirements, now: SystemTime) -> Option<String> {
         if let Err(error) = requirements.check(&self.chain, now) {
             return Some(format!("its certificate is no longer accepted: {error}"));
@@ -129,12 +129,12 @@ impl OpenClients {
     }
 }
 
-/// A connected client; dropped when it disconnects.
+/// A connected client; it counts as disconnected when this value is dropped.
 #[derive(Debug)]
 pub(super) struct CertificateGuard {
     clients: Arc<OpenClients>,
     id: u64,
-    /// When its certificates expire, seconds since 1970.
+    /// When the client's certificates expire, seconds since 1970.
     ends: Vec<u64>,
     refused: CancellationToken,
 }

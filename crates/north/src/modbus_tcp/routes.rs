@@ -16,14 +16,14 @@ pub struct View {
     pub buses: Option<Vec<String>>,
     /// Name of the drive at units 0 and 255, in place of the gateway's own registers.
     pub default_drive: Option<String>,
-    /// Where its registers are.
+    /// Where the view's registers are.
     pub registers: Registers,
 }
 
 /// The registers of a drive that clients see.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Registers {
-    /// The common model from 0x8000 on, and those of the drive below.
+    /// The common model from 0x8000 on, and the registers of the drive below.
     #[default]
     Model,
     /// The common model from 0 on, and those of the drive from 0x0300 on.
@@ -35,9 +35,9 @@ pub enum Registers {
 /// Where a register of a client is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum At {
-    /// In the common model, by its address from 0x8000 on.
+    /// In the common model, at this address counted from 0x8000.
     Model(u16),
-    /// In the drive.
+    /// In the registers of the drive.
     Drive,
     /// Nowhere.
     Nowhere,
@@ -49,7 +49,7 @@ const FLOATS_AT: u16 = 0x0200;
 const DRIVE_AT: u16 = 0x0300;
 
 impl Registers {
-    /// How it is named where it is listed.
+    /// Name of this choice where registers are listed.
     pub fn name(self) -> &'static str {
         match self {
             Registers::Model => "model",
@@ -120,7 +120,7 @@ impl Registers {
     }
 }
 
-/// A view, and since when clients have it: none of the first one.
+/// A view, and the time since clients have it; no time for the first view.
 #[derive(Debug)]
 struct Shown {
     view: View,
@@ -159,7 +159,7 @@ impl PlantView {
         self.shown.store(Arc::new(Shown { view, since }));
     }
 
-    /// Whether that bus is visible.
+    /// Whether a bus is visible.
     pub(super) fn shows(&self, bus: &str) -> bool {
         self.shown.load().view.has(bus)
     }
@@ -256,7 +256,7 @@ impl Routes {
         &self.drives
     }
 
-    /// All of these drives, to stop them.
+    /// All visible drives, as the scope of a stop.
     pub(super) fn scope(&self) -> Scope {
         match &self.shown.view.buses {
             Some(buses) => Scope::Buses(buses.clone()),
@@ -264,7 +264,7 @@ impl Routes {
         }
     }
 
-    /// The bus at that index of the configuration, if it is visible.
+    /// The bus with this index in the configuration, if that bus is visible.
     pub(super) fn bus(&self, index: usize) -> Option<&BusHandle> {
         let visible = self.visible.get(index).copied().unwrap_or_default();
         self.plant.buses.get(index).filter(|_| visible)

@@ -29,7 +29,7 @@ use crate::register_map::{
 };
 use crate::stop_all;
 
-/// Function codes that write.
+/// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
 /// Function codes that every drive supports, through the blocks from 0x8000 on and the device identification.
 const OWN_FUNCTIONS: [u8; 6] = [3, 4, 6, 16, 23, 43];

@@ -32,7 +32,7 @@ const HANDSHAKE: Duration = Duration::from_secs(10);
 pub struct Tls {
     /// Addresses to listen on.
     pub listen: Vec<SocketAddr>,
-    /// Networks that may connect.
+    /// Networks whose clients may connect.
     pub allow: Vec<IpNet>,
     /// Names of the visible buses; `None` for all.
     pub buses: Option<Vec<String>>,
@@ -158,7 +158,7 @@ impl Requirements {
         })
     }
 
-    /// Whether the certificates of a client, its own first, are accepted at `now`.
+    /// Whether a client's certificates, its own first, are accepted at `now`.
     ///
     /// # Errors
     /// Why they are not.

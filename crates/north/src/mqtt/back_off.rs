@@ -15,7 +15,7 @@ pub(super) struct Rotation {
     current: usize,
     /// Brokers tried since the last wait that duplicate.
     tried: usize,
-    /// How often the turn came back to the first one.
+    /// Number of times that the turn came back to the first broker.
     round: usize,
     wait: Duration,
 }
@@ -36,7 +36,7 @@ impl Rotation {
         self.current
     }
 
-    /// How often the turn came back to the first broker.
+    /// Number of times that the turn came back to the first broker.
     pub(super) fn round(&self) -> usize {
         self.round
     }

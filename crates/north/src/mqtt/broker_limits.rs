@@ -21,7 +21,7 @@ pub(super) struct BrokerLimits {
     pub(super) wildcards: bool,
     /// Number of topic aliases.
     pub(super) aliases: u16,
-    /// The keep-alive interval that it set instead of ours, s.
+    /// Keep-alive interval that the broker set in place of ours, s.
     pub(super) keep_alive: Option<u16>,
 }
 

@@ -51,7 +51,7 @@ const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 /// Minimum time between two log lines about lost messages.
 const LOST_LOGGED: Duration = Duration::from_secs(60);
 
-/// Expiring messages are renewed after this fraction of their time.
+/// Expiring messages are renewed after their time divided by this number.
 const RENEWED: u32 = 2;
 
 /// An expiry in whole seconds: 0 would mean at once.
@@ -90,14 +90,14 @@ struct PlainClient {
     history: Store,
     history_at: Instant,
     commands: Commands,
-    /// When `online` is published again, before it expires.
+    /// When `online` is published again, shortly before it expires.
     renew_at: Option<Instant>,
     /// When messages that the broker refused are published again, and log lines about them.
     retry: Retry,
     refused: LogThrottle,
     /// Number of events lost because they arrived too fast.
     missed: u64,
-    /// How many lost messages were logged, and log lines about them.
+    /// Number of lost messages already logged, and the limit for log lines about them.
     lost_logged: u64,
     lost: LogThrottle,
     repair: Repair,
@@ -221,7 +221,7 @@ impl PlainClient {
         }
     }
 
-    /// Publishes `online` again: someone published another status, or it would expire.
+    /// Publishes `online` again if someone published another status, or if it would expire.
     fn repair_status(&mut self, now: Instant) {
         let renews = self.renew_at.is_some_and(|at| now >= at);
         if self.is_alive() && (self.repair.take(now) || renews) {
@@ -279,7 +279,7 @@ impl PlainClient {
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!(target: "drivegate::north::mqtt", "the MQTT buffer is too slow: the last messages may be missing after a restart");
         }
-        // The client that replaces it after a reload continues with them.
+        // The client that follows after a reload continues with these events.
         let mut left = self.common.stats.mqtt_left.lock();
         left.unread = Some(self.events);
         left.client = ClientLeft {
@@ -451,7 +451,7 @@ impl session::Client for PlainClient {
         self.commands.is_idle()
     }
 
-    /// Sends what waits, then `offline`.
+    /// Sends the waiting messages, then `offline`.
     async fn say_goodbye(&mut self) -> bool {
         let status: Arc<str> = self.topics.status().into();
         let last_results = tokio::time::Instant::now() + LAST_RESULTS;

@@ -33,7 +33,7 @@ const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
-/// Processes commands and returns their results.
+/// Processes commands and publishes their results.
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
@@ -52,7 +52,7 @@ pub(super) struct Commands {
 /// The configuration of commands.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
-    /// Where results may go.
+    /// Topics that results may go to.
     pub(super) responses: ResponseTopics,
     /// Commands without an `id` are refused, except stops.
     pub(super) require_id: bool,
@@ -60,7 +60,7 @@ pub(super) struct Rules {
     pub(super) right: Right,
 }
 
-/// Pending results that a client hands over to its successor.
+/// Pending results that a client hands to its successor.
 #[derive(Debug, Default)]
 pub(super) struct OrdersLeft {
     waiting: PendingCommands,
@@ -70,7 +70,7 @@ pub(super) struct OrdersLeft {
     pub(super) results: Vec<Message>,
 }
 
-/// A command, until it is answered.
+/// A command that is not answered yet.
 #[derive(Debug)]
 pub(super) struct PendingCommand {
     number: u64,
@@ -328,7 +328,7 @@ impl Commands {
         }
     }
 
-    /// There are no more of them than commands that the gateway keeps.
+    /// The list holds no more stops than the commands that the gateway keeps.
     fn poll_stopped(&mut self, cx: &mut Context<'_>) -> Poll<(Reply, StopReport)> {
         for (index, stop) in self.stopping.iter_mut().enumerate() {
             if let Poll::Ready(report) = Pin::new(&mut stop.report).poll(cx) {

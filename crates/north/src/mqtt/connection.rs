@@ -79,11 +79,11 @@ pub(super) enum Step {
     Refused(u16, PubAckReason),
     /// A message on a topic that was subscribed to.
     Message(Box<Incoming>),
-    /// There is room for further messages.
+    /// The connection has room for further messages.
     Room,
     /// A ping was sent to the broker.
     Pinged,
-    /// Nothing for the client, such as any other packet from the broker.
+    /// Nothing that concerns the client, such as any other packet from the broker.
     Nothing,
     /// The connection stands and cannot be used any more, for this reason: it is to be given up.
     Stuck(&'static str),
@@ -101,14 +101,14 @@ pub(super) struct Connection {
     backlog: Arc<Backlog>,
     aliases: Box<Aliases>,
     silence: Silence,
-    /// No message may be published before then.
+    /// Time before which no message may be published.
     held_until: Option<Instant>,
     /// The subscription that is repeated to test a silent broker.
     question: Option<Filter>,
     /// Number of subscriptions whose answers are awaited, and the answers so far.
     wanted: usize,
     answers: Vec<Option<String>>,
-    /// `None` once it ends by itself.
+    /// The task; `None` once it ends by itself.
     task: Option<JoinHandle<()>>,
 }
 
@@ -207,7 +207,7 @@ impl Connection {
             let password = password.map(|password| password.0).unwrap_or_default();
             mqtt.set_credentials(user, password);
         }
-        // Behind a proxy nothing is looked up but its own name.
+        // Behind a proxy, the only name to look up is the name of the proxy.
         let dialled = match &options.proxy {
             None => broker.clone(),
             Some((host, port)) => Broker {
@@ -305,7 +305,7 @@ impl Connection {
         verdict == Verdict::Lost
     }
 
-    /// Publishes a message; false if there is no room until [`Step::Room`].
+    /// Publishes a message; returns false if no room is left until [`Step::Room`].
     pub(super) fn publish(&mut self, message: Message, limits: BrokerLimits) -> bool {
         let waiting = self.backlog.messages.load(Ordering::SeqCst);
         if let Err(until) = self.backlog.rate().take(waiting, Instant::now()) {
@@ -455,7 +455,7 @@ fn mqtt_options(
     mqtt
 }
 
-/// The broker as the library names it.
+/// The broker's address in the form of the library.
 fn target(broker: &Broker) -> rumqttc::Broker {
     // TLS would take an IPv6 address with brackets for a name.
     let plain = || rumqttc::Broker::tcp(broker.bare_host(), broker.port);
@@ -542,7 +542,7 @@ fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
             Incoming::of(publish, arrival).map(|message| Step::Message(Box::new(message)))
         }
         Event::Incoming(_) => Some(Step::Nothing),
-        // A packet id was about to be used again before its acknowledgement.
+        // A packet id would have been used again before its acknowledgement.
         Event::Outgoing(Outgoing::AwaitAck(_)) => Some(Step::Stuck("the broker did not acknowledge a message")),
         Event::Outgoing(Outgoing::PingReq) => Some(Step::Pinged),
         Event::Outgoing(_) | Event::Auth(_) => None,
@@ -656,7 +656,7 @@ fn packets(filters: Vec<Filter>, most: usize) -> Vec<Vec<Filter>> {
     let most_filters = MOST_FILTERS.max(filters.len().div_ceil(MOST_PACKETS));
     let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
     for filter in filters {
-        // Besides the path: its length, the options; the head of the packet.
+        // Each filter needs, besides its path, the path's length and the options; each packet has a head.
         let bytes = filter.path.len() + 3;
         let has_room = |(size, packet): &&mut (usize, Vec<Filter>)| size + bytes <= most && packet.len() < most_filters;
         match packets.last_mut().filter(has_room) {

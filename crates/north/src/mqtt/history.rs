@@ -22,7 +22,7 @@ pub(super) struct Recorder {
     entries: usize,
     array: Vec<u8>,
     begun: Option<Instant>,
-    /// Largest packet of the broker, bytes, as far as it is known.
+    /// Largest packet that the broker accepts, bytes, if known.
     max_packet: usize,
     /// Arrays that are complete because the broker takes no larger ones.
     complete: Vec<Update>,
@@ -98,7 +98,7 @@ impl Recorder {
         }
     }
 
-    /// All arrays, the last one as far as it goes.
+    /// All arrays, including the unfinished last one.
     pub(super) fn take_all(&mut self) -> Vec<Update> {
         let last = self.take();
         std::mem::take(&mut self.complete).into_iter().chain(last).collect()

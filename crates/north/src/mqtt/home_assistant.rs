@@ -26,7 +26,7 @@ const BIRTHS: Duration = Duration::from_secs(10);
 #[derive(Debug, Clone)]
 pub(super) struct Sources {
     pub(super) topics: Topics,
-    /// Which telemetry is published.
+    /// The telemetry that is published.
     pub(super) telemetry: Telemetry,
     /// Whether the set topics are served.
     pub(super) commands: bool,
@@ -49,7 +49,7 @@ pub(super) struct Announcer {
     /// A device has another number of messages.
     changed: bool,
     begun: Option<Instant>,
-    /// Home Assistant was started: everything is announced again then.
+    /// When everything is announced again because Home Assistant was started.
     again: Option<Instant>,
 }
 
@@ -77,7 +77,7 @@ impl Announcer {
         }
     }
 
-    /// Announces the devices of this plant from now on, all of them again.
+    /// Announces the devices of this plant from now on, and announces all of them again.
     pub(super) fn adopt(&mut self, plant: &Plant) {
         let gateway = Device::gateway(&self.gateway, plant);
         let drives = plant
@@ -139,7 +139,7 @@ impl Announcer {
         self.devices.iter().flat_map(|announced| &announced.topics)
     }
 
-    /// Whether there are other topics than at the last call.
+    /// Whether the topics have changed since the last call.
     pub(super) fn take_changed(&mut self) -> bool {
         std::mem::take(&mut self.changed)
     }

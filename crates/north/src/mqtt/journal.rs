@@ -41,11 +41,11 @@ struct Segment {
     end: u64,
     /// Up to here the records were loaded.
     read: u64,
-    /// Number of its first and of its last message.
+    /// Numbers of the first and the last message in the segment.
     numbers: Option<(u64, u64)>,
 }
 
-/// The messages on disk, and behind them those in memory.
+/// The messages on disk, and after them the messages in memory.
 #[derive(Debug)]
 pub(super) struct Journal {
     /// `None`: everything stays in memory.
@@ -169,7 +169,7 @@ impl Journal {
                 && end == 0
                 && !is_full(&error)
             {
-                // Nothing in it is understood, and nothing of it could be kept elsewhere.
+                // The gateway understands nothing in the file and could keep none of it elsewhere.
                 let path = path.display();
                 tracing::warn!(target: "drivegate::north::mqtt", "{path}: nothing in it is valid; it is left as it \
                                                                   is, and nothing from it is published");
@@ -247,7 +247,7 @@ impl Journal {
         self.unwritten.push_back((self.last, message));
     }
 
-    /// Drops the first message that waits to be written; its number.
+    /// Drops the first message that waits to be written; returns its number.
     fn drop_unwritten(&mut self) -> Option<u64> {
         let (number, message) = self.unwritten.pop_front()?;
         self.unwritten_bytes -= message.bytes();
@@ -330,7 +330,7 @@ impl Journal {
         }
     }
 
-    /// The next message is this one; those between are lost.
+    /// Notes that the next message is this one; the messages in between are lost.
     fn pass(&mut self, number: u64) {
         if number <= self.passed {
             return;
@@ -342,12 +342,12 @@ impl Journal {
         self.passed = number;
     }
 
-    /// All messages up to this number are acknowledged.
+    /// Notes that all messages up to this number are acknowledged.
     pub(super) fn acknowledge(&mut self, number: u64) {
         self.acknowledged = self.acknowledged.max(number.min(self.last));
     }
 
-    /// Writes what was appended and acknowledged; whether there was anything to write.
+    /// Writes appended messages and acknowledgements; returns whether there was anything to write.
     ///
     /// # Errors
     /// The disk does not take it; it stays in memory, and the next call tries again.
@@ -474,7 +474,7 @@ impl Journal {
             segment.file.read_exact_at(&mut bytes, 0)?;
             let file = (place.create)(&segment.path)?;
             if let Err(error) = file.write_all_at(&bytes, 0) {
-                // The next attempt creates it again.
+                // The next attempt creates the file again.
                 let _ = fs::remove_file(&segment.path);
                 return Err(error);
             }

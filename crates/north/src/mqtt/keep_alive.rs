@@ -14,9 +14,9 @@ const OF_INTERVAL: f64 = 0.8;
 /// The decision about a broker that may be silent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// Nothing.
+    /// The broker is fine; nothing has to be done.
     Fine,
-    /// Send it a request that it must answer.
+    /// Send the broker a request that it must answer.
     Ask,
     /// The connection is lost.
     Lost,
@@ -25,7 +25,7 @@ pub(super) enum Verdict {
 /// How long the broker has been silent.
 #[derive(Debug)]
 pub(super) struct Silence {
-    /// Time of its last packet.
+    /// Time of the broker's last packet.
     heard: Instant,
     /// Whether a test subscription was sent, and the answer is still to come.
     asked: bool,
@@ -137,7 +137,7 @@ mod tests {
             assert_eq!(hour(interval, true, Some(pings)), (vec![], None));
             assert_eq!(hour(interval, true, None), (vec![], Some(31)));
         }
-        // Before the library closes the connection, after two intervals.
+        // The silence is noticed before the library closes the connection after two intervals.
         for (interval, pings, lost) in [(None, 10, 18), (Some(10), 10, 18), (Some(5), 5, 9), (Some(20), 20, 31)] {
             assert_eq!(hour(interval, false, Some(pings)).1, Some(lost), "{interval:?}");
         }

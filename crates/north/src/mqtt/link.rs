@@ -31,7 +31,7 @@ pub(super) enum Due {
 
 #[derive(Debug)]
 enum State {
-    /// No connection; the next attempt follows then.
+    /// No connection; the next attempt follows at `retry_at`.
     Down { retry_at: Instant },
     /// A connection that the broker may not have accepted yet.
     Up(Box<Connection>, Phase),
@@ -59,7 +59,7 @@ impl Phase {
 pub(super) struct BrokerLink {
     options: Arc<Options>,
     client_id: String,
-    /// Prefix of its log lines.
+    /// Prefix of the link's log lines.
     prefix: &'static str,
     state: State,
     rotation: Rotation,
@@ -96,7 +96,7 @@ impl BrokerLink {
         }
     }
 
-    /// The broker whose turn it is.
+    /// The broker that is tried now.
     pub(super) fn broker(&self) -> Broker {
         let broker = self.options.brokers.get(self.rotation.current());
         broker.cloned().unwrap_or_default()
@@ -238,13 +238,13 @@ impl BrokerLink {
         }
     }
 
-    /// Subscribes; false if the connection does not take it.
+    /// Subscribes; returns false if the connection does not accept the packet.
     pub(super) fn subscribe(&mut self, filters: Vec<Filter>) -> bool {
         let accepted = self.accepted();
         accepted.is_none_or(|(connection, limits)| connection.subscribe(filters, limits))
     }
 
-    /// Publishes a message; false if there is no room, or no connection.
+    /// Publishes a message; returns false if room or a connection is lacking.
     pub(super) fn publish(&mut self, message: Message) -> bool {
         let accepted = self.accepted();
         accepted.is_some_and(|(connection, limits)| connection.publish(message, limits))
@@ -326,7 +326,7 @@ impl BrokerLink {
         }
     }
 
-    /// Closes the connection, if there is one; the next attempt follows after `wait`.
+    /// Closes the connection, if any; the next attempt follows after `wait`.
     pub(super) fn close(&mut self, wait: Duration) {
         drop(self.turn_to_next(Some(wait), Instant::now()));
     }

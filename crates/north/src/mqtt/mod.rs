@@ -72,7 +72,7 @@ pub use self::rights::BrokerRights;
 
 pub use self::password::{Password, Secret, SecretFault};
 
-/// Where a broker is.
+/// Address of a broker.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Broker {
     /// Host; an IPv6 address with or without brackets.
@@ -101,9 +101,9 @@ impl Broker {
 /// Configuration of the MQTT client.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// The brokers, in the order in which they are tried; at least one.
+    /// The brokers in the order in which they are tried; at least one.
     pub brokers: Vec<Broker>,
-    /// TLS (`mqtts://`), of all of them.
+    /// Whether all brokers are reached with TLS (`mqtts://`).
     pub tls: bool,
     pub client_id: String,
     /// User name, with password.
@@ -111,15 +111,15 @@ pub struct Options {
     pub password: Option<Password>,
     /// Host and port of an HTTP proxy, by whose CONNECT all brokers are reached.
     pub proxy: Option<(String, u16)>,
-    /// Most messages that each connection publishes in any second; any number with 0.
+    /// Most messages that each connection publishes in any second; 0 sets no limit.
     pub publish_limit: usize,
-    /// CA certificates (PEM) for the broker; those of the system if absent.
+    /// CA certificates (PEM) for the broker; if absent, the certificates of the system.
     pub ca: Option<PathBuf>,
     /// Client certificate chain and key (PEM).
     pub identity: Option<(PathBuf, PathBuf)>,
     /// First level of all topics.
     pub base: String,
-    /// Which telemetry is published.
+    /// The telemetry that is published.
     pub telemetry: Telemetry,
     /// Quality of service of telemetry.
     pub telemetry_qos: Qos,
@@ -151,7 +151,7 @@ pub struct Options {
     pub sparkplug: Option<sparkplug::Options>,
 }
 
-/// Which telemetry is published.
+/// The telemetry that is published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Telemetry {
     /// The state of each drive as one object.
@@ -167,14 +167,14 @@ pub struct Telemetry {
 pub enum Qos {
     /// 0: sent once, not acknowledged.
     AtMostOnce,
-    /// 1: sent until it is acknowledged.
+    /// QoS 1: a message is sent until the broker acknowledges it.
     AtLeastOnce,
 }
 
 /// Which values of an outage are published afterwards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum History {
-    /// None.
+    /// No history.
     #[default]
     Off,
     /// Only values that changed.
@@ -208,7 +208,7 @@ impl Buffer {
 #[derive(Debug, Default)]
 pub struct Mqtt {
     tasks: Vec<JoinHandle<()>>,
-    /// How it runs, and where the rights of its clients are.
+    /// Options that the client runs with, and where the rights of its clients are.
     rights: Option<(Options, Arc<NorthState>)>,
 }
 

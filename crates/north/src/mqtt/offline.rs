@@ -43,7 +43,7 @@ pub struct Offline {
     held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
-    /// With the broker.
+    /// The connection to the broker.
     connection: Connection,
 }
 

@@ -33,9 +33,9 @@ pub(super) struct Message {
     pub(super) topic: Arc<str>,
     pub(super) payload: Vec<u8>,
     pub(super) retain: bool,
-    /// Whether the broker acknowledges it (QoS 1).
+    /// Whether the broker acknowledges the message (QoS 1).
     pub(super) acknowledged: bool,
-    /// The broker drops it after this time, s.
+    /// Time after which the broker drops the message, s.
     pub(super) expiry: Option<u32>,
     /// Correlation data of the request that this answers.
     pub(super) correlation: Option<Vec<u8>>,
@@ -62,7 +62,7 @@ impl Message {
 /// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
-    /// Telemetry of this topic.
+    /// The latest telemetry of this topic.
     Latest(Arc<str>),
     /// Entry of a queue, with this serial number.
     Queued(MqttKind, u64),
@@ -98,7 +98,7 @@ struct Slot {
     /// Time after which a lasting message expires as well, s.
     expiry: Option<u32>,
     in_flight: bool,
-    /// The broker refused it; it waits for [`Outbox::retry`].
+    /// Whether the broker refused the message, which then waits for [`Outbox::retry`].
     put_back: bool,
 }
 
@@ -118,7 +118,7 @@ struct Queue {
     bytes: usize,
     /// The broker refused one of them for now; all wait for [`Outbox::retry`], so that the order stays.
     put_back: bool,
-    /// Given up since the last [`Outbox::take_lost`]: too many waited, or they broke connections.
+    /// Messages given up since the last [`Outbox::take_lost`]: too many waited, or they broke connections.
     lost: u64,
 }
 
@@ -141,7 +141,7 @@ pub(super) struct Outbox {
     unacknowledged: HashMap<u16, Key>,
     /// The first topic of `order` is published before everything else.
     has_leader: bool,
-    /// Whose turn it is: results, events or telemetry.
+    /// The kind that is sent next: results, events or telemetry.
     turn: usize,
 }
 
@@ -168,7 +168,7 @@ impl Outbox {
         self.put_slot(topic, payload, false);
     }
 
-    /// As [`Outbox::put`], for what must arrive and does not expire.
+    /// Puts a message like [`Outbox::put`] does, for messages that must arrive and do not expire.
     pub(super) fn put_lasting(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         self.put_slot(topic, payload, true);
     }
@@ -215,7 +215,7 @@ impl Outbox {
         let serial = self.serial;
         let queue = self.queue_mut(kind);
         while kind != MqttKind::Result && queue.is_full_for(&message) {
-            // Entries in flight are dropped last: they have probably been delivered.
+            // Entries in flight are dropped last, because the broker has probably received them.
             let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
             queue.remove(victim);
             queue.lost += 1;
@@ -259,7 +259,7 @@ impl Outbox {
         }
     }
 
-    /// Whether another command may be received: a result of it finds room.
+    /// Whether another command may be received, because its result would find room.
     pub(super) fn has_room_for_results(&self) -> bool {
         self.results.entries.len() < RESULTS && self.results.bytes < RESULT_BYTES
     }
@@ -371,7 +371,7 @@ impl Outbox {
                 if let Some(slot) = self.latest.get_mut(topic) {
                     (slot.sent, slot.in_flight) = (slot.waiting.take().filter(|_| acknowledged), true);
                 }
-                // At or near the front: only topics in flight come before it.
+                // The topic is at or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
@@ -411,7 +411,7 @@ impl Outbox {
         }
     }
 
-    /// The broker acknowledged a message; its entry is removed.
+    /// Removes the entry whose message the broker acknowledged.
     pub(super) fn acked(&mut self, packet: u16) -> Option<Settled> {
         self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }

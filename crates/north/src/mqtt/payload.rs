@@ -22,14 +22,14 @@ pub(super) fn published_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
 /// The state object of a drive without its times; a change of it is published.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StateContent {
-    /// `None` while it is not known.
+    /// State of the drive; `None` while it is unknown.
     pub(super) state: Option<State>,
     pub(super) quality: Quality,
     /// Why the motor does not run, in one word each.
     pub(super) blocked_by: Vec<String>,
     /// For how long an ordinary stop still waits, in whole seconds.
     pub(super) stop_waits: Option<u64>,
-    /// Whether what was ordered is being written again; none where it never is.
+    /// Whether the drive's orders are being written again; `None` where orders never are.
     pub(super) refreshing: Option<bool>,
     /// Holder of the drive; none where `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
@@ -72,7 +72,7 @@ pub(super) struct StateObject<'s> {
     pub(super) shown: &'s StateContent,
     /// Names in the order of `shown.points`.
     pub(super) names: &'s [String],
-    /// Their indices in the profile.
+    /// The points' indices in the profile.
     pub(super) indices: &'s [PointIndex],
     pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
@@ -158,12 +158,12 @@ pub(super) enum PointPayload {
 }
 
 impl PointPayload {
-    /// The value, if it is good.
+    /// The payload of a point: its value, if that is good.
     pub(super) fn of(value: Option<Value>) -> PointPayload {
         value.map_or(PointPayload::Nothing, PointPayload::Value)
     }
 
-    /// The state of the drive, if it is known.
+    /// The payload of a drive's state, if the state is known.
     pub(super) fn state(state: Option<State>) -> PointPayload {
         state.map_or(PointPayload::Nothing, PointPayload::State)
     }

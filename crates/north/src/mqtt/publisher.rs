@@ -39,7 +39,7 @@ pub(super) struct Publisher {
     /// Woken when a drive was updated.
     fresh: Arc<Notify>,
     drives: Vec<DriveTopics>,
-    /// The drive that is looked at next, of those that are due.
+    /// Index of the drive that is looked at next among the drives that are due.
     cursor: usize,
     buses: Vec<BusTopic>,
     buses_at: Option<Instant>,
@@ -107,7 +107,7 @@ enum PointSource {
 struct BusTopic {
     bus: BusHandle,
     topic: Arc<str>,
-    /// As last published.
+    /// The bus as it was last published.
     state: Option<(BusState, Instant)>,
     figures: Option<(BusFigures, Instant)>,
 }
@@ -166,7 +166,7 @@ impl Publisher {
         self.clear(old);
     }
 
-    /// Clears those of these topics that are no longer published.
+    /// Clears those of the given topics that are no longer published.
     pub(super) fn clear(&mut self, old: impl IntoIterator<Item = Arc<str>>) {
         let present: BTreeSet<Arc<str>> = self.all_topics().cloned().collect();
         self.vanished.extend(old);
@@ -420,7 +420,7 @@ impl DriveTopics {
     }
 }
 
-/// The state object with the first points, of which there are so many.
+/// The state object with the first `fits` points.
 fn render(
     (names, indices, fits): (&[String], &[PointIndex], usize),
     reading: &Reading<'_>,

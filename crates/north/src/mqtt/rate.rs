@@ -68,7 +68,7 @@ mod tests {
             while rate.take(waiting, now).is_ok() {
                 waiting += 1;
             }
-            // The connection stands still now and then.
+            // The connection stops sending now and then.
             if ms % 900 < 400 && waiting > 0 {
                 waiting -= 1;
                 rate.sent(now);

@@ -17,13 +17,13 @@ const ACKNOWLEDGED: u8 = b'A';
 /// The content of a record.
 #[derive(Debug, PartialEq)]
 pub(super) enum Entry {
-    /// A message and its number.
+    /// A message with its number.
     Message(u64, Message),
     /// All messages up to this number are acknowledged.
     Acknowledged(u64),
 }
 
-/// A record and its place.
+/// A record of the journal, with its place in the file.
 #[derive(Debug, PartialEq)]
 pub(super) struct Record {
     pub(super) entry: Entry,

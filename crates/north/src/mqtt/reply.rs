@@ -16,7 +16,7 @@ const LEVELS: usize = 128;
 pub(super) struct ResponseTopics {
     /// The gateway's own topics, `{base}/{gateway}`.
     own: String,
-    /// Below it are those of other gateways.
+    /// Topic below which other gateways have their topics.
     base: String,
     /// Filters of topics below `base` that are allowed all the same.
     allowed: Vec<String>,
@@ -42,7 +42,7 @@ impl ResponseTopics {
     }
 }
 
-/// Whether `topic` is `parent` or below it.
+/// Whether `topic` equals `parent` or is below it.
 fn is_below(topic: &str, parent: &str) -> bool {
     let rest = topic.strip_prefix(parent);
     rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))

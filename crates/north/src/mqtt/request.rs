@@ -18,11 +18,11 @@ pub struct Incoming {
     pub payload: Vec<u8>,
     /// Whether the message is or was retained, so that it is not a command.
     pub retain: bool,
-    /// The broker marks it as a repetition.
+    /// Whether the broker marks the message as a repetition.
     pub dup: bool,
     /// Packet id, which identifies the repetition of the broker.
     pub packet: u16,
-    /// Where the client expects its result.
+    /// Topic where the client expects the result.
     pub response_topic: Option<String>,
     /// Sent back with the result.
     pub correlation: Option<Vec<u8>>,
@@ -32,12 +32,12 @@ pub struct Incoming {
     pub who: Option<String>,
     /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
     pub oversized: Option<usize>,
-    /// How it came; none where it is taken at once.
+    /// How the message arrived; `None` if it is processed at once.
     pub arrival: Option<Arrival>,
 }
 
 impl Incoming {
-    /// A message that came so; `None` if its topic is not UTF-8.
+    /// A message that arrived in this way; `None` if its topic is not UTF-8.
     pub(super) fn of(publish: Publish, arrival: Arrival) -> Option<Incoming> {
         let properties = publish.properties.unwrap_or_default();
         let who = properties.user_properties.into_iter().find(|(name, _)| name == "who");
@@ -71,7 +71,7 @@ impl Incoming {
         Origin::of(client.clone(), kind, who)
     }
 
-    /// The message, as far as its repetition is recognised by it.
+    /// The parts of the message by which its repetition is recognised.
     pub(super) fn taken(&self) -> Taken<'_> {
         Taken {
             topic: &self.topic,
@@ -118,7 +118,7 @@ pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile)
     Ok(asked)
 }
 
-/// The text of an enumeration as the bare value of its point.
+/// The text of an enumeration, sent as the bare value of its point.
 fn text_of(payload: &[u8], name: &str, profile: &Profile) -> Option<Json> {
     let point = profile.points.get(profile.point_index(name)?)?;
     let text = std::str::from_utf8(payload).ok()?.trim();

@@ -93,7 +93,7 @@ pub(super) trait Client {
     /// Follows this plant from now on; a reload replaced the previous one.
     fn adopt(&mut self, plant: Arc<Plant>);
 
-    /// Whatever else is due.
+    /// Does all else that is due.
     fn check(&mut self, now: Instant);
 
     /// Looks at the drives that were updated or are due, and sets when to look again.
@@ -211,7 +211,7 @@ fn lost(client: &mut impl Client, why: &str) {
     client.down();
 }
 
-/// Ends a client: its commands that are in progress, then the connection.
+/// Ends a client: first its commands in progress, then the connection.
 pub(super) async fn end(client: &mut impl Client) {
     let until = tokio::time::Instant::now() + LAST_COMMANDS;
     client.publish();
@@ -232,7 +232,7 @@ async fn leave(client: &mut impl Client) {
         if !client.say_goodbye().await || !client.common().link.disconnect() {
             return;
         }
-        // The broker counts what is still in progress from it as delivered.
+        // The broker counts messages still in progress from it as delivered.
         loop {
             match client.common().link.next().await {
                 Step::Lost(_) => return,

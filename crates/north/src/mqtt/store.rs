@@ -34,9 +34,9 @@ const LOCK_WAIT: Duration = Duration::from_millis(50);
 pub(super) type Number = i64;
 
 enum Job {
-    /// A message, and whether it is in the outbox already.
+    /// Append this message; the flag tells whether it is in the outbox already.
     Append(Message, bool),
-    /// All messages up to this one are acknowledged.
+    /// Note that all messages up to this one are acknowledged.
     Acknowledge(Number),
     /// Load up to so many messages.
     Load(usize),
@@ -47,7 +47,7 @@ enum Job {
 /// A report from the disk thread.
 #[derive(Debug)]
 pub(super) enum Loaded {
-    /// Messages of earlier runs, and the topics published then.
+    /// Number of messages from earlier runs, and the topics published in those runs.
     Opened { waiting: u64, topics: Vec<String> },
     /// The next messages; nothing up to `through` is left on disk.
     Messages {
@@ -86,9 +86,9 @@ struct Shared {
     kind: MqttKind,
     /// Size of the messages among the jobs.
     bytes: AtomicUsize,
-    /// Up to this message nothing is kept, because the buffer was full.
+    /// Number of the message up to which nothing is kept, because the buffer was full.
     gone: AtomicI64,
-    /// Number of lost messages among those after it.
+    /// Number of lost messages among the messages after `gone`.
     missing: AtomicU64,
 }
 
@@ -242,13 +242,13 @@ impl Store {
 }
 
 impl Disk {
-    /// Gives a message to the disk, unless too much waits for it.
+    /// Hands a message to the disk thread, unless too many bytes wait for it.
     fn append(&self, message: &Message, sent: bool) -> bool {
         let bytes = message.bytes();
         if self.shared.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
             return false;
         }
-        // Before the thread can subtract it.
+        // The bytes are added first, so that the thread cannot subtract them earlier.
         self.shared.bytes.fetch_add(bytes, Ordering::Relaxed);
         let given = self.jobs.try_send(Job::Append(message.clone(), sent)).is_ok();
         if !given {
@@ -428,7 +428,7 @@ impl Thread {
         let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
         let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
         if let Err(error) = written {
-            // A part of it would only take room from the messages.
+            // An incomplete file would only take room from the messages.
             let _ = std::fs::remove_file(&new);
             let file = file.display();
             tracing::warn!(target: "drivegate::north::mqtt", "{file}: {error}; topics removed before the next start are not cleared");

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 /// Number of closed connections that is reported, within this time.
 const CLOSED: usize = 3;
 const WITHIN: Duration = Duration::from_secs(60);
-/// Minimum time between two lines about it.
+/// Minimum time between two log lines about a takeover.
 const AGAIN: Duration = Duration::from_secs(600);
 
 /// The last connections that the broker accepted and then closed without a reason.
@@ -31,7 +31,7 @@ impl Takeovers {
         true
     }
 
-    /// The message and its remedy.
+    /// The text about the takeover, and what to do about it.
     pub(super) fn words(client_id: &str) -> String {
         format!(
             "the broker closed {CLOSED} connections within a minute without giving a reason; this usually means that \
@@ -53,7 +53,7 @@ mod tests {
         assert!(closed(102));
         assert_eq!((103..700).filter(|s| closed(*s)).count(), 0);
         assert_eq!((700..720).filter(|s| closed(*s)).collect::<Vec<_>>(), [702]);
-        // A broker that is restarted now and then.
+        // Such closings come from a broker that is restarted now and then.
         assert_eq!((10..100).filter(|n| closed(n * 100)).count(), 0);
     }
 }

@@ -16,7 +16,7 @@ pub(super) enum Target<'t> {
     Set(&'t str, Option<&'t str>),
     /// The hold of this drive is taken, renewed, released or broken.
     Hold(&'t str),
-    /// All drives are stopped.
+    /// All drives, which are stopped.
     StopAll,
 }
 

@@ -21,7 +21,7 @@ use crate::process_image::{Access, Machine};
 
 /// Longest wait of a request for its turn; then it is repeated.
 const EXPIRY: Duration = Duration::from_secs(60);
-/// A drive that does not answer for that long ends its reading.
+/// Time without an answer after which the reading of a drive ends.
 const AWAY: Duration = Duration::from_secs(3600);
 /// Changes that an event names.
 const NAMED_CHANGES: usize = 5;
@@ -31,7 +31,7 @@ const NAMED_CHANGES: usize = 5;
 pub struct How {
     /// Reads every address, regardless of what earlier readings found.
     pub afresh: bool,
-    /// How much of a busy line that takes.
+    /// How much of a busy line the reading takes.
     pub pace: Pace,
 }
 
@@ -192,14 +192,14 @@ fn told(drive: &str, since: &str, changes: &[Difference]) -> String {
     )
 }
 
-/// By what it took so far.
+/// Time that is left, estimated from the time for the work so far.
 fn remaining((done, all): (usize, usize), worked: Duration) -> Option<Duration> {
     let left = u32::try_from(all.checked_sub(done)?).ok()?;
     let done = u32::try_from(done).ok().filter(|done| *done > 0)?;
     Some(worked.checked_div(done)?.saturating_mul(left))
 }
 
-/// The drive's identification, from the points that its profile names for that.
+/// The drive's identification, from the points that its profile names for this.
 fn identification(drive: &DriveHandle) -> String {
     let reading = drive.reading(Instant::now());
     let profile = &drive.image.spec.profile;
@@ -240,7 +240,7 @@ async fn keep(store: Store, file: ParameterFile) {
 
 /// A reading that failed is tried again after that time.
 const AGAIN: Duration = Duration::from_secs(600);
-/// How often it is looked which drives are due.
+/// Time between two looks at which drives are due.
 const LOOK: Duration = Duration::from_secs(10);
 
 /// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.

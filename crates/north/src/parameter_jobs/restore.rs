@@ -29,13 +29,13 @@ const SHARE: u32 = 5;
 /// Action on an interrupted restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Again {
-    /// Resume it.
+    /// Resumes the interrupted restore.
     Resume,
     /// The former values are written.
     Undo,
 }
 
-/// Starts preparing a restore of `wanted`. Returns its number.
+/// Starts preparing a restore of `wanted` and returns its number.
 ///
 /// # Errors
 /// Why nothing can be restored to the drive now.
@@ -132,7 +132,7 @@ pub fn carry_out(
         .map_err(|refusal| refusal.to_string())?;
     let machine = drive.machine();
     let prepared = vault.carry_out(&machine, &spec.name, number)?;
-    // The reference that stands may be another one than when it was prepared.
+    // The drive's reference may have changed since the restore was prepared.
     if let Some(new) = passes(drive, &prepared.plan)
         .into_iter()
         .find(|passed| !prepared.risks.contains(passed))
@@ -277,7 +277,7 @@ fn no_store() -> String {
     "the gateway stores no readings, so there is no place for a journal".to_string()
 }
 
-/// Something with the disk, by a thread that may wait for it.
+/// Runs work with the disk in a thread that may block.
 pub(super) async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> std::io::Result<T> + Send + 'static,
 ) -> Result<T, String> {
@@ -332,7 +332,7 @@ fn start(
         plant,
         vault,
         restoration,
-        // Judged when it began, so that no reload leaves it half done.
+        // The rights of the origin are judged at the beginning, so that no reload leaves the restore half done.
         origin: origin.lasting(),
     };
     tokio::spawn(run.carry_on());
@@ -395,7 +395,7 @@ impl Run {
         done.map_err(|why| format!("{}: {why}; free space or correct its permissions", path.display()))
     }
 
-    /// The machine as it is configured now, whatever it is called.
+    /// The machine as it is configured now, under whatever name.
     ///
     /// # Errors It is not, or that name now belongs to another machine.
     fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
@@ -417,7 +417,7 @@ impl Run {
         Ok(drive)
     }
 
-    /// Gives a command to the drive as it is configured now.
+    /// Gives an order to the drive as that drive is configured now.
     async fn set(&mut self, order: ParameterOrder) {
         let plant = self.plant.load_full();
         let drive = match self.bound(&plant) {

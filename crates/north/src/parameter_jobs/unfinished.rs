@@ -12,7 +12,7 @@ use crate::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
 
-/// A journal, and its owner.
+/// A journal and its owner.
 type Found = (JournalFile, Result<Owner, String>);
 
 /// A journal that concerns a drive.
@@ -24,7 +24,7 @@ pub(super) struct Concerning {
 }
 
 impl Concerning {
-    /// The journal, if it belongs to that machine.
+    /// The journal, if it belongs to this machine.
     ///
     /// # Errors
     /// The journal belongs to another machine, or cannot be read.
@@ -176,7 +176,7 @@ pub(super) fn unfinished_event(bus: &str, drive: Option<&str>, text: String) -> 
     }
 }
 
-/// A drive as it is configured.
+/// A drive as the configuration has it.
 struct Configured {
     machine: Machine,
     spec: DriveSpec,
@@ -263,7 +263,7 @@ fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
     vault.hold(&drive.machine).set(Some(why));
 }
 
-/// Why a drive is held, by the journal that concerns it.
+/// Why a drive is held because of the journal that concerns it.
 fn why_held(spec: &DriveSpec, (file, owner): &Found, claim: Claim) -> String {
     let name = &spec.name;
     if let (Claim::Place | Claim::Name, Ok(owner)) = (claim, owner) {

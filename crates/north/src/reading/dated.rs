@@ -16,7 +16,7 @@ use super::Reader;
 
 /// Properties of a stream besides its bytes.
 pub(crate) trait Source {
-    /// Whether there is something to read.
+    /// Whether the source has bytes to read.
     fn is_readable(&self) -> bool;
 
     /// Whether the other end has closed or reset it, whatever is left to read. One that has only ended writing, and still
@@ -26,12 +26,12 @@ pub(crate) trait Source {
 
 fn shows(source: &impl AsFd, flags: PollFlags) -> bool {
     let mut fds = [PollFd::new(source, flags)];
-    // Where the system does not say it, nothing is.
+    // If the system cannot tell, the answer is no.
     let any = poll(&mut fds, Some(&Timespec::default())).unwrap_or(0) > 0;
     any && fds.iter().any(|fd| fd.revents().intersects(flags))
 }
 
-/// Whether there is something to read or accept.
+/// Whether the source has something to read or accept.
 pub(crate) fn is_readable(source: &impl AsFd) -> bool {
     shows(source, PollFlags::IN)
 }
@@ -75,7 +75,7 @@ impl Source for DuplexStream {
     }
 }
 
-/// A stream with its reader.
+/// A stream with the reader that dates its bytes.
 #[derive(Debug)]
 pub(crate) struct Dated<S> {
     stream: S,

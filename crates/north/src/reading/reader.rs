@@ -17,7 +17,7 @@ pub(crate) struct Reader {
 
 #[derive(Debug)]
 struct State {
-    /// No byte that is unread came before.
+    /// Time before which no unread byte arrived.
     floor: Instant,
     /// Whether the reader found nothing, and waits.
     waited: bool,
@@ -25,7 +25,7 @@ struct State {
     last: Dated,
     /// Date of the first read since nothing was left.
     first: Dated,
-    /// Nothing was left since the last read.
+    /// Whether nothing was left after the last read.
     fresh: bool,
 }
 
@@ -110,7 +110,7 @@ impl Reader {
         self.connection.hang_up();
     }
 
-    /// How what was read last came.
+    /// How the bytes that were read last arrived.
     pub(crate) fn last(&self) -> Arrival {
         self.arrival(self.state().last)
     }

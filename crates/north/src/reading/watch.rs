@@ -39,7 +39,7 @@ pub struct Watch {
     ran: AtomicU64,
     /// By how many nanoseconds the time since the machine was started was ahead of that.
     boot_ahead: AtomicU64,
-    /// Until when a stall of before matters.
+    /// Time until which an earlier stall matters.
     matters_until: AtomicU64,
     stalls: Mutex<Stalls>,
     untold: Mutex<Vec<Stall>>,
@@ -47,7 +47,7 @@ pub struct Watch {
 }
 
 impl Watch {
-    /// For a runtime of one thread, or of several.
+    /// A watch for a runtime with one thread, or with several.
     pub fn new(single: bool) -> Arc<Watch> {
         Watch::by(single, since_boot)
     }
@@ -140,7 +140,7 @@ impl Watch {
         }
     }
 
-    /// Never 0, which stands for none.
+    /// The time in ns; never 0, which stands for no time.
     fn nanos(&self, at: Instant) -> u64 {
         in_nanos(at.saturating_duration_since(self.base)).max(1)
     }
@@ -173,7 +173,7 @@ impl Watch {
         at <= self.matters_until.load(Ordering::Relaxed)
     }
 
-    /// The runtime did not run since `ran`, or one of its workers.
+    /// Notes that the runtime, or one of its workers, did not run since `ran`.
     fn stood(&self, (now, boot): (Instant, Duration), ran: u64, worker: Option<u64>) {
         let at = |nanos: u64| self.base + Duration::from_nanos(nanos);
         let mut stalls = self.stalls();

@@ -12,11 +12,11 @@ pub(crate) struct CommandWrite {
     /// Points to set as one command: index in the profile, value in engineering units. May be empty when
     /// only the heartbeat was written.
     pub(crate) points: Vec<(PointIndex, Value)>,
-    /// The word at 0x8100, if it was written.
+    /// The word written to 0x8100, if any.
     pub(crate) word: Option<u16>,
     /// The heartbeat was written.
     pub(crate) heartbeat: bool,
-    /// Why all else is refused; `points` are those of its stop then.
+    /// Why all but a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
 }
 
@@ -165,7 +165,7 @@ fn command_word(
             "0x{word:04X} is not a command: bits 3 to 15 must be 0; nothing was written"
         ))));
     }
-    // No bit is ignored silently: one that the family lacks must be 0.
+    // No bit is ignored silently: a bit that the drive family lacks must be 0.
     let lacks = |refusal: Refusal| Ok(Some(Refusal::BadValue(refusal.to_string())));
     let reverse = word & REVERSE != 0;
     match writable(profile, ModelPoint::Reverse) {

@@ -21,7 +21,7 @@ pub struct BusFigures {
     pub(crate) load: Option<f64>,
     /// Achieved cycle of the fast poll class.
     pub(crate) cycle: Option<Duration>,
-    /// Transactions so far.
+    /// Number of transactions so far.
     pub(crate) transactions: u64,
     /// Transactions that failed so far.
     pub(crate) errors: u64,
@@ -36,7 +36,7 @@ pub struct BusRegister {
     pub offset: u16,
     /// Content of the register.
     pub name: &'static str,
-    /// How it is encoded.
+    /// How the value is encoded.
     pub form: Form,
     /// Engineering value of one count.
     pub scale: &'static str,

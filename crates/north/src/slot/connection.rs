@@ -50,7 +50,7 @@ pub(super) struct Connection<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
-    /// A connection that begins with `greeting`; with a `port` it uses telnet.
+    /// A connection that begins with `greeting`; with a `port`, the connection uses telnet.
     pub(super) fn new(stream: Dated<S>, tool: Arc<Tool>, port: Option<ServedPort>, greeting: Vec<u8>) -> Connection<S> {
         Connection {
             stream,
@@ -90,7 +90,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         self.flush().await
     }
 
-    /// Waits for one thing and does it.
+    /// Waits for one event and processes it.
     async fn turn(&mut self, idle_timeout: Option<Duration>, place: &ConnectionPlace) -> Result<(), End> {
         let mut buffer = [0; 1024];
         self.flush().await?;
@@ -126,7 +126,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         Ok(())
     }
 
-    /// Bytes came in.
+    /// Takes bytes that the tool sent.
     fn take(&mut self, bytes: &[u8]) {
         let mut data = Vec::with_capacity(bytes.len());
         match &mut self.port {
@@ -155,7 +155,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
     }
 }
 
-/// Until then; for ever without a time.
+/// Sleeps until this time; for ever if no time is given.
 pub(super) async fn sleep_until(at: Option<Instant>) {
     match at {
         Some(at) => tokio::time::sleep_until(at).await,

@@ -35,9 +35,9 @@ struct Pending {
 #[derive(Debug)]
 struct Held {
     request: ToolRequest,
-    /// How it came.
+    /// How the request arrived.
     arrival: Arrival,
-    /// Stops that its drives had been given when it was whole.
+    /// Number of stops given to the request's drives when the request was complete.
     stops: u64,
     until: Instant,
     deadline: Instant,
@@ -52,7 +52,7 @@ pub(super) struct Dialogue {
     held: Option<Held>,
     /// When the last request was given to the bus.
     asked: Option<Instant>,
-    /// When more of the tool is read, while that is not now.
+    /// When more input of the tool is read; `None` if at once.
     reads_at: Option<Instant>,
     /// The reply to the tool.
     pub(super) output: Vec<u8>,
@@ -148,7 +148,7 @@ impl Dialogue {
         }
     }
 
-    /// The tool is no longer there.
+    /// Gives up the requests of a tool that is no longer connected.
     pub(super) fn ended(&mut self) {
         self.give_up(SlotOutcome::Abandoned);
     }

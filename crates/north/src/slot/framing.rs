@@ -31,7 +31,7 @@ pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
     arrivals: Arrivals,
-    /// How the last message came, dated from its first byte.
+    /// How the last message arrived, dated from its first byte.
     arrival: Option<Arrival>,
 }
 
@@ -65,12 +65,12 @@ impl Framing {
         }
     }
 
-    /// How the tool's last message came, dated from its first byte.
+    /// How the tool's last message arrived, dated from its first byte.
     pub(super) fn arrival(&self) -> Option<Arrival> {
         self.arrival.clone()
     }
 
-    /// Between two lines there may be blanks and line feeds.
+    /// Whether the bytes are blanks and line feeds, which may stand between two lines.
     fn is_blank(&self, bytes: &[u8]) -> bool {
         self.protocol.is_text() && bytes.iter().all(u8::is_ascii_whitespace)
     }
@@ -154,7 +154,7 @@ mod tests {
         assert_eq!(all(&mut framing, until), [Said::Broken]);
         let mut broken = frame.clone();
         broken[7] ^= 1;
-        // Behind a broken frame and behind half of one, without a pause.
+        // The request follows a broken frame and half a frame without a pause.
         add(
             &mut framing,
             &[broken.as_slice(), &frame, &frame[..4], &frame].concat(),

@@ -45,14 +45,14 @@ pub const MAX_TOOLS: usize = 4;
 pub enum SlotAccess {
     #[default]
     Read,
-    /// Also write like a Modbus TCP client that may write.
+    /// Tools may also write, like a Modbus TCP client that may write.
     Write,
     /// Also what cannot be checked: broadcasts, functions that are not decoded, addresses of no configured drive.
     Raw,
 }
 
 impl SlotAccess {
-    /// In words.
+    /// What the access means, in words.
     pub fn meaning(self) -> &'static str {
         match self {
             SlotAccess::Read => "tools may only read",
@@ -67,17 +67,17 @@ impl SlotAccess {
 pub struct Slot {
     /// Name of the bus.
     pub bus: String,
-    /// The protocol of its line.
+    /// Protocol of the slot's line.
     pub protocol: Protocol,
     /// Character format of the line.
     pub format: LineFormat,
-    /// Where frames are taken as they are on the line.
+    /// Address where the slot takes frames as they are on the line.
     pub listen: Option<SocketAddr>,
     /// Where a COM port is served by RFC 2217.
     pub rfc2217: Option<SocketAddr>,
     /// Link to a pseudo-terminal.
     pub pty: Option<PathBuf>,
-    /// The rights of its tools.
+    /// Rights of the slot's tools.
     pub access: SlotAccess,
     /// Networks that may connect.
     pub allow: Vec<IpNet>,
@@ -86,7 +86,7 @@ pub struct Slot {
 }
 
 impl Slot {
-    /// The addresses that it listens on, and whether each serves a COM port.
+    /// The addresses that the slot listens on, and whether each serves a COM port.
     fn addresses(&self) -> impl Iterator<Item = (SocketAddr, bool)> {
         let raw = self.listen.map(|address| (address, false));
         raw.into_iter().chain(self.rfc2217.map(|address| (address, true)))
@@ -133,13 +133,13 @@ pub type Server = TcpServer<Slots, Options>;
 #[derive(Debug)]
 pub struct Slots {
     ptys: Vec<RunningPty>,
-    /// The slots as they are now.
+    /// The slots as they are configured now.
     current: Arc<ArcSwap<Options>>,
     plant: SharedPlant,
     stats: Arc<NorthState>,
     paces: Arc<WritePaces>,
     refusals: Arc<Refusals>,
-    /// Listeners opened so far.
+    /// Number of listeners opened so far.
     opened: usize,
     tasks: TaskTracker,
     cancel: CancellationToken,

@@ -39,7 +39,7 @@ impl Offline {
         )
     }
 
-    /// From now on the slot has that access.
+    /// Gives the slot this access from now on.
     pub fn reload(&self, access: SlotAccess) {
         let slot = Slot {
             access,

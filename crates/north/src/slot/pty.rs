@@ -73,7 +73,7 @@ struct Port {
     /// The gateway's end of the pseudo-terminal. The runtime treats it as a pipe.
     reader: Dated<pipe::Receiver>,
     dialogue: Dialogue,
-    /// When bytes came or went last; `None` once the port rests.
+    /// When bytes last came or went; `None` once the port is idle.
     used: Option<Instant>,
 }
 

@@ -20,7 +20,7 @@ pub(super) struct ToolRequest {
 /// The meaning of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Meaning {
-    /// Reads and nothing else.
+    /// A read and nothing else.
     Read(RequestPdu),
     /// Writes registers, coils or an object.
     Write(RequestPdu),

@@ -10,7 +10,7 @@ use arc_swap::ArcSwap;
 use super::{Options, Slot, SlotAccess};
 use crate::order::{Grants, Proof, Right};
 
-/// By which way a tool came.
+/// The way by which a tool is connected.
 #[derive(Debug, Clone)]
 enum Way {
     Address(IpAddr),

@@ -43,7 +43,7 @@ pub(super) enum Work {
 }
 
 impl Work {
-    /// How it ended, and the frame of the drive where it was kept.
+    /// How the work ended, with the frame of the drive where it was kept.
     pub(super) fn poll(&mut self, cx: &mut Context<'_>) -> Poll<(Outcome, Option<Vec<u8>>)> {
         match self {
             Work::Exchange(exchange) => exchange.poll(cx),
@@ -58,7 +58,7 @@ pub(super) struct Pace {
     pub(super) not_before: Instant,
     /// Whether the request stops a drive: it is then sent at once.
     pub(super) is_stop: bool,
-    /// Stops that its drives were given so far.
+    /// Number of stops given to the request's drives so far.
     pub(super) stops: u64,
 }
 
@@ -78,11 +78,11 @@ impl WritePaces {
     }
 }
 
-/// A slot as it is configured now, with the plant after it.
+/// A slot as it is configured now, with the plant that belongs to it.
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) slot: Slot,
-    /// The slots of all buses as they are now.
+    /// The slots of all buses as they are configured now.
     pub(super) current: Arc<ArcSwap<Options>>,
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthState>,
@@ -95,7 +95,7 @@ pub(super) struct Tool {
     terms: Arc<Terms>,
     /// With the right to write.
     origin: Origin,
-    /// With the right to send what cannot be checked.
+    /// Origin with the right to send requests that cannot be checked.
     raw: Origin,
 }
 
@@ -272,7 +272,7 @@ impl Tool {
         }
         for drive in drives {
             let whole = Order::Write(pdu.clone());
-            // Limits hold for each of them.
+            // Limits hold for each of the drives.
             if let Meaning::Write(_) = &request.meaning
                 && let Err(refusal) = permit::admit(whole, &drive.reading(now), Authority::Write)
             {

@@ -52,7 +52,7 @@ struct Waiting {
     drive: DriveHandle,
     /// Whether the command makes the motor run.
     runs: bool,
-    /// For those who repeat it; none of a stop, which is always executed.
+    /// Lets repetitions of the request share its reply; `None` for a stop, which is always executed.
     shared: Option<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit)>,
 }
 
@@ -97,7 +97,7 @@ fn status(outcome: &Outcome) -> StatusCode {
 pub(in crate::http) struct Asked(Arrival, Option<Arc<Reader>>);
 
 impl Asked {
-    /// How the request came, once its body is read.
+    /// How the request arrived, once its body is read.
     fn complete(self) -> Arrival {
         match self.1 {
             Some(reader) => self.0.completed(&reader.last()),
@@ -335,7 +335,7 @@ pub(in crate::http) struct Commandable<'d> {
     commanded_last: bool,
     /// Name of the client in `[authority]`.
     principal: Option<String>,
-    /// The ranks below its own.
+    /// The ranks below this client's own rank.
     outranks: Option<Vec<String>>,
 }
 
@@ -391,7 +391,7 @@ pub(in crate::http) async fn heartbeat(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Renews the lease of a drive, if the login commanded it last.
+/// Renews the lease of a drive if this login gave the drive its last command.
 ///
 /// # Errors
 /// Why not.

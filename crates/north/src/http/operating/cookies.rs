@@ -38,7 +38,7 @@ impl Cookies {
         find(headers, &self.known)
     }
 
-    /// Sets the session's cookie; it ends with the browser, or with the session.
+    /// Sets the session's cookie; the cookie ends with the browser or with the session.
     pub(super) fn set_session(&self, value: &str) -> Option<HeaderValue> {
         self.set(&self.session, value, "")
     }

@@ -14,7 +14,7 @@ use super::super::replies::{Refused, Replied, not_found, refused};
 use super::asker::{Commander, Ordered};
 use crate::drill::{DrillRefusal, DrillReport, Kind};
 
-/// All that are known, the newest first.
+/// All known drills, the newest first.
 pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {
     Json(app.north.drills.reports())
 }
@@ -28,7 +28,7 @@ pub(in crate::http) async fn drill(
     report.map(Json).ok_or_else(|| why_not(&DrillRefusal::Unknown(id)))
 }
 
-/// Arms one; 201.
+/// Arms a drill and answers with status 201.
 pub(in crate::http) async fn arm_drill(
     State(app): State<Arc<AppState>>,
     Ordered(operator, payload): Ordered,
@@ -52,7 +52,7 @@ pub(in crate::http) async fn arm_drill(
     Ok((StatusCode::CREATED, Json(report)).into_response())
 }
 
-/// Starts an armed one.
+/// Starts an armed drill.
 pub(in crate::http) async fn start_drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,

@@ -28,7 +28,7 @@ const MAX_LOGIN: usize = 4096;
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(in crate::http) struct SessionReply<'s> {
     user: &'s str,
-    /// For the header X-CSRF-Token.
+    /// Token that the client sends in the header X-CSRF-Token.
     csrf: &'s str,
     /// s
     expires_in: u64,
@@ -150,7 +150,7 @@ pub(in crate::http) async fn session(
     }
 }
 
-/// `POST /api/v1/logout`: ends the session, if there is one.
+/// `POST /api/v1/logout`: ends the session, if any.
 pub(in crate::http) async fn log_out(
     State(app): State<Arc<AppState>>,
     Extension(reached): Extension<Reached>,

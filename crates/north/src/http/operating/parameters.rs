@@ -35,7 +35,7 @@ pub(in crate::http) async fn read(
     reading(&app, &drive)
 }
 
-/// `GET …/params/reading`: how far it is, and the file once it has ended.
+/// `GET …/params/reading`: progress of the reading, and its file once it has ended.
 pub(in crate::http) async fn progress(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
@@ -55,7 +55,7 @@ pub(in crate::http) async fn restore(
     restored(&app, &drive)
 }
 
-/// `GET …/params/restore`: how far it is.
+/// `GET …/params/restore`: progress of the restore.
 pub(in crate::http) async fn look(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

@@ -2,7 +2,7 @@
 
 use axum::http::Method;
 
-/// Whether a path belongs to commands; without them there is nothing at it.
+/// Whether a path belongs to commands; while commands are off, such a path does not exist.
 pub(in crate::http) fn is_operating(path: &str) -> bool {
     let of_drive = |rest: &str| {
         rest.split_once('/')
@@ -15,7 +15,7 @@ pub(in crate::http) fn is_operating(path: &str) -> bool {
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)
 }
 
-/// Whether that is about the session of a user.
+/// Whether a path is about the session of a user.
 pub(in crate::http) fn is_session(path: &str) -> bool {
     matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
 }

@@ -9,7 +9,7 @@ use crate::hex;
 
 /// A session ends when its user did nothing for that long. Reading values is nothing, so a page that is left alone ends.
 pub(super) const IDLE: Duration = Duration::from_secs(30 * 60);
-/// A session ends that long after its login, whatever its user does.
+/// Longest time from login to the end of a session, whatever its user does.
 const LONGEST: Duration = Duration::from_secs(12 * 3600);
 /// Most sessions of one user; another login ends the one that was used the longest time ago.
 const MOST_OF_USER: usize = 8;
@@ -40,7 +40,7 @@ impl Session {
         (self.used + IDLE).min(self.begun + LONGEST)
     }
 
-    /// Time until it ends if its user does nothing.
+    /// Time until the session ends if its user does nothing.
     pub(super) fn expires_in(&self, now: Instant) -> Duration {
         self.ends().saturating_duration_since(now)
     }
@@ -50,7 +50,7 @@ impl Session {
 #[derive(Debug, Default)]
 pub(super) struct Sessions {
     open: HashMap<[u8; 32], Session>,
-    /// Logins so far.
+    /// Number of logins so far.
     logins: u64,
 }
 

@@ -72,7 +72,7 @@ pub(in crate::http) struct Operator {
     pub(super) kind: SourceKind,
     pub(super) proof: Proof,
     pub(super) right: Right,
-    /// The cookie of its session; `None` for a program.
+    /// The cookie of the operator's session; `None` for a program.
     pub(super) cookie: Option<String>,
 }
 
@@ -96,22 +96,22 @@ impl Operator {
     }
 }
 
-/// Why a request is not answered as one of a user.
+/// Why a request is not accepted as the request of a user.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(in crate::http) enum Denied {
     /// No session and no password.
     #[error("log in first: POST /api/v1/login, or send user and password with each request (HTTP Basic)")]
     NotLoggedIn,
-    /// The session ended, or its cookie was never one.
+    /// The session has ended, or the cookie never belonged to one.
     #[error("the session has ended; log in again")]
     SessionEnded,
-    /// Whichever it is, the answer is the same.
+    /// User or password is wrong; the reply does not tell which.
     #[error("wrong user or password")]
     Wrong,
-    /// Too many failures.
+    /// Too many failed logins; the next attempt is possible after this time.
     #[error("too many failed logins; try again in {} s", .0.as_secs() + 1)]
     TooMany(Duration),
-    /// Too many at once.
+    /// Too many passwords wait to be verified.
     #[error("too many logins at once; try again")]
     Busy,
     /// A page of someone else.
@@ -136,7 +136,7 @@ impl Denied {
     }
 }
 
-/// A user and a password, as a client sent them.
+/// A user name and a password, as a client sent them.
 #[derive(Clone, serde::Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct Credentials {
@@ -210,7 +210,7 @@ impl Operating {
         }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
-            // As it is before the password is compared, which takes a while.
+            // The right as it is now: comparing the password takes a while.
             let right = self.right_of(&credentials.user);
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
@@ -273,7 +273,7 @@ impl Operating {
         Ok(operator)
     }
 
-    /// Whether the request repeats the token of its session.
+    /// Whether the request repeats the CSRF token of its session.
     pub(super) fn check_csrf(&self, headers: &HeaderMap, cookie: &str) -> Result<(), Denied> {
         let session = self.session(cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
         let given = headers.get(CSRF).map_or(&[][..], |value| value.as_bytes());
@@ -283,7 +283,7 @@ impl Operating {
         }
     }
 
-    /// The user did something: its session and the places of its address stay.
+    /// Notes that the user did something: the session and the places of the address stay.
     fn used(&self, operator: &Operator, now: Instant) {
         let mut state = self.state();
         if let Some(cookie) = &operator.cookie {

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 const FREE: u32 = 5;
 /// Failures for one user after which addresses that failed before have to wait.
 const FREE_OF_USER: u32 = 20;
-/// First and longest pause; each failure doubles it.
+/// First and longest pause after a failed login; each failure doubles the pause.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-/// Failures are forgotten when there was none for that long.
+/// Time without a failed login after which earlier failures are forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(15 * 60);
 /// Most addresses and browsers, and most users, that are distinguished; beyond it the oldest is forgotten.
 const MOST_SOURCES: usize = 4096;
@@ -83,7 +83,7 @@ impl Throttle {
         }
     }
 
-    /// The password was right: its source has a clean record.
+    /// Forgets the failures of this source, because the password was right.
     pub(super) fn succeeded(&mut self, source: Source, user: u64) {
         self.withdraw(source, user);
         self.sources.remove(&source);

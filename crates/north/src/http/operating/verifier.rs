@@ -8,14 +8,14 @@ use tokio::sync::oneshot;
 
 use super::super::users::Workspace;
 
-/// Most passwords that wait for their turn.
+/// Most passwords that wait to be verified.
 const MOST_WAITING: usize = 16;
-/// Most of them from one address.
+/// Most waiting passwords from one address.
 const MOST_OF_ADDRESS: usize = 4;
 /// Niceness of the thread.
 const NICE: i32 = 10;
 
-/// A password that waits.
+/// A password that waits to be verified.
 #[derive(Debug)]
 struct Waiting {
     /// Failures of its source: who has fewer goes first, and is not turned away by who has more.
@@ -126,7 +126,7 @@ impl Verifier {
     }
 
     fn serve(&self) {
-        // Without it the thread only competes as others do.
+        // If the priority cannot be lowered, the thread competes like any other.
         let _ = rustix::process::nice(NICE);
         let mut workspace = std::mem::take(&mut self.lock().workspace);
         loop {

@@ -120,7 +120,7 @@ async fn an_incomplete_frame_times_out_after_ten_seconds() {
 async fn silent_and_slow_clients_stay_connected() {
     let mut rig = rig(1024);
     tokio::time::sleep(Duration::from_secs(100_000)).await;
-    // There is always an incomplete frame, but each is completed in time.
+    // Every moment has an incomplete frame, but each frame is completed in time.
     rig.send(&REQUEST[..5]).await;
     for _ in 0..5 {
         tokio::time::sleep(FRAME_TIMEOUT - Duration::from_secs(1)).await;

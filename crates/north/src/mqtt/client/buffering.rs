@@ -142,7 +142,7 @@ impl PlainClient {
         }
     }
 
-    /// Counts what the outbox lost, and logs it once a minute.
+    /// Counts the messages that the outbox lost, and logs their number once a minute.
     pub(super) fn count_lost(&mut self, now: Instant) {
         for (kind, count) in self.outbox.take_lost() {
             self.common.stats.mqtt.lost(kind, count);

@@ -18,7 +18,7 @@ pub(super) enum Subscribed {
     Leftovers,
 }
 
-/// The discovery messages, if they are configured.
+/// The publisher of discovery messages, if they are configured.
 pub(super) fn announcer(options: &Options, topics: &Topics) -> Option<Announcer> {
     let prefix = options.home_assistant.as_deref()?;
     let sources = Sources {

@@ -34,7 +34,7 @@ impl SetTopics {
         }
     }
 
-    /// A reload starts the client anew.
+    /// Starts the client anew, as a reload does.
     fn reload_client(&mut self) {
         self.commands = commands(&self.memory, &self.stop_all);
     }
@@ -55,7 +55,7 @@ impl SetTopics {
         self.commands = after(before.leave(Vec::new()));
     }
 
-    /// A reload starts the bus anew.
+    /// Starts the bus anew, as a reload does.
     fn reload_bus(&mut self) {
         let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
         self.plant.buses[0].take_over(&stopped, self.now);
@@ -83,7 +83,7 @@ impl SetTopics {
         Some(json(&self.commands.answer(ended, SystemTime::UNIX_EPOCH)))
     }
 
-    /// The drive acknowledges the next command; its effect has not been read yet.
+    /// Lets the drive acknowledge the next command, whose effect is not read yet.
     fn take_order(&self) -> Option<(Order, Receipt)> {
         let pop = |bus: &crate::plant::BusHandle| next_command(&mut bus.queue.lock(), Urgency::Read, self.now);
         let command = self.plant.buses.iter().find_map(pop)?;

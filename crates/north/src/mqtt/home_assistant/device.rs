@@ -6,7 +6,7 @@ use super::entity::{self, Entities, extend};
 use super::{Sources, id_of};
 use crate::plant::{DriveHandle, Plant};
 
-/// With whose names titles of profiles begin.
+/// Manufacturers with whose names titles of profiles begin.
 const MANUFACTURERS: [&str; 18] = [
     "ABB",
     "Danfoss",
@@ -37,9 +37,9 @@ pub(super) struct Device {
 
 #[derive(Debug)]
 enum Kind {
-    /// With its name and those of its buses.
+    /// The gateway, with its name and the names of its buses.
     Gateway { name: String, buses: Vec<String> },
-    /// With the id of its gateway.
+    /// A drive, with the id of its gateway.
     Drive { drive: DriveHandle, gateway: String },
 }
 

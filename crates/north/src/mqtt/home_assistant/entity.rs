@@ -175,7 +175,7 @@ impl DriveEntities<'_> {
         self.command(point).unwrap_or_else(|| self.sensor(point))
     }
 
-    /// The control of a point, if it is commanded.
+    /// The entity that controls a point, if the point can be commanded.
     fn command(&self, point: &Point) -> Option<(String, Value)> {
         if !self.is_commanded(point) || point.kind() == Kind::Text {
             return None;
@@ -322,7 +322,7 @@ enum Shown<'p> {
     Bool,
     /// A number between limits; Home Assistant would refuse another one and keep the last.
     Within(f64, f64),
-    /// An enumeration by its texts.
+    /// The texts of an enumeration.
     Texts(&'p Point),
 }
 
@@ -413,7 +413,7 @@ fn component(platform: Platform, name: &str, keys: impl IntoIterator<Item = Valu
     (format!("{}_{name}", platform.name()), component)
 }
 
-/// Adds keys, or replaces them.
+/// Adds keys to an entity, or replaces their values.
 pub(super) fn extend(entity: &mut Value, more: Value) {
     if let (Value::Object(entity), Value::Object(more)) = (entity, more) {
         entity.extend(more);

@@ -19,7 +19,7 @@ fn sources(base: &str, commands: bool, [state, points]: [bool; 2]) -> Sources {
     }
 }
 
-/// An announcer of drives with these names, and all it publishes.
+/// An announcer of drives with these names, and all that it publishes.
 fn announced(names: &[&str]) -> (Announcer, Vec<Update>) {
     let mut announcer = Announcer::new("homeassistant", sources("drivegate", true, [true, true]));
     announcer.adopt(&fixture::plant(names));
@@ -45,7 +45,7 @@ fn entities(profile: &str, access: Access, sources: &Sources) -> Vec<(String, Va
     entity::of_drive(sources, "drivegate_hall_drive_p1", &spec)
 }
 
-/// Without those that are only taken away.
+/// The entities without those that are only removed.
 fn present(entities: &[(String, Value)]) -> impl Iterator<Item = (&str, &Value)> {
     let described = entities.iter().filter(|(_, entity)| entity.get("uniq_id").is_some());
     described.map(|(key, entity)| (key.as_str(), entity))

@@ -153,7 +153,7 @@ fn a_file_of_another_version_is_left_as_it_is() {
         assert_eq!(journal.take_lost(), 0);
         assert_eq!(fs::read(&path).unwrap(), later);
     }
-    // The version that wrote it is back.
+    // The version that wrote the file is back.
     fs::write(&path, &bytes).unwrap();
     assert_eq!(numbers(&take_all(&mut open(dir.path(), BIG))), [1, 2]);
 }
@@ -267,7 +267,7 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
     for n in 101..201 {
         journal.append(event(n), false);
     }
-    // There is room again.
+    // The disk has room again.
     let segment = journal.segments.front_mut().unwrap();
     fs::remove_file(&segment.path).unwrap();
     segment.file = real(&segment.path).unwrap();

@@ -39,7 +39,7 @@ impl PublishedPlant {
         fixture::read(&self.plant, "p1", status, frequency, self.now);
     }
 
-    /// Lets time pass, then publishes; topics below `drivegate/hall/`.
+    /// Lets time pass, then publishes; returns the topics below `drivegate/hall/`.
     fn after(&mut self, ms: u64) -> Vec<(String, String)> {
         self.now += Duration::from_millis(ms);
         self.wall += Duration::from_millis(ms);
@@ -334,7 +334,7 @@ fn the_values_of_an_outage_are_recorded() {
         let mut arrays = Vec::new();
         for value in [2500, 2500, 2501, 2501, 2501, 2502] {
             bench.read(0x0023, value);
-            // Too early for another entry.
+            // It is too early for another entry.
             for ms in [0, 50, 50] {
                 bench.now += Duration::from_millis(ms);
                 bench.wall += Duration::from_millis(ms);

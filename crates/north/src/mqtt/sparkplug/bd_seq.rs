@@ -12,7 +12,7 @@ use crate::files::names::SPARKPLUG;
 /// Longest wait for the file.
 const WRITE: Duration = Duration::from_secs(1);
 
-/// Gives each connection its number, 0 to 255 in a circle.
+/// Numbers the connections from 0 to 255 and then from 0 again.
 #[derive(Debug)]
 pub(super) struct BdSeq {
     path: PathBuf,

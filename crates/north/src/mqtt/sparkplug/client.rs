@@ -34,7 +34,7 @@ use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
 use crate::{MqttKind, NorthState};
 
-/// Messages published before other events have their turn.
+/// Most messages published before other events have their turn.
 const MESSAGES: usize = 64;
 /// Least time between two log lines of one kind.
 const LOGGED: Duration = Duration::from_secs(60);
@@ -91,7 +91,7 @@ struct NodeClient {
     common: Common,
     session: Session,
     drives: Vec<Drive>,
-    /// The drive that is looked at next, of those that are due.
+    /// Index of the drive that is looked at next among the drives that are due.
     cursor: usize,
     orders: Orders,
     bd_seq: BdSeq,
@@ -295,7 +295,7 @@ impl NodeClient {
             return false;
         };
         if connection::packet_size(&message) > limits.max_packet {
-            // Without it the sequence has a gap, and a birth lacks its metrics.
+            // If this message is not sent, the sequence has a gap, or a birth lacks its metrics.
             let (topic, most) = (&message.topic, limits.max_packet);
             let why =
                 format!("the broker accepts at most {most} bytes per packet, {topic} needs more; raise its limit");

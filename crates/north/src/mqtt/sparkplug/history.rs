@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use super::metric::Sample;
 
-/// Collects what changes.
+/// Collects changes while the host is away.
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
-    /// Place of the metric and its value, oldest first.
+    /// Place and value of each metric, the oldest first.
     entries: VecDeque<(usize, Sample)>,
     at: Option<Instant>,
 }

@@ -8,11 +8,11 @@ use super::topics::StateForm;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 struct State {
     online: bool,
-    /// ms since 1970.
+    /// Time of the state, ms since 1970.
     timestamp: u64,
 }
 
-/// The primary host as its messages on this connection tell.
+/// The primary host, as its messages on this connection describe it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Host {
     state: Option<State>,

@@ -21,12 +21,12 @@ impl Moment {
         }
     }
 
-    /// ms since 1970.
+    /// This moment as ms since 1970.
     pub(super) fn millis(self) -> u64 {
         self.millis_at(None)
     }
 
-    /// ms since 1970 at an earlier time, if there is one.
+    /// An earlier time, if given, as ms since 1970.
     pub(super) fn millis_at(self, at: Option<Instant>) -> u64 {
         let age = at.map(|at| self.now.saturating_duration_since(at)).unwrap_or_default();
         let time = self.wall.checked_sub(age).unwrap_or(self.wall);
@@ -67,7 +67,7 @@ impl From<Value> for Datum {
             Value::Integer(code) => Datum::Integer(code),
             Value::Unsigned(count) => Datum::Unsigned(count),
             Value::Text(text) => Datum::Text(text.shown()),
-            // No negative zero.
+            // Adding 0.0 turns a negative zero into zero.
             Value::Number(number) => Datum::Number(number + 0.0),
         }
     }
@@ -100,18 +100,18 @@ pub(super) struct Sample {
     /// `None` unless the quality is good.
     pub(super) value: Option<Datum>,
     pub(super) quality: Quality,
-    /// When it was read, ms since 1970.
+    /// When the value was read, ms since 1970.
     pub(super) time: u64,
 }
 
 impl Sample {
-    /// Whether there is nothing new but the time.
+    /// Whether the two samples differ in nothing but the time.
     pub(super) fn is_same(&self, other: &Sample) -> bool {
         (&self.value, self.quality) == (&other.value, other.quality)
     }
 }
 
-/// How a metric is named in messages other than births.
+/// How a metric is named in all messages but births.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Naming {
     Name,

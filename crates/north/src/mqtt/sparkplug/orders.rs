@@ -51,7 +51,7 @@ struct Awaited {
 /// The result of a command.
 #[derive(Debug, PartialEq)]
 pub(super) struct Finished {
-    /// The drive by its name: a reload may have moved it.
+    /// Name of the drive: a reload may have moved the drive.
     pub(super) drive: String,
     /// The metrics that were to be changed.
     pub(super) metrics: Vec<usize>,
@@ -162,7 +162,7 @@ impl Orders {
             ..Taken::default()
         };
         let mut memory = self.memory.lock();
-        // The payload with its time is all that identifies it.
+        // Only the payload, which contains the time, identifies the message.
         let print = memory.fingerprint(&taken, Some(""));
         if memory.repeated(&taken, print, 0, now).is_some() {
             return Err(
@@ -196,7 +196,7 @@ impl Orders {
         finished.map_or(Poll::Pending, Poll::Ready)
     }
 
-    /// Whether no order waits for its result.
+    /// Whether no order waits for a result.
     pub(super) fn is_idle(&self) -> bool {
         self.awaited.is_empty()
     }
@@ -204,7 +204,7 @@ impl Orders {
 
 /// The request in a message.
 struct Request {
-    /// The metrics as they came, and their place in the session.
+    /// The metrics in the order of the message, with their places in the session.
     metrics: Vec<(Metric, Option<usize>)>,
     timestamp: Option<u64>,
 }
@@ -238,7 +238,7 @@ impl Request {
         metrics.filter_map(|(_, place)| *place).collect()
     }
 
-    /// For the audit, if it is refused before it becomes a command.
+    /// Text for the audit if the request is refused before it becomes a command.
     fn what(&self) -> String {
         let name = |(metric, _): &(Metric, Option<usize>)| {
             let value = json(metric).map_or_else(|| "null".to_string(), |value| value.to_string());
@@ -327,7 +327,7 @@ fn json(metric: &Metric) -> Option<Json> {
         MetricValue::Int(word) => Some(Json::from(word.cast_signed())),
         MetricValue::Long(word) if unsigned => Some(Json::from(*word)),
         MetricValue::Long(word) => Some(Json::from(word.cast_signed())),
-        // As the decimal that the host meant: 33.3, not 33.29999923706055.
+        // The value as the decimal that the host meant: 33.3, not 33.29999923706055.
         MetricValue::Float(value) => number(value.to_string().parse().ok()?),
         MetricValue::Double(value) => number(*value),
         MetricValue::String(_) => None,

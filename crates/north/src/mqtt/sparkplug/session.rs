@@ -49,7 +49,7 @@ pub(super) struct Packet {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// No connection, or none that is subscribed.
+    /// No connection, or no subscribed connection.
     Away,
     /// Connected; the primary host is not online.
     Waiting,
@@ -60,7 +60,7 @@ enum Phase {
     Live,
 }
 
-/// The session; it lasts over connections.
+/// The session of a node; it lasts over several connections.
 #[derive(Debug)]
 pub(super) struct Session {
     rules: Rules,
@@ -73,7 +73,7 @@ pub(super) struct Session {
     devices: Vec<Device>,
     /// Devices that are no longer configured and are to be declared dead.
     departed: Vec<String>,
-    /// The device that is looked at first, so that each has its turn.
+    /// Index of the device that is looked at first, so that each device has its turn.
     cursor: usize,
     rebirth: bool,
     born_at: Option<Instant>,
@@ -278,7 +278,7 @@ impl Session {
         }
     }
 
-    /// The name of a metric and its data type.
+    /// Name and data type of a metric.
     pub(super) fn definition(&self, device: usize, metric: usize) -> Option<&Definition> {
         self.devices.get(device)?.definitions.get(metric)
     }
@@ -395,7 +395,7 @@ impl Session {
         self.seq = u8::MAX;
         (self.phase, self.rebirth, self.born_at) = (Phase::DeviceBirths(0), false, Some(moment.now));
         for device in &mut self.devices {
-            // The birth of the node ends what hosts knew of its devices.
+            // After the birth of the node, hosts know nothing of its devices.
             (device.born, device.gone) = (false, false);
         }
         let control = Definition::new(REBIRTH_METRIC, DataType::Boolean);

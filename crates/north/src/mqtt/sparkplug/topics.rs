@@ -36,7 +36,7 @@ pub(super) enum Received<'t> {
     DeviceCommand(&'t str),
 }
 
-/// The version of Sparkplug in which the primary host reports its state.
+/// The version of Sparkplug that the primary host's state messages follow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StateForm {
     /// 3.0: `spBv1.0/STATE/{host}`, an object with the time.
@@ -91,7 +91,7 @@ impl Topics {
         format!("{NAMESPACE}/{}/DCMD/{}/{device}", self.group, self.node)
     }
 
-    /// The state of the primary host, if there is one.
+    /// Topic of the primary host's state, if there is such a host.
     pub(super) fn state(&self) -> Option<String> {
         (!self.primary_host.is_empty()).then(|| format!("{NAMESPACE}/STATE/{}", self.primary_host))
     }

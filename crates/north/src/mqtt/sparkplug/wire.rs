@@ -8,7 +8,7 @@ use prost::Message as _;
 
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct Payload {
-    /// When it was sent, ms since 1970.
+    /// When the message was sent, ms since 1970.
     #[prost(uint64, optional, tag = "1")]
     pub(super) timestamp: Option<u64>,
     #[prost(message, repeated, tag = "2")]
@@ -18,7 +18,7 @@ pub(super) struct Payload {
     pub(super) seq: Option<u64>,
 }
 
-/// A metric: its name, its alias or both, and its value.
+/// A metric, with its name, its alias or both, and with its value.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct Metric {
     #[prost(string, optional, tag = "1")]

@@ -110,7 +110,7 @@ fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
     assert_eq!(again, None, "the first one's result is still to come");
 }
 
-/// A run, which it returns, and a stop after it.
+/// Takes a run command, which this function returns, and a stop after it.
 fn run_and_stop(bench: &mut SetTopics) -> Incoming {
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     for command in [run.clone(), set("p1/set", r#"{"id": 2, "run": false}"#)] {
@@ -139,7 +139,7 @@ fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
         assert_eq!(again["error"]["code"], "not_allowed", "{again}");
         assert_eq!(bench.queued(), 0);
     }
-    // Also where no stop came.
+    // This holds even without a stop in between.
     let start = set("p1/set", r#"{"id": 3, "run": true}"#);
     assert_eq!(bench.take(start.clone()), None);
     bench.acknowledge();

@@ -25,7 +25,7 @@ pub(super) struct Device {
     pub(super) now_is: Vec<Sample>,
     /// As last published or recorded.
     pub(super) sent: Vec<Option<Sample>>,
-    /// Metrics to be published although they did not change.
+    /// Metrics that are published although they did not change.
     pub(super) repeat: Vec<usize>,
     pub(super) sent_at: Option<Instant>,
     /// Whether the present samples may differ from those sent.

@@ -19,7 +19,7 @@ fn rules(primary_host: &str) -> Rules {
     }
 }
 
-/// Without history, for tests of everything else.
+/// Rules without history, for tests of everything else.
 fn live() -> Rules {
     Rules {
         history: false,
@@ -40,13 +40,13 @@ fn sample(number: f64, time: u64) -> Sample {
     }
 }
 
-/// A session with a clock, and a host that watches it.
+/// A session with a clock, watched by a host.
 struct SessionWithHost {
     session: Session,
     start: Instant,
-    /// ms since the start.
+    /// Time since the start, ms.
     time: u64,
-    /// ms from the host's word that it is online to the births.
+    /// Time from the host's message that it is online to the births, ms.
     births_after: u64,
     host: Watcher,
 }
@@ -58,11 +58,11 @@ struct Watcher {
     bd_seq: Option<u8>,
     /// Alias to device and name, as of the last births.
     aliases: BTreeMap<u64, (String, String)>,
-    /// Every alias that there ever was.
+    /// All aliases that were ever used.
     ever: BTreeMap<u64, (String, String)>,
     born: BTreeSet<String>,
     births: usize,
-    /// The last values, and those that came as history, with their times.
+    /// The last values, and the values received as history, with their times.
     values: BTreeMap<(String, String), (f64, u64)>,
     past: Vec<(String, String, f64, u64)>,
     deaths: Vec<String>,
@@ -322,7 +322,7 @@ fn changes_keep_their_distance() {
         (bench.kinds(), bench.value("p0", "a")),
         (vec![of(Kind::DeviceData, "p0")], Some(3.0))
     );
-    // Back to what it was before it was sent: nothing.
+    // The value returns to the one last sent before anything is sent, so nothing is sent.
     bench.time += 10;
     bench.tell(0, true, 4.0);
     bench.tell(0, true, 3.0);
@@ -403,7 +403,7 @@ fn the_primary_host_opens_and_ends_the_session() {
     let death = bench.session.end(bench.tick());
     bench.host.see(&death);
     assert_eq!(bench.send(9), 0);
-    // The next connection waits for a state of its own.
+    // The next connection waits for a state message of its own.
     bench.connect(1);
     bench.session.subscribed();
     assert_eq!(bench.send(9), 0);
@@ -428,7 +428,7 @@ fn an_outage_is_told_afterwards_in_order() {
     for step in 1..=600u32 {
         bench.time += 60;
         bench.tell(0, true, f64::from(step));
-        // Unchanged, so not recorded.
+        // The value is unchanged, so it is not recorded.
         bench.tell(1, true, 0.0);
         expected.push((f64::from(step), bench.time));
     }
@@ -457,7 +457,7 @@ fn what_there_is_no_room_for_is_counted() {
         bench.time += 100;
         bench.tell(0, true, f64::from(step));
     }
-    // Two metrics at first, then one at a time; five are kept.
+    // Two metrics come first, then one at a time; the session keeps five.
     assert_eq!((bench.waiting(), bench.session.take_lost()), (5, 6));
     let mut off = SessionWithHost::new(
         Rules {
