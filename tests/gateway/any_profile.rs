@@ -37,7 +37,7 @@ fn is_shown(site: &Site, point: &str, value: &Value) {
     until(&format!("{point} = {value}"), read);
 }
 
-/// The profiles at the beginning of the page, by their names.
+/// The profiles at the beginning of the page, each with its name.
 fn examples() -> Vec<(String, String)> {
     let page = std::fs::read_to_string(root().join("docs/profiles.md")).unwrap();
     let (_, examples) = page.split_once("\n## Four examples\n").unwrap();
@@ -181,7 +181,7 @@ fn a_register_list_becomes_a_device_that_is_read() {
     for (name, _, value) in &given {
         is_shown(&site, name, value);
     }
-    // As they stand in the registers: IEEE 754, low word first, digits.
+    // The registers hold IEEE 754 numbers, the low word first, and digits.
     let raw = |start: u16, count: u16| read_input(&site, start, count);
     assert_eq!(raw(0, 2), [0x4365, 0xC000]);
     assert_eq!(raw(2, 2), [0xCFC7, 0xFFFF]);

@@ -14,7 +14,7 @@ use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
 const SPEED_REFERENCE: u16 = 0x8101;
 const AUDIT: &str = "[audit]\nfile = \"audit.jsonl\"\n";
 
-/// A site that keeps its audit in its own folder.
+/// A site that keeps its audit in a folder of its own.
 fn site(parts: &[&str]) -> Site {
     let line1 = LINE1.replace("name = \"test\"\n", "name = \"test\"\nstate_dir = \"state\"\n");
     Site::of(&[&[line1.as_str(), &controlled("pump", 1, ""), AUDIT], parts].concat())
@@ -50,7 +50,7 @@ fn verify(site: &Site, more: &[&str]) -> Output {
         .unwrap()
 }
 
-/// Their counts together.
+/// Sum of the records' counts.
 fn sum<'r>(records: impl IntoIterator<Item = &'r Value>) -> u64 {
     records
         .into_iter()

@@ -202,7 +202,7 @@ fn compared(shown: &Json, told: &Json) -> Result<usize, String> {
         let (value, fault) = (&point["value"], point["quality"] != "good");
         let same = match (value, seen) {
             (Json::String(text), Json::String(seen)) => text == seen,
-            // An enumeration shows the place of its code.
+            // A multi-state object shows the place of the code in the enumeration.
             _ if id.starts_with("multi-state") => true,
             _ => {
                 let value = value
@@ -516,7 +516,7 @@ fn tshark_finds_nothing_wrong_with_any_frame() {
         vec![1, 0x80, 6, 0],
         vec![1, 0x20, 0, 77, 0, 0xFF, 0x10, 8],
         vec![1, 0x20, 0xFF, 0xFF, 0, 0xFF, 0x10, 7, 0x3D, 4, 0, b'r', b'u', b'n'],
-        // All of every kind of object, and of one that is not there.
+        // The requests ask for all properties of each kind of object, and of an object that does not exist.
         routed(
             &[
                 &[2, 5, 1, 14][..],
@@ -648,7 +648,7 @@ fn a_change_is_told_within_a_round() {
     let mut modbus = TcpStream::connect(("127.0.0.1", plant.site.modbus)).unwrap();
     let mut took = Vec::new();
     for number in 0..200_u16 {
-        // At another time of the round each time.
+        // Each write comes at another time of the polling round.
         std::thread::sleep(Duration::from_millis(u64::from(number) * 37 % 113));
         let on = u8::from(number % 2 == 0);
         modbus.write_all(&[0, 1, 0, 0, 0, 6, 5, 6, 0x81, 0, 0, on]).unwrap();

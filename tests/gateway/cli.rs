@@ -466,7 +466,7 @@ fn checked(path: &Path) -> String {
     run(&["check", "--json", "--config", &path]).out.replace(&path, "FILE")
 }
 
-/// The configuration in an inventory, as PyYAML reads it, and its host.
+/// The configuration in an inventory as PyYAML reads it, and the host of the inventory.
 fn from_inventory(inventory: &Path) -> (String, toml::Table) {
     let script = "import json, sys, yaml\n(host, variables), = yaml.safe_load(open(sys.argv[1]))['drivegate']['hosts'].items()\n\
         print(json.dumps([host, variables['drivegate_configuration']]))";
@@ -589,7 +589,7 @@ fn a_closed_pipe_ends_the_output_quietly() {
         let Output { status, stderr, .. } = drivegate(&args).stdout(writer).output().unwrap();
         assert_eq!((status.code(), stderr.as_slice()), (Some(0), &b""[..]), "{args:?}");
     }
-    // Errors cannot be printed either: only the exit code shows them.
+    // Even errors cannot be printed, so only the exit code shows them.
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let bad = drivegate(&["check", "--config", "tests/bad/twice.toml"])

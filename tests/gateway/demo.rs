@@ -159,7 +159,7 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
     for line in &lines {
         until(line, || {
             let output = pasted(line);
-            // The one that shows topics as they come ends by the time limit.
+            // The command that shows topics as they arrive is ended by the time limit.
             let endless = line.starts_with("mosquitto_sub ") && output.status.code() == Some(124);
             (endless && !output.stdout.is_empty() || output.status.success()).then_some(())
         });

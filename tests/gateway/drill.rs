@@ -164,7 +164,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
         site.until_point("pump-1", "running", false);
         site.until_state("pump-1", "ready");
     };
-    // A PLC that stops it, and one that orders something else.
+    // A PLC stops the motor; in the next drill, a PLC writes another command.
     let id = begin(json!(["gateway"]));
     write_registers(site.modbus, 1, 0x8100, &[0]);
     stands(&id, "aborted", "modbus_tcp 127.0.0.1");
@@ -192,7 +192,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
         assert_eq!(status, 422, "{refused}");
         assert!(refused["error"].as_str().unwrap().contains(text), "{refused}");
     }
-    // A reload that removes the drive stops its motor first.
+    // A reload that removes the drive stops the drive's motor first.
     let id = begin(json!(["gateway"]));
     let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
     site.change(&controlled("pump-1", 1, supervised), "");

@@ -9,7 +9,7 @@ use crate::support::process::{self, Running, api, free_port, until, until_ready}
 use crate::support::site::line_of;
 use crate::support::tools::tool;
 
-/// How a command ended, what it printed and what it complained of.
+/// Exit code of a command, and what the command printed on standard output and standard error.
 pub(crate) struct Ran {
     pub(crate) code: i32,
     pub(crate) out: String,
@@ -29,7 +29,7 @@ pub(crate) fn ran(command: &mut Command) -> Ran {
     }
 }
 
-/// Two simulated drives behind a link, and a gateway's configuration for them.
+/// Two simulated drives on a line, and the configuration of a gateway for them.
 pub(crate) struct Line {
     pub(crate) directory: TempDir,
     _drives: Running,
@@ -69,14 +69,14 @@ impl Line {
         self.directory.path().join("own.sock")
     }
 
-    /// The gateway of this configuration, once its socket listens.
+    /// Starts a gateway with this configuration and waits until its socket listens.
     pub(crate) fn gateway(&self) -> Running {
         let gateway = Running::drivegate(&["run", "--config", self.config().to_str().unwrap()]);
         gateway.until_printed("drivegate is running");
         gateway
     }
 
-    /// Writes the configuration anew, changed.
+    /// Writes a changed configuration.
     pub(crate) fn reconfigure(&self, change: impl FnOnce(String) -> String) {
         let text = std::fs::read_to_string(self.config()).unwrap();
         std::fs::write(self.config(), change(text)).unwrap();
@@ -123,7 +123,7 @@ impl Line {
         );
     }
 
-    /// Why the motor stands: run is still on in the drive.
+    /// Checks that `why` explains why the motor stands although run is still on in the drive.
     fn is_explained(&self) {
         let why = self.command("why", &["pump-1"]);
         assert_eq!(why.code, 0, "{}", why.err);

@@ -17,7 +17,7 @@ use crate::support::process::{PATIENCE, Running, api, free_port, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, curl};
 use crate::support::tools::{python, root};
 
-/// Each profile with the module of its drive.
+/// Each profile, with the module of its drive.
 pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
     let mut all: Vec<_> = cases().iter().map(|case| (case.profile, case.peer)).collect();
     all.sort_unstable();
@@ -69,7 +69,7 @@ impl Rig {
         }
     }
 
-    /// Sends the orders as they stand; each is seen by the drive.
+    /// Sends the orders and checks that the drive sees each of them.
     fn order(&self, orders: &[Order]) {
         for order in orders {
             let before = self.drive.output().len();
@@ -114,7 +114,7 @@ impl Rig {
         answer(self.slot, &rtu(address, pdu), 1)
     }
 
-    /// A command of named values by the local socket: its status and result.
+    /// Gives a command with named values over the local socket; returns status and result.
     fn command(&self, values: &str) -> (u16, serde_json::Value) {
         let socket = self.site.path("own.sock");
         let url = "http://gateway/api/v1/drives/drive/commands";

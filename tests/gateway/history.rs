@@ -53,7 +53,7 @@ fn counters_and_events_survive_a_kill() {
         let text = fs::read_to_string(site.file("state/events.jsonl")).ok()?;
         text.matches("\"stopped\"").nth(1).map(drop)
     });
-    // An orderly stop writes the counters; a kill then costs what came since.
+    // An orderly stop writes the counters; after that, a kill only loses what was counted since.
     gateway.signal("TERM");
     gateway.ended();
     let mut gateway = site.run_ready();

@@ -50,7 +50,7 @@ impl Plant {
         self.site.curl("alice", &format!("drives/pump-1/{what}"), &["-d", body])
     }
 
-    /// 0x8013 and 0x8104 as the PLC reads them, and the state over HTTP.
+    /// Registers 0x8013 and 0x8104 as the PLC reads them, and the state over HTTP.
     fn seen(&self) -> (u16, u16, Json, Json) {
         let read = |address| until("registers", || mbpoll_read(self.site.modbus, 1, address, 1).ok())[0];
         let (holder, own) = (read(0x8013), read(0x8104));
@@ -102,7 +102,7 @@ fn who_sees_and_may_what() {
     );
     assert_eq!(plant.site.ask("pump-1/hold", "take")["result"], "not_allowed");
     assert_eq!(plant.site.point("pump-1", "output_frequency"), 25.0);
-    // A higher rank takes it over: the motor runs on.
+    // A higher rank takes the drive over; the motor keeps running.
     assert_eq!(plant.curl("hold", r#"{"action": "take"}"#).0, 409);
     let (status, answer) = plant.curl("hold", r#"{"action": "break"}"#);
     assert_eq!(

@@ -55,7 +55,7 @@ impl Shared {
         self.site.path("master")
     }
 
-    /// A gateway that listens, once it is up.
+    /// Starts a gateway that listens, and waits until it is up.
     fn gateway(&self, protocol: Protocol, baud: u32, profile: &str, drives: u8) -> Running {
         let mut text = format!(
             "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nmode = \"listen\"\nprotocol = \"{}\"\nbaud = {baud}\n\
@@ -89,7 +89,7 @@ impl Shared {
         api(self.site.http, name)
     }
 
-    /// Ends the line; what the gateway sent on it.
+    /// Ends the line; returns what the gateway sent on it.
     fn sent_by_the_gateway(self) -> String {
         self.line.signal("TERM");
         self.line.until_printed("the listener sent")

@@ -203,7 +203,7 @@ fn a_gateway_is_set_up_again_from_its_backup() {
     let refused = restore("state", &[]);
     assert!(refused.code == 1 && refused.err.contains("--force"), "{}", refused.err);
     assert_eq!(restore("state", &["--force"]).code, 0);
-    // Nothing is left behind.
+    // The restore leaves no other files behind.
     let names = fs::read_dir(place.path().join("etc")).unwrap();
     let mut names: Vec<_> = names.map(|file| file.unwrap().file_name()).collect();
     names.sort();

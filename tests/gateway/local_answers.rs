@@ -33,7 +33,7 @@ fn order(site: &Site, body: &str) -> UnixStream {
     stream
 }
 
-/// All that is answered until the connection is closed.
+/// All that the server answers until it closes the connection.
 fn answer(mut stream: UnixStream) -> String {
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();

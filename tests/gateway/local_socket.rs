@@ -104,7 +104,7 @@ fn its_file_is_for_owner_and_group_is_replaced_after_a_kill_and_removed_at_the_e
     drop(second);
     let stop = line.command("write", &["pump-1", "run=false"]);
     assert!(stop.out.contains("through the gateway"), "{}{}", stop.out, stop.err);
-    // A reload opens and closes it.
+    // One reload closes the socket, and the next one opens it again.
     line.reconfigure(|text| text.replace("own.sock", ""));
     gateway.signal("HUP");
     until("no socket", || (!exists(&line.socket())).then_some(()));
@@ -425,7 +425,7 @@ fn a_command_without_run_never_carries_it_on_any_family() {
     }
 }
 
-/// A stop between two commands without `run` stands, however they interleave with it.
+/// A stop between two commands without `run` remains in effect, however the commands interleave with it.
 #[test]
 fn a_stop_that_comes_in_between_is_not_undone() {
     let family = Family::start("vacon-nx", ("38400", "silence = \"chars\"\n"), "");
@@ -439,7 +439,7 @@ fn a_stop_that_comes_in_between_is_not_undone() {
                 scope.spawn(move || {
                     let mut client = Client::connect(socket);
                     for on in [true, false, true, false] {
-                        // A stop may cut it short, which is an answer too.
+                        // A stop may cut the command short; its reply is an answer, too.
                         client.post("/api/v1/drives/fan-1/commands", &json!({ point: on }));
                     }
                 });
@@ -451,7 +451,7 @@ fn a_stop_that_comes_in_between_is_not_undone() {
     }
 }
 
-/// Derived points are those of the gateway: `frequency_range` counts, as over MQTT.
+/// Derived points are computed like the gateway's: `frequency_range` counts, as over MQTT.
 #[test]
 fn a_configured_frequency_range_counts_as_over_mqtt() {
     let folder = TempDir::new().unwrap();

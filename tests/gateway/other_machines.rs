@@ -196,7 +196,7 @@ fn a_bit_that_a_controller_holds_is_no_edge_at_another_machine() {
     let sent = plant.words(2).split_off(before);
     assert_eq!(sent, Vec::<u16>::new(), "no reset, and no start");
     assert_eq!(api(plant.site.http, "pump-2")["state"], "fault");
-    // A stop of its own, and the bit is an edge again.
+    // After a stop from this controller, the bit is an edge again.
     assert_eq!(write(&mut plc, 11, 0)[7], 6);
     assert_eq!(write(&mut plc, 11, 4)[7], 6);
     plant.site.until_state("pump-2", "ready");

@@ -15,7 +15,7 @@ const MS: Duration = Duration::from_millis(1);
 const RESPONSE_TIMEOUT: Duration = Duration::from_millis(300);
 /// Times of each kind of pause in which the order of two clients is not known.
 const TIMES: usize = 12;
-/// As for what clients sent in it: a hiccup, and pauses.
+/// Lengths of pauses, as in the tests of what clients sent during a pause.
 const HICCUP: Duration = Duration::from_millis(200);
 const PAUSES: [Duration; 4] = [
     HICCUP,
@@ -74,7 +74,7 @@ impl Plant {
         done
     }
 
-    /// Any reading of before it is outdated by then.
+    /// Whether the motor runs; after the sleep, any earlier reading is outdated.
     fn runs(&self) -> bool {
         std::thread::sleep(700 * MS);
         until("a reading", || self.site.point("pump-1", "running").as_bool())
@@ -207,7 +207,7 @@ impl Client {
         self.stream.write_all(&bytes).unwrap();
     }
 
-    /// The answer to it: whether it was carried out.
+    /// Reads the answer; returns whether the request was carried out.
     fn is_done(&mut self) -> bool {
         self.answer().is_ok()
     }

@@ -64,7 +64,7 @@ fn clients_stay_connected_over_a_reload() {
     assert_eq!(client.ask(&WRITE), WRITE);
     assert_eq!(get(site.http, "/readyz").unwrap().0, 200);
 
-    // Other rights and limits: the connection follows them.
+    // The reload changes rights and limits, and the connection follows them.
     site.configure(&[&before]);
     site.change("write = [\"127.0.0.1/32\"]", "write = []\nmax_connections = 5");
     gateway.signal("HUP");

@@ -19,7 +19,7 @@ fn captures() -> Vec<PathBuf> {
     files
 }
 
-/// Exit code, what it printed, and what it complained of.
+/// Exit code of the replay, and what it printed on standard output and standard error.
 fn replay(capture: &Path, config: &Path) -> (Option<i32>, String, String) {
     let arguments = [
         "replay",

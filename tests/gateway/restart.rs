@@ -11,7 +11,7 @@ use crate::support::process::{Running, api, get, mbpoll_read, until, until_ready
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, functions};
 use crate::support::tools::{run_well, tool};
 
-/// A gateway for `pump-1`; `keys` are further lines of it.
+/// A site with a gateway for `pump-1`; `keys` are further lines of the drive's section.
 fn site(keys: &str) -> Site {
     Site::of(&[LINE1, &controlled("pump-1", 1, keys), MODBUS_TCP, HTTP])
 }

@@ -18,7 +18,7 @@ struct Plant {
     line: SimulatedBus,
 }
 
-/// Two drives, the second full of random parameters, and a file of those.
+/// Two drives, the second one full of random parameters, and a file with those parameters.
 fn plant(keys: &str) -> Plant {
     let site = Site::new();
     site.write("few.toml", &few());
@@ -49,7 +49,7 @@ impl Plant {
         (output.status.code(), text(output.stdout), text(output.stderr))
     }
 
-    /// Ends well; what it printed.
+    /// Runs a command that must succeed; returns what the command printed.
     fn well(&self, arguments: &[&str]) -> (String, String) {
         let (code, printed, said) = self.ran(arguments);
         assert_eq!(code, Some(0), "{arguments:?}: {printed}{said}");
@@ -177,7 +177,7 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
         until("the journal", || journal.exists().then_some(()));
         let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
         if code == Some(0) && !journal.exists() {
-            // On a busy machine the restore is over before the order comes.
+            // On a busy machine the restore ends before the order arrives.
             assert_eq!(settle(&plant, &["write", "pump-1", "run=false"]).0, Some(0));
             assert!(restore.ended().success());
             continue;
@@ -248,7 +248,7 @@ fn a_restore_that_an_earlier_version_began_is_resumed_and_undone() {
         fs::write(&journal, EARLIER).unwrap();
         let _gateway = plant.site.run_ready();
         assert!(plant.held());
-        // Some of the values were written before it was killed.
+        // Some of the values were written before the gateway was killed.
         let rows: Vec<Vec<u16>> = EARLIER
             .lines()
             .filter_map(|line| line.split_once(" kept "))
@@ -280,7 +280,7 @@ fn function_6(port: u16, register: u16, value: u16) -> [u8; 2] {
     [answer[7], answer[8]]
 }
 
-/// A command of its own.
+/// Runs a `drivegate` command; returns exit code, standard output and standard error.
 fn settle(plant: &Plant, arguments: &[&str]) -> (Option<i32>, String, String) {
     let config = plant.site.config();
     let output = drivegate(&[arguments, &["--config", &config]].concat())
@@ -365,7 +365,7 @@ fn a_restore_does_not_go_on_at_another_machine() {
     let others = plant.line.with_drive(2, |drive, _| drive.parameter_writes()).unwrap();
     assert!(others.is_empty(), "{others:?}");
 
-    // Where the drive is not configured any more its journal is an orphan.
+    // While the drive is not configured, its journal is an orphan.
     let there = "name = \"pump-2\"\naddress = 1\n";
     plant.site.change(there, "name = \"pump-2\"\naddress = 3\n");
     let check = drivegate(&["check", "--config", &config]).output().unwrap();

@@ -69,7 +69,7 @@ fn http(site: &Site) -> Begun {
     start_over_http(tcp(site.http), COMMANDS, START)
 }
 
-/// Requests that change something, but for commands: each with its body.
+/// Requests other than commands that change something, each with its body.
 const OTHERS: [(&str, &str); 5] = [
     ("/api/v1/stop", "{}"),
     ("/api/v1/drives/pump-1/hold", "{\"action\": \"take\"}"),
@@ -273,7 +273,7 @@ fn a_right_that_a_reload_took_away_serves_no_request_that_had_begun() {
     assert_eq!(refused, 4, "three over HTTP, one by the socket: {audit:?}");
 }
 
-/// A reload that is refused has no effect on them.
+/// A reload that is refused has no effect on the rights of clients.
 #[test]
 fn a_refused_reload_takes_no_right_away() {
     let mut rights = Rights::new();

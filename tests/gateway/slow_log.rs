@@ -41,7 +41,7 @@ fn a_log_that_nobody_reads_holds_nobody_up() {
     let filling = std::thread::spawn(move || other.write_all(&vec![b'x'; 1 << 20]));
     let mut client = TcpStream::connect(("127.0.0.1", site.modbus)).unwrap();
     client.set_read_timeout(Some(PATIENCE)).unwrap();
-    // Each is refused, since the client is not in `write`.
+    // The gateway refuses each request, because the client is not in `write`.
     for _ in 0..1000 {
         assert_eq!(ask(&mut client, 1, &[6, 0x81, 0x00, 0, 0]), [0x86, 1]);
     }

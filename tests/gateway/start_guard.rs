@@ -21,7 +21,7 @@ fn curl(site: &Site, drive: &str, body: &str) -> (u16, Json) {
     site.curl("alice", &format!("drives/{drive}/commands"), &["-d", body])
 }
 
-/// Stops `pump-1` and waits until it stands.
+/// Stops `pump-1` and waits until its motor stands.
 fn stop(site: &Site) {
     write_registers(site.modbus, 1, COMMAND, &[0]);
     site.until_point("pump-1", "running", false);
@@ -52,7 +52,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     site.until_state("pump-1", "ready");
     site.until_state("fan-2", "ready");
 
-    // The interlock, to each side in its own words.
+    // The interlock refuses the start, and names itself on each side in that side's form.
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
     assert_eq!((status, &answer["result"]), (409, &json!("interlocked")), "{answer}");
     let message = answer["error"]["message"].as_str().unwrap();
@@ -73,7 +73,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     starts(&site, "pump-1");
     stop(&site);
 
-    // Too soon: refused with the time, or it waits for it.
+    // A start that comes too soon is refused with the time to wait, or waits for that time.
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
     assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
     let retry = answer["retry_after_ms"].as_u64().unwrap();
@@ -102,7 +102,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
         "{events}"
     );
 
-    // Killed and started anew, it has not forgotten the starts.
+    // A gateway that was killed and started again has not forgotten the starts.
     stop(&site);
     gateway.signal("KILL");
     gateway.ended();
@@ -118,7 +118,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
         Some((status, answer)).filter(|(_, answer)| answer["retry_after_ms"].as_u64() > Some(60_000))
     });
     assert_eq!((status, &answer["result"]), (409, &json!("guarded")), "{answer}");
-    // Under another name it is the same motor.
+    // Under another name, the drive still has the same motor.
     site.change("name = \"pump-1\"", "name = \"pump-9\"");
     gateway.signal("HUP");
     until("the new name", || {
@@ -144,7 +144,7 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
     starts(&site, "fan-2");
     site.until_point("fan-2", "running", true);
     starts(&site, "pump-1");
-    // Nothing can be written in its place any more.
+    // This folder makes it impossible to write the file of starts.
     std::fs::create_dir(site.file("state/starts.partial")).unwrap();
     stop(&site);
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
@@ -178,7 +178,7 @@ fn a_refused_reload_leaves_the_guards_as_they_were() {
         &format!("127.0.0.1:{}", site.modbus),
         &taken.local_addr().unwrap().to_string(),
     );
-    // Each drive in a group of its own.
+    // Each drive gets a group of its own.
     let text = std::fs::read_to_string(site.config()).unwrap();
     site.write(
         "drivegate.conf",

@@ -144,7 +144,7 @@ fn from_every_side() {
     let alice = ["--token-file", &login];
     let (code, text) = ran(&["write", "pump-1", "speed_reference=30"], &alice);
     assert!(code == 0 && text.contains("through the gateway"), "{text}");
-    // A point that is not polled is read for those who may command.
+    // A point that is not polled is read only for users who may command.
     let (code, text) = ran(&["read", "pump-1", "running", "process_data_in_8"], &[]);
     assert!(code == 1 && text.contains("it is not polled"), "{text}");
     let (_, text) = ran(&["read", "pump-1", "running", "process_data_in_8"], &alice);
@@ -185,7 +185,7 @@ fn a_retained_stop_of_all_stops_nothing_and_is_told() {
             (results.output().matches("the message was retained").count() == times).then_some(())
         });
     }
-    // Further refusals of one client are counted.
+    // Further refusals of the same client are only counted.
     let of_all = |record: &Json| record["drive"] == "all drives" && record["result"] == "not_allowed";
     assert!(plant.site.audit().iter().any(of_all));
     let (_, log) = get(plant.site.http, "/api/v1/events/log?kind=refused_command").unwrap();

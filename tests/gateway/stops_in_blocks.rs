@@ -141,7 +141,7 @@ enum Way {
     /// The body, and the status of the reply.
     Http(&'static str, u16),
     Socket(&'static str, u16),
-    /// Arguments of `drivegate write`, and the word of its error.
+    /// Arguments of `drivegate write`, and a word from the error that must follow.
     CommandLine(&'static [&'static str], &'static str),
     /// Object, value and priority of writes, and class and code of the error.
     Bacnet(&'static [(&'static str, f64)], [u8; 2]),
@@ -188,7 +188,7 @@ fn ways() -> Vec<(&'static str, Way)> {
     ways.push(("pump", Registers(1, 0x8100, vec![0, 20_000, 0xFFFF], 3)));
     ways.push(("coil", Registers(2, 0x8100, vec![0, 0, 0, 0, 0], 2)));
     ways.push(("fan", Registers(3, 0x80F0, around(16, 0, 9), 2)));
-    // Their own registers and coils.
+    // Registers and coils of the drives themselves.
     ways.push(("pump", Registers(1, 1990, around(10, 0, 0), 2)));
     ways.push(("pump", Registers(1, 2000, around(0, 0, 100), 2)));
     ways.push(("pump", Registers(1, 1950, around(50, 0, 70), 2)));
@@ -197,7 +197,7 @@ fn ways() -> Vec<(&'static str, Way)> {
     ways.push(("coil", Coils(2, 3, states(2, 4), 2)));
     ways.push(("coil", Coils(2, 0, states(5, 0), 2)));
     ways.push(("coil", Coils(2, 5, states(0, 200), 2)));
-    // All drives.
+    // Registers that stop all drives.
     ways.push(("pump", Registers(255, 0x0100, vec![1, 7], 2)));
     ways.push(("pump", Registers(255, 0x00FE, vec![7, 0, 1, 0], 2)));
     // Objects.

@@ -78,7 +78,7 @@ fn shown(text: &str) -> Vec<Shown> {
 fn line(text: &str) -> Shown {
     let fields: Vec<&str> = text.split_whitespace().collect();
     let clock: Vec<u64> = fields[0].split([':', '.']).map(|n| n.parse().unwrap()).collect();
-    // Two blanks divide the bytes from their meaning.
+    // Two spaces separate the bytes from their meaning.
     let (_, rest) = text.split_once(fields[3]).unwrap();
     let (hex, meaning) = rest.trim_start().split_once("  ").unwrap_or(("", rest));
     let bytes = hex
@@ -103,7 +103,7 @@ fn frames_their_times_and_their_meaning() {
     assert_eq!(frames.len(), 40);
     let transcript = plant.line.transcript();
 
-    // As the line itself saw them, one behind the other.
+    // The frames are found in the line's own record, one directly after the other.
     let first = transcript
         .windows(frames.len())
         .position(|window| {
@@ -119,7 +119,7 @@ fn frames_their_times_and_their_meaning() {
         assert_eq!(frame.drive, format!("pump-{}", frame.bytes[0]));
         let gap = frame.gap.expect("something came before");
         if frame.request {
-            // No sooner than the silence ends, and not out of this world.
+            // A request follows no sooner than after the silence, and after a plausible time.
             assert!((SILENCE_US..5_000_000).contains(&gap), "{frame:?}");
             assert!(frame.meaning.starts_with("read "), "{frame:?}");
             reads += usize::from(frame.meaning == "read holding 2100..2110");
@@ -291,7 +291,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     assert!(child.wait().unwrap().success());
     assert_eq!(reported, "");
 
-    // A bus that is not there.
+    // The bus does not exist.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--bus", "hall 1"]);
     assert_eq!(output.status.code(), Some(1));
     let reported = String::from_utf8(output.stderr).unwrap();
@@ -306,7 +306,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     let reported = String::from_utf8(output.stderr).unwrap();
     assert!(reported.starts_with("error: cannot write the capture: "), "{reported}");
 
-    // A gateway that stops.
+    // The gateway stops while the trace runs.
     let mut trace = Running::drivegate(&["trace", "--url", &url]);
     trace.until_printed("read holding");
     plant.gateway.signal("TERM");
@@ -314,7 +314,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     assert_eq!(trace.ended().code(), Some(1));
     trace.until_printed("error: the gateway ended the stream");
 
-    // None there any more.
+    // No gateway is there any more.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url]);
     assert_eq!(output.status.code(), Some(1));
     let reported = String::from_utf8(output.stderr).unwrap();

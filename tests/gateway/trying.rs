@@ -16,7 +16,7 @@ use super::drive_access::ran;
 use crate::support::process::{PATIENCE, Running, api, drivegate, get, until};
 use crate::support::site::{functions, line_of};
 
-/// A program on a terminal of its own.
+/// A program that runs on a terminal of its own.
 struct OnTerminal {
     child: Child,
     keyboard: File,
@@ -206,7 +206,7 @@ fn ctrl_c_ends_it_at_any_moment() {
         // The thread that reads the terminal may come after the end of the program.
         trial.until_shown("stopped; nothing was written");
     }
-    // At the question.
+    // The key is pressed at the question.
     let mut trial = OnTerminal::start(&words(&rig.arguments(&[])));
     trial.until_shown("Save this as a configuration?");
     trial.press("\x03");

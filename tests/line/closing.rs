@@ -11,18 +11,18 @@ use drivegate::sim::endpoint::EndpointOptions;
 
 use super::rig::{Rig, Setup};
 
-/// When the server closes its connection.
+/// When the device server closes the connection of its client.
 #[derive(Debug, Clone, Copy)]
 enum Rule {
-    /// Behind so many replies.
+    /// After this number of replies.
     Behind(u32),
     /// Upon the request that follows so many replies, which is lost.
     Upon(u32),
-    /// After a pause of its client.
+    /// After a pause of this length without requests.
     Pause(Duration),
 }
 
-/// A device server before the simulated line at `to`, which it keeps open.
+/// A device server in front of the simulated line at `to`; it keeps its connection to the line open.
 fn device_server(to: &str, rule: Rule) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("tcp://{}", listener.local_addr().unwrap());
@@ -114,7 +114,7 @@ async fn a_server_that_closes_after_replies_or_pauses_is_no_lost_port() {
         });
         let ready = |r: &Rig| r.state(1) == State::Ready && r.state(2) == State::Ready;
         rig.until("both drives answer", ready).await;
-        // A drive's first event follows behind its values.
+        // A drive's first event follows after its values.
         let told = |r: &Rig| {
             let events = r.events.recent();
             events.iter().filter(|e| e.kind == EventKind::Online).count() == 2

@@ -121,7 +121,7 @@ async fn a_port_that_is_busy() {
     assert!(text.contains(&rig.line.address()), "{text}");
     assert!(!second.bus_up());
     assert_eq!(rig.state(1), State::Ready, "the first is not disturbed");
-    // The first lets go; the second gets it by itself.
+    // The first bus releases the port; the second bus then opens the port by itself.
     let Rig { bus, line, .. } = rig;
     bus.stop();
     second.until("it has the port", Rig::bus_up).await;
@@ -149,7 +149,7 @@ async fn a_port_that_is_none() {
     assert_eq!(std::fs::read_to_string(path("file")).unwrap(), "precious");
 }
 
-/// The pauses between are proved where they are reckoned.
+/// The pauses between attempts are tested where they are computed.
 #[tokio::test]
 async fn a_server_that_hangs_up_is_tried_again() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();

@@ -28,7 +28,7 @@ const RESPONSE_TIMEOUT: Duration = Duration::from_secs(2);
 pub(crate) struct Rig {
     pub(crate) plant: Plant,
     pub(crate) events: Events,
-    // The bus ends before its line.
+    // Dropped first, so that the bus ends before its line.
     pub(crate) bus: BusTask,
     pub(crate) line: SimulatedBus,
     _link: tempfile::TempDir,
@@ -96,7 +96,7 @@ impl Rig {
                 turnaround: Duration::from_micros(500),
                 ..testkit::controlled(&drive(address), "line1", address, &setup.profile)
             };
-            // Nothing is stale because this machine is busy.
+            // With this limit, no value becomes stale because the test machine is busy.
             Arc::new(DriveImage::new(spec, Duration::from_millis(500)).with_stale_floor(PATIENCE))
         };
         let handle = testkit::bus(spec, (1..=setup.drives).map(image).collect());
@@ -176,7 +176,7 @@ pub(crate) fn reason(rig: &Rig) -> String {
     rig.bus.handle().image.health().reason.unwrap_or_default()
 }
 
-/// A rig whose bus is to open something else than its line.
+/// A rig whose bus is configured to open `port` instead of its line.
 pub(crate) fn with_port(port: &str) -> Rig {
     Rig::of(Setup {
         port: Some(port.to_string()),

@@ -20,7 +20,7 @@ fn drivegate(arguments: &[&str]) -> String {
     format!("{err}{out}")
 }
 
-/// Gives a command, again until it is acknowledged.
+/// Gives a command, and repeats it until the drive acknowledges it.
 fn command(site: &Site, points: &[&str]) {
     let config = site.config();
     let arguments = [&["write", "--config", &config, "drive"], points].concat();
@@ -42,7 +42,7 @@ fn site(bus: &str, profile: &str) -> Site {
     Site::of(&[line, &drive, HTTP, MODBUS_TCP])
 }
 
-/// A transaction counter of the gateway, 0 while it does not stand there.
+/// A transaction counter of the gateway; 0 while the metrics do not show the counter.
 fn counted(http: u16, outcome: &str) -> f64 {
     let (_, text) = get(http, "/metrics").unwrap();
     let wanted = format!("outcome=\"{outcome}\"");
@@ -73,7 +73,7 @@ point = [
 ]
 "#;
 
-/// Two pseudo-terminals joined by socat, one with a pymodbus slave behind it.
+/// Two pseudo-terminals joined by socat, with a pymodbus slave behind one of them.
 fn slave(site: &Site, framer: &str) -> (Running, Running) {
     let end = |name: &str| format!("pty,raw,echo=0,link={}", site.path(name));
     let socat = Running::start(&tool("socat"), &[&end("line1"), &end("far")]);

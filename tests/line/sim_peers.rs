@@ -196,7 +196,7 @@ fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
     assert_eq!(line.statistics().broadcasts, 1);
 }
 
-/// A drive 1 of that model, and what pymodbus sees of it.
+/// A simulated drive 1 of this model, and what pymodbus reads from it.
 fn pymodbus(name: &str, protocol: Protocol, format: &str) -> (SimulatedBus, Vec<String>) {
     let drive = DriveOptions::new(1, ModelOptions::by_name(name).unwrap());
     let rules = LineRules::of(protocol, LineFormat::new(19_200, format).unwrap());

@@ -86,7 +86,7 @@ fn programs_of_others_read_through_the_slot() {
     ] {
         print!("{}", run_well(&python(), &[&script, way, &target, REQUESTS]));
     }
-    // mbpoll is libmodbus; its own baud rate and parity have no effect.
+    // mbpoll uses libmodbus; the baud rate and parity given here have no effect.
     let arguments = [
         "-m", "rtu", "-b", "19200", "-P", "even", "-a", "2", "-t", "4", "-0", "-r", "2100", "-c", "3", "-1", "-o", "5",
         &pty,
@@ -173,7 +173,7 @@ fn tools_that_misbehave_harm_nobody() {
         answered(&ask(&mut sound, &request)),
         "the others are answered meanwhile"
     );
-    // Broken, then whole without a pause; then byte by byte.
+    // A broken request, directly followed by a whole one; then a request byte by byte.
     let mut broken = request.clone();
     broken[4] ^= 0x55;
     assert!(answered(&ask(&mut sound, &[broken, request.clone()].concat())));

@@ -22,7 +22,7 @@ use crate::support::tools::{python, run_well};
 const DEADLINE: Duration = PATIENCE;
 const VERSIONS: [&str; 2] = ["mqttv311", "mqttv5"];
 
-/// A broker on a port of its own.
+/// A broker with a port of its own.
 struct DemoBroker {
     broker: Broker,
     cancel: CancellationToken,
@@ -57,7 +57,7 @@ impl DemoBroker {
         assert!(published.unwrap().success(), "{arguments:?}");
     }
 
-    /// Starts `mosquitto_sub` and waits until it is subscribed.
+    /// Starts `mosquitto_sub` and waits until its subscription is active.
     fn subscribe(&self, version: &str, arguments: &[&str]) -> Reader {
         self.subscribe_as(version, "%t q%q r%r %p", arguments)
     }

@@ -133,7 +133,7 @@ fn the_password_file_gives_its_line() {
     }
 }
 
-/// All files below the project that are part of it.
+/// All files that belong to the project.
 fn project_files() -> Vec<PathBuf> {
     let mut files = Vec::new();
     let mut directories = vec![PathBuf::from(ROOT)];

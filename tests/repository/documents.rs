@@ -26,7 +26,7 @@ fn documents() -> Vec<PathBuf> {
     found
 }
 
-/// All files below `dir` with that extension.
+/// All files below `dir` with this extension.
 pub(super) fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir).unwrap() {
@@ -80,7 +80,7 @@ fn every_configuration_that_ships_is_valid() {
             } else {
                 "[gateway]\nname = \"g\"\n\n"
             };
-            // The directory of an installation is not there.
+            // The directory of an installed gateway does not exist here, so another one replaces it.
             let profiles = dir.path().join("profiles");
             fs::create_dir_all(&profiles).unwrap();
             let block = block.replace("/etc/drivegate/profiles", &profiles.display().to_string());
@@ -96,7 +96,7 @@ fn every_configuration_that_ships_is_valid() {
     }
 }
 
-/// A defence that names a test which is not there proves nothing.
+/// Every test that the threat model names as a proof must exist.
 #[test]
 fn the_tests_of_the_threat_model_exist() {
     let text = read(&root().join("docs/threat-model.md"));
@@ -265,7 +265,7 @@ fn the_two_commands_of_the_readme_exist() {
     assert!(ci.contains("make test"), "CI runs the same command");
 }
 
-/// Every page is in the contents of the book, and nothing else.
+/// The contents of the book name every page and nothing else.
 #[test]
 fn the_contents_name_every_page() {
     let docs = root().join("docs");

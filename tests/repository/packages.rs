@@ -28,7 +28,7 @@ fn assets() -> Vec<(String, String)> {
     assets.iter().map(|asset| (text(&asset[0]), text(&asset[1]))).collect()
 }
 
-/// Every command below `command`, as the name of its manual page.
+/// Collects every subcommand of `command`, as the name of its manual page.
 fn names(command: &clap::Command, page: &str, found: &mut Vec<String>) {
     found.push(page.to_string());
     for inner in command.get_subcommands().filter(|inner| !inner.is_hide_set()) {

@@ -173,7 +173,7 @@ fn prometheus_takes_its_configuration_and_the_rules_do_what_they_say() {
     }
 }
 
-/// Metrics, and what rules record of them.
+/// Metrics of the gateway and series that rules record.
 fn metrics_in(text: &str) -> BTreeSet<String> {
     let word = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == ':';
     text.split(|c| !word(c))
@@ -204,7 +204,7 @@ fn expressions(dashboard: &Value) -> Vec<String> {
 #[test]
 fn dashboards_and_alerts_use_metrics_that_exist() {
     let mut known: BTreeSet<String> = METRICS.iter().map(ToString::to_string).collect();
-    // A rule may use what was recorded before it.
+    // A rule may use a series that an earlier rule records.
     for rule in rules_of(RECORDING) {
         let unknown: Vec<_> = metrics_in(&rule["expr"].to_string())
             .into_iter()

@@ -123,7 +123,7 @@ fn closing(text: &str) -> usize {
     end.map_or(text.len(), |(at, _)| at)
 }
 
-/// A message without what is put into it and what stands between backticks.
+/// The text of a message without its placeholders and without the parts between backticks.
 fn said(literal: &str) -> String {
     let (mut depth, mut plain) = (0_u32, String::new());
     for c in literal.chars() {

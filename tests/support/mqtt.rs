@@ -33,7 +33,7 @@ pub(crate) fn next_json(port: u16, topic: &str) -> Option<serde_json::Value> {
 pub(crate) struct Subscriber(Child);
 
 impl Subscriber {
-    /// Starts it; `on_line` gets each line as it comes.
+    /// Starts the client; `on_line` receives each line when it is printed.
     pub(crate) fn start(command: &mut Command, mut on_line: impl FnMut(String) + Send + 'static) -> Subscriber {
         let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn();
         let mut child = child.unwrap();

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use super::tools::tool;
 
-/// Longest wait for something that must come, on a machine however busy.
+/// Longest wait for something that must happen, even on a very busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(240);
 
 /// A running process; killed when dropped.
@@ -22,12 +22,12 @@ pub(crate) struct Running {
 }
 
 impl Running {
-    /// Starts a program; its output is kept.
+    /// Starts a program and keeps its output.
     pub(crate) fn start(program: &Path, arguments: &[&str]) -> Running {
         Running::spawn(Command::new(program).args(arguments))
     }
 
-    /// Starts what is prepared; its output is kept.
+    /// Starts the prepared command and keeps its output.
     pub(crate) fn spawn(command: &mut Command) -> Running {
         let mut child = command
             .stdin(Stdio::null())
@@ -56,7 +56,7 @@ impl Running {
         self.output.lock().unwrap().clone()
     }
 
-    /// Waits until it has printed `text`.
+    /// Waits until the program has printed `text`.
     pub(crate) fn until_printed(&self, text: &str) -> String {
         until(&format!("the output `{text}`"), || {
             self.output().contains(text).then(|| self.output())
@@ -94,7 +94,7 @@ impl Running {
         });
     }
 
-    /// Waits for its end.
+    /// Waits until the program ends.
     pub(crate) fn ended(&mut self) -> ExitStatus {
         until("the end of the process", || self.child.try_wait().unwrap())
     }
@@ -141,7 +141,7 @@ impl Notifications {
         Notifications(socket, file)
     }
 
-    /// Has the program send them.
+    /// Makes the program send its notifications here.
     pub(crate) fn of<'c>(&self, command: &'c mut Command) -> &'c mut Command {
         command.env("NOTIFY_SOCKET", &self.1).env("WATCHDOG_USEC", "1000000")
     }

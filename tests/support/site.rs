@@ -18,7 +18,7 @@ use super::tools::{feed, root, run, tool};
 /// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
      [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nsilence = \"chars\"\nresponse_timeout = \"2s\"\n";
-/// Nothing is stale because this machine is busy.
+/// With this limit, no value becomes stale because the test machine is busy.
 pub(crate) const MODBUS_TCP: &str =
     "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
 pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n";
@@ -28,7 +28,7 @@ pub(crate) const USERS: &str = "commands = true\nusers_file = \"users\"\n";
 /// Password of every user.
 pub(crate) const PASSWORD: &str = "correct horse battery";
 
-/// The section of a Vacon NX; `keys` are further lines of it.
+/// The section of a Vacon NX; `keys` are further lines of the section.
 pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
     format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{keys}\n")
 }
@@ -98,7 +98,7 @@ impl Site {
         self.write("drivegate.conf", &text);
     }
 
-    /// Writes the configuration anew with something in another's place; what it was before.
+    /// Replaces a part of the configuration and writes it; returns the configuration as it was before.
     pub(crate) fn change(&self, from: &str, to: &str) -> String {
         let text = std::fs::read_to_string(self.config()).unwrap();
         assert!(text.contains(from), "{from} does not stand in\n{text}");
@@ -204,7 +204,7 @@ impl Site {
         self.respond(&format!("drivegate/test/drive/{topic}"), payload)
     }
 
-    /// The response to a message, by a client of its own.
+    /// The response to a message that a separate client sends.
     pub(crate) fn respond(&self, topic: &str, payload: &str) -> serde_json::Value {
         let mut client = client("mosquitto_rr", self.mqtt);
         client.args(["-q", "1", "-W", "60", "-t", topic, "-e", "answers/1", "-m", payload]);

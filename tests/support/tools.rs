@@ -33,7 +33,7 @@ pub(crate) fn python() -> PathBuf {
     python
 }
 
-/// Runs a program to its end.
+/// Runs a program until it ends.
 pub(crate) fn run(program: &Path, arguments: &[&str]) -> Output {
     Command::new(program)
         .args(arguments)
@@ -42,7 +42,7 @@ pub(crate) fn run(program: &Path, arguments: &[&str]) -> Output {
         .unwrap_or_else(|error| panic!("cannot run {}: {error}", program.display()))
 }
 
-/// Runs a program that must succeed, and returns what it printed, stderr first.
+/// Runs a program that must succeed; returns its output, standard error first.
 pub(crate) fn run_well(program: &Path, arguments: &[&str]) -> String {
     let output = run(program, arguments);
     let printed = [output.stderr, output.stdout].concat();
@@ -57,7 +57,7 @@ pub(crate) fn run_well(program: &Path, arguments: &[&str]) -> String {
     printed
 }
 
-/// Runs a program to its end, with `input` on its standard input.
+/// Runs a program until it ends, with `input` on its standard input.
 pub(crate) fn feed(program: &Path, arguments: &[&str], input: &str) -> Output {
     let mut child = Command::new(program)
         .args(arguments)

@@ -38,7 +38,7 @@ type Why = (u8, u8);
 const DENIED: Why = (2, 40);
 const REFUSED: Why = (5, 29);
 
-/// A client, and the request that it waits for.
+/// A client, with the request whose answer it waits for.
 #[derive(Debug, Clone, Default)]
 struct Client {
     invoke: u8,
@@ -248,7 +248,7 @@ impl BacnetWorld {
         .collect()
     }
 
-    /// A register of the drive, as the drive itself has it.
+    /// A register of the drive, read from the drive itself.
     fn register(&mut self, table: Table, start: u16) -> u16 {
         let read = RequestPdu::Read { table, start, count: 1 };
         match self.rig.with_drive(DRIVE, |drive, now| drive.answer(&read, now)) {
@@ -301,7 +301,7 @@ struct Rules {
 
 type Array = [Option<(f64, usize)>; 16];
 
-/// The priority that governs.
+/// The priority in effect.
 fn governs(array: &Array) -> Option<(usize, f64, usize)> {
     let occupied = array
         .iter()

@@ -36,11 +36,11 @@ pub struct Asked {
     pub is_poll: bool,
     /// Whether the request is a refresh: an order written again.
     pub is_refresh: bool,
-    /// When the image had the first word of a read from, before.
+    /// When the image last had the first word of a read before this request.
     pub last_read: Option<Instant>,
     /// Reply of the drive, if it acted upon the request.
     pub reply: Option<Reply>,
-    /// The frame of that.
+    /// Frame of the reply.
     pub frame: Vec<u8>,
     /// Address of the drive that acted last.
     pub acted: u8,
@@ -51,7 +51,7 @@ pub struct Asked {
 pub enum Seen {
     Sent(Asked),
     Acted(Asked),
-    /// The exchange before ended.
+    /// The previous exchange has ended.
     Over(Asked),
     /// Bytes came to the gateway.
     Heard(Vec<u8>),
@@ -64,14 +64,14 @@ pub struct WorldBus {
     pub core: BusCore,
     pub wire: HalfDuplex,
     pub options: BusOptions,
-    /// The starts of its drives, as long as the process lives.
+    /// Record of the drives' starts; it lasts as long as the process.
     pub guards: Arc<Guards>,
     pub profile: Arc<Profile>,
     pub open: bool,
     /// Whether the bus is about to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
-    /// Replies may come when they are not expected any more, or twice.
+    /// Whether replies may come twice, or when they are no longer expected.
     pub late: bool,
     /// The fast cycle of the line when it is saturated with polls, as predicted.
     pub round: Duration,
@@ -333,7 +333,7 @@ impl WorldBus {
         closed
     }
 
-    /// Lets the bus go on as far as it can at `now`.
+    /// Advances the bus as far as possible at `now`.
     pub fn step(&mut self, now: Instant, seen: &mut Vec<Seen>) {
         self.deliver(now, false, seen);
         while self.open {
@@ -433,7 +433,7 @@ impl WorldBus {
                 continue;
             }
             let Some(image) = self.handle.image.drives.get(DriveIndex::new(asked.drive)) else {
-                // None is configured at that address.
+                // No drive is configured at that address.
                 seen.push(Seen::Acted(asked.clone()));
                 continue;
             };

@@ -14,14 +14,14 @@ use drivegate_world::plant::{Placed, SharedPlant};
 
 use super::scenario::Habit;
 
-/// A client with what it waits for.
+/// A client, with the orders that it waits for.
 pub struct Client {
     pub habit: Habit,
     pub next: Instant,
     pub way: Way,
-    /// Orders that it waits for.
+    /// Number of orders that the client waits for.
     pub open: usize,
-    /// Nothing comes from it before then.
+    /// Time before which the client sends nothing.
     pub silent_until: Instant,
     /// Bus and drive that it commands for a moment, and with how many more orders.
     pub burst: (usize, usize, u64),
@@ -46,7 +46,7 @@ pub struct Waiting {
 /// The broker between a client and the gateway, whose session outlives the connection.
 #[derive(Default)]
 pub struct Broker {
-    /// The gateway is not connected until then.
+    /// Time until which the gateway is not connected.
     pub away_until: Option<Instant>,
     /// The last messages delivered, with the time and the number of the order: the broker repeats unacknowledged ones.
     pub delivered: VecDeque<(Instant, usize, Incoming)>,
@@ -153,7 +153,7 @@ pub fn write_frame(transaction: u16, unit: u8, address: u16, value: u16) -> Vec<
     vec![t1, t2, 0, 0, 0, 6, unit, 6, a1, a2, v1, v2]
 }
 
-/// The transactions that are answered by `bytes`, each with its exception.
+/// The transactions that `bytes` answer, each with its exception.
 pub fn answers(mut bytes: &[u8]) -> Vec<(u16, Option<u8>)> {
     let mut answers = Vec::new();
     while bytes.len() > 7 {

@@ -45,7 +45,7 @@ fn block(word: u16, reference: u16) -> Order {
     })
 }
 
-/// The writes since there were so many requests: function and first address.
+/// The writes after the first `since` requests: function and first address.
 fn writes(rig: &Rig, since: usize) -> Vec<(u8, u16)> {
     let frames = rig.requests();
     let writes = frames[since..].iter().map(|frame| &frame.bytes);

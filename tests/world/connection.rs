@@ -137,7 +137,7 @@ fn orders_survive_the_end_of_a_connection() {
     for mut rig in usual() {
         let order = rig.points(1, &[("run", 1.0)]);
         let mut run = rig.place(1, order);
-        // The drive may have taken it, or not: it is sent again.
+        // The drive may or may not have received the write, so the write is sent again.
         assert_eq!(close_on(&mut rig, is_write, true), Closed::Reconnect);
         let order = rig.points(1, &[("speed_reference", 30.0)]);
         let mut waits = rig.place(1, order);

@@ -32,7 +32,7 @@ fn works(family: &'static str, faults: &str) -> Line {
 enum Allowed {
     /// A stop was acknowledged, and no start was given since.
     Stands,
-    /// A run command was given, whatever became of it.
+    /// A run command was given, whatever its outcome.
     MayRun,
 }
 
@@ -42,7 +42,7 @@ struct World {
     dice: Random,
     allowed: Allowed,
     turns_by_point: bool,
-    /// The point that takes it, in Hz or percent.
+    /// Name of the point that takes the reference, in Hz or percent.
     reference: &'static str,
 }
 
@@ -119,7 +119,7 @@ impl World {
             6 if self.resets() => drop(self.order(&[("fault_reset", 1.0)])),
             7 => {
                 self.rig.with_drive(1, |drive, _| drive.trip(3));
-                // Nothing but a new run command starts it after that, no reset either.
+                // After a fault, only a new run command starts the motor; a reset does not.
                 self.allowed = Allowed::Stands;
                 self.look(&[("a fault", 1.0)]);
             }

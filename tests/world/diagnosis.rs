@@ -17,7 +17,7 @@ const SECOND: Duration = Duration::from_secs(1);
 /// Time within which each cause must be reported.
 const TOLD: Duration = Duration::from_secs(60);
 
-/// When the drive is started whose line is to be disturbed by it.
+/// When the drive is started in cases where a running drive disturbs the line.
 const RUNS_FROM: Duration = Duration::from_secs(20);
 
 /// Reported causes, each with the address of its drive (0: none).

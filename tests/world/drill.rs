@@ -106,7 +106,7 @@ impl Play {
         }
     }
 
-    /// However it ended: the drive has its stop, and takes orders again.
+    /// Checks that, however the drill ended, the drive is stopped and takes orders again.
     fn healed(&mut self) {
         self.rig.run(20 * SECOND);
         assert!(
@@ -296,7 +296,7 @@ fn what_does_not_stop_is_named() {
 /// Trouble during a drill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Trouble {
-    /// Another master keeps it running.
+    /// Another master keeps the drive running.
     IgnoresStops,
     /// Another master keeps the drive running for three seconds, which is in time.
     StopsLate,
@@ -307,7 +307,7 @@ enum Trouble {
     CommandOfAnother,
     /// The commands reach the motor of another drive.
     WrongMotor,
-    /// Whatever the drive does by itself when its master is silent.
+    /// The gateway falls silent, and the drive does whatever it does without its master.
     SilentGateway,
 }
 
@@ -402,7 +402,7 @@ impl Trouble {
 fn whatever_goes_wrong_is_named_with_every_family() {
     for (number, (family, protocol)) in FAMILIES.into_iter().enumerate() {
         for trouble in Trouble::ALL {
-            // Nothing else is to stop it.
+            // No supervision, so that nothing but the drill stops the drive.
             let works = Line {
                 supervision: None,
                 ..works(family, protocol)
@@ -519,7 +519,7 @@ impl Disk {
     fn look(&mut self, drills: &Drills, now: Instant) {
         match self.writing.take() {
             Some((0, generation, saved)) => {
-                // As it is read by the next process.
+                // The drills as the next process reads them.
                 let bytes = serde_json::to_vec(&saved).unwrap();
                 self.on_disk = Some(SavedDrills::from_json(&bytes).unwrap());
                 drills.kept(generation, now);
@@ -543,7 +543,7 @@ impl Disk {
 fn a_kill_at_any_moment_leaves_no_motor_running() {
     let mut stopped = 0;
     for kill in 0..60_u32 {
-        // Nothing else is to stop it.
+        // No supervision, so that nothing but the drill stops the drive.
         let works = Line {
             supervision: None,
             ..works("vacon-nx", Protocol::ModbusRtu)

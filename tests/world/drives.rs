@@ -14,7 +14,7 @@ const KEPT: usize = 400;
 /// A drive of a world.
 #[derive(Debug)]
 pub struct Truth {
-    /// The run command, as the drive has it.
+    /// The run command in the drive.
     pub run: bool,
     /// Until when a run may go onto the wire; none behind a stop.
     pub may_run: Option<Instant>,
@@ -22,7 +22,7 @@ pub struct Truth {
     pub last_stop_over: Option<Instant>,
     /// Behind that place are the orders that may still go onto the wire, stops apart.
     pub last_place: usize,
-    /// The last order with these words: they come again after some thousands.
+    /// The last order with these words; the words repeat after some thousand orders.
     pub uniques: HashMap<Unique, usize>,
     /// Requests that the drive carried out, with the words that it answered.
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
@@ -30,46 +30,46 @@ pub struct Truth {
     pub ordered: HashMap<(Table, u16), u16>,
     /// The run command was written last, by an order or again.
     pub fed: Option<Instant>,
-    /// An order started it then, and nothing has stopped it since.
+    /// When an order started the motor, if nothing has stopped it since.
     pub ran_by_order: Option<Instant>,
-    /// An order to it waited last.
+    /// When an order to the drive last waited.
     pub waited_until: Option<Instant>,
     /// The latest time at which a client was certainly alive, and the latest at which it may have been.
     pub heard: (Option<Instant>, Option<Instant>),
-    /// The motor runs since.
+    /// Time since which the motor runs.
     pub running_since: Option<Instant>,
     pub ran_at: Option<Instant>,
-    /// The motor turned last, whether or not anybody saw it.
+    /// When the motor last turned, whether or not anything noticed.
     pub turned_at: Option<Instant>,
-    /// The image has had it online since.
+    /// Time since which the drive is online in the image.
     pub online_since: Option<Instant>,
     /// Supervision last acted.
     pub supervised: Option<Instant>,
-    /// Something befell it: until then that excuses much.
+    /// Time until which a disturbance of the drive excuses deviations.
     pub troubled_until: Option<Instant>,
     /// The bus was restarted: until this time that excuses some deviations.
     pub found_anew_until: Option<Instant>,
     /// The word of the control register was changed by something else than the line.
     pub lost_word: Option<Instant>,
-    /// The last order of a client that stops it.
+    /// The last order of a client that stops the drive.
     pub last_stop: Option<usize>,
-    /// A write that takes its run command away was last on the wire.
+    /// When a write that takes the drive's run command away was last on the wire.
     pub stop_sent: Option<Instant>,
     /// The action of supervision that was last on the wire, while nothing else was written since.
     pub action: Option<Tried>,
     /// A stop that the broker delivered once more may be under way until then.
     pub repeated_until: Option<Instant>,
-    /// A request to it was last on the wire.
+    /// When a request to the drive was last on the wire.
     pub asked: Option<Instant>,
-    /// The image has had it offline since.
+    /// Time since which the drive is offline in the image.
     pub offline_since: Option<Instant>,
-    /// The bus was started anew while it ran, its lease being of then.
+    /// When the bus was started anew while the motor ran; the lease counts from then.
     pub carried: Option<Instant>,
     /// Maximum frequency in Hz, with the time from which it applies.
     pub maxima: Vec<(Instant, f64)>,
 }
 
-/// A write that is tried until it is answered.
+/// A write that is repeated until it is answered.
 #[derive(Debug)]
 pub struct Tried {
     pub pdu: RequestPdu,
@@ -128,7 +128,7 @@ impl Truth {
         }
     }
 
-    /// The last order that sets words of this write which only it writes.
+    /// The last order that sets a word of this write with a value that only it writes.
     pub fn order_of(&self, pdu: &RequestPdu) -> Option<usize> {
         let (table, items) = written(pdu)?;
         let tails = (0..items.len()).flat_map(|from| (from + 1..=items.len()).map(move |to| from..to));
@@ -177,7 +177,7 @@ impl Truth {
         self.befell_since(since) || self.found_anew_until.is_some_and(|until| until >= since)
     }
 
-    /// Whether something befell the drive itself or its line, the gateway apart.
+    /// Whether something disturbed the drive or its line since then; the gateway does not count.
     pub fn befell_since(&self, since: Instant) -> bool {
         self.troubled_until.is_some_and(|until| until >= since)
     }

@@ -44,7 +44,7 @@ const EVERYWHERE: [ModelPoint; 12] = [
     ModelPoint::SpeedReference,
 ];
 
-/// The line that a family has by its works.
+/// The line with the factory settings of a drive family.
 fn works(family: &'static str, protocol: Protocol) -> Line {
     let (baud, format) = match protocol {
         Protocol::ModbusRtu => (19_200, "8N2"),
@@ -54,7 +54,7 @@ fn works(family: &'static str, protocol: Protocol) -> Line {
     Line {
         format,
         spec: |spec| {
-            // Families that do not report their frequencies.
+            // The range is set only for families that do not report their frequencies.
             let reported = spec.profile.point_index("maximum_frequency").is_some();
             spec.frequency_range = (!reported).then_some(0.0..=60.0);
         },
@@ -88,7 +88,7 @@ fn operate(line: &Line, fault: u16, code: i64, text: &str) {
     rig.until("the reference read back", PATIENCE, |rig| {
         number(rig, ModelPoint::SpeedReference) == Some(50.0)
     });
-    // At reference may be reported from some hertz before it on.
+    // The drive may report "at reference" some hertz before it reaches the reference.
     rig.until("half of 50 or 60 Hz", PATIENCE, |rig| {
         number(rig, ModelPoint::OutputFrequency).is_some_and(|output| [25.0, 30.0].contains(&output))
     });
@@ -196,7 +196,7 @@ fn bits_of_the_application_leave_run_and_stop_alone() {
     rig.until_state(1, State::Running);
     set(&mut rig, &[("control_bit_3", 0.0)]);
     assert_eq!(rig.word(1, 2000), 0x8001, "it stops nothing");
-    // Stopped elsewhere meanwhile: the next bit does not start it again.
+    // The motor was stopped elsewhere meanwhile; the next bit does not start it again.
     rig.at_the_drive(1, 2000, 0x8000);
     set(&mut rig, &[("control_bit_4", 1.0)]);
     assert_eq!(rig.word(1, 2000), 0x8010);

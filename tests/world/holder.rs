@@ -24,7 +24,7 @@ const LEASE: Duration = Duration::from_secs(3);
 const DRIVES: u8 = 2;
 /// Each client on a north side of its own. Its reference identifies its frames: 10 % plus its place.
 const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
-/// Their ranks; the last one has none.
+/// Ranks of the clients; the last client has none.
 const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
 
 /// The drives of every second world are guarded as well: that changes who is refused with what, and nothing of who holds.
@@ -143,7 +143,7 @@ impl Play {
             while let Some(seen) = self.rig.step(next) {
                 seen.into_iter().for_each(|seen| self.note(seen));
             }
-            // A disk that takes what it gets.
+            // Each file of the guards is written at once and with success.
             let guards = self.rig.bus.guards.clone();
             if let Some((generation, _)) = guards.to_write(self.rig.now, self.time()) {
                 guards.wrote(generation, Ok(()));

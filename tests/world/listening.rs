@@ -266,7 +266,7 @@ impl Scene {
         );
     }
 
-    /// The other master runs its cycle so often.
+    /// Lets the other master run its cycle for this number of exchanges.
     fn cycles(&mut self, exchanges: u64) {
         let end = self.exchanges + exchanges;
         let n2 = self.line.protocol == Protocol::N2;

@@ -33,9 +33,9 @@ const PAUSE: Duration = Duration::from_millis(7);
 /// Time in which all drives are back behind a storm: the longest back-off, and a round.
 const BACK: Duration = Duration::from_secs(15);
 
-/// Blocks of process data, two of them that look alike on the wire.
+/// Blocks of process data, two of which look alike on the wire.
 const TWINS: &[(u16, u16)] = &[(2100, 3), (2104, 3)];
-/// Two such pairs.
+/// Two pairs of such blocks.
 const PAIRS: &[(u16, u16)] = &[(2100, 2), (2103, 2), (2106, 1), (2108, 1)];
 
 /// A profile with these blocks, by first register and count.
@@ -87,9 +87,9 @@ fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
 /// Effect of a fault on the counters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shows {
-    /// Nothing: the exchange goes well.
+    /// The fault has no effect: the exchange goes well.
     Nothing,
-    /// No reply is believed; drives are now and then taken for dead.
+    /// No reply is accepted; drives are now and then considered offline.
     Timeouts,
     Corrupt,
     Foreign,
@@ -116,13 +116,13 @@ impl Shows {
     }
 }
 
-/// A row: a fault, and what comes of it.
+/// A row of the table: a fault, and the effects that it must have.
 #[derive(Clone)]
 struct Row {
     fault: String,
     rates: String,
     shows: Shows,
-    /// Good exchanges, of those of the sound line, at least.
+    /// Least share of good exchanges, compared with a line without faults.
     share: f64,
     /// Whether drives are now and then taken for dead; in a storm of all faults it may be either.
     vanish: Option<bool>,
@@ -322,7 +322,7 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
     let before = watched.rig.counts();
     watched.rig.set_faults(FaultPlan::new(row.rates.parse().unwrap(), 7));
     watched.run(storm(protocol), true);
-    // An echo that ceases takes the acknowledgement of a write with it.
+    // When an echo stops, the acknowledgement of a write is lost with it.
     watched.run(Duration::from_secs(1), false);
     let ok = watched.rig.counts().since(before).ok;
     // Waits for the effects of the last fault, and for drives that were taken for dead.
@@ -349,7 +349,7 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
         format!("the counters do not show {:?}", row.shows),
     );
     must(counts.faults >= 50, "hardly a fault was met".to_string());
-    // A refused register stays refused for a minute; the drives are there.
+    // A refused register stays refused for a minute, but the drives are online.
     let back = (0..usize::from(DRIVES)).all(|drive| rig.is_online(drive));
     let refused = matches!(row.shows, Shows::Exceptions | Shows::All);
     must(

@@ -15,7 +15,7 @@ use super::scenario::Line;
 
 fn nx(drives: u8) -> Line {
     Line {
-        // The drive reports its frequencies.
+        // The drive reports its frequencies, so none are configured.
         spec: |spec| spec.frequency_range = None,
         ..line("vacon-nx-n2", Protocol::N2, 9600, drives)
     }
@@ -97,7 +97,7 @@ fn what_was_changed_at_the_drive_is_written_again() {
     for turn in 1..=3 {
         rig.until_good(1, ModelPoint::SpeedReference, Value::Number(25.0));
         rig.until_good(1, ModelPoint::Running, Value::Bool(true));
-        // The gateway cannot have read it by the time of the command.
+        // The gateway cannot have read this change before the command.
         rig.at_the_drive(1, 2002, 7700);
         assert!(rig.set(1, &[("speed_reference", 25.0)]).is_ok());
         assert_eq!(rig.word(1, 2002), 2500, "turn {turn}");

@@ -76,7 +76,7 @@ fn the_frames_on_the_line_are_those_of_the_reference() {
 
 #[test]
 fn a_fault_is_told_and_reset() {
-    // With a lease, so that no missing one is reported.
+    // A lease is configured, because a missing one would be reported.
     let mut rig = ready(&Line {
         supervision: supervised(LeaseAction::Hold, PATIENCE),
         ..nx(115_200, 1)
@@ -100,7 +100,7 @@ fn a_motor_that_was_stopped_elsewhere_is_not_started_by_a_command_that_does_not_
     for (points, left) in [(("reverse", 1.0), 2), (("fault_reset", 1.0), 0), (("reverse", 1.0), 2)] {
         assert!(rig.set(1, &[("run", 1.0), ("reverse", 0.0)]).is_ok());
         rig.until_state(1, State::Running);
-        // The gateway cannot have read it by the time of the command.
+        // The gateway cannot have read this change before the command.
         rig.at_the_drive(1, address, 0);
         rig.bus.wire.record(1_000);
         assert!(rig.set(1, &[points]).is_ok());
@@ -470,7 +470,7 @@ fn a_drive_that_nothing_stops_is_told_once() {
 
 #[test]
 fn a_stop_that_waits_while_a_reload_starts_the_bus_anew_is_sent() {
-    // At any moment of the exchange before it, and of its own.
+    // The reload comes at each step of the exchange before the stop, and of the stop's own exchange.
     for steps in 0..12 {
         let mut rig = ready(&nx(19_200, 2));
         assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());

@@ -21,7 +21,7 @@ pub enum Wish {
     RawBlock(bool),
     Reset,
     Reverse,
-    /// A parameter of the drive, which it stores: the acceleration time (N2).
+    /// A parameter that the drive stores: the acceleration time (N2).
     Parameter,
     RawRead,
     /// By function 5, 6 or 16, registers of which the last is of no point, or of one that is not writable.
@@ -94,7 +94,7 @@ pub struct Record {
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
     /// Orders to the same drive that waited when it was accepted: they go before it.
     pub before: usize,
-    /// A newer reference took its place.
+    /// Whether a newer reference took the order's place.
     pub succeeded: bool,
 }
 

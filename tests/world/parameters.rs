@@ -44,7 +44,7 @@ impl Rig {
         }
     }
 
-    /// All parameters of the first drive; `meanwhile` happens before each request.
+    /// Reads all parameters of the first drive; `meanwhile` runs before each request.
     fn read_parameters(&mut self, known: BTreeSet<u16>, mut meanwhile: impl FnMut(&mut Rig)) -> ParameterFile {
         let profile = self.drive(DRIVE).image.spec.profile.clone();
         let mut reading = Reading::new(profile, known);
@@ -169,7 +169,7 @@ fn nothing_is_written_by_reading() {
             Protocol::ModbusRtu => rig.requests().iter().map(|frame| frame.bytes[1]).collect(),
             _ => continue,
         };
-        // Function 08 gives the counters of a drive that has them.
+        // Function 08 reads the counters of a drive that has counters.
         let reads = |function: &u8| (1..=4).contains(function) || *function == 8;
         assert!(functions.iter().all(reads), "{functions:?}");
         assert_eq!(functions.contains(&8), line.family == "vacon-cx", "{}", line.family);
@@ -227,7 +227,7 @@ fn rounds(rig: &Rig) -> u64 {
 
 #[test]
 fn process_data_keeps_its_rate_while_parameters_are_read() {
-    // A line that cannot carry its cadence, and one with time left over.
+    // Some lines cannot keep their cycle, and one has time left over.
     for (baud, drives, cycle) in [(9600, 6, 10), (19_200, 12, 10), (38_400, 4, 100)] {
         let line = Line {
             cycle: Duration::from_millis(cycle),

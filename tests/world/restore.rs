@@ -54,15 +54,15 @@ struct RestoreWorld {
     /// The journal on disk.
     disk: Option<String>,
     plan: Plan,
-    /// The gateway is killed then.
+    /// Time at which the gateway is killed.
     cut_at: Option<Instant>,
-    /// The next thing happens then.
+    /// Time of the next event.
     next: Instant,
     /// Whether anything happens.
     troubled: bool,
     /// The motor was last started by somebody at the drive.
     started: Option<Instant>,
-    /// Somebody stops it, or puts the drive back on the line, then.
+    /// Time at which somebody stops the motor, or puts the drive back on the line.
     mended: Option<Instant>,
     /// When the drive answered that its motor stands, if that was the last transaction on the line.
     stands: Option<Instant>,
@@ -73,7 +73,7 @@ struct RestoreWorld {
     writes: usize,
 }
 
-/// All parameters of a drive, as it has them.
+/// All parameters of a drive, with the values in the drive.
 fn held(rig: &mut Rig, address: u8) -> ParameterFile {
     let profile = rig.drive(address).image.spec.profile.clone();
     let mut reading = Reading::new(profile, BTreeSet::new());

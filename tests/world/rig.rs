@@ -27,7 +27,7 @@ pub struct Rig {
     pub plant: Plant,
 }
 
-/// Exchanges by how they ended, foreign frames and faults that were met.
+/// Exchanges by their outcome, foreign frames, and faults that occurred.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Counts {
     pub ok: u64,
@@ -152,7 +152,7 @@ impl Rig {
         placed
     }
 
-    /// The bus is started anew, as by a reload.
+    /// Starts the bus anew, as a reload does.
     pub fn restart(&mut self) {
         while self.bus.core.asked().is_some() {
             self.step(self.now + Duration::from_secs(1));
@@ -169,7 +169,7 @@ impl Rig {
         self.plant.buses = vec![self.bus.handle.clone()];
     }
 
-    /// The plant as servers have it.
+    /// The plant in the form that servers use.
     pub fn shared_plant(&self) -> SharedPlant {
         Arc::new(ArcSwap::from_pointee(Plant {
             gateway: self.plant.gateway.clone(),
@@ -180,7 +180,7 @@ impl Rig {
         }))
     }
 
-    /// Gives an order and waits for its answer.
+    /// Gives an order and waits for the answer.
     pub fn ordered(&mut self, address: u8, order: Order) -> Outcome {
         let mut placed = self.place(address, order);
         self.answered(&mut placed)
@@ -244,7 +244,7 @@ impl Rig {
         self.until(&what, PATIENCE, |rig| rig.good(address, point) == Some(value));
     }
 
-    /// Does something with a drive as it is now.
+    /// Does something with a simulated drive in its present state.
     pub fn with_drive<R>(&mut self, address: u8, act: impl FnOnce(&mut SimulatedDrive, SimTime) -> R) -> R {
         let now = self.bus.sim(self.now);
         let drive = self.bus.wire.slaves().drive(address).unwrap();
@@ -266,7 +266,7 @@ impl Rig {
             .unwrap();
     }
 
-    /// A holding register as the drive itself has it.
+    /// A holding register, read from the drive itself.
     pub fn word(&mut self, address: u8, start: u16) -> u16 {
         let (table, count) = (Table::Holding, 1);
         let read = RequestPdu::Read { table, start, count };

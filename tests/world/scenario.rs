@@ -11,13 +11,13 @@ use drivegate_world::sim::random::Random;
 #[derive(Debug, Clone)]
 pub struct Scenario {
     pub seed: u64,
-    /// How long it goes on before the gateway stops.
+    /// How long the world runs before the gateway stops.
     pub time: Duration,
     pub buses: Vec<Line>,
     pub clients: Vec<Habit>,
     /// Mean time between two incidents (a drive that trips, restarts, vanishes ...); none in a calm world.
     pub incidents: Option<Duration>,
-    /// Whether the gateway takes a new configuration now and then.
+    /// Whether the gateway loads a new configuration now and then.
     pub reloads: bool,
     /// Clients that flood a drive seldom pause.
     pub floods: bool,
@@ -41,12 +41,12 @@ pub struct Line {
     /// Share of what comes to the gateway in which one bit is wrong besides.
     pub flips: f64,
     pub supervision: Option<Supervision>,
-    /// How often what was ordered is written again.
+    /// How often the gateway writes its orders again.
     pub refresh: Option<Duration>,
     pub on_shutdown: OnShutdown,
     /// Addresses without a drive that answers.
     pub dead: Vec<u8>,
-    /// The names and units of its drives stand in the opposite order.
+    /// Whether the names and units of the drives are in the opposite order.
     pub swapped: bool,
     /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
@@ -59,13 +59,13 @@ pub struct Line {
 pub enum Habit {
     /// By MQTT: single points and whole objects, often two at once.
     Mqtt,
-    /// By Modbus TCP: words of the common model, requests in one segment.
+    /// Uses Modbus TCP: words of the common model, and several requests in one segment.
     ModbusTcp,
     /// Orders of all kinds by the function that all north sides use.
     Plain,
     /// By Modbus TCP: writes 0 to the command word of one drive without end.
     StopsInALoop,
-    /// Commands one drive as fast as it is answered.
+    /// Commands one drive as fast as the drive is answered.
     Floods,
     /// Commands all drives of a line as fast as it can, with hardly a stop: the queue is full.
     Crowds,
@@ -132,7 +132,7 @@ impl Scenario {
                 clients.push(habit);
             }
         }
-        // A world of its own for what many clients hide.
+        // Some worlds have few clients, because many clients hide certain faults.
         match dice.within(0..=9) {
             0 | 1 => clients = vec![Habit::Operates; dice.within(1..=2) as usize],
             2 => clients = vec![Habit::Duels; dice.within(1..=2) as usize],
@@ -221,7 +221,7 @@ impl Line {
             },
             swapped: false,
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
-            // Without the dice: the rest of the world is the same.
+            // Chosen without the random numbers, so that the rest of the world stays the same.
             spec: match drives % 3 {
                 0 => |spec| spec.raw_writes = RawWrites::All,
                 1 => |_| {},
@@ -230,7 +230,7 @@ impl Line {
         }
     }
 
-    /// Whether anything goes wrong on its wire.
+    /// Whether the line has faults on its wire.
     pub fn is_noisy(&self) -> bool {
         !self.faults.is_empty() || self.flips > 0.0
     }
@@ -240,7 +240,7 @@ impl Line {
         self.flips > 0.0 || self.faults.contains("corrupt")
     }
 
-    /// Whether replies may come when they are not expected any more, or twice.
+    /// Whether replies may come twice, or when they are no longer expected.
     pub fn is_late(&self) -> bool {
         ["late", "double", "stray"]
             .iter()

@@ -13,7 +13,7 @@ use super::rig::{PATIENCE, Rig, line};
 /// IDs of the selectors of process data out 4 (torque) and 8 (fault code), less 1.
 const OUT_4: u16 = 854;
 const OUT_8: u16 = 858;
-/// IDs of what they may select.
+/// IDs of the values that the drive may select.
 const TORQUE: u16 = 4;
 const DC_LINK: u16 = 7;
 const FAULT: u16 = 37;
@@ -105,7 +105,7 @@ fn a_changed_selection_is_told_once_and_the_value_is_that_of_the_monitoring_regi
     let torque = good(&rig, ModelPoint::MotorTorque).expect("a value");
     let monitored = f64::from(rig.word(1, TORQUE - 1) as i16) / 10.0;
     assert!((torque - monitored).abs() <= 5.0, "{torque} {monitored}");
-    // Once per drive and start, however often it is away.
+    // The event comes once per drive and start, however often the selection goes wrong.
     back_with(&mut rig, OUT_4, DC_LINK);
     rig.until_state(1, State::Running);
     assert_eq!(differing(&mut rig, &mut events), [""; 0]);

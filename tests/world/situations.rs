@@ -82,7 +82,7 @@ fn an_action_that_the_drive_does_not_hear_is_written_again() {
         leave_running(&mut rig);
         // Half of the requests are lost: of one action in four both tries.
         rig.set_faults(faults("deaf=0.5", seed));
-        // Most of the time it is away, and probed every 10 s.
+        // Most of the time the drive is offline, and probed every 10 s.
         rig.run(120 * SECOND);
         assert!(
             !is_running(&mut rig),
@@ -264,7 +264,7 @@ impl Duel {
         stops
     }
 
-    /// No run goes out while an older stop is still to be answered.
+    /// Checks that no run command is sent while an older stop is still unanswered.
     fn look(&mut self, seen: &Seen) {
         match seen {
             Seen::Acted(asked) if !matches!(asked.reply, Some(Reply::Exception(_))) && asked.drive == 0 => {

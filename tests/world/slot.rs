@@ -23,7 +23,7 @@ use super::scenario::Line;
 
 /// Requests on each line of every test run.
 const REQUESTS: u64 = 400;
-/// A tool gives its request up after this time.
+/// Time after which a tool gives up its request.
 const TIMEOUT: Duration = Duration::from_millis(1100);
 /// Time within which the gateway answers a tool, or not at all.
 const ANSWER_WITHIN: Duration = Duration::from_secs(1);
@@ -61,7 +61,7 @@ struct ToolRig {
     next: Instant,
     /// Chooses the next request: address and PDU.
     asks: fn(&mut Random, &Line) -> (u8, RequestPdu),
-    /// Share of requests that it gives up after a few ms.
+    /// Share of requests that the tool gives up after a few ms.
     impatient: f64,
     heard: Vec<u8>,
     figures: Figures,
@@ -109,7 +109,7 @@ impl ToolRig {
         }
     }
 
-    /// Until the tool has made so many requests more.
+    /// Runs until the tool has made this number of further requests.
     fn ask(&mut self, requests: u64) {
         let until = self.figures.asked + requests;
         while self.figures.asked < until || self.question.is_some() {
@@ -201,7 +201,7 @@ impl ToolRig {
             patience,
             said: Vec::new(),
         });
-        // As a serial program writes it: sometimes in two pieces.
+        // Some requests arrive in two pieces, as a serial program writes them.
         let cut = self.dice.within(0..=frame.len() as u64) as usize;
         let early = self.pass(&frame[..cut]);
         assert!(early.is_empty() || cut == frame.len(), "an answer to half a request");
@@ -502,7 +502,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
         Protocol::ModbusRtu.encode(&drivegate_world::codec::Request::new(1, pdu.clone()), &mut frame);
         frame
     };
-    // A reference takes the share of writes; the start behind it is held.
+    // A reference uses up the share of writes, so the start after it is held.
     let now = tool.rig.now;
     let reference = RequestPdu::WriteRegister {
         address: 2002,
@@ -511,7 +511,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
     tool.pass(&frame(&reference));
     tool.pass(&frame(&set(1)));
     assert!(tool.slot.is_waiting() && tool.slot.wake_at().is_some_and(|at| at > now));
-    // A stop of somebody else comes before it goes.
+    // A stop of another client comes before the held start is sent.
     let stop = tool.rig.points(1, &[("run", 0.0)]);
     assert!(tool.rig.ordered(1, stop).is_ok());
     for _ in 0..200 {

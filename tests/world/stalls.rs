@@ -36,25 +36,25 @@ use super::scenario::{Habit, Line};
 
 /// Seeds of every test run.
 const FIXED: u64 = 240;
-/// A thread shows at least this often that it runs.
+/// A running thread shows at least this often that it runs.
 const BEAT: Duration = Duration::from_millis(100);
 /// The motors are looked at this often.
 const LOOK: Duration = Duration::from_millis(50);
-/// Longest time of a request and its reply on the slowest wire.
+/// Longest time of a request with its reply on the slowest wire.
 const ON_THE_WIRE: Duration = Duration::from_millis(250);
 /// Time in which everything is well again.
 const HEALED: Duration = Duration::from_secs(20);
 
-/// A connection of a client, as the system keeps it.
+/// A connection of a client, as the operating system keeps it.
 struct Connection {
-    /// Which of all it is.
+    /// Number of the connection.
     number: usize,
     offline: Offline,
-    /// The gateway has accepted it.
+    /// Whether the gateway has accepted the connection.
     open: bool,
     /// Unread bytes, each with the order whose first or last byte is among them.
     inbox: VecDeque<(Instant, Vec<u8>, Option<usize>)>,
-    /// The client has closed it.
+    /// When the client closed the connection.
     closed: Option<Instant>,
     /// The rest of a request that is sent later.
     rest: Option<(Instant, Vec<u8>, usize)>,
@@ -83,7 +83,7 @@ struct World {
     next_tick: Instant,
     bus_ran: Instant,
     connections: Vec<Connection>,
-    /// How many connections there were.
+    /// Number of connections so far.
     clients: usize,
     /// The last transaction.
     number: u16,
@@ -309,7 +309,7 @@ impl World {
             .unwrap_or(bus)
     }
 
-    /// The thread of the bus, as long as it runs.
+    /// Lets the thread of the bus work, if that thread runs now.
     fn run_bus(&mut self) {
         let now = self.now;
         if self.standing.bus.is_some() || self.bus.wake_at().min(self.bus_ran + BEAT) > now {
@@ -403,7 +403,7 @@ impl World {
         }
     }
 
-    /// The thread that reads the connections, as long as it runs.
+    /// Lets the thread that reads the connections work, if that thread runs now.
     fn run_readers(&mut self) {
         let now = self.now;
         if self.standing.readers.is_some() {

@@ -28,7 +28,7 @@ const GUARD: Guard = Guard {
     min_run: Duration::ZERO,
     stagger: Duration::from_secs(2),
 };
-/// Between the word of a start and the drive that acts upon it.
+/// Longest time between the write of a start and the drive's action.
 const WIRE: Duration = Duration::from_millis(100);
 
 /// Drives 1 to 3 are guarded, the first also by the fourth.
@@ -64,7 +64,7 @@ struct Disk {
 struct Truth {
     running: BTreeMap<u8, bool>,
     stood: BTreeMap<u8, Instant>,
-    /// The last word that starts, when the drive acted upon it.
+    /// When each drive acted upon the last word that starts it.
     acted: BTreeMap<u8, Instant>,
     /// Starts by orders.
     starts: BTreeMap<u8, Vec<Instant>>,
@@ -386,7 +386,7 @@ fn an_interlock_that_fails_stops_the_motor_and_keeps_it_from_starting() {
     };
     start(&mut play, 4);
     start(&mut play, 1);
-    // The other drive goes away: its last reading is old by and by.
+    // The other drive goes offline, so its last reading becomes too old after a while.
     play.rig.set_alive(4, false);
     play.run(6 * SECOND);
     assert_eq!(play.rig.state(1), State::Ready);
@@ -430,7 +430,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
     };
     start(&mut rig);
     let stop = rig.points(1, &[("run", 0.0)]);
-    // The client that started it, by MQTT.
+    // A stop over MQTT, from the client that started the motor.
     let mut first = rig.place(1, stop.clone());
     rig.run(10 * SECOND);
     let waits = rig.drive(1).stop_waits(rig.now).unwrap();
@@ -618,7 +618,7 @@ fn the_clearance_of_an_order_ends_with_its_bus() {
         });
     });
     rig.run(8 * SECOND);
-    // The first order of its bus.
+    // This is the first order of its bus.
     assert!(rig.set(1, &[("run", 1.0), ("speed_reference", 20.0)]).is_ok());
     rig.until_state(1, State::Running);
     assert!(rig.set(1, &[("run", 0.0)]).is_ok());

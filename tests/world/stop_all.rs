@@ -166,7 +166,7 @@ fn a_second_order_joins_and_one_behind_a_start_does_not() {
     look(&mut rig, Duration::from_millis(200));
     assert_eq!(stops_since(&rig, before, true), 0, "it joins");
     assert!(turns(&mut rig, 1), "it slows down");
-    // Somebody starts one of them before the motors stand.
+    // Another client starts one of the motors before all of them stand.
     let started = rig.set(1, &[("run", 1.0)]);
     assert!(started.is_ok(), "{started}");
     let before = rig.requests().len();

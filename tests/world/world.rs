@@ -39,7 +39,7 @@ use super::scenario::{Habit, Scenario};
 
 /// Time in which an order is answered behind its expiry: its last exchange, a pulse, a late reply.
 const LAST_STEPS: Duration = Duration::from_secs(6);
-/// Time that a stop has from its turn on.
+/// Time that a stop has, counted from its turn.
 const STOP_TIME: Duration = Duration::from_secs(2);
 /// Time between a lease that ran out and its action: a round, and an exchange of another drive.
 const ACTION: Duration = Duration::from_millis(1_500);
@@ -47,7 +47,7 @@ const ACTION: Duration = Duration::from_millis(1_500);
 const PROBED: Duration = Duration::from_millis(11_000);
 /// Longest pause between two tries of an action that is not acknowledged: ten times what one took, and a second.
 const REPEATED: Duration = Duration::from_secs(8);
-/// How often what must hold at any time is looked at.
+/// Interval of the checks of what must hold at any time.
 const LOOK: Duration = Duration::from_millis(50);
 
 /// Figures of a world.
@@ -104,14 +104,14 @@ pub struct World {
     open: BTreeMap<(usize, usize), Vec<usize>>,
     next_incident: Option<Instant>,
     next_reload: Option<Instant>,
-    /// A bus that is to be started anew when its exchange is over.
+    /// A bus that is started anew when its exchange has ended.
     restarts: Option<usize>,
     next_look: Instant,
     /// Times that a client has read a drive by HTTP.
     readings: usize,
-    /// Buses whose port is away until then.
+    /// Time until which the port of each bus is away.
     away: Vec<Option<Instant>>,
-    /// Drives that are off until then.
+    /// Bus, address and time of drives that are off until then.
     off: Vec<(usize, u8, Instant)>,
     history: History,
     /// Writes that were answered when answers were last looked for.

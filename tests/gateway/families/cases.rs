@@ -25,7 +25,7 @@ impl Order {
         }
     }
 
-    /// As the drive prints it.
+    /// The order as the drive prints it.
     pub(super) fn as_seen(&self) -> String {
         match *self {
             Raw(Word(address, word) | Single(address, word)) | Model(_, address, word) => {
@@ -57,7 +57,7 @@ pub(super) struct Case {
 }
 
 impl Case {
-    /// The register of the reference, where it is one.
+    /// The register of the reference, if the reference is a register.
     pub(super) fn reference_register(&self) -> Option<u16> {
         match self.reference.as_slice() {
             [Raw(Word(address, _) | Single(address, _))] => Some(*address),
@@ -92,7 +92,7 @@ ls-g100            | ls         | frequency reversed |                          
 teco-f510          | teco       | frequency reversed | 0x2501=0,8,0                | 0x2501=5,4,0x11
 vacon-10           | vacon10    | frequency reversed | 2000=4                      |";
 
-/// All of them, in the order of [`families`].
+/// All cases, in the order of [`families`].
 pub(super) fn cases() -> Vec<Case> {
     let rows = rows::<5>(CASES).into_iter();
     let case = |(family, [profile, peer, shows, reset, refused]): (drivegate_testkit::Family, [&'static str; 5])| {

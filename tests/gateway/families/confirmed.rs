@@ -26,7 +26,7 @@ fn confirms(case: &Case) {
     }
 }
 
-/// Every third family, so that three tests run side by side.
+/// Tests every third family from `first` on, so that three tests can run side by side.
 fn every_third(first: usize) {
     for case in cases().iter().skip(first).step_by(3) {
         println!("{}", case.profile);

@@ -8,7 +8,7 @@ use drivegate::drive::profile::Profiles;
 enum Does {
     Runs,
     Stops,
-    /// Nothing, something else, or it is not known.
+    /// The word does nothing, does something else, or its effect is unknown.
     Other,
 }
 

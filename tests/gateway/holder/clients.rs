@@ -56,7 +56,7 @@ impl Client {
         ["plc", "alice", "cloud", "host", "nobody"][self as usize]
     }
 
-    /// Place of its rank among site, operator, automation, remote.
+    /// Place of the client's rank among site, operator, automation, remote.
     fn rank(self) -> usize {
         [2, 1, 3, 2, usize::MAX][self as usize]
     }
@@ -127,7 +127,7 @@ impl Plant {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// A host's command; its result as the audit trail has it.
+    /// Gives a command as a Sparkplug host; returns the command's result in the audit trail.
     fn dcmd(&self, point: &str, value: &Json) -> String {
         let kind = if value.is_boolean() { "Boolean" } else { "Double" };
         // A payload with the time of an earlier one repeats that.
@@ -151,7 +151,7 @@ impl Plant {
         })
     }
 
-    /// The client sets a point: the code of its result.
+    /// Sets a point as this client; returns the code of the result.
     fn set(&self, client: Client, point: &str, value: &Json) -> String {
         let payload = json!({ point: value });
         let code = |answer: Json| {
@@ -181,7 +181,7 @@ impl Plant {
     }
 
     fn reference(&self, client: Client) -> String {
-        // Each time another one: what stands already is confirmed by itself.
+        // Each client sets another value: a value that is set already would be confirmed at once.
         self.set(client, "speed_reference", &json!(10.0 + client as usize as f64))
     }
 

@@ -33,7 +33,7 @@ impl Reply {
 }
 
 impl Reply {
-    /// A reply without its connection.
+    /// Parses a reply from its text.
     fn parse(text: &str) -> Reply {
         let (head, body) = text.split_once("\r\n\r\n").expect("a head");
         let status = head.split(' ').nth(1).and_then(|s| s.parse().ok()).expect("a status");

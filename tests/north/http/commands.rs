@@ -93,7 +93,7 @@ impl Rig {
     }
 }
 
-/// The cookies that a reply sets, by the beginning of their names.
+/// The cookie that a reply sets and whose name begins with `name`.
 fn cookie(reply: &Reply, name: &str) -> String {
     let set = |line: &str| {
         let (key, value) = line.split_once(": ")?;
@@ -460,7 +460,7 @@ async fn only_who_commanded_last_renews_the_lease() {
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
     assert_eq!(renew(&alice).await, (409, false));
     assert_eq!(renew(&bob).await, (204, true));
-    // Any other client.
+    // The lease cannot be renewed after a command of another kind of client, either.
     let drive = rig.server.plant().drive("pump-1").unwrap();
     let run = drive.image.spec.profile.point_index("run").unwrap();
     let order = Order::Points(vec![(run, Value::Bool(false))]);

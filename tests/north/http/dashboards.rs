@@ -75,7 +75,7 @@ fn without_comparisons(query: &str) -> String {
     let mut kept = Vec::new();
     while let Some(word) = words.next() {
         match word {
-            // The figure behind it goes with it.
+            // The number after the comparison is skipped as well.
             "==" | ">" | "<" => {
                 words.next();
             }

@@ -318,7 +318,7 @@ async fn what_is_not_good_has_no_sample() {
     assert_eq!(names("mixer-3").await, never);
     assert_eq!(names("fan-2").await, stale);
     assert!(names("pump-1").await.contains("drivegate_drive_motor_speed_rpm"));
-    // Online, but its process data is too old.
+    // The drive is online, but its process data is too old.
     let image = server.image("pump-1");
     plant::answer(&image, Instant::now() - 2 * STALE_AFTER, plant::nx_running);
     let mut old = names("pump-1").await;
@@ -434,7 +434,7 @@ impl Prometheus {
         }
     }
 
-    /// Value of the only series that a query finds, once there is one.
+    /// Value of the only series that a query finds; waits until the series exists.
     async fn ask(&self, query: &str) -> String {
         let found = self.find(query, |found| !found.is_empty()).await;
         found[0]["value"][1].as_str().expect("a value").to_string()

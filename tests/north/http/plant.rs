@@ -108,7 +108,7 @@ pub(crate) fn bus(name: &str, drives: Vec<Arc<DriveImage>>) -> BusHandle {
     drivegate_testkit::bus(bus_spec(name), drives)
 }
 
-/// The drive answers, and all its points were read at `at`.
+/// Makes the drive online, with all its points read at `at`.
 pub(crate) fn answer(image: &DriveImage, at: Instant, word: impl Fn(u16) -> u16) {
     read_all(image, at, word);
     image.count(Outcome::Ok);
@@ -216,7 +216,7 @@ impl Server {
         Server::showing(plant, stats()).await
     }
 
-    /// With what was recorded.
+    /// A server with these recorded figures.
     pub(crate) async fn showing(plant: Plant, stats: Arc<NorthState>) -> Server {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
         Server::start(plant, stats, Options::at(listen)).await
@@ -241,7 +241,7 @@ impl Server {
         }
     }
 
-    /// Reloads other options.
+    /// Reloads the server with other options.
     pub(crate) async fn reload(&mut self, options: Options) {
         let change = self.http.prepare(options).await.expect("it is possible");
         self.http.commit(change);
@@ -251,7 +251,7 @@ impl Server {
         self.shared.load_full()
     }
 
-    /// The drive of that name; it must exist.
+    /// The image of the drive with this name, which must exist.
     pub(crate) fn image(&self, name: &str) -> Arc<DriveImage> {
         self.plant().drive(name).expect("a drive").image
     }

@@ -14,7 +14,7 @@ use drivegate_testkit::{number, rows};
 use super::rig::{Client, Rig, frame, options, plant, plant_where, registers, until, words, write};
 use crate::support::tools;
 
-/// Unit 1, a Vacon NX with its coils and discrete inputs missing.
+/// Unit 1: a Vacon NX without coils and discrete inputs.
 const NX: u8 = 1;
 /// Unit 4, a family with all four tables.
 const METER: u8 = 4;
@@ -36,7 +36,7 @@ enum State {
     DriveOwnCode,
 }
 
-/// Names of the columns, and what they stand for.
+/// Names of the table's columns, and what each of them means.
 const STATES: [(State, &str, &str); 12] = [
     (
         State::Usual,
@@ -186,7 +186,7 @@ async fn scene(state: State) -> (Rig, Client) {
     (rig, client)
 }
 
-/// Fills both queues; the clients that wait there must live on.
+/// Fills both queues; returns the clients that wait there, which must be kept alive.
 async fn fill_queues(rig: &Rig) -> Vec<Client> {
     let mut waiting = Vec::new();
     for (bus, unit, address) in [(0, NX, 2003), (1, METER, 50)] {

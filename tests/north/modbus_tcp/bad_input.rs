@@ -92,7 +92,7 @@ async fn a_client_that_does_not_read_holds_nobody_up() {
     let batch: Vec<u8> = (0..1000u16)
         .flat_map(|t| frame(t, 1, &words(3, &[0x8000, 19])))
         .collect();
-    // Until both sockets are full: the server has stopped reading from it.
+    // The client sends until both sockets are full: the server has then stopped reading.
     while tokio::time::timeout(std::time::Duration::from_millis(300), deaf.stream.write_all(&batch))
         .await
         .is_ok()

@@ -189,7 +189,7 @@ async fn each_listener_has_its_own_rights_and_buses() {
     assert_eq!(two.ask(255, &words(4, &[1, 1])).await, [0x84, 2]);
     assert_eq!(two.ask(255, &words(4, &[17, 1])).await, registers(4, &[1]));
     assert_eq!(all.ask(255, &words(4, &[0, 32])).await.len(), 66);
-    // A reload reaches the listeners as it reaches one.
+    // A reload of the plant reaches all listeners.
     let mut next = plant();
     next.buses.remove(0);
     rig.plant.store(Arc::new(next));
@@ -298,7 +298,7 @@ async fn a_reload_that_cannot_bind_changes_nothing() {
     assert!(why.contains("Address already in use"), "{why}");
     assert!(may_write(&mut client).await);
     assert!(may_write(&mut rig.client().await).await);
-    // Another address replaces the first one: who is connected there is disconnected.
+    // Another address replaces the first one, whose clients are disconnected.
     let mut moved = options();
     moved.listeners[0].listen = vec![SocketAddr::from(([127, 0, 0, 5], 0))];
     rig.reload(moved).await.unwrap();

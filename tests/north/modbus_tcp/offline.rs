@@ -25,7 +25,7 @@ impl OfflineClient {
         OfflineClient {
             client: Offline::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
             plant,
-            // No clock of this machine is there yet.
+            // A time in the future: no clock of this machine has reached it.
             now: Instant::now() + Duration::from_secs(600),
         }
     }

@@ -11,7 +11,7 @@ use tokio_modbus::slave::{Slave, SlaveContext};
 use super::rig::Rig;
 use crate::support::tools;
 
-/// A request of `tests/peers/script.json`, and what must come of it.
+/// A request of `tests/peers/script.json`, and the result that it must have.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Step {
@@ -33,7 +33,7 @@ fn script() -> Vec<Step> {
     serde_json::from_str(&text).unwrap()
 }
 
-/// Whether a client ended well, and what it printed.
+/// Whether the client program ended with success, and what it printed.
 async fn run(mut command: Command) -> (bool, String) {
     let output = tokio::task::spawn_blocking(move || {
         command
@@ -45,7 +45,7 @@ async fn run(mut command: Command) -> (bool, String) {
     (output.status.success(), String::from_utf8_lossy(&text).into_owned())
 }
 
-/// The writes of the script that may reach the bus have reached it.
+/// Checks that the script's allowed writes have reached the bus.
 fn assert_written(rig: &Rig) {
     let written = rig.buses.iter().flat_map(|bus| bus.orders());
     let written = written.filter(|order| !matches!(order, Order::Read(_))).count();

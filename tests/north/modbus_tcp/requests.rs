@@ -66,7 +66,7 @@ async fn a_client_that_may_not_write() {
 async fn offline_drives_and_closed_buses() {
     let rig = Rig::new().await;
     let mut client = rig.client().await;
-    // Never answered.
+    // This drive never answered.
     assert_eq!(client.ask(3, &words(3, &[2100, 11])).await, [0x83, 0x0B]);
     assert_eq!(client.ask(3, &words(3, &[500, 1])).await, [0x83, 0x0B]);
     assert_eq!(client.ask(3, &words(6, &[0x8100, 1])).await, [0x86, 0x0B]);
@@ -219,7 +219,7 @@ async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
         "there is no AI 256"
     );
     assert_eq!(rig.buses[0].orders(), []);
-    // The first that fails ends it.
+    // The first object that fails ends the request.
     rig.buses[0].answers(|_| Some(Outcome::TimedOut));
     assert_eq!(client.ask(1, &words(2, &[7, 8])).await, [0x82, 0x0B]);
     assert_eq!(rig.buses[0].orders().len(), 1);

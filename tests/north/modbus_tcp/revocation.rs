@@ -22,7 +22,7 @@ async fn is_served(client: &mut TlsClient) -> bool {
     }
 }
 
-/// The directory of a CA of its own with these files of [`WORKS`].
+/// A directory for one CA with these files of [`WORKS`].
 fn copy(names: &[&str]) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for name in names {

@@ -121,12 +121,12 @@ impl FakeBus {
         bus
     }
 
-    /// From now on commands are answered like this.
+    /// Answers commands in this way from now on.
     pub(crate) fn answers(&self, script: impl FnMut(&Command) -> Option<Outcome> + Send + 'static) {
         *self.script.lock().unwrap() = Box::new(script);
     }
 
-    /// Leaves commands in the queue, or takes them again.
+    /// Leaves commands in the queue while `paused`, or takes them again.
     pub(crate) fn pause(&self, paused: bool) {
         self.paused.store(paused, Ordering::SeqCst);
         self.queue.wake();
@@ -339,7 +339,7 @@ impl Rig {
         Client::connect(self.address()).await
     }
 
-    /// Ends the server and waits for all its tasks.
+    /// Ends the server and waits until all its tasks have ended.
     pub(crate) async fn end(self) {
         self.cancel.cancel();
         tokio::time::timeout(PATIENCE, self.server.stopped()).await.unwrap();
@@ -373,7 +373,7 @@ impl Client {
         self.stream.write_all(bytes).await.unwrap();
     }
 
-    /// Sends a request; gives its transaction id.
+    /// Sends a request; returns the transaction id of the request.
     pub(crate) async fn request(&mut self, unit: u8, pdu: &[u8]) -> u16 {
         self.transaction = self.transaction.wrapping_add(1);
         self.send(&frame(self.transaction, unit, pdu)).await;
@@ -431,7 +431,7 @@ pub(crate) fn write(start: u16, values: &[u16]) -> Vec<u8> {
     pdu
 }
 
-/// The regular answer with those registers.
+/// The regular answer with these registers.
 pub(crate) fn registers(function: u8, values: &[u16]) -> Vec<u8> {
     let mut pdu = vec![function, values.len() as u8 * 2];
     values.iter().for_each(|w| pdu.extend_from_slice(&w.to_be_bytes()));

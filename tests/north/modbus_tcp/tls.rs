@@ -191,7 +191,7 @@ fn refused_for(rig: &Rig, reason: ConnectionRefusal) -> u64 {
         .1
 }
 
-/// The server's clock jumps ahead; then it goes on as before.
+/// Lets the server's clock jump ahead; then the clock goes on as before.
 async fn later(seconds: f32) {
     tokio::time::pause();
     tokio::time::advance(Duration::from_secs_f32(seconds)).await;
@@ -300,7 +300,7 @@ async fn who_is_not_known_is_refused() {
     rig.end().await;
 }
 
-/// Ten seconds for the whole handshake, however lively it is kept.
+/// The whole handshake may take ten seconds, even while the client keeps sending.
 #[tokio::test]
 async fn who_never_ends_the_handshake_is_closed() {
     let rig = Rig::with(tls_options()).await;

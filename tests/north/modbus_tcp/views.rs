@@ -97,7 +97,7 @@ async fn a_default_drive_is_read_and_commanded_like_its_own_unit() {
             [vec![("speed_reference".to_string(), Value::Number(10.0))]]
         );
     }
-    // Without it, both are what they were.
+    // Without a default drive, both units behave as before.
     rig.reload(showing(View::default())).await.unwrap();
     assert_eq!(client.ask(0, &words(4, &[0x8000, 1])).await, [0x84, 0x0A]);
     assert_eq!(client.ask(255, &words(6, &[0x8101, 1000])).await, [0x86, 1]);
@@ -159,7 +159,7 @@ async fn registers_of_the_drive_alone_are_there_up_to_the_last() {
             2
         ))]
     );
-    // The control word of the drive: its stop is a stop.
+    // This is the control word of the drive, so a stop written to it is treated as a stop.
     assert_eq!(client.ask(1, &words(6, &[2000, 0])).await[0], 6);
     assert_eq!(
         rig.buses[0].orders(),

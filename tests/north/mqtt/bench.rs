@@ -128,7 +128,7 @@ impl Broker {
         assert!(sent.success());
     }
 
-    /// Publishes with `mosquitto_pub`, QoS 1: it is with the broker when this returns.
+    /// Publishes with `mosquitto_pub` and QoS 1; the broker has the message when this returns.
     pub(crate) fn publish(&self, topic: &str, payload: &str, more: &[&str]) {
         let output = self.run(
             "mosquitto_pub",
@@ -147,7 +147,7 @@ impl Broker {
         assert!(client.wait().unwrap().success());
     }
 
-    /// Runs a client to its end.
+    /// Runs a client program until it ends.
     pub(crate) fn run(&self, name: &str, arguments: &[&str]) -> Output {
         client(name, self.port).args(arguments).output().unwrap()
     }
@@ -171,7 +171,7 @@ impl Drop for Broker {
     }
 }
 
-/// A message as `mosquitto_sub` saw it.
+/// A message as `mosquitto_sub` received it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Seen {
     pub(crate) retain: bool,
@@ -188,7 +188,7 @@ impl Seen {
 
 static MARKERS: AtomicU64 = AtomicU64::new(0);
 
-/// `mosquitto_sub`, and all that it saw.
+/// `mosquitto_sub`, and all messages that it received.
 pub(crate) struct Watcher {
     _client: Subscriber,
     seen: Arc<(Mutex<Vec<Seen>>, Condvar)>,
@@ -244,7 +244,7 @@ impl Watcher {
         all.map(|m| m.payload).collect()
     }
 
-    /// Forgets what was seen.
+    /// Forgets the messages received so far.
     pub(crate) fn clear(&self) {
         self.seen.0.lock().unwrap().clear();
     }
@@ -270,7 +270,7 @@ impl Watcher {
         })
     }
 
-    /// Waits until `count` messages came on a topic; returns them.
+    /// Waits until `count` messages have arrived on a topic; returns them.
     pub(crate) fn wait_count(&self, topic: &str, count: usize) -> Vec<Seen> {
         wait_for(&format!("{count} messages on {topic}"), || {
             let all: Vec<_> = self.all().into_iter().filter(|m| m.topic == topic).collect();

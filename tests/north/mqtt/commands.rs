@@ -233,13 +233,13 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
 fn retained_messages_are_never_commands() {
     let broker = Broker::start();
     let watcher = Watcher::new(&broker, "#");
-    // Retained before the gateway is there.
+    // The message is retained before the gateway connects.
     broker.publish(SET, r#"{"id": 1, "run": true}"#, &["-r"]);
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     let event = watcher.wait("the first event", |m| m.topic == EVENT).json();
     assert_eq!(event["event"], "refused_command");
     assert!(event["text"].as_str().unwrap().contains("retained"), "{event}");
-    // Retained while it is connected.
+    // The message is retained while the gateway is connected.
     watcher.clear();
     broker.publish("drivegate/hall/drive/p1/set/run", "true", &["-r"]);
     watcher.wait("the second event", |m| {

@@ -312,7 +312,7 @@ fn a_mosquitto_without_qos_1_or_retained_messages_is_served() {
             false => "has no QoS 1",
         };
         wait_log(broker.port, said);
-        // With QoS 0, since the clients of mosquitto refuse more themselves.
+        // QoS 0 is used because with more, the clients of mosquitto refuse messages themselves.
         let port = broker.port;
         let seen = std::thread::spawn(move || next_message(port, EVENT, &["-W", "240"]));
         while !seen.is_finished() {

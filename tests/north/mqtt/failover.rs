@@ -81,7 +81,7 @@ fn the_next_broker_follows_and_a_working_one_is_kept() {
     }
     assert_eq!(on_first.all(), []);
 
-    // Killed while in use: the third one, then from the beginning.
+    // The broker is killed while in use: the third one follows, then the first one.
     let on_third = all_of(&third);
     let from = Instant::now();
     second.kill();
@@ -135,7 +135,7 @@ fn after_return(message_expiry: Option<Duration>, later: Duration) -> [Option<St
     let gateway = Gateway::start(options, plant(&["p1"]));
     let kept = || Some((first.retained(STATUS)?, first.retained(STATE)?));
     wait_for("retained messages", || kept().filter(|(status, _)| status == "online"));
-    // Writes all of them to its disk.
+    // The signal makes the broker write all its messages to its disk.
     first.signal("USR1");
     wait_for("the disk", || {
         first.dir.path().join("mosquitto.db").is_file().then_some(())

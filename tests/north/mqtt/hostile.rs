@@ -16,7 +16,7 @@ const STATE: &str = "drivegate/hall/drive/p1/state";
 /// Behaviour of the broker.
 #[derive(Clone, Default)]
 struct Manners {
-    /// Properties of its CONNACK.
+    /// Properties of the broker's CONNACK.
     properties: Vec<u8>,
     /// Topics below this get this reason code, so many times.
     refused: Option<(&'static str, u8, usize)>,
@@ -28,7 +28,7 @@ struct Manners {
     farewell: Option<Vec<u8>>,
     /// Whether the broker leaves subscriptions unanswered.
     deaf: bool,
-    /// From the first ping on it answers nothing.
+    /// Whether the broker answers nothing from the first ping on.
     mute: bool,
     /// Whether the broker refuses a last will with QoS 1, and one that is retained.
     no_will: bool,
@@ -36,7 +36,7 @@ struct Manners {
     no_wildcards: bool,
 }
 
-/// A broker with these properties of its CONNACK.
+/// A broker whose CONNACK has these properties.
 fn with(properties: Vec<u8>) -> Manners {
     Manners {
         properties,
@@ -105,7 +105,7 @@ struct Session {
     seen: Arc<Mutex<Seen>>,
     first: bool,
     aliases: HashMap<u16, String>,
-    /// Packet ids of events to acknowledge, with their reason codes.
+    /// Packet ids of events still to acknowledge, with the reason codes.
     owed: Vec<(u16, u8)>,
     pinged: bool,
 }
@@ -260,7 +260,7 @@ impl Session {
     }
 }
 
-/// Publishes `count` events; they, the state and the status arrive.
+/// Publishes `count` events and checks that these, the state and the status arrive.
 fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
     wait_for("the status", || {
         broker.has(|(topic, .., payload)| topic == "drivegate/hall/status" && payload == b"online")

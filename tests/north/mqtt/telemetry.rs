@@ -18,7 +18,7 @@ fn all_topics_are_there_retained() {
     watcher.wait_payload("drivegate/hall/status", "online");
     watcher.wait("state of p2", |m| m.topic == "drivegate/hall/drive/p2/state");
     watcher.wait("the bus", |m| m.topic == "drivegate/hall/bus/line1");
-    // A client that comes later gets all of it as retained messages.
+    // A client that subscribes later receives all topics as retained messages.
     let late = Watcher::new(&broker, "drivegate/#");
     for (topic, payload) in [
         ("status", "online"),
@@ -51,7 +51,7 @@ fn all_topics_are_there_retained() {
         (&bus["state"], &bus["drives"], &bus["online"]),
         (&"up".into(), &2.into(), &2.into())
     );
-    // Nothing is retained for points that are not good.
+    // Points that are not good have no retained message.
     assert!(
         late.payloads("drivegate/hall/drive/p1/point/heatsink_temperature")
             .is_empty()

@@ -14,7 +14,7 @@ pub(crate) fn table() -> String {
     text
 }
 
-/// A row for the command, or one for each command below it.
+/// Adds a row for the command, or one row for each of its subcommands.
 fn rows(text: &mut String, path: &str, command: &Command) {
     let path = format!("{path} {}", command.get_name());
     let about = command.get_about().map(ToString::to_string).unwrap_or_default();

@@ -8,7 +8,7 @@ use drivegate::drive::{Bound, Derived, ModelPoint, Point, PointIndex, PollClass,
 
 /// The families, Modbus first.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
-/// Profiles of one application, each based on one of them.
+/// Profiles for one application, each based on another profile.
 const APPLICATIONS: [&str; 6] = [
     "vacon-nx-multipurpose",
     "vacon-nx-pid",
@@ -78,7 +78,7 @@ fn model(profiles: &Profiles, names: &[&str]) -> String {
     text
 }
 
-/// Address, scale, class, and whether it is verified.
+/// Address, scale and class of a point, and whether it is verified.
 fn cell(profile: &Profile, point: &Point) -> String {
     let place = place(profile, point);
     let class = if point.raw().is_some() {
@@ -117,7 +117,7 @@ fn place(profile: &Profile, point: &Point) -> String {
                 Table::Input => "IR",
                 Table::Holding => "HR",
             };
-            // TECO's manual numbers its registers in hexadecimal.
+            // The manual of TECO numbers its registers in hexadecimal.
             if profile.protocols == [Protocol::ModbusAscii] {
                 format!("{short} {:04X}H", raw.address)
             } else {
@@ -267,7 +267,7 @@ fn faults(profiles: &Profiles, profile: &Profile) -> String {
     text
 }
 
-/// The points by which profiles of an application differ from their base.
+/// The points by which application profiles differ from the profiles that they are based on.
 fn applications(profiles: &Profiles) -> String {
     let mut text = String::from(
         "\n## Profiles of one application\n\nWhat process data in means depends on the application, and no read shows which one \

@@ -31,7 +31,7 @@ impl ToolRig {
         }
     }
 
-    /// A client orders; its answer.
+    /// Gives an order as another client; returns its answer.
     fn client(&mut self, address: u8, run: f64) -> Outcome {
         let order = self.rig.points(address, &[("run", run)]);
         let mut placed = self.rig.place(address, order);

@@ -93,7 +93,7 @@ impl World {
         id
     }
 
-    /// The client closes its connection, and another one comes.
+    /// Closes a client's connection and opens another one.
     pub(super) fn hang_up(&mut self, index: usize) {
         let connection = &mut self.connections[index];
         connection.closed = Some(self.now);

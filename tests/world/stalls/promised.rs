@@ -39,17 +39,17 @@ pub struct Order {
     pub read: Option<Instant>,
     /// When the client closed the connection, if before that.
     pub closed: Option<Instant>,
-    /// With the exception, if it was one.
+    /// When the order was answered, and with which exception, if any.
     pub answer: Option<(Instant, Option<u8>)>,
 }
 
 /// Orders of all clients, and actions of the drives.
 pub struct Promised {
     pub orders: Vec<Order>,
-    /// When each drive was sent the writes that it carried out.
+    /// When the writes that each drive carried out were sent to it.
     told: BTreeMap<u8, Vec<Instant>>,
     running: Vec<bool>,
-    /// When each drive was last stopped by something else than the line.
+    /// When each drive was last stopped by anything but the line.
     befell: BTreeMap<u8, Instant>,
 }
 
@@ -78,12 +78,12 @@ impl Promised {
         self.orders.len() - 1
     }
 
-    /// The last of it is sent.
+    /// Notes that the last byte of the order is sent.
     pub fn complete(&mut self, id: usize, now: Instant) {
         self.orders[id].complete = now;
     }
 
-    /// The gateway has read all of it.
+    /// Notes that the gateway has read the whole order.
     pub fn read(&mut self, id: usize, now: Instant) {
         self.orders[id].read = Some(now);
     }
@@ -93,7 +93,7 @@ impl Promised {
         self.orders[id].closed.get_or_insert(now);
     }
 
-    /// The rest of it is never sent.
+    /// Notes that the rest of the order is never sent.
     pub fn never_sent(&mut self, id: usize) {
         self.orders[id].does = Does::Other;
     }
@@ -113,7 +113,7 @@ impl Promised {
         self.befell.insert(machine, now);
     }
 
-    /// Whether its motor started or ended just now.
+    /// Whether the motor of the machine has just started or stopped.
     pub fn runs(&mut self, machine: u8, running: bool) -> bool {
         std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
     }
@@ -121,7 +121,7 @@ impl Promised {
     /// If the motor has started: by a write that some client wanted when it was sent.
     pub fn must_want_start(&self, machine: u8, now: Instant) {
         let told = self.told.get(&machine).into_iter().flatten().rev();
-        // The motor follows its drive by an update of it or two.
+        // The motor follows its drive after one or two updates.
         let told: Vec<Instant> = told.take_while(|at| now - **at < FOLLOWS).copied().collect();
         if !self.running[usize::from(machine) - 1] || told.iter().any(|at| self.is_wanted(machine, *at)) {
             return;

@@ -4,7 +4,7 @@ use super::*;
 use drivegate_world::drive::PointIndex;
 use drivegate_world::plant::OrderRequest;
 
-/// How much longer a client waits whose order was answered at once.
+/// Additional time that a client waits whose order was answered at once.
 const TURNED_AWAY: Duration = Duration::from_millis(40);
 
 impl World {
@@ -126,7 +126,7 @@ impl World {
                 } else {
                     Wish::of(&mut self.dice)
                 };
-                // Without the dice: the rest of the world is the same.
+                // Chosen without the random numbers, so that the rest of the world stays the same.
                 let wish = match wish {
                     Wish::RawRead if self.records.len().is_multiple_of(2) => Wish::RawOther,
                     wish => wish,
@@ -184,7 +184,7 @@ impl World {
         }
     }
 
-    /// Takes note of an order that is given now; its number.
+    /// Records an order that is given now; returns its number.
     pub(super) fn record(&mut self, client: usize, bus: usize, drive: usize, wish: Wish, expiry: Duration) -> usize {
         let now = self.now;
         let id = self.records.len();

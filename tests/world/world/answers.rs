@@ -149,7 +149,7 @@ impl World {
         }
     }
 
-    /// An order has its answer: is it true?
+    /// Checks that the answer to an order is true.
     pub(super) fn answered(&mut self, id: usize, code: &str, outcome: Option<&Outcome>) {
         let now = self.now;
         let text = code.to_string();

@@ -21,7 +21,7 @@ const STEP: Duration = Duration::from_millis(10);
 /// The oldest values of each read of a drive in a time of observation.
 type Ages = Vec<Vec<((Table, u16, PollClass), Option<Duration>)>>;
 
-/// How the second half goes.
+/// State of the second half, in which all faults have ended.
 #[derive(Debug, Clone, Copy)]
 pub struct Healing {
     /// When the last fault ended.
@@ -142,7 +142,7 @@ impl World {
             let drive = self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize;
             if self.is_alive(bus, drive) {
                 self.plain(client, bus, drive, Wish::Stop, Duration::from_millis(400));
-                // Where a slow acknowledgement is waited for, it stands for this stop.
+                // Where a slow acknowledgement is waited for, that wait counts for this stop.
                 let waiting = self
                     .open
                     .values()

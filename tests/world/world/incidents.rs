@@ -98,7 +98,7 @@ impl World {
         self.note(move || format!("line{bus} drive {address} {words}"));
     }
 
-    /// Somebody changes the maximum frequency of a drive at its panel.
+    /// Changes the maximum frequency of a drive, as a person at its panel does.
     fn at_the_panel(&mut self, bus: usize, address: u8) {
         let hertz = [50.0, 60.0, 80.0, 100.0][self.dice.within(0..=3) as usize];
         if let Some(hertz) = self.buses[bus].maximum_frequency(address, Some(hertz), self.now) {

@@ -73,17 +73,17 @@ impl World {
         }
     }
 
-    /// No order waits longer than its time and its last steps.
+    /// Checks that no order waits longer than its time and its last steps.
     pub(super) fn check_answered_in_time(&self) {
         for id in self.open.values().flatten() {
             let record = &self.records[*id];
             // By MQTT the answer waits for the confirmation, 5 s at most.
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
             let most = if by_mqtt { 2 * LAST_STEPS } else { LAST_STEPS };
-            // The end of a reset pulse is tried until the drive takes it.
+            // The end of a reset pulse is repeated until the drive accepts it.
             let noisy = self.buses[record.bus].line.is_noisy();
             let most = if noisy { 3 * most } else { most };
-            // A stop does not expire: its time begins when it has its turn.
+            // A stop does not expire: its time begins when its turn comes.
             let expires = match record.wish.is_stop() {
                 true => record.expires.max(record.accepted + 2 * STOP_TIME),
                 false => record.expires,
@@ -96,7 +96,7 @@ impl World {
         }
     }
 
-    /// A drive that runs, whose client fell silent, gets its action.
+    /// Checks that supervision acts on a running drive whose client fell silent.
     pub(super) fn check_leases(&self) {
         for (index, bus) in self.buses.iter().enumerate() {
             let Some(supervision) = &bus.line.supervision else {
@@ -141,7 +141,7 @@ impl World {
     pub(super) fn check_polls(&self) {
         let sound = |bus: &&WorldBus| bus.open && !bus.line.is_noisy() && self.scenario.incidents.is_none();
         for bus in self.buses.iter().filter(sound) {
-            // Until two rounds began, the cycle is the predicted one.
+            // Until two rounds have begun, the predicted cycle counts.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
             for (drive, truth) in bus.handle.image.drives.iter().zip(&self.truths[bus.index]) {
                 let settled = |at: Instant| self.now - at > Duration::from_secs(3);
@@ -179,7 +179,7 @@ impl World {
         }
     }
 
-    /// A state is known only while all that it rests on is.
+    /// Checks that a state is known only while all its sources are known.
     pub(super) fn check_states(&self) {
         let plant = self.plant.load();
         for drive in plant.drives() {

@@ -77,7 +77,7 @@ impl World {
             if bus.line.is_noisy() || !bus.open || bus.line.refuses.is_some() {
                 continue;
             }
-            // All others may have their turn before.
+            // All other drives may have their turn before this one.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
             let most = 4 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
             for (drive, truth) in truths.iter().enumerate() {
@@ -85,7 +85,7 @@ impl World {
                     continue;
                 };
                 let alive = self.now - heard < supervision.timeout / 2;
-                // After a lease expired only an order begins it again, not a heartbeat.
+                // After a lease expired, only an order begins a new lease, a heartbeat does not.
                 let expired = truth.supervised.is_some_and(|at| at >= ordered);
                 let waits = expired || self.open.contains_key(&(bus.index, drive)) || truth.is_troubled(ordered);
                 let runs = truth.run && truth.running_since.is_some_and(|since| self.now - since > most);
