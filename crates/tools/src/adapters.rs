@@ -59,7 +59,7 @@ fn persistent_in(dev: &Path, port: &str) -> String {
     link.map_or_else(|| port.to_string(), |(link, _)| link.display().to_string())
 }
 
-/// Links in `serial/by-id` with what they lead to.
+/// Links in `serial/by-id`, each with the device that it leads to.
 fn persistent_names(dev: &Path) -> Vec<(PathBuf, PathBuf)> {
     let directory = dev.join("serial/by-id");
     let links = names(&directory).into_iter().map(|name| directory.join(name));
@@ -74,7 +74,7 @@ fn has_hardware(port: &Path) -> bool {
     port.join("device").exists() && kind.trim() != "0"
 }
 
-/// Names in a directory, sorted; none where it cannot be read.
+/// Sorted names in a directory; empty if the directory cannot be read.
 fn names(directory: &Path) -> Vec<String> {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
     let mut names: Vec<String> = entries

@@ -16,7 +16,7 @@ pub(super) const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
 /// Largest manifest, bytes.
 const MOST_MANIFEST: u64 = 64 << 20;
-/// Most members.
+/// Most members of an archive.
 const MOST_MEMBERS: usize = 100_000;
 /// Most bytes of all members together.
 const MOST_BYTES: u64 = 8 << 30;
@@ -26,23 +26,23 @@ const MOST_BYTES: u64 = 8 << 30;
 pub(super) struct Manifest {
     /// [`FORMAT`].
     pub(super) drivegate_backup: u32,
-    /// Version of the program that made it.
+    /// Version of the program that made the archive.
     pub(super) version: String,
-    /// When, RFC 3339.
+    /// When the archive was made, RFC 3339.
     pub(super) time: String,
     /// Name of the gateway.
     pub(super) gateway: String,
-    /// Path of the configuration when it was made.
+    /// Path of the configuration when the archive was made.
     pub(super) config: PathBuf,
-    /// The state directory then.
+    /// State directory when the archive was made.
     pub(super) state_dir: PathBuf,
-    /// The members, in their order; the configuration is the first.
+    /// The members in their order; the first one is the configuration.
     pub(super) members: Vec<Member>,
     /// Directories of profiles, `config/…`, which may be empty.
     pub(super) directories: Vec<String>,
     /// Files that belong to the gateway and are not in the archive.
     pub(super) left_out: Vec<LeftOut>,
-    /// The recordings that there were; they themselves are not in the archive.
+    /// The recordings that existed; the archive itself does not contain them.
     pub(super) recordings: Vec<serde_json::Value>,
 }
 
@@ -62,9 +62,9 @@ pub(super) struct Member {
 /// A file that is not in the archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct LeftOut {
-    /// Where it is.
+    /// Path of what was left out.
     pub(super) path: PathBuf,
-    /// Why.
+    /// Why the file was left out.
     pub(super) why: String,
 }
 
@@ -121,7 +121,7 @@ pub(super) struct Content<R> {
     pub(super) reader: R,
 }
 
-/// Writes an archive: the manifest, then each member as it is in it.
+/// Writes an archive: first the manifest, then each member as the manifest lists it.
 ///
 /// # Errors
 /// The archive cannot be written, a file no longer matches its member in the manifest, or [`read`] would refuse the
@@ -206,7 +206,7 @@ pub(super) fn read(
     }
 }
 
-/// A manifest, and whether it can be that of a backup.
+/// Parses a manifest, and checks that it can be the manifest of a backup.
 fn parse(json: &[u8]) -> Result<Manifest, String> {
     #[derive(Deserialize)]
     struct Version {
@@ -271,7 +271,7 @@ impl<R> Hashed<R> {
         }
     }
 
-    /// Bytes that were read, and their hash.
+    /// Number of bytes that were read, and their hash.
     pub(super) fn finish(self) -> (u64, String) {
         (self.bytes, hex::encode(self.hash.finish().as_ref()))
     }

@@ -8,9 +8,9 @@ use super::failure::{Outcome, negative};
 use super::report;
 use crate::order::chain::{Hash, Verifier, seq};
 
-/// Longest line that is read, bytes; an entry is far shorter.
+/// Longest line that is read, bytes; any entry is far shorter.
 const LONGEST_LINE: u64 = 16 << 20;
-/// Findings that are printed.
+/// Most findings that are printed.
 const PRINTED: usize = 20;
 
 /// Checks the file of commands that the gateway writes ([audit])
@@ -58,7 +58,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 impl Verify {
-    /// Verifies the files. Returns the summary if they are intact.
+    /// Verifies the files. Returns the summary if the files are intact.
     fn run(&self) -> Result<String, Vec<String>> {
         let ordered = in_order(&self.files).map_err(|error| vec![error])?;
         let (mut verifier, mut faults, mut lines) = (Verifier::new(self.last), Vec::new(), 0);
@@ -110,7 +110,7 @@ fn fault(why: &str, place: &str) -> String {
     format!("{why}; {place}; compare with the log, and with a backup if there is one")
 }
 
-/// The files by the number of their first entry.
+/// The files, sorted by the number of their first entry.
 fn in_order(files: &[PathBuf]) -> Result<Vec<PathBuf>, String> {
     let mut numbered = Vec::new();
     for path in files {
@@ -139,7 +139,7 @@ impl Lines {
         })
     }
 
-    /// The next line, without its end.
+    /// The next line without its line end.
     fn next(&mut self) -> Result<Option<Vec<u8>>, String> {
         let mut line = Vec::new();
         let read = io::Read::take(&mut self.reader, LONGEST_LINE).read_until(b'\n', &mut line);

@@ -45,7 +45,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(report::print(&summary(&args.file, &manifest)))
 }
 
-/// The files of a backup, and what is not in it.
+/// The files of a backup, and what the backup leaves out.
 #[derive(Debug, Default)]
 struct Sources {
     files: Vec<(PathBuf, Member)>,
@@ -116,7 +116,7 @@ fn collect(config: &Path, settings: &Settings, with_keys: bool) -> io::Result<So
     Ok(sources)
 }
 
-/// Names what the gateway keeps outside of its state directory.
+/// Names the files that the gateway keeps outside its state directory.
 fn elsewhere(state_dir: &Path, kept: impl Iterator<Item = PathBuf>, sources: &mut Sources) {
     let state_dir = real(state_dir);
     for path in kept.filter(|path| path.exists() && !real(path).starts_with(&state_dir)) {
@@ -156,7 +156,7 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
         } else if let Err(error) = sources.add(Root::State, dir, &below)
             && error.kind() != io::ErrorKind::NotFound
         {
-            // The gateway may have removed it meanwhile; any other error is one.
+            // The gateway may have removed the file meanwhile; any other error is returned.
             return Err(error);
         }
     }

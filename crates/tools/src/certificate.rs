@@ -91,7 +91,7 @@ fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<Strin
     ))
 }
 
-/// A key and its certificate, PEM.
+/// A key and its certificate, both as PEM.
 struct Made {
     key: String,
     certificate: String,

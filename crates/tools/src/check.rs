@@ -64,7 +64,7 @@ struct Bus<'a> {
     load_ratio: f64,
     fast_cycle_ms: Option<f64>,
     slow_cycle_ms: Option<f64>,
-    /// Share of the line that refreshes take; absent where there are none.
+    /// Share of the line that refreshes take; absent if the line has no refreshes.
     #[serde(skip_serializing_if = "Option::is_none")]
     refresh_ratio: Option<f64>,
     /// Duration of the stops at shutdown if all drives reply, and if none does.
@@ -182,7 +182,7 @@ fn json(loaded: &Loaded) -> String {
         memory_bytes: memory.as_ref().map(|(settings, memory)| memory.total(settings)),
         buses: buses.collect(),
     };
-    // Only maps with keys that are not strings fail, and there are none.
+    // Only maps whose keys are not strings can fail, and the report has no such maps.
     serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
 }
 
@@ -226,7 +226,7 @@ fn refused(drive: &DriveSpec) -> impl Iterator<Item = Refused<'_>> {
     })
 }
 
-/// Most drives that a line names.
+/// Most drives that one line of output names.
 const NAMED: usize = 4;
 
 /// Values that raw writes may not set, one line for the drives that have them in common; empty without Modbus TCP,
@@ -396,7 +396,7 @@ fn bacnet(settings: &Settings) -> String {
     )
 }
 
-/// Where tools reach the line, one line a slot.
+/// Where tools reach the line, with one line for each slot.
 fn slots(bus: &BusSettings, settings: &Settings) -> String {
     let all = settings.slots.iter().flat_map(|slots| &slots.slots);
     let of_bus = all.filter(|slot| slot.bus == bus.spec.name);
@@ -412,7 +412,7 @@ fn slots(bus: &BusSettings, settings: &Settings) -> String {
     of_bus.map(line).collect()
 }
 
-/// Whose commands are written again, and what that takes of the line.
+/// Drives whose commands are written again, and the share of the line that this takes.
 fn refreshes(bus: &BusSettings, prediction: &Prediction) -> String {
     let refreshed: Vec<String> = bus
         .drives
@@ -482,7 +482,7 @@ fn memory(memory: &BusMemory, reach: Reach) -> String {
         )
 }
 
-/// How far back trends reach where that is less than usual.
+/// How far back trends reach, if that is less than usual.
 fn reaches(reach: Reach) -> String {
     if reach == Reach::FULL {
         return String::new();
@@ -491,7 +491,7 @@ fn reaches(reach: Reach) -> String {
     format!("; they reach back {} (many drives share the memory)", spans.join(", "))
 }
 
-/// Duration of the stops at shutdown; empty where there are none.
+/// Duration of the stops at shutdown; empty if there are none.
 fn shutdown(bus: &BusSettings) -> String {
     let time = bus.shutdown_time();
     if time.drives == 0 {

@@ -29,18 +29,18 @@ const CONNECT: Duration = Duration::from_secs(10);
 /// How often a request that only reads is sent in all where the connection is cut off: a gateway that just ends does that, and
 /// has gone a moment later.
 const TRIES: u32 = 5;
-/// Pause before the next of them.
+/// Pause before the next attempt.
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a gateway sent nothing; the messages say what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ClientError {
-    /// Nothing listens there, or the connection is blocked.
+    /// No gateway listens there, or the connection is blocked.
     #[error(
         "cannot reach the gateway: {1}; {0}; start it with an [http] section, or pass its `listen` address with --url"
     )]
     Unreachable(String, String),
-    /// No gateway of the configuration is at its sockets.
+    /// No gateway of the configuration listens at its sockets.
     #[error("no running gateway was found: {}; start it with this file, use sudo, or join the group of the socket", .0.told())]
     NotFound(NotFound),
     /// A file of the command line cannot be used.
@@ -79,7 +79,7 @@ impl From<ClientError> for String {
 pub(crate) struct NotFound {
     /// Sockets that cannot be opened.
     pub(crate) closed: Vec<String>,
-    /// Other gateways.
+    /// Names of other gateways that were found.
     pub(crate) others: Vec<String>,
     file: Option<PathBuf>,
 }
@@ -118,12 +118,12 @@ impl Client {
         }
     }
 
-    /// Where it looks.
+    /// The places where the client looks for the gateway.
     pub(crate) fn doors(&self) -> &[Door] {
         &self.doors
     }
 
-    /// Sends a request, and waits for the head of its reply.
+    /// Sends a request and waits for the head of the reply.
     ///
     /// # Errors
     /// No gateway is found, or it does not answer.
@@ -184,7 +184,7 @@ impl Client {
         }
     }
 
-    /// Sends a request, and waits for its reply.
+    /// Sends a request and waits for the reply.
     ///
     /// # Errors
     /// No gateway is found, or it does not answer.

@@ -10,16 +10,16 @@ use std::time::{Duration, Instant};
 
 use crate::north::http::{Credential, Credentials};
 
-/// How long someone else may take to change the file.
+/// Time that another program may take to change the file.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How often that is looked for.
+/// Time between two looks at whether the other program has finished.
 const AGAIN: Duration = Duration::from_millis(20);
 
 /// A kind of credential that is kept in a file.
 pub(super) trait Filed: Credential + Send + Sync + 'static {
     /// Kind of the file, for messages.
     const FILE: &'static str;
-    /// Permissions of a new one; those of an old one stay.
+    /// Permissions of a new file; an existing file keeps its permissions.
     const MODE: u32;
 }
 
@@ -89,7 +89,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// # Errors
     /// The error of `change`, or of the system; the file is unchanged.
     fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
-        // A link stays one.
+        // A symbolic link stays a link: the file that it leads to is changed.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());
         let _lock = self.lock(&file)?;
         let text = match self.path.exists() {

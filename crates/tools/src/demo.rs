@@ -49,7 +49,7 @@ struct DemoLine {
     format: &'static str,
     /// `cycle` and `slow_cycle`.
     cadence: [&'static str; 2],
-    /// Drives with their profiles, addresses from 1 on.
+    /// Drives with their profiles; their addresses begin at 1.
     drives: &'static [(&'static str, &'static str)],
 }
 
@@ -133,7 +133,7 @@ async fn demo(args: &Args) -> Result<(), String> {
     };
     let cancel = CancellationToken::new();
     let mut started = start(&place, &cancel).await;
-    // Another program may take a port between the check and its use.
+    // Another program may take a port between the check and the use of the port.
     for _ in 0..4 {
         if started.is_err() {
             started = start(&place, &cancel).await;
@@ -157,13 +157,13 @@ async fn demo(args: &Args) -> Result<(), String> {
     broker.stop().await;
     lines.into_iter().for_each(SimulatedBus::stop);
     if place.written.is_none() {
-        // There is none while nothing was recorded.
+        // While nothing was recorded, the directory does not exist.
         let _ = std::fs::remove_dir_all(place.state_dir());
     }
     Ok(())
 }
 
-/// Where the demo is on this machine.
+/// Places of the demo on this machine.
 struct DemoPlace {
     /// Ports of the lines.
     ports: Vec<String>,
@@ -172,7 +172,7 @@ struct DemoPlace {
 }
 
 impl DemoPlace {
-    /// Where the recordings of this demo are.
+    /// The directory of this demo's recordings.
     fn state_dir(&self) -> PathBuf {
         match &self.written {
             Some(written) => written.state_dir(),
@@ -180,7 +180,7 @@ impl DemoPlace {
         }
     }
 
-    /// The local socket; without a configuration file it would not be usable.
+    /// The local socket; without a configuration file, no client could find the socket.
     fn socket(&self) -> String {
         let socket = self.written.as_ref().map(Written::socket);
         socket.map_or_else(String::new, |socket| socket.display().to_string())
@@ -221,7 +221,7 @@ async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon,
             Ok(daemon) => return Ok((daemon, broker, sides)),
             Err(error) => error,
         };
-        // Another program may have taken a port since it was found free.
+        // Another program may have taken a port since the port was found free.
         match failed.address_in_use() {
             Some(taken) if taken == sides.modbus => modbus = taken.port().saturating_add(1),
             Some(taken) if taken == sides.http => http = taken.port().saturating_add(1),

@@ -14,7 +14,7 @@ use super::{printable, report};
 use crate::drill::{DrillReport, DrillState, Kind};
 use crate::north::http::messages::DrillWish;
 
-/// How often a drill that is under way is looked at.
+/// Time between two looks at a running drill.
 const LOOK: Duration = Duration::from_millis(500);
 
 /// Proves that a motor stops: by a command, when its client goes silent, when the gateway goes silent.
@@ -180,7 +180,7 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
     watch(&client, started).await
 }
 
-/// Shows what the drill does until it is over. Ctrl-C ends it.
+/// Shows the steps of the drill until it ends. Ctrl-C ends the drill.
 async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, String> {
     let mut told = String::new();
     let mut now = started;
@@ -211,7 +211,7 @@ async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, Str
 }
 
 async fn interrupted() {
-    // Without a handler for it Ctrl-C ends the process.
+    // Without a handler for the signal, Ctrl-C ends the process.
     if tokio::signal::ctrl_c().await.is_err() {
         std::future::pending::<()>().await;
     }

@@ -33,7 +33,7 @@ pub(super) struct OneDrive {
 }
 
 impl OneDrive {
-    /// The drive, and its gateway.
+    /// The drive and its gateway.
     pub(super) fn target(&self) -> Result<Target, Failure> {
         target(&self.gateway, &self.name)
     }
@@ -48,7 +48,7 @@ pub(super) struct Target {
     configured: Option<Box<Configured>>,
 }
 
-/// The drive as the configuration has it.
+/// The drive according to the configuration.
 #[derive(Debug, Clone)]
 struct Configured {
     settings: Settings,
@@ -61,11 +61,11 @@ struct Configured {
 pub(super) enum Way {
     /// Through the running gateway.
     Gateway,
-    /// On the line itself.
+    /// Directly on the line.
     Direct,
 }
 
-/// The drive, of the configuration unless the gateway is named by its address.
+/// The drive; it is looked up in the configuration unless the gateway is named by its address.
 pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> {
     let drive_name = drive.to_string();
     if let Some(client) = gateway.network() {
@@ -102,12 +102,12 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> 
 }
 
 impl Target {
-    /// The profile, where it is known here.
+    /// The profile of the drive, if this command knows it.
     pub(super) fn profile(&self) -> Option<&Arc<Profile>> {
         self.configured.as_ref().map(|configured| &configured.spec.profile)
     }
 
-    /// Where the API has that of the drive.
+    /// Path of `what` about this drive in the API.
     pub(super) fn path(&self, what: &str) -> String {
         format!("/api/v1/drives/{}/{what}", encoded(&self.drive))
     }

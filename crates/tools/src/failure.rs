@@ -29,7 +29,7 @@ impl<T: Into<String>> From<T> for Failure {
 }
 
 impl Failure {
-    /// Prints it to stderr.
+    /// Prints the failure to stderr.
     pub(super) fn report(self) -> ExitCode {
         match self {
             Failure::Failed(message) => report::failed(&message),
@@ -54,7 +54,7 @@ pub(super) fn documented(json: bool, outcome: Outcome) -> Outcome {
     outcome
 }
 
-/// The command did its work and has reported what it found wrong.
+/// The outcome of a command that did its work and reported a finding.
 pub(super) fn negative() -> Outcome {
     Ok(ExitCode::from(EXIT_FAILED))
 }

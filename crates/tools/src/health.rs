@@ -40,9 +40,9 @@ pub(super) fn run(args: &Args) -> Outcome {
     })
 }
 
-/// Why the gateway is not ready; nothing if it is.
+/// Why the gateway is not ready; empty if it is ready.
 async fn unready(gateway: &Gateway) -> Result<Vec<String>, String> {
-    // No token is needed there.
+    // The path `/readyz` needs no token.
     let asked = Asked::view("/readyz");
     let reply = gateway.client()?.ask(&asked).await?;
     match (reply.status, reply.text()) {

@@ -68,7 +68,7 @@ fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
     Ok(yaml::document(&nested(GROUP, nested("hosts", host))))
 }
 
-/// The first string that Ansible would change, with its key.
+/// The first string that Ansible would take for a template, with its key.
 fn template<'v>(value: &'v Value, key: &str) -> Option<(String, &'v str)> {
     match value {
         Value::String(text) if TEMPLATES.iter().any(|begin| text.contains(begin)) => Some((key.to_string(), text)),
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn every_key_with_a_secret_is_known() {
-        // In the schema: all keys but those of files.
+        // Collects the keys in the schema, except the keys of files.
         fn secrets(schema: &serde_json::Value, path: &str, found: &mut Vec<String>) {
             for (name, below) in schema["properties"].as_object().into_iter().flatten() {
                 let path = format!("{path}.{name}");

@@ -229,7 +229,7 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
     built.map_err(cannot_start)
 }
 
-/// Runs `command` on a runtime of its own.
+/// Runs `command` on a new runtime.
 fn block_on(command: impl Future<Output = Outcome>) -> Outcome {
     let runtime = north::reading::watched_runtime();
     runtime.map_err(cannot_start)?.block_on(command)
@@ -245,7 +245,7 @@ fn settings(path: &Path) -> Result<Settings, Failure> {
     loaded.settings.ok_or(Failure::Invalid(loaded.errors))
 }
 
-/// The built-in profiles, and those of these directories.
+/// The built-in profiles, and the profiles in these directories.
 fn profiles_of(dirs: &[PathBuf]) -> Result<Profiles, Failure> {
     let mut profiles = Profiles::built_in();
     add_profiles(&mut profiles, dirs)?;

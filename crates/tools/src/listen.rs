@@ -24,7 +24,7 @@ use crate::line::{Lost, Receiver, Woken};
 const DWELL: Duration = Duration::from_secs(3);
 /// Rounds over all settings.
 const ROUNDS: u32 = 2;
-/// Longest wait for bytes.
+/// Longest single wait for bytes.
 const LOOK: Duration = Duration::from_millis(20);
 /// Bauds that are tried by default.
 const BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
@@ -116,7 +116,7 @@ fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
     Ok((protocols, formats))
 }
 
-/// Listens at one port.
+/// A listener at one port.
 struct Ear<'a> {
     args: &'a Args,
     stop: Arc<AtomicBool>,

@@ -62,7 +62,7 @@ impl Loading {
         Ok(Loading { loaded, deadline })
     }
 
-    /// The configuration when it is read; cancel safe.
+    /// Waits until the configuration is read; cancel safe.
     pub(super) async fn finished(&mut self) -> Result<Loaded, NotLoaded> {
         let loaded = match self.deadline {
             Some(deadline) => tokio::time::timeout_at(deadline, &mut self.loaded)

@@ -21,7 +21,7 @@ use self::line::{Form, LogLine};
 use crate::config::{LogFormat, LogSettings};
 use crate::order::SENT;
 
-/// Where commands are logged (`command::AuditRecord`), and the level of their lines.
+/// Log target of commands (`command::AuditRecord`), and the level of their lines.
 const AUDIT: &str = "audit";
 const AUDIT_LINES: Level = Level::INFO;
 

@@ -135,7 +135,7 @@ fn begin(name: &str, base: Option<&str>, profiles: &Profiles) -> Result<String, 
     Err(misused("NAME", invalid))
 }
 
-/// Longest list that is read.
+/// Longest list that is read, bytes.
 const MOST_BYTES: u64 = 16 << 20;
 
 fn read_list(file: &Path) -> Result<String, Vec<Problem>> {
@@ -304,7 +304,7 @@ fn commissioning(profile: &Profile) -> String {
     text
 }
 
-/// The usual format, then the others.
+/// The usual format, followed by the other formats.
 fn formats_of(profile: &Profile) -> String {
     match profile.formats.as_slice() {
         [] => "any".to_string(),

@@ -113,7 +113,7 @@ struct Player {
     text: String,
 }
 
-/// Events as they come, then the values at the end.
+/// Replays the packets; returns the events as they occur, then the last values.
 fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<String, String> {
     let began = Instant::now();
     let image = |spec| Arc::new(DriveImage::new(spec, Duration::ZERO));

@@ -23,7 +23,7 @@ pub(super) fn json(document: &impl Serialize) -> ExitCode {
     print_bytes((text + "\n").as_bytes())
 }
 
-/// Writes `bytes` to stdout as they are.
+/// Writes `bytes` to stdout unchanged.
 pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
@@ -63,7 +63,7 @@ pub(super) fn note(message: &str) {
 
 /// Prints the lines of `text`, harmless for a terminal, to stderr.
 pub(super) fn lines_to_stderr(text: &str) {
-    // With stderr gone there is nowhere left to report that.
+    // If stderr is closed, this error cannot be reported anywhere.
     let _ = io::stderr().lock().write_all(printable::lines(text).as_bytes());
 }
 
@@ -90,11 +90,11 @@ fn line(kind: &str, message: &str) {
         "warning" => "<4>",
         _ => "<5>",
     };
-    // With stderr gone there is nowhere left to report that.
+    // If stderr is closed, this error cannot be reported anywhere.
     let _ = writeln!(io::stderr().lock(), "{priority}{kind}: {}", printable::line(message));
 }
 
-/// Columns of a terminal that does not say how many it has.
+/// Width of a terminal that does not tell its width, in columns.
 const USUAL_WIDTH: u16 = 80;
 
 /// A table without a frame, as wide as the terminal at most.

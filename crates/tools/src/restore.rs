@@ -62,7 +62,7 @@ fn restore(args: &Args) -> Result<String, Failure> {
     let mut staging = Staging::new(base, &args.state_dir)?;
     let mut is_first = true;
     let manifest = archive::read(file, |member, root, path, content| {
-        // The first member is the configuration, whatever it was called.
+        // The first member is the configuration, whatever its name was.
         let path = if std::mem::take(&mut is_first) {
             Path::new(name)
         } else {
@@ -76,7 +76,7 @@ fn restore(args: &Args) -> Result<String, Failure> {
     }
     let loaded = check(&staging, name, &manifest, base)?;
     let Some(settings) = &loaded.settings else {
-        // As if it were in its place.
+        // The configuration is checked as if it were in its place already.
         let [aside, base] = [staging.of(Root::Config), base].map(|dir| dir.display().to_string());
         let errors = loaded
             .errors

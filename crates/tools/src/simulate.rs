@@ -126,7 +126,7 @@ pub(super) struct Args {
     pub speed: Speed,
 }
 
-/// Default baud rate, if the drives support it.
+/// Default baud rate if the drives support it.
 const USUAL_BAUD: u32 = 38_400;
 
 /// `nx, svx, hvx 1998; cx 9999; ...`
@@ -168,7 +168,7 @@ fn model_of(profile: &Arc<Profile>) -> Result<ModelOptions, String> {
     })
 }
 
-/// `POINT=VALUE`, the value as the point has it.
+/// Parses `POINT=VALUE`; the value has the form of the point.
 fn given(text: &str, profile: &Profile) -> Result<(PointIndex, Given), String> {
     let (name, value) = text
         .split_once('=')
@@ -207,7 +207,7 @@ fn given(text: &str, profile: &Profile) -> Result<(PointIndex, Given), String> {
 /// How fast the simulated lines are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum Speed {
-    /// Every character takes its time.
+    /// Every character takes as long as on a real line.
     Real,
     /// No time on the wire.
     Max,

@@ -58,7 +58,7 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
     }
 }
 
-/// A line for each drive, those that are not proven to stand first.
+/// A line for each drive; first come the drives that are not proven to stand.
 fn shown(stopped: &StopReport) -> String {
     let (standing, others): (Vec<_>, Vec<_>) = stopped
         .drives

@@ -102,7 +102,7 @@ enum More {
     No,
 }
 
-/// A frame as the gateway sends it.
+/// A frame in the form in which the gateway sends it.
 #[derive(Debug, Deserialize)]
 struct Frame {
     bus: String,
@@ -127,7 +127,7 @@ struct Lagged {
     lost: u64,
 }
 
-/// Where the frames go.
+/// Where and how the frames are shown.
 struct View {
     colours: bool,
     with_bus: bool,
@@ -295,7 +295,7 @@ fn line(frame: &Frame, with_bus: bool, colours: bool) -> String {
     };
     let drive = printable::line(frame.drive.as_deref().unwrap_or("-"));
     let mut meaning = vec![];
-    // An exception is its own verdict.
+    // For an exception, meaning and verdict are equal, so only one of them is printed.
     if frame.decode != frame.verdict {
         meaning.push(printable::line(&frame.decode));
     }

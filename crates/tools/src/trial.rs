@@ -16,7 +16,7 @@ use super::failure::{Failure, Outcome, negative};
 use super::scan::{self, Extent, Options, Search, parse_port, verdict};
 use super::{EXIT_FAILED, report};
 
-/// How long the line is listened to before anything is sent.
+/// Time for which the command listens to the line before it sends anything.
 const LISTEN: Duration = Duration::from_secs(1);
 
 /// Finds the drives on a line, shows their values on a page, offers to write a configuration; only reads.

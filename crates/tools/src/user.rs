@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     if file.path.exists() {
-        // Before the password prompt.
+        // This is checked before the password prompt.
         file.list()?;
     }
     let user =
@@ -134,7 +134,7 @@ impl Hidden {
 
 impl Drop for Hidden {
     fn drop(&mut self) {
-        // Nothing else can be done about a terminal that has gone.
+        // If the terminal is gone, nothing else can be done.
         let _ = tcsetattr(io::stdin(), OptionalActions::Flush, &self.0);
     }
 }

@@ -206,7 +206,7 @@ fn holder(drive: &Value) -> String {
     }
 }
 
-/// The state, with the warning that the drive reports with it.
+/// The state, with the warning that the drive reports.
 fn state(drive: &Value) -> String {
     let state = at(drive, "/state").as_str().unwrap_or("unknown");
     let warning = at(drive, "/points/warning");
@@ -215,7 +215,7 @@ fn state(drive: &Value) -> String {
     format!("{state}{warned}")
 }
 
-/// The value there, or null.
+/// The value at `pointer`, or null.
 fn at<'v>(value: &'v Value, pointer: &str) -> &'v Value {
     value.pointer(pointer).unwrap_or(&Value::Null)
 }

@@ -48,7 +48,7 @@ impl Serialize for Body<'_> {
     }
 }
 
-/// How a command ended.
+/// How the write of a command ended.
 #[derive(Debug, Deserialize)]
 struct Written {
     ok: bool,

@@ -13,7 +13,7 @@ use crate::document::{Finding, Problem};
 const UNIT: &str = "drivegate.service";
 /// Group of the shipped unit, used where systemd cannot be queried.
 const SHIPPED_GROUP: &str = "dialout";
-/// Made by systemd for the service while it runs.
+/// Directory that systemd makes for the service while the service runs.
 const CREDENTIALS: &str = "/run/credentials/";
 const READ: u32 = 0o4;
 const SEARCH: u32 = 0o1;
@@ -28,7 +28,7 @@ struct Service {
     /// The user; `None` for one that exists only while the service runs, and owns nothing.
     user: Option<u32>,
     groups: BTreeSet<u32>,
-    /// Directories whose files it does not see.
+    /// Directories whose files the service does not see.
     hidden: Vec<&'static str>,
     /// User and groups in words.
     shown: String,
@@ -127,7 +127,7 @@ pub(super) fn problems(path: &Path) -> Vec<Problem> {
 }
 
 fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem> {
-    // A file that there is not is reported by who reads it.
+    // A file that does not exist is reported where it is read.
     let whole = file.path.canonicalize().ok()?;
     let shown = |finding| Some(Problem::of_file(config.display().to_string(), &file.key, finding));
     if let Some(dir) = service.hidden.iter().find(|dir| whole.starts_with(dir)) {

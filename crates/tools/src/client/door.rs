@@ -33,7 +33,7 @@ pub(crate) enum Door {
 #[derive(Debug, Clone)]
 pub(crate) struct Network {
     pub(crate) url: Url,
-    /// `None`: those of the system.
+    /// CA certificates; `None` for the certificates of the system.
     pub(crate) ca: Option<PathBuf>,
     pub(crate) token_file: Option<PathBuf>,
 }
@@ -48,9 +48,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 pub(super) enum NotConnected {
     /// No gateway listens there.
     Nobody,
-    /// There may be one.
+    /// A gateway may be there; the text tells why it was not reached.
     Because(String),
-    /// No other way is to be tried.
+    /// The error is final: no other way is tried.
     Final(ClientError),
 }
 
@@ -111,13 +111,13 @@ impl Door {
     }
 }
 
-/// Whether no gateway listens there.
+/// Whether the error means that no gateway listens there.
 fn is_nobody(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionRefused, NotADirectory, NotFound};
     matches!(error.kind(), ConnectionRefused | NotFound | NotADirectory)
 }
 
-/// A token, or user and password, as the header has it.
+/// The token, or user and password, in the form of the header.
 fn authorization(file: &Path) -> Result<String, ClientError> {
     let text = std::fs::read_to_string(file).map_err(|error| {
         let shown = file.display();

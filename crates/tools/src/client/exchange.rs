@@ -18,7 +18,7 @@ use super::ClientError;
 use super::door::{Door, Stream};
 use crate::north::http::messages::{EXPECT, ErrorReply, Expected};
 
-/// Largest reply: some thousand drives with all their points.
+/// Largest reply, bytes: enough for some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;
 /// Time for the reply to a request that only shows what is known.
 const SHOWN_WITHIN: Duration = Duration::from_secs(10);
@@ -36,7 +36,7 @@ pub(crate) struct Asked {
     pub(super) within: Duration,
     /// The remedy if the reply is lost.
     lost: &'static str,
-    /// The remedy if it is refused, unless the status gives it.
+    /// What to do if the request is refused, unless the status tells that.
     refused: &'static str,
 }
 
@@ -81,7 +81,7 @@ impl Asked {
         Asked { lost, ..self }
     }
 
-    /// The remedy if it is refused, unless the status gives it.
+    /// Sets what to do if the request is refused, unless the status tells that.
     pub(crate) fn if_refused(self, refused: &'static str) -> Asked {
         Asked { refused, ..self }
     }
@@ -96,7 +96,7 @@ impl Asked {
 pub(super) struct Opened {
     pub(super) status: StatusCode,
     pub(super) headers: HeaderMap,
-    /// Where it comes from.
+    /// Where the reply comes from.
     pub(super) place: String,
     over_network: bool,
     body: Incoming,
@@ -126,7 +126,7 @@ impl Opened {
         let (prefix, authority) = door.base();
         let mut request = Request::new(asked.body.clone());
         *request.method_mut() = asked.method.clone();
-        // All of it was checked, or is percent-encoded.
+        // All parts of the path were checked, or are percent-encoded.
         *request.uri_mut() = format!("{prefix}{}", asked.path).parse().unwrap_or_default();
         let headers = request.headers_mut();
         let expected = expected.map(|expected| {
@@ -171,7 +171,7 @@ impl Opened {
         }
     }
 
-    /// The reply with its body.
+    /// Reads the body of the reply and returns the whole reply.
     ///
     /// # Errors
     /// The reply does not arrive complete.

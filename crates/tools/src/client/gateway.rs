@@ -126,7 +126,7 @@ fn http_of(config: &Path) -> Result<Url, String> {
     format!("http://{}", from_here(http.listen)).parse()
 }
 
-/// The address as a client on this machine has to name it.
+/// The address by which a client on this machine reaches it.
 fn from_here(listen: SocketAddr) -> SocketAddr {
     let address = match listen {
         SocketAddr::V4(at) if at.ip().is_unspecified() => Ipv4Addr::LOCALHOST.into(),

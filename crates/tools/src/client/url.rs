@@ -9,7 +9,7 @@ use hyper::Uri;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Url {
     pub(super) tls: bool,
-    /// An IPv6 address without its brackets.
+    /// Host; an IPv6 address has no brackets.
     pub(super) host: String,
     pub(super) port: u16,
     pub(super) authority: String,

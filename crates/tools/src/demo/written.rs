@@ -3,7 +3,7 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// How a file begins that a demo wrote and another one may replace.
+/// Beginning of a file that a demo wrote, which another demo may replace.
 const MARK: &str = "# Written by `drivegate demo --write-config`";
 
 /// The directory.

@@ -64,7 +64,7 @@ impl Conversation {
         }
     }
 
-    /// Closes the port, if it is open.
+    /// Closes the port if it is open.
     pub(super) async fn end(self) {
         if let Some(direct) = self.direct {
             direct.stop().await;

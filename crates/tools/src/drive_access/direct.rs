@@ -17,20 +17,20 @@ use crate::process_image::{OnShutdown, Reading};
 /// Time to open the port, on a machine however busy; and how long one that cannot be opened is tried.
 const OPEN: Duration = Duration::from_secs(10);
 const TRIED: Duration = Duration::from_millis(750);
-/// Time until the drive answers, beyond that of its tries.
+/// Time until the drive answers, in addition to the time of its tries.
 const ANSWERS: Duration = Duration::from_secs(2);
 /// Time for all points of a slow line.
 const READ: Duration = Duration::from_secs(20);
 /// Time between two looks at the image.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// Cadence of process data where the line is there for parameters.
+/// Cycle of process data while the line is needed for parameters.
 const RESTFUL: Duration = Duration::from_secs(1);
 
 /// Values of the drive that the bus must have read before a request is carried out.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Needs<'n> {
-    /// All that is polled.
+    /// All points that are polled.
     All,
     /// The named points.
     Points(&'n [String]),
@@ -40,7 +40,7 @@ pub(crate) enum Needs<'n> {
     Identification,
 }
 
-/// A bus of its own, with the one drive.
+/// A bus that belongs to this command, with the one drive.
 pub(super) struct Direct {
     daemon: Daemon,
     drive: DriveHandle,
@@ -191,7 +191,7 @@ fn is_polled(profile: &Profile, index: PointIndex) -> bool {
     }
 }
 
-/// Whether the drive has answered or refused it.
+/// Whether the drive has answered or refused the read of the point.
 fn is_settled(reading: &Reading<'_>, index: PointIndex) -> bool {
     let sources = match reading.spec.profile.points.get(index).map(|p| &p.source) {
         Some(Source::Derived(derived)) => derived.rests_on(),

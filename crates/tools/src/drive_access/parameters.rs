@@ -7,7 +7,7 @@ use super::{Conversation, Needs, Target};
 use crate::client::Asked;
 use crate::north::http::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, Stage};
 
-/// Time between two looks at how far it is.
+/// Time between two looks at the progress.
 const LOOK: Duration = Duration::from_millis(250);
 
 impl Target {

@@ -26,7 +26,7 @@ const OWN: &str = "drivegate";
 pub(super) enum Form {
     /// An entry of the journal, with fields.
     Entry,
-    /// A line with the priority before it, which the journal reads.
+    /// A line that begins with the priority, which the journal reads.
     Priority,
     /// A line as text.
     Text,

@@ -19,7 +19,7 @@ pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
     Some(listing::devices(&settings.gateway, options, buses))
 }
 
-/// Prints the objects, and writes the tables where they are wanted.
+/// Prints the objects, and writes the tables if they are wanted.
 pub(super) fn run(settings: &Settings, csv: bool, ede: Option<&Path>) -> Outcome {
     let Some(devices) = devices(settings) else {
         let why = "no BACnet objects; --bacnet; add [bacnet] to the configuration";
@@ -48,7 +48,7 @@ fn as_text(lines: &[Line]) -> String {
     report::lines(&table)
 }
 
-/// Writes the three tables; what stands there already is replaced.
+/// Writes the three tables; existing files are replaced.
 fn write(path: &Path, tables: &Ede) -> Result<(), String> {
     let beside = |what: &str| -> PathBuf {
         let stem = path.file_stem().unwrap_or_default().to_string_lossy();

@@ -24,7 +24,7 @@ pub(super) struct Row {
     pub(super) unit: String,
     pub(super) not_available: &'static str,
     pub(super) access: &'static str,
-    /// Where the value comes from, or a write goes to.
+    /// Where the value comes from, or where a write goes.
     pub(super) source: String,
     pub(super) note: String,
 }
@@ -76,7 +76,7 @@ pub(super) fn drive_rows(drive: &DriveHandle, access: Access, registers: Registe
     let entries = BLOCKS
         .into_iter()
         .flatten()
-        // Without [authority] nothing is there.
+        // Without [authority], the entry of the hold does not exist.
         .filter(|entry| entry.content != Content::Hold || drive.has_authority())
         .filter_map(|entry| Some((entry, registers.of_model(entry.address)?)))
         .map(|(entry, address)| Row {

@@ -58,7 +58,7 @@ fn listed_by(client: &Client, drive: Option<&str>) -> Result<Vec<StoredReading>,
     Ok(client.ask_now(&asked)?.accepted(&asked)?)
 }
 
-/// The readings of the configuration, and their directory.
+/// The readings of the drives in the configuration, and the directory of the readings.
 fn listed_here(config: &Path, drive: Option<&str>) -> Result<(Vec<StoredReading>, String), Failure> {
     let store = store(config)?;
     let dir = store.dir().display().to_string();

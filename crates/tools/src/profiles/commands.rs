@@ -5,7 +5,7 @@ use crate::document::format_duration;
 use crate::drive::Profile;
 use crate::drive::control::{Control, ControlItem, Mask, OwnWord, Run, Setting, Step, Until};
 
-/// A line for each command, with its words in hex.
+/// A line for each command, with the words of the command in hexadecimal.
 pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {
     let own = match control.own_word {
         OwnWord::Read | OwnWord::Kept => "",

@@ -32,7 +32,7 @@ const COLUMNS: [&str; 17] = [
 const MAX: &str = "max";
 /// Items of a read request, where the list gives no number.
 const READ: u16 = 16;
-/// Longest list.
+/// Most rows of a list.
 const MOST_ROWS: usize = 10_000;
 
 /// The profile that the list `text` of the file `path` makes.
@@ -101,7 +101,7 @@ pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
     Ok(text)
 }
 
-/// Lines with their cells; empty ones are left out.
+/// Lines of the list, each with its cells; empty lines are left out.
 fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
     let text = text.trim_start_matches('\u{feff}');
     let first = text.lines().next().unwrap_or_default();
@@ -268,7 +268,7 @@ fn place(text: &str, table: Option<&str>) -> Result<(Table, u16), Mistake> {
     Ok((of, address))
 }
 
-/// A number as TOML has it; a decimal comma is understood.
+/// A number in the form of TOML; a decimal comma is accepted.
 fn number(key: &'static str, text: &str) -> Result<String, Mistake> {
     let dotted = text.replace(',', ".");
     let hex = dotted

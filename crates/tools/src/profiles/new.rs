@@ -34,7 +34,7 @@ pub(super) fn over(name: &str, base: &Profile) -> String {
     text
 }
 
-/// A profile of its own.
+/// The frame of a profile that is based on no other.
 pub(super) fn frame(name: &str) -> String {
     FRAME.replace("NAME", name)
 }

@@ -11,7 +11,7 @@ use crate::{printable, report};
 
 /// Samples that are shown before and after the trigger.
 const SHOWN: (usize, usize) = (8, 6);
-/// Points that are shown, as far as they were read.
+/// Points that are shown, if they were read.
 const POINTS: [&str; 8] = [
     "fault",
     "fault_code",
@@ -46,7 +46,7 @@ pub(super) fn text(recording: &Recording) -> String {
     text + &timeline(recording) + &samples(recording)
 }
 
-/// Events, commands and failed transactions in their order.
+/// Events, commands and failed transactions in order of time.
 fn timeline(recording: &Recording) -> String {
     let mut lines: Vec<(f64, String)> = Vec::new();
     let drives = &recording.header.bus.drives;
@@ -102,7 +102,7 @@ fn samples(recording: &Recording) -> String {
         let points = header.reads.get(read).map_or(&[][..], |read| &read.points);
         points.iter().filter(|point| places.contains(point)).count()
     };
-    // The read that shows most of them.
+    // The read that shows most of these points.
     let Some(read) = (0..header.reads.len()).max_by_key(|read| shows(*read)) else {
         return String::new();
     };

@@ -25,9 +25,9 @@ pub(super) struct Staging {
 struct Destination {
     /// The destination.
     to: PathBuf,
-    /// Where it is unpacked, in the destination or what there is of it.
+    /// Where the archive is unpacked: in the destination, or in the existing part of its path.
     aside: PathBuf,
-    /// Whether the destination was not there before.
+    /// Whether the destination did not exist before.
     is_new: bool,
 }
 
@@ -62,7 +62,7 @@ impl Drop for Destination {
 }
 
 impl Staging {
-    /// For these destinations, which are created if necessary.
+    /// A staging area for these destinations, which are created if necessary.
     ///
     /// # Errors
     /// The directories cannot be written to.
@@ -134,7 +134,7 @@ impl Staging {
         made.map_err(|error| format!("cannot read {}: {error}", path.display()))
     }
 
-    /// Destinations that exist.
+    /// Destination files that exist already.
     pub(super) fn existing(&self) -> Vec<PathBuf> {
         let all = self.files.iter().map(|(root, path)| self.place_of(*root).to.join(path));
         all.filter(|path| fs::symlink_metadata(path).is_ok()).collect()
@@ -147,7 +147,7 @@ impl Staging {
     pub(super) fn place(&self) -> Result<Vec<PathBuf>, String> {
         for path in &self.directories {
             let failed = |error: io::Error| format!("cannot create {}: {error}", path.display());
-            // The directory of any file in it.
+            // This call creates the directory that would contain such a file.
             directory_of(&self.config.to, &path.join("file")).map_err(failed)?;
         }
         let mut placed = Vec::new();

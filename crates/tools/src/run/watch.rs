@@ -15,7 +15,7 @@ use crate::north::http::messages::ReloadOutcome;
 use crate::plant::{Plant, SharedPlant};
 use crate::printable;
 
-/// Longest status, in characters: it is one line of `systemctl status`.
+/// Longest status in characters, for one line of `systemctl status`.
 const LONGEST_STATUS: usize = 300;
 
 /// Serves the watchdog and keeps the status of the service.
@@ -50,7 +50,7 @@ impl Watch<'_> {
         }
     }
 
-    /// Waits for the next beat of the watchdog and serves it; cancel safe.
+    /// Waits for the next beat of the watchdog and handles it; cancel safe.
     pub(super) async fn tick(&mut self) {
         self.feed.tick().await;
         self.log.report_lost();

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::settings::Setting;
 use crate::drive::profile::Profiles;
 
-/// A drive that answered.
+/// A drive that answered the scan.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Found {
     /// Settings of the line.
@@ -21,7 +21,7 @@ pub(crate) struct Found {
 }
 
 impl Found {
-    /// For people.
+    /// Description of the drive for people.
     pub(crate) fn title(&self, profiles: &Profiles) -> String {
         let names = self.profiles.join(" or ");
         let more = [

@@ -46,7 +46,7 @@ impl Progress {
         }
     }
 
-    /// From now on so many steps remain, which take `patience` at most.
+    /// Plans this number of further steps, which take `patience` at most.
     pub(super) fn plan(&mut self, steps: usize, patience: Duration) {
         self.total = self.done + steps;
         self.patience = patience;
@@ -78,7 +78,7 @@ impl Progress {
     /// Prints a line that stays.
     pub(super) fn print_line(&mut self, text: &str) {
         let clear = if self.live { "\r\x1b[K" } else { "" };
-        // With stderr gone there is nowhere left to report that.
+        // If stderr is closed, this error cannot be reported anywhere.
         let _ = writeln!(std::io::stderr().lock(), "{clear}{}", printable::line(text));
         self.shown = None;
     }

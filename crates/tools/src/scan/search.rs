@@ -28,9 +28,9 @@ pub(crate) struct Heard {
     pub(crate) unasked: usize,
     /// Requests that the adapter sent back.
     pub(crate) echoes: usize,
-    /// Replies without their beginning, otherwise valid.
+    /// Number of replies that lack their beginning but are otherwise valid.
     pub(crate) start_lost: usize,
-    /// Echoes that lack their end.
+    /// Number of echoes that lack their end.
     pub(crate) cut_echoes: usize,
     /// Stray bytes directly before a reply.
     pub(crate) stray_before: usize,
@@ -43,7 +43,7 @@ pub(crate) struct Heard {
 /// Whether other settings are tried once a drive has answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Extent {
-    /// No: a line has one.
+    /// The search ends with the first setting that works, because a line has only one.
     OneSetting,
     /// Yes.
     Exhaustive,
@@ -80,7 +80,7 @@ impl<'a> Search<'a> {
     pub(crate) fn listen(&mut self, setting: Setting, time: Duration) -> Result<(), String> {
         let line = self.open(&setting.format)?;
         let mut prober = self.prober(&line, setting);
-        // In pieces, so that a signal ends it.
+        // Listens in short pieces, so that a signal can end the wait.
         for _ in 0..time.as_millis() / 50 {
             if !self.stopped() {
                 let heard = prober.listen_for(Duration::from_millis(50));
@@ -119,7 +119,7 @@ impl<'a> Search<'a> {
                 break;
             }
             if self.found.len() > before && extent == Extent::OneSetting {
-                // The settings are those of the line: what is left of them.
+                // The settings of the line are known, so only the remaining work with these settings is left.
                 waiting.retain(|other| other.setting == part.setting);
                 let (steps, time) = work(&waiting, self);
                 self.progress.plan(steps, time);
@@ -178,7 +178,7 @@ impl<'a> Search<'a> {
                 Ended::Reply(_) => return Ok(true),
                 Ended::Silent => {}
                 Ended::Corrupt(_) => {
-                    // Once more: it may have been noise.
+                    // The request is repeated, because the reply may have been noise.
                     if matches!(self.ask(prober, hello)?.ended, Ended::Reply(_)) {
                         return Ok(true);
                     }

@@ -18,7 +18,7 @@ const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
 /// Baud that is assumed behind a raw device server, which sets up its line itself: the highest of the usual ones,
 /// because a reply that comes later than the wire needs is accepted, one that comes earlier is not.
 const ASSUMED_BAUD: u32 = 38_400;
-/// All bauds of the built-in profiles and those of faster devices.
+/// All baud rates of the built-in profiles, and the rates of faster devices.
 const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Addresses that are tried first with all settings: most lines have a drive among them.
 const LIKELY_ADDRESSES: u8 = 10;
@@ -173,7 +173,7 @@ fn check_addresses(args: &Options, settings: &[Setting]) -> Result<(), String> {
     ))
 }
 
-/// The protocols of these names; `all` is all of them.
+/// The protocols with these names; `all` means all protocols.
 pub(crate) fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
     if names.iter().any(|name| name == "all") {
         return Ok(Protocol::ALL.to_vec());

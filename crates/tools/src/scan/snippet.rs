@@ -16,15 +16,15 @@ const HTTP: &str = "127.0.0.1:9488";
 
 /// The parts of a configuration snippet.
 pub(crate) struct Snippet<'a> {
-    /// The port as a configuration names it.
+    /// The port as written in a configuration.
     pub(crate) port: &'a str,
-    /// Drives that answered.
+    /// Drives that answered the scan.
     pub(crate) found: &'a [Found],
-    /// All profiles.
+    /// All known profiles.
     pub(crate) profiles: &'a Profiles,
     /// Absolute directories of the user's profiles.
     pub(crate) profile_dirs: Vec<PathBuf>,
-    /// Time for the first byte of a reply, if it was chosen.
+    /// Time limit for the first byte of a reply, if the user chose one.
     pub(crate) timeout: Option<Duration>,
     /// Whether the gateway is to poll the drives or only to listen.
     pub(crate) mode: Mode,
@@ -164,7 +164,7 @@ fn slower_than(measured: Duration, usual: Duration) -> Option<Duration> {
     (measured > usual + Duration::from_millis(1)).then_some(whole)
 }
 
-/// The lines `cycle` and `slow_cycle`, as the line carries them.
+/// The lines `cycle` and `slow_cycle`, with values that the line can keep.
 fn cadence(bus: &BusSettings) -> String {
     let Some((cycle, slow_cycle)) = predict::carried(&bus.spec, bus.options.silence, &bus.drives) else {
         return String::new();

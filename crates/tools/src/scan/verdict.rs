@@ -24,7 +24,7 @@ pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> 
     })
 }
 
-/// Why no drive may have answered, and what to do.
+/// Why probably no drive answered, and what to do.
 pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     let requests = heard.requests;
     if let Some(told) = told_by_shape(heard) {
@@ -150,7 +150,7 @@ pub(crate) fn before_commands(found: &[Found], profiles: &Profiles) -> String {
     format!("before the first command; `drivegate profiles show NAME` has the rest of the commissioning:\n{lines}")
 }
 
-/// Lines below the names of the profiles that have them.
+/// The lines, each group below the names of the profiles that share it.
 fn grouped(lines: &[Shared<'_>]) -> String {
     let mut text = String::new();
     for same in lines.chunk_by(|one, next| one.profiles == next.profiles) {

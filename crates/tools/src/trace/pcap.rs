@@ -28,7 +28,7 @@ pub(super) struct Capture<W: Write> {
 }
 
 impl Capture<File> {
-    /// Creates the file, or empties it.
+    /// Creates the file; an existing file is emptied.
     ///
     /// # Errors
     /// When it cannot be written.

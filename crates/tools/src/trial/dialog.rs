@@ -10,7 +10,7 @@ use crate::adapters::{Adapter, adapters};
 use crate::failure::Failure;
 use crate::printable;
 
-/// Whether there is someone to ask.
+/// Whether a person can be asked.
 pub(super) fn is_terminal() -> bool {
     io::stdin().is_terminal() && io::stderr().is_terminal()
 }

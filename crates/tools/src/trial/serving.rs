@@ -66,7 +66,7 @@ async fn start(mut settings: Settings) -> Result<Daemon, String> {
         let address = demo::free_port("the status page", port)?;
         settings.http = Some(http::Options::at(address));
         match Daemon::start(settings.clone()).await {
-            // Another program took the port since it was found free.
+            // Another program has taken the port since the port was found free.
             Err(error) if error.address_in_use().is_some() => port = address.port().saturating_add(1),
             started => return started.map_err(|error| error.to_string()),
         }
