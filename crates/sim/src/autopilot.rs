@@ -18,7 +18,7 @@ enum Next {
     ResetOff,
 }
 
-/// Operates one drive.
+/// Operates one drive at random.
 #[derive(Debug, Clone)]
 pub(crate) struct Autopilot {
     random: Random,
@@ -43,7 +43,7 @@ impl Autopilot {
         }
     }
 
-    /// When it acts next.
+    /// When the autopilot acts next.
     pub(crate) fn next_at(&self) -> SimTime {
         self.at
     }

@@ -21,7 +21,7 @@ use network::Network;
 pub enum EndpointOptions {
     /// A pseudo-terminal, with a symbolic link that keeps its name.
     Pty {
-        /// The link; without it the pseudo-terminal's own path is used.
+        /// Path of the link; without a link, masters use the pseudo-terminal's own path.
         link: Option<PathBuf>,
     },
     /// A serial port on whose line the simulated drives sit.
@@ -31,17 +31,17 @@ pub enum EndpointOptions {
     },
     /// Raw serial-over-TCP, as a serial device server gives it. One master at a time.
     Tcp {
-        /// Where to listen; port 0 takes a free one.
+        /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
     },
     /// Modbus TCP, as a drive with Ethernet on board speaks it. One client at a time.
     ModbusTcp {
-        /// Where to listen; port 0 takes a free one.
+        /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
     },
     /// Each datagram carries one frame of the line.
     Udp {
-        /// Where to listen; port 0 takes a free one.
+        /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
     },
     /// The line dials in at a gateway, as a modem does.
@@ -66,7 +66,7 @@ pub(super) enum Endpoint {
 }
 
 impl Endpoint {
-    /// Opens it; `format` is set on a real serial port.
+    /// Opens the endpoint; `format` is set on a real serial port.
     pub(super) fn open(options: &EndpointOptions, format: &LineFormat) -> io::Result<Endpoint> {
         match options {
             EndpointOptions::Pty { link } => Pty::open(link.as_deref()).map(Endpoint::Pty),
@@ -120,7 +120,7 @@ impl Endpoint {
         }
     }
 
-    /// Bytes of the master; 0 when there are none now.
+    /// Receives bytes from the master; returns 0 if there are none now.
     ///
     /// # Errors
     /// The port is gone.
@@ -151,7 +151,7 @@ impl Endpoint {
         }
     }
 
-    /// Hands bytes to the master and returns how many it took.
+    /// Hands bytes to the master; returns how many bytes the master accepted.
     ///
     /// # Errors
     /// The port is gone.

@@ -14,13 +14,13 @@ use std::time::Duration;
 /// In what a foreign reply differs from the true one. Its data differs, its check code is right.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Foreign {
-    /// From another drive.
+    /// The reply comes from another drive.
     Address,
-    /// To another function.
+    /// The reply is to another function.
     Function,
     /// A reply of another length.
     Length,
-    /// In nothing but its data.
+    /// Only the data of the reply is foreign.
     Data,
 }
 
@@ -29,7 +29,7 @@ pub enum Foreign {
 pub enum Fault {
     /// The drive does not hear the request.
     Deaf,
-    /// The drive acts, its reply is lost.
+    /// The drive acts, but its reply is lost.
     Drop,
     /// Only the first characters of the reply arrive.
     Truncate,
@@ -45,7 +45,7 @@ pub enum Fault {
     Stray(Foreign),
     /// The master hears its own request before the reply.
     Echo,
-    /// The master hears its own request, the drive does not.
+    /// The master hears its own request, but the drive does not.
     DeafEcho,
     /// Noise runs into the beginning of the reply.
     NoiseBefore,
@@ -53,7 +53,7 @@ pub enum Fault {
     NoiseAfter,
     /// The reply is delivered character by character.
     Split,
-    /// The drive refuses with this exception code; it does not act.
+    /// The drive refuses the request with this exception code and does not act.
     Exception(u8),
     /// The first character of the reply is lost: the adapter turns to receiving too late.
     ReplyStart,
@@ -104,7 +104,7 @@ const NAMED: [(&str, Fault); 27] = [
     ("mains:50", Fault::Mains(50)),
 ];
 
-/// Every name that a fault has in text, for messages.
+/// Every name of a fault in text, for messages.
 pub fn names() -> String {
     NAMED.map(|(name, _)| name).join(", ")
 }
@@ -257,7 +257,7 @@ impl FaultPlan {
         }
     }
 
-    /// Whether the drive at `address` refuses that request for what it reads.
+    /// Whether the drive at `address` refuses a request because of the registers that it reads.
     pub fn refuses(&self, address: u8, request: &RequestPdu) -> bool {
         let RequestPdu::Read { table, start, count } = request else {
             return false;

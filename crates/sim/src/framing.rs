@@ -14,7 +14,7 @@ use crate::codec::{Protocol, ascii, rtu};
 /// same.
 pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
-/// Whether the character begins a frame, whatever was before it.
+/// Whether the character begins a frame, regardless of the characters before it.
 pub(crate) fn begins(protocol: Protocol, character: u8) -> bool {
     match protocol {
         Protocol::ModbusRtu => false,

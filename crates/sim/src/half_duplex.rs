@@ -39,7 +39,7 @@ pub enum Wire {
     Instant,
 }
 
-/// How the line behaves.
+/// Rules that the line follows.
 #[derive(Debug, Clone)]
 pub struct LineRules {
     /// Protocol of the drives.
@@ -49,7 +49,7 @@ pub struct LineRules {
     /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and the
     /// reply. A drive whose manual states a time of its own uses that.
     pub turnaround: Duration,
-    /// Whether drives ignore a request that comes too early; counted it is anyway.
+    /// Whether drives ignore a request that comes too early; such a request is counted in any case.
     pub strict: bool,
     /// How the bytes of a reply reach the master.
     pub delivery: Delivery,
@@ -102,7 +102,7 @@ struct Incoming {
     ended: bool,
 }
 
-/// Characters of a drive, on the wire or waiting for it.
+/// Characters of a drive that are on the wire or wait for it.
 #[derive(Debug)]
 struct Outgoing {
     start: SimTime,
@@ -115,9 +115,9 @@ struct Outgoing {
 /// When the line needs attention again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wake {
-    /// When.
+    /// Time of the wake-up.
     pub at: SimTime,
-    /// Whether bytes are due then, so that every microsecond counts.
+    /// Whether bytes are due at that time, so that every microsecond counts.
     pub delivery: bool,
 }
 
@@ -128,7 +128,7 @@ pub struct Act {
     pub at: SimTime,
     /// The drive.
     pub address: u8,
-    /// The frame of its reply, as the drive made it.
+    /// Frame of the drive's reply, without the effects of faults.
     pub reply: Vec<u8>,
 }
 
@@ -183,7 +183,7 @@ impl HalfDuplex {
         self.acts.replace(Vec::new()).unwrap_or_default()
     }
 
-    /// How the line behaves.
+    /// The rules that the line follows.
     pub fn rules(&self) -> &LineRules {
         &self.rules
     }
@@ -198,7 +198,7 @@ impl HalfDuplex {
         self.faults = faults;
     }
 
-    /// Counters so far.
+    /// Counters of the line so far.
     pub fn statistics(&self) -> Statistics {
         self.statistics
     }
@@ -223,7 +223,7 @@ impl HalfDuplex {
         self.transcript = Transcript::new(limit);
     }
 
-    /// The line was cut: what is on it is gone.
+    /// Cuts the line: all characters on it are lost.
     pub fn cut(&mut self) {
         self.incoming = None;
         self.outgoing.clear();
@@ -311,7 +311,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Ends the master's frame when it is over by `now`.
+    /// Ends the master's frame if it is complete by `now`.
     pub fn on_time(&mut self, now: SimTime) {
         if let Some(frame) = self.incoming.take_if(|frame| Self::is_over(frame, &self.rules, now)) {
             self.finish(&frame);
@@ -434,7 +434,7 @@ impl HalfDuplex {
         self.respond(frame, asked, fault, reply, now);
     }
 
-    /// The drives hear the request without its last character.
+    /// Gives the drives the request without its last character.
     fn cut_request(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, now: SimTime) {
         let cut = frame.bytes.split_last().map_or(&[][..], |(_, rest)| rest);
         self.statistics.bad_crc += 1;
@@ -463,7 +463,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Puts a reply onto the wire, with what a fault makes of it.
+    /// Puts a reply onto the wire, changed by a fault if there is one.
     fn respond(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, reply: Vec<u8>, now: SimTime) {
         let gap = match self.rules.wire {
             Wire::Instant => Duration::ZERO,
@@ -498,7 +498,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Puts a burst onto the wire at `start`; its end is returned.
+    /// Puts a burst onto the wire at `start`; returns the end of the burst.
     fn send(&mut self, start: SimTime, burst: Burst) -> SimTime {
         let end = start + self.chars(burst.bytes.len());
         match burst.kind {

@@ -6,7 +6,7 @@ use super::SimTime;
 use super::model::Model;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
-/// A drive and its clock.
+/// A drive together with its clock.
 pub(crate) struct InTime<D> {
     pub(crate) drive: D,
     pub(crate) now: SimTime,

@@ -37,7 +37,7 @@ pub struct DriveState {
     pub running: bool,
     /// The motor turns counterclockwise, or is about to.
     pub reverse: bool,
-    /// Active fault as the drive's registers show it, 0 for none.
+    /// Active fault as the drive's registers show it; 0 for no fault.
     pub fault: u16,
     /// Output frequency, Hz, negative for counterclockwise.
     pub output: f64,
@@ -68,7 +68,7 @@ impl Body {
         }
     }
 
-    /// The inverter feeds the motor, and no fault hides it.
+    /// Whether the inverter feeds the motor and no fault hides that.
     pub(super) fn shows_running(&self) -> bool {
         self.motor.fed && self.latch.fault() == 0
     }
@@ -155,7 +155,7 @@ pub(crate) trait Model: fmt::Debug {
         None
     }
 
-    /// Whether the drive has supply; without it, it answers nothing.
+    /// Whether the drive has supply; without supply, the drive does not answer.
     fn powered(&self) -> bool {
         self.body().powered
     }
@@ -179,7 +179,7 @@ pub(crate) trait Model: fmt::Debug {
     /// Gives its parameters random values that it would take, but that it obeys the same commands as before.
     fn fill_parameters(&mut self, random: &mut Random);
 
-    /// Faults that happen now and then, for the autopilot.
+    /// Faults that occur now and then, for the autopilot.
     fn usual_faults(&self) -> &'static [u16];
 
     /// Commands the drive as another master on the bus would.
@@ -312,12 +312,12 @@ impl Latch {
         self.fault = 0;
     }
 
-    /// A run command that is there now is not obeyed any more.
+    /// Makes the drive ignore a run command that is on now.
     pub(super) fn disarm(&mut self) {
         self.armed = false;
     }
 
-    /// Whether the run command, as it is now, is obeyed.
+    /// Whether the drive obeys the present run command.
     pub(super) fn obeys(&mut self, run: bool) -> bool {
         if !run && self.fault == 0 {
             self.armed = true;
@@ -326,12 +326,12 @@ impl Latch {
     }
 }
 
-/// A figure as a signed register shows it.
+/// A figure as the value of a signed register.
 pub(super) fn signed(value: f64) -> u16 {
     value.round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16 as u16
 }
 
-/// A figure as an unsigned register shows it.
+/// A figure as the value of an unsigned register.
 pub(super) fn unsigned(value: f64) -> u16 {
     value.round().clamp(0.0, f64::from(u16::MAX)) as u16
 }

@@ -50,9 +50,9 @@ impl Default for Load {
     }
 }
 
-/// Heatsink: rise above ambient at nominal current, kelvin, and its time constant, s.
+/// Rise of the heatsink above ambient at nominal current, kelvin, and its time constant, s.
 const HEATSINK: (f64, f64) = (38.0, 180.0);
-/// Motor: calculated heat at nominal current, %, and its time constant, s.
+/// Calculated heat of the motor at nominal current, %, and its time constant, s.
 const MOTOR_HEAT: (f64, f64) = (82.0, 900.0);
 /// Time in which a coasting motor comes down from nominal frequency, s.
 const COAST_TIME: f64 = 8.0;
@@ -62,9 +62,9 @@ const DC_SAG: f64 = 6.0;
 /// How the inverter feeds the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Feed {
-    /// Nothing: the motor coasts or stands.
+    /// The inverter does not feed the motor, which coasts or stands.
     Off,
-    /// Turns it towards this frequency, Hz, negative for counterclockwise.
+    /// The inverter turns the motor towards this frequency, Hz; a negative one is counterclockwise.
     To(f64),
 }
 

@@ -12,7 +12,7 @@ pub(crate) struct Parameter {
     pub min: u16,
     /// Greatest value.
     pub max: u16,
-    /// Present value.
+    /// Present value of the parameter.
     pub value: u16,
 }
 
@@ -39,7 +39,7 @@ pub struct Writes {
 /// The parameters of one drive.
 #[derive(Debug, Clone)]
 pub(crate) struct ParameterSet {
-    /// By ascending key.
+    /// The parameters by ascending key.
     all: Vec<Parameter>,
     /// Pairs of keys: the first is never below the second.
     limits: Vec<(u16, u16)>,
@@ -158,7 +158,7 @@ impl ParameterSet {
         }
     }
 
-    /// All of them, by ascending key.
+    /// All parameters by ascending key.
     pub(crate) fn iter(&self) -> impl Iterator<Item = &Parameter> {
         self.all.iter()
     }

@@ -23,7 +23,7 @@ const FORCED: Wishes = Wishes {
     force: true,
 };
 
-/// A drive of a family alone on its line.
+/// A drive of one family that is alone on its line.
 struct DriveOnLine {
     profile: Arc<Profile>,
     slaves: Slaves,
@@ -44,7 +44,7 @@ impl DriveOnLine {
         rig
     }
 
-    /// With random parameters, in the mode in which it takes them.
+    /// A drive with random parameters, in the mode in which it accepts parameters.
     fn filled(profile: &Arc<Profile>, seed: u64) -> DriveOnLine {
         let mut rig = DriveOnLine::new(profile);
         rig.drive().fill_parameters(seed);
@@ -96,7 +96,7 @@ impl DriveOnLine {
         })
     }
 
-    /// All of them taken, and saved.
+    /// Carries out the plan; checks that the drive takes all values and saves them.
     fn carry_out(&mut self, plan: &Plan) {
         for write in &plan.writes {
             assert_eq!(
@@ -113,7 +113,7 @@ impl DriveOnLine {
     }
 }
 
-/// The families with parameters, and where those of their simulated drives lie.
+/// The families with parameters, and the addresses of the parameters in their simulated drives.
 fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
     // Profiles of one application are left out: they have the parameters of their base.
@@ -206,7 +206,7 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
     }
 }
 
-/// Each parameter was written once, and the memory that keeps it as often.
+/// Checks that each parameter was written once, and that the drive's memory was written as often.
 fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
     let (profile, is_n2) = (rig.profile.clone(), rig.is_n2());
     let writes = rig.drive().parameter_writes();

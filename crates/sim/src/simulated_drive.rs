@@ -31,21 +31,21 @@ pub struct DriveOptions {
     pub autopilot: Option<u64>,
 }
 
-/// The models, each with its options.
+/// The drive models, each with its options.
 #[derive(Debug, Clone)]
 pub enum ModelOptions {
     /// Vacon NX, Eaton SVX, Eaton HVX.
     Nx(NxOptions),
     /// Vacon CX, CXL, CXS.
     Cx(CxOptions),
-    /// TECO 7300PA with its PA-C card.
+    /// A TECO 7300PA with its PA-C card.
     Teco(TecoOptions),
     /// A drive of any profile.
     Profile(ProfileOptions),
 }
 
 impl ModelOptions {
-    /// Names that [`ModelOptions::by_name`] knows.
+    /// Names of models that [`ModelOptions::by_name`] knows.
     pub const NAMES: [&'static str; 5] = ["nx", "svx", "hvx", "cx", "teco"];
 
     /// The model that a profile names in its key `simulator`, with its default options.
@@ -158,7 +158,7 @@ pub struct SimulatedDrive {
     turnaround: Option<Duration>,
     autopilot: Option<Autopilot>,
     alive: bool,
-    /// How often it was switched on again.
+    /// How often the drive was switched on again.
     power_cycles: u32,
 }
 
@@ -198,12 +198,12 @@ impl SimulatedDrive {
         self.alive && self.model.get().powered()
     }
 
-    /// Takes it off the line (it goes on living) or puts it back.
+    /// Takes the drive off the line (the drive keeps running) or puts it back.
     pub fn set_alive(&mut self, alive: bool) {
         self.alive = alive;
     }
 
-    /// Response delay where its manual states one.
+    /// Response delay, if the manual of the drive states one.
     pub fn turnaround(&self) -> Option<Duration> {
         self.turnaround
     }
@@ -255,12 +255,12 @@ impl SimulatedDrive {
         self.model.get_mut().broadcast(request, now);
     }
 
-    /// Trips it with a fault as its registers show it; 0 does nothing.
+    /// Trips the drive with a fault as its registers show it; 0 does nothing.
     pub fn trip(&mut self, fault: u16) {
         self.model.get_mut().trip(fault);
     }
 
-    /// Commands it as another master on the bus would.
+    /// Commands the drive as another master on the bus would.
     pub fn command(&mut self, command: Command) {
         self.model.get_mut().command(command);
     }
@@ -270,7 +270,7 @@ impl SimulatedDrive {
         self.model.get_mut().set_reset(on);
     }
 
-    /// Gives it to the bus, or to panel or terminals.
+    /// Gives control of the drive to the bus, or to panel or terminals.
     pub fn set_remote(&mut self, on: bool) {
         self.model.get_mut().set_remote(on);
     }
@@ -292,7 +292,7 @@ impl SimulatedDrive {
         self.power_cycles = self.power_cycles.wrapping_add(1);
     }
 
-    /// Power cycles so far: whatever shares its supply has restarted as often.
+    /// Power cycles so far; a device with the same supply has restarted as often.
     pub(crate) fn power_cycles(&self) -> u32 {
         self.power_cycles
     }
@@ -320,7 +320,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// The Vacon CX that it is, if it is one.
+    /// The drive as a Vacon CX; `None` if it is another model.
     #[cfg(test)]
     pub(crate) fn as_cx(&mut self) -> Option<&mut CxDrive> {
         match &mut self.model {

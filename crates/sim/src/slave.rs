@@ -18,9 +18,9 @@ const BROADCAST: u8 = 0;
 /// Meaning of a frame to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Heard {
-    /// The check code is wrong, or it is not a frame at all.
+    /// The check code is wrong, or the bytes are no frame at all.
     BadFrame,
-    /// No drive with that address is on the line, or it is dead.
+    /// No drive with this address is on the line, or the drive is dead.
     Nobody(u8),
     /// A broadcast, acted upon.
     Broadcast,
@@ -37,13 +37,13 @@ pub struct Asked {
     pub protocol: Protocol,
     /// The drive's address.
     pub address: u8,
-    /// The function code as it was sent.
+    /// The function code in the frame.
     pub function: u8,
-    /// The request, or what a plain slave answers to its PDU.
+    /// The request, or the exception that a plain slave answers to the PDU.
     pub request: Result<RequestPdu, Exception>,
-    /// The command on a line of N2, or the code of its refusal.
+    /// The command on an N2 line, or the code of its refusal.
     pub command: Option<Result<Command, u8>>,
-    /// The PDU as it was sent, where it is not a valid request.
+    /// The PDU in the frame, if it is not a valid request.
     pub malformed: Vec<u8>,
 }
 
@@ -51,7 +51,7 @@ pub struct Asked {
 #[derive(Debug, Clone, Default)]
 pub struct Slaves {
     drives: BTreeMap<u8, SimulatedDrive>,
-    /// Their N2 boards, where the line is one of N2.
+    /// N2 boards of the drives, on an N2 line.
     boards: BTreeMap<u8, Board>,
     /// The drive that [`Slaves::advance_next`] served last.
     served: u8,

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::time::Duration;
 
-/// Counters of a line since it was started.
+/// Counters of a line since its start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Statistics {
     /// Sound requests to drives that answer.
@@ -63,7 +63,7 @@ pub struct Lateness {
 const LATENESS_KEPT: usize = 16_384;
 
 impl Lateness {
-    /// Adds one delivery.
+    /// Records the lateness of one delivery.
     pub fn record(&mut self, late: Duration) {
         if self.recent.len() >= LATENESS_KEPT {
             self.recent.pop_front();
@@ -82,12 +82,12 @@ impl Lateness {
     }
 }
 
-/// Who sent a frame.
+/// The sender of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
     /// The master.
     ToDrives,
-    /// A drive, or a fault in its place.
+    /// A drive, or a fault in place of a drive.
     FromDrives,
 }
 
@@ -96,9 +96,9 @@ pub enum Direction {
 pub struct Recorded {
     /// Sender of the frame.
     pub direction: Direction,
-    /// When its first character began.
+    /// When the first character of the frame began.
     pub start: SimTime,
-    /// When its last character ended.
+    /// When the last character of the frame ended.
     pub end: SimTime,
     pub bytes: Vec<u8>,
 }

@@ -25,13 +25,13 @@ use std::time::{Duration, Instant};
 pub struct SimulatedBusOptions {
     /// Name for messages and for the thread.
     pub name: String,
-    /// Where a master reaches it.
+    /// Where a master reaches the simulated line.
     pub endpoint: EndpointOptions,
     /// Behaviour of the line. On a real serial port the wire keeps the time, whatever `wire` says, and silence is
     /// counted but not enforced: drivers and adapters hand bytes over late.
     pub rules: LineRules,
     pub drives: Vec<DriveOptions>,
-    /// Options of their boards, where they speak N2.
+    /// Options of the drives' boards, if the drives speak N2.
     pub boards: BoardOptions,
     /// Faults on the line.
     pub faults: FaultPlan,
@@ -66,7 +66,7 @@ const REOPEN: Duration = Duration::from_secs(1);
 /// Longest wait for the thread of the line to carry out an action.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Whether the port is to be there.
+/// Whether the port should exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Wanted {
     Present,
@@ -74,7 +74,7 @@ enum Wanted {
     Stop,
 }
 
-/// Where the port is.
+/// Whether the port exists, and where.
 #[derive(Debug)]
 enum Found {
     Present(String),
@@ -103,7 +103,7 @@ impl Shared {
         self.start.elapsed()
     }
 
-    /// A line is sound after a panic elsewhere too: it is a simulation.
+    /// A panic elsewhere leaves the line usable: it is only a simulation.
     fn line(&self) -> MutexGuard<'_, HalfDuplex> {
         self.line.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -245,7 +245,7 @@ impl SimulatedBus {
         self.shared.now()
     }
 
-    /// Counters so far.
+    /// Counters of the line so far.
     pub fn statistics(&self) -> Statistics {
         self.shared.line().statistics()
     }

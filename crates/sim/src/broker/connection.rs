@@ -26,13 +26,13 @@ enum End {
     Left { with_will: bool },
     /// Client or network are gone.
     Lost,
-    /// The broker ends it.
+    /// The broker ends the connection.
     Closed(Fault),
 }
 
-/// Serves `stream` until it ends or the broker stops.
+/// Serves `stream` until the connection ends or the broker stops.
 pub(super) async fn serve(shared: &Shared, mut stream: TcpStream, peer: SocketAddr) {
-    // Small packets are to leave at once; without it they are merely later.
+    // Small packets should be sent at once; if this option fails, they are only later.
     let _ = stream.set_nodelay(true);
     let mut input = Vec::new();
     let connect = tokio::select! {
@@ -63,7 +63,7 @@ pub(super) async fn serve(shared: &Shared, mut stream: TcpStream, peer: SocketAd
     client.run(stream, &wake, ended).await;
 }
 
-/// The CONNECT; `None` when the connection ends before it.
+/// Receives the CONNECT; `None` if the connection ends before it.
 async fn receive_connect(stream: &mut TcpStream, input: &mut Vec<u8>) -> Option<Result<Connect, Fault>> {
     loop {
         match packet::packet_length(input) {
@@ -81,7 +81,7 @@ async fn receive_connect(stream: &mut TcpStream, input: &mut Vec<u8>) -> Option<
     }
 }
 
-/// Sends last words, as far as the client takes them in time.
+/// Sends the last bytes of a connection, as far as the client accepts them in time.
 async fn farewell(stream: &mut TcpStream, bytes: &[u8]) {
     let _ = tokio::time::timeout(FAREWELL_LIMIT, async {
         stream.write_all(bytes).await?;
@@ -99,10 +99,10 @@ struct Client<'a> {
     max_packet: usize,
     /// QoS 1 messages under way at most.
     window: usize,
-    /// Their packet identifiers.
+    /// Packet identifiers of messages that are not acknowledged yet.
     inflight: BTreeSet<u16>,
     last_pkid: u16,
-    /// Longest silence; zero: any.
+    /// Longest silence of the client; zero allows any silence.
     silence: Duration,
     input: Vec<u8>,
     output: Vec<u8>,
@@ -220,7 +220,7 @@ impl<'a> Client<'a> {
         (!self.output.is_empty()).then(|| self.progress + STALL_LIMIT)
     }
 
-    /// When to look next whether the client is still there.
+    /// When to check next whether the client is still connected.
     fn deadline(&self) -> Option<Instant> {
         self.silent_at().into_iter().chain(self.stalled_at()).min()
     }
@@ -251,7 +251,7 @@ impl<'a> Client<'a> {
         fits
     }
 
-    /// Takes messages from the queue while there is room in the output.
+    /// Takes messages from the queue while the output has room.
     fn fill(&mut self, now: Instant) {
         while self.output.len() < OUTPUT_BYTES {
             let room = self.inflight.len() < self.window;

@@ -34,7 +34,7 @@ const MAX_CONNECTIONS: usize = 128;
 const MAX_PACKET_BYTES: usize = 256 * 1024;
 /// Longest client id, bytes.
 const MAX_CLIENT_ID_BYTES: usize = 256;
-/// Subscriptions of one client.
+/// Most subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 64;
 /// Retained messages. One too many is passed on but not kept, nor is the one that it would replace.
 const MAX_RETAINED_MESSAGES: usize = 5_000;
@@ -46,7 +46,7 @@ const MAX_QUEUE_MESSAGES: usize = 10_000;
 const MAX_QUEUE_BYTES: usize = 16 * 1024 * 1024;
 /// QoS 1 messages sent to one client and not acknowledged.
 const MAX_INFLIGHT: usize = 64;
-/// Time that a client has for its CONNECT.
+/// Time limit for the client's CONNECT.
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 /// Time for which a client may accept no byte while there is something to send.
 const STALL_LIMIT: Duration = Duration::from_secs(10);
@@ -67,7 +67,7 @@ pub struct Broker {
 #[derive(Debug)]
 struct Shared {
     state: Mutex<State>,
-    /// Connections so far.
+    /// Number of connections so far.
     connections: AtomicU64,
     stop: CancellationToken,
 }

@@ -16,7 +16,7 @@ pub(super) use self::writer::{
 };
 use super::{MAX_CLIENT_ID_BYTES, MAX_PACKET_BYTES, topic};
 
-/// Reason codes (section 2.4); 3.1.1 has only some of them, in other numbers.
+/// Reason codes (section 2.4); version 3.1.1 has only some of them, with other numbers.
 pub(super) mod reason {
     pub(crate) const SUCCESS: u8 = 0x00;
     pub(crate) const NO_SUBSCRIPTION_EXISTED: u8 = 0x11;
@@ -67,7 +67,7 @@ mod property {
     pub(crate) const OF_DISCONNECT: &[u8] = &[17, 31, USER];
 }
 
-/// Version that a client chose by the level byte of its CONNECT.
+/// Version of MQTT, which a client chooses by the level byte of its CONNECT.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Version {
     /// Level 4.
@@ -88,7 +88,7 @@ pub(super) enum Qos {
 pub(super) struct Fault {
     /// Reason code sent to v5 clients, see [`reason`].
     pub(super) reason: u8,
-    /// For the log.
+    /// Description of the fault for the log.
     pub(super) what: &'static str,
 }
 
@@ -111,9 +111,9 @@ pub(super) struct Message {
     pub(super) payload: Vec<u8>,
     pub(super) qos: Qos,
     pub(super) retain: bool,
-    /// Encoded properties that subscribers get as they came.
+    /// Encoded properties, which subscribers receive unchanged.
     pub(super) properties: Vec<u8>,
-    /// Time after `published` in which it may be delivered.
+    /// Time after `published` in which the message may be delivered.
     pub(super) lifetime: Option<Duration>,
     pub(super) published: Instant,
 }
@@ -144,7 +144,7 @@ pub(super) struct Connect {
     pub(super) client_id: String,
     /// Zero: no supervision.
     pub(super) keep_alive: Duration,
-    /// QoS 1 messages that the client takes without having acknowledged them.
+    /// Most QoS 1 messages that the client accepts without having acknowledged them.
     pub(super) receive_maximum: usize,
     /// Largest packet that the client takes, bytes.
     pub(super) max_packet: usize,
@@ -161,13 +161,13 @@ pub(super) struct Subscription {
     pub(super) qos: Qos,
     /// The client's own messages are left out.
     pub(super) no_local: bool,
-    /// Messages keep the retain flag that they were published with.
+    /// Whether messages keep the retain flag that they were published with.
     pub(super) retain_as_published: bool,
     /// Retained messages are sent: 0 at each subscription, 1 if it is new, 2 never.
     pub(super) retain_handling: u8,
 }
 
-/// What a client sends after its CONNECT.
+/// A packet that a client sends after its CONNECT.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Incoming {
     /// A message; the packet identifier is 0 at QoS 0.

@@ -14,7 +14,7 @@ use super::{MAX_QUEUE_BYTES, MAX_QUEUE_MESSAGES, MAX_RETAINED_BYTES, MAX_RETAINE
 /// All state of the broker.
 #[derive(Debug, Default)]
 pub(super) struct State {
-    /// By the number of their connection.
+    /// The clients by the number of their connection.
     clients: BTreeMap<u64, Client>,
     retained: BTreeMap<String, Arc<Message>>,
     retained_bytes: usize,
@@ -28,7 +28,7 @@ struct Client {
     subscriptions: Vec<Subscription>,
     queue: VecDeque<Delivery>,
     queue_bytes: usize,
-    /// Notified when there is something to send.
+    /// Notified when the client has something to send.
     wake: Arc<Notify>,
     /// Ends the connection, once.
     end: Option<oneshot::Sender<Fault>>,
@@ -45,7 +45,7 @@ pub(super) struct Delivery {
 /// How a connection ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Leave {
-    /// The client took its leave: no will.
+    /// The client sent a DISCONNECT, so no will is published.
     Clean,
     /// Anything else: the will is published.
     Lost,

@@ -143,7 +143,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether only a master changes it.
+    /// Whether only a master changes the register.
     fn is_written(&self, point: &Point, raw: &Raw) -> bool {
         let own = self.control.as_ref().is_some_and(|control| {
             let at = raw.covers(control.at.table, control.at.address);
@@ -255,7 +255,7 @@ impl ProfileDrive {
         steps.iter().enumerate().filter_map(wish).collect()
     }
 
-    /// Whether a state is so, and how much it counts.
+    /// Whether the drive is in a state, and how much the state counts.
     fn state_of(&self, index: PointIndex, point: &Point) -> Option<(u8, bool)> {
         if let Some(Given::Number(number)) = self.options.values.get(&index) {
             return Some((0, *number != 0.0));

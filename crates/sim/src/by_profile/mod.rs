@@ -38,7 +38,7 @@ pub struct ProfileOptions {
     pub profile: Arc<Profile>,
     /// The registers that no real drive has are there: a fault code trips, and 1 behind it gives the drive to its panel.
     pub trip_register: bool,
-    /// Time before a reply; none leaves it to the line.
+    /// Time before a reply; with `None` the line decides.
     pub turnaround: Option<Duration>,
     /// Values of points that the motor does not change, by index.
     pub values: BTreeMap<PointIndex, Given>,
@@ -101,7 +101,7 @@ pub struct ProfileDrive {
     body: Body,
     /// The control word that counted last.
     word: u16,
-    /// How far the start sequence has come, and when that shows.
+    /// How many words of the start sequence the drive has received, and when its status shows that.
     position: usize,
     shows_at: SimTime,
     /// The run command that holds: in reverse or not.
@@ -159,7 +159,7 @@ impl ProfileDrive {
         Arc::clone(&self.options.profile)
     }
 
-    /// How far the start sequence has come as the status shows it.
+    /// How many words of the start sequence the status shows as received.
     fn shown_position(&self, now: SimTime) -> usize {
         match now >= self.shows_at {
             true => self.position,
@@ -186,7 +186,7 @@ impl ProfileDrive {
         let told = match self.family {
             Some(family) if place == control.at => Some((family.word)(&known, word)),
             Some(family) => (family.other)(place.table, place.address, word).or_else(|| {
-                // Another direction, say: the control word is looked at anew.
+                // The write may have changed the direction, for example, so the control word is evaluated again.
                 let again = (family.word)(&known, self.word);
                 let plain = Told { resets: false, ..again };
                 matches!(plain.does, Does::Runs { .. }).then_some(plain)
@@ -240,7 +240,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether a run command acts when it is written and does not stand.
+    /// Whether a run command acts only at the moment when it is written.
     fn acts_once(&self) -> bool {
         let said = || self.control.as_ref().is_some_and(said::acts_once);
         self.family.map_or_else(said, |family| family.acts_once)
@@ -282,7 +282,7 @@ impl ProfileDrive {
         self.word = 0;
     }
 
-    /// The reference, Hz, with its sign.
+    /// The reference with its sign, Hz.
     fn reference(&self) -> f64 {
         let hertz = |model: ModelPoint, factor: f64| self.commanded(model).map(|value| value * factor);
         let frequency = hertz(ModelPoint::FrequencyReference, 1.0);

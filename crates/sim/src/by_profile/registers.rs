@@ -42,7 +42,7 @@ impl Registers {
         self.0.get(&(table, address)).copied()
     }
 
-    /// Sets one that exists.
+    /// Sets a register that exists.
     pub(super) fn set(&mut self, key: Key, value: u16) -> Result<(), Exception> {
         self.0.get_mut(&key).map(|held| *held = value).ok_or(Exception::ADDRESS)
     }
@@ -131,7 +131,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether that is one of the registers that no real drive has.
+    /// Whether the register is one that no real drive has.
     fn is_extra(&self, table: Table, address: u16) -> bool {
         let first = self.options.trip_address();
         self.options.trip_register && table == Table::Holding && (first..=first + 1).contains(&address)

@@ -60,13 +60,13 @@ fn next_step(control: &Control, position: usize, place: ControlItem, word: u16) 
         .max()
 }
 
-/// Whether a write there can start the motor or turn it round.
+/// Whether a write to this place can start the motor or reverse it.
 fn concerns_run(control: &Control, place: ControlItem) -> bool {
     let mut of_run = control.runs().into_iter().chain(control.reverse);
     of_run.any(|setting| place_of(&setting, control) == place)
 }
 
-/// Every place that takes commands.
+/// All places that take commands.
 pub(super) fn places(control: &Control) -> Vec<ControlItem> {
     let steps: &[Step] = match &control.run {
         Run::Steps(steps) => steps,
@@ -80,7 +80,7 @@ pub(super) fn places(control: &Control) -> Vec<ControlItem> {
         .collect()
 }
 
-/// Whether the run command acts when it is written and does not stand.
+/// Whether the run command acts only at the moment when it is written.
 pub(super) fn acts_once(control: &Control) -> bool {
     control.runs().iter().all(|setting| setting.once)
 }

@@ -60,14 +60,14 @@ impl ProfiledDrive {
     }
 }
 
-/// A family, and what its drives show.
+/// A family, and what its drives must show.
 struct Case {
     family: Family,
     reset: Vec<Order>,
     /// The status register while it runs forward: address, bits that count and what they are, from the manuals.
     runs: [u16; 3],
     fault: [u16; 3],
-    /// Each alone, at standstill: they start nothing.
+    /// Orders that start nothing when each is given alone at standstill.
     idle: Vec<Order>,
 }
 
@@ -92,7 +92,7 @@ ls-g100            | 5=8                         | 13 0x000E 0x0002     | 13 0x0
 teco-f510          | 0x2501=0,8,0                | 0x2520 0x000B 0x0001 | 0x2520 0x0009 0x0008 | 0x2501=2,8,0x10
 vacon-10           | 2000=0,4,0                  | 2100 0x000E 0x0002   | 2100 0x000A 0x0008   | 2000=2,4";
 
-/// All of them, in the order of [`families`].
+/// All cases, in the order of [`families`].
 fn cases() -> Vec<Case> {
     let register = |text: &str| -> [u16; 3] {
         let numbers: Vec<u16> = text.split_whitespace().map(number).collect();
@@ -164,7 +164,7 @@ fn words_that_start_nothing() {
             rig.wait(1000);
             assert!(!rig.drive.state().running, "{}: {order:?}", case.family.profile);
         }
-        // Without the first word of its sequence a drive does not run.
+        // Without the first word of the start sequence, a drive does not run.
         if case.family.start.len() > 1 && case.family.profile != "hitachi-wj200" {
             let mut rig = ProfiledDrive::named(case.family.profile);
             rig.send(&case.family.reference);

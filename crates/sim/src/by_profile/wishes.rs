@@ -23,7 +23,7 @@ const MOST_TRIES: usize = 4000;
 /// Ways to keep a state from being so that are followed.
 const MOST_WAYS: usize = 24;
 
-/// Bits that are decided.
+/// Bits whose values are decided.
 type Fixed = BTreeMap<Key, Part>;
 
 /// Bits that fulfil the wishes, the first ones before later ones that contradict them; where there is a choice the bits stay as

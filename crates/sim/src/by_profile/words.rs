@@ -22,7 +22,7 @@ pub(super) enum Does {
     Trips,
 }
 
-/// All that a word does.
+/// All effects of a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Told {
     pub(super) does: Does,
@@ -37,7 +37,7 @@ pub(super) struct Told {
 pub(super) struct Known<'d> {
     /// The word that counted last.
     pub(super) before: u16,
-    /// How far it has come in its start sequence.
+    /// How many words of the start sequence the drive has received.
     pub(super) position: usize,
     pub(super) faulted: bool,
     /// Whether reverse was commanded last.
@@ -272,7 +272,7 @@ fn delta_reset(table: Table, address: u16, word: u16) -> Option<Told> {
     ((table, address) == (Table::Holding, 0x2002)).then(|| told(does, is(word, 2), word))
 }
 
-/// Codes that act when they are written; jogs are not simulated.
+/// The codes act when they are written; jogs are not simulated.
 fn invt(_: &Known<'_>, word: u16) -> Told {
     let does = match word {
         1 | 2 => pair(word),

@@ -15,7 +15,7 @@ mod subfunction {
     pub(super) const NO_RESPONSES: u16 = 0x000F;
 }
 
-/// Event counters; they wrap at 16 bits.
+/// Event counters, which wrap at 16 bits.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Valid frames on the line, for any address.
@@ -26,7 +26,7 @@ pub struct Counters {
     pub exceptions: u16,
     /// Frames for this slave, broadcasts included.
     pub slave_messages: u16,
-    /// Frames for this slave that it did not answer, broadcasts included.
+    /// Frames for this slave that the slave did not answer, including broadcasts.
     pub no_responses: u16,
 }
 
@@ -51,7 +51,7 @@ impl Diagnostics {
         subfunction == subfunction::REINITIALISE && matches!(data, 0 | 0xFF00)
     }
 
-    /// As after power-on.
+    /// Resets the diagnostics to the state after power-on.
     pub(super) fn reinitialise(&mut self) {
         *self = Diagnostics::default();
     }

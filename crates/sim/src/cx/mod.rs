@@ -36,11 +36,11 @@ struct Coils {
 struct Totals {
     /// Operating days.
     days: f64,
-    /// Operating hours since they were reset.
+    /// Operating hours since the counter was reset.
     trip_hours: f64,
     /// Energy, MWh.
     energy: f64,
-    /// Energy since it was reset, MWh.
+    /// Energy since the counter was reset, MWh.
     trip_energy: f64,
 }
 
@@ -73,7 +73,7 @@ pub struct CxDrive {
     totals: Totals,
     diagnostics: Diagnostics,
     coils: Coils,
-    /// Frequency reference as it was taken, 0.01 Hz.
+    /// Frequency reference that the drive accepted, 0.01 Hz.
     reference: u16,
     /// Whether the fieldbus is the active control source.
     fieldbus: bool,

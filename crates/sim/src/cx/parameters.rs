@@ -57,10 +57,10 @@ const TABLE: [(u16, u16, u16, u16, u16); 28] = [
     (4, 7, 0, 1, 1),
 ];
 
-/// cos phi of the motor; no parameter holds it.
+/// cos phi of the motor, which no parameter holds.
 const COS_PHI: f64 = 0.85;
 
-/// All parameters of one drive by address. They survive a power cycle.
+/// All parameters of one drive by address. Parameters survive a power cycle.
 #[derive(Debug, Clone)]
 pub(super) struct Parameters {
     set: ParameterSet,
@@ -123,7 +123,7 @@ impl Parameters {
         f64::from(self.set.number(MINIMUM_FREQUENCY)) * self.frequency_step
     }
 
-    /// The motor and its ramps.
+    /// Ratings of the motor and its ramps, from the parameters.
     pub(super) fn ratings(&self) -> Ratings {
         let number = |key| f64::from(self.set.number(key));
         Ratings {

@@ -106,7 +106,7 @@ impl Network {
             .collect()
     }
 
-    /// Dials in where it does that and has no connection.
+    /// Connects to the server if this endpoint dials and has no connection.
     pub(crate) fn connect(&mut self) {
         if let Way::Dial {
             server,
@@ -129,7 +129,7 @@ impl Network {
                     && stream.set_nonblocking(true).is_ok()
                     && stream.set_nodelay(true).is_ok()
                 {
-                    // A client that comes anew has lost its connection.
+                    // A client that connects again has lost its former connection.
                     (*client, self.received) = (Some(stream), Vec::new());
                 }
                 let count = super::receive_from(client, buffer);

@@ -99,7 +99,7 @@ pub enum Kind {
 /// Characters without a gap.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Burst {
-    /// Time between what came before and its first character.
+    /// Time between the characters before the burst and its first character.
     pub gap: Duration,
     /// The characters.
     pub bytes: Vec<u8>,

@@ -6,7 +6,7 @@ use super::*;
 use proptest::prelude::*;
 
 const READ_STATUS: [u8; 8] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B, 0x47, 0xA3];
-/// 27 characters: the reply to it.
+/// Length of the reply to the request, characters.
 const REPLY_CHARS: usize = 27;
 
 fn us(micros: u64) -> Duration {

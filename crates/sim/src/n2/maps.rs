@@ -4,7 +4,7 @@ use crate::codec::Table;
 use crate::codec::n2::Region;
 use crate::simulated_drive::ModelOptions;
 
-/// Where the value of an object comes from, and where an override goes.
+/// Where the value of an object comes from, and where an override is written.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Backing {
     /// A signed register; the value of one count.
@@ -25,7 +25,7 @@ pub struct Entry {
     pub number: u8,
     /// The register or bit of the drive behind the object.
     pub place: Backing,
-    /// Limits of the drive's parameter; without them those of the register hold.
+    /// Limits of the drive's parameter; if absent, the limits of the register hold.
     pub limits: Option<(f64, f64)>,
 }
 
@@ -37,10 +37,10 @@ pub enum Beyond {
     Refuse,
 }
 
-/// The objects of a family's board and how it behaves.
+/// The objects of a family's N2 board, and how the board behaves.
 #[derive(Debug, Clone, Copy)]
 pub struct Map {
-    /// All objects.
+    /// All objects of the board.
     pub entries: &'static [Entry],
     /// An override of AI, BI or ADI changes what the bus sees, and a release ends it; else both do nothing.
     pub overrides_inputs: bool,
@@ -184,7 +184,7 @@ pub(crate) const HVX: Map = Map {
 /// A family without N2.
 pub(crate) const NONE: Map = Map { entries: &[], ..NX };
 
-/// TECO 7300PA with its PA-C card: the column Modbus of the tables.
+/// TECO 7300PA with its PA-C card: the column "Modbus" of the tables.
 pub(crate) const TECO: Map = Map {
     entries: &[
         entry(Ai, 1, Unsigned(HOLDING, 0x0023, 0.01)),

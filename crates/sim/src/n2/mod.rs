@@ -33,7 +33,7 @@ pub struct BoardOptions {
     pub state_bit: u8,
     /// Device type that Identify returns.
     pub device_type: u8,
-    /// Nothing is answered before Identify.
+    /// Whether the board answers nothing before Identify.
     pub waits_for_identify: bool,
 }
 
@@ -49,7 +49,7 @@ impl Default for BoardOptions {
     }
 }
 
-/// The drive behind a board; it may stay silent.
+/// The drive behind a board, which may give no reply.
 pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 
 /// The board of one drive.
@@ -61,16 +61,16 @@ pub struct Board {
     waiting: bool,
     /// Attributes set over the bus: configuration bytes, limits and times, by object and attribute.
     attributes: BTreeMap<(Object, u8), Vec<u8>>,
-    /// Overridden objects and the values that they were given.
+    /// Overridden objects, with the values that they were given.
     overridden: BTreeMap<Object, Vec<u8>>,
     /// Status of the objects as last reported.
     reported: BTreeMap<Object, u8>,
     /// Records that are not acknowledged yet, a reply each.
     reports: VecDeque<Vec<u8>>,
-    /// The first of them was sent.
+    /// Whether the first of these reports was sent.
     has_sent_reports: bool,
     polled: SimTime,
-    /// Power cycles of the drive that the board has gone through with it.
+    /// Number of the drive's power cycles that the board has followed.
     power_cycles: u32,
 }
 
@@ -368,7 +368,7 @@ fn fetch(place: Backing, model: Model<'_>) -> Option<f64> {
         let (start, count) = (address, 1);
         match model(&RequestPdu::read(table, start, count))? {
             Reply::Registers(words) => words.first().copied(),
-            // The drive does not have it: it is at rest.
+            // A drive without this register counts as having 0, the value at rest.
             _ => Some(0),
         }
     };

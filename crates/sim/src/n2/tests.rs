@@ -26,7 +26,7 @@ impl NxWithBoard {
         }
     }
 
-    /// Identified, its report taken.
+    /// A board that is identified and whose first report was taken.
     fn ready(map: &'static Map) -> NxWithBoard {
         let mut rig = NxWithBoard::new(map);
         assert_eq!(rig.ask("01F"), "A1061");
@@ -108,7 +108,7 @@ fn reports_come_in_pieces_until_they_are_acknowledged() {
         "what was sent before is not what is acknowledged"
     );
     while rig.ask("0105") != "A" {}
-    // BI 2 reports its changes once that is switched on.
+    // BI 2 reports its changes once its reports are switched on.
     assert_eq!(rig.ask("0121020101"), "A");
     assert_eq!(rig.ask("0122020101"), "A");
     rig.ask("0104");

@@ -82,7 +82,7 @@ pub mod status_word {
 /// Fault code: fieldbus fault (reference/drives.md 3.11).
 pub const FIELDBUS_FAULT: u16 = 53;
 
-/// Where a drive takes its commands from.
+/// Place from which a drive takes its commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ControlPlace {
     /// I/O terminals.
@@ -114,9 +114,9 @@ impl ControlPlace {
 pub struct NxState {
     /// Status word, ID 2101.
     pub status: u16,
-    /// Control word as a master wrote it, ID 2001.
+    /// Control word that a master wrote, ID 2001.
     pub control: u16,
-    /// Speed reference as a master wrote it, ID 2003, 0.01 %.
+    /// Speed reference that a master wrote, ID 2003, 0.01 %.
     pub reference: i16,
     /// Output frequency, Hz.
     pub output: f64,

@@ -28,14 +28,14 @@ pub enum Base {
 pub enum Unit {
     /// 0.01 %.
     Percent,
-    /// 0.01 Hz, as Eaton's tables of the Multipurpose and PID applications print it.
+    /// Unit 0.01 Hz, as in Eaton's tables of the Multipurpose and PID applications.
     Hertz,
 }
 
 /// How the speed reference, ID 2003, and the actual speed, ID 2103, are to be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SpeedReference {
-    /// Whether a negative reference is allowed; it turns the direction round.
+    /// Whether a negative reference is allowed, which reverses the direction.
     pub signed: bool,
     /// The range that 100 % stands for.
     pub base: Base,

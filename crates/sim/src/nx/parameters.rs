@@ -42,7 +42,7 @@ pub const OUT_SELECTION: u16 = 852;
 /// Items of process data out 1 to 8 by default (reference/drives.md 3.8): IDs 1 to 7, then the active fault.
 const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
 
-/// All parameters of one drive by ID. They survive a power cycle.
+/// All parameters of one drive by ID. Parameters survive a power cycle.
 #[derive(Debug, Clone)]
 pub struct Parameters(ParameterSet);
 
@@ -150,9 +150,9 @@ impl Parameters {
 /// How the drive stops the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StopFunction {
-    /// Lets it run out.
+    /// Lets the motor coast to a stop.
     Coast,
-    /// Brings it down with the deceleration time.
+    /// Slows the motor down with the deceleration time.
     Ramp,
 }
 
@@ -161,11 +161,11 @@ pub enum StopFunction {
 pub struct Settings {
     /// Minimum frequency, Hz.
     pub minimum: f64,
-    /// The motor and its ramps.
+    /// Ratings of the motor and its ramps.
     pub motor: Ratings,
-    /// Where the drive takes its commands from.
+    /// Place from which the drive takes its commands.
     pub place: ControlPlace,
-    /// How it stops.
+    /// How the drive stops its motor.
     pub stop: StopFunction,
     /// P2.7.22.
     pub fieldbus_fault: u16,

@@ -31,7 +31,7 @@ pub enum Hole {
 /// ID of the simulator's own register that trips a fault.
 const TRIP: u16 = NxOptions::TRIP_ADDRESS + 1;
 
-/// The groups of reference/drives.md 3.2; a request may not cross their borders.
+/// The groups of reference/drives.md 3.2; a request may not cross the borders of a group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Group {
     Actual,
@@ -161,7 +161,7 @@ impl NxDrive {
         Ok(())
     }
 
-    /// All values of one message are taken, or none.
+    /// Takes either all values of a message or none.
     fn write_process(&mut self, first: u16, values: &[u16]) -> Result<(), Exception> {
         let at = usize::from(first) - 2001;
         if at + values.len() > PROCESS_DATA {
@@ -245,7 +245,7 @@ impl NxDrive {
         );
         let (share, whole) = match self.options.reference.base {
             Base::Maximum => (output.abs(), maximum),
-            // Below the minimum frequency there is no reference to compare with.
+            // Below the minimum frequency, no reference exists for comparison.
             Base::Band => ((output.abs() - minimum).max(0.0), maximum - minimum),
         };
         if whole > 0.0 {

@@ -85,7 +85,7 @@ pub(crate) struct TecoDrive {
     control: Control,
     /// Terminals 1 to 8.
     terminals: u16,
-    /// Frequency detection 1 and 2, with their hysteresis.
+    /// State of frequency detections 1 and 2, which have a hysteresis.
     detected: [bool; 2],
     /// Time above the level of overtorque detection, s.
     overtorque: f64,
@@ -147,7 +147,7 @@ impl TecoDrive {
         }
     }
 
-    /// Whether they say that it is to turn in reverse.
+    /// Whether the commands tell the motor to turn in reverse.
     fn is_told_to_reverse(&self) -> bool {
         match self.run_from_bus() {
             true => self.control.operation & operation::REVERSE != 0,

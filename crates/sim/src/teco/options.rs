@@ -72,7 +72,7 @@ pub struct TecoOptions {
     pub load: Load,
     /// The operator's mode after power-on.
     pub mode: Mode,
-    /// How Sn-08 and Sn-24 hold their digits.
+    /// How Sn-08 and Sn-24 store their digits.
     pub digits: Digits,
     /// The levels of frequency detection.
     pub detection_levels: DetectionLevels,
@@ -83,7 +83,7 @@ pub struct TecoOptions {
     /// Parameters in the EEPROM at first: register and value; those that a drive does not have or not allow are passed
     /// over.
     pub parameters: Vec<(u16, u16)>,
-    /// Time between a message and its answer; `None` leaves it to the line.
+    /// Time between a message and its answer; with `None` the line decides.
     pub turnaround: Option<Duration>,
     /// Whether a request with a wrong check code is answered by error 00H. The manual's error table has that code; the
     /// text next to it, and everything else about messages, describes no answer (reference/drives.md 9.8).

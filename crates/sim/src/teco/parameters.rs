@@ -59,7 +59,7 @@ const GROUPS: [Group; 5] = [
 const NOT_SAVED: std::ops::RangeInclusive<u16> = 0x0313..=0x0317;
 
 pub(super) const SN_08: u16 = 0x0108;
-/// Function of the multifunction reference 1; those of 2 to 4 follow.
+/// Function of the multifunction reference 1; the functions of 2 to 4 follow.
 pub(super) const SN_15: u16 = 0x010F;
 /// Functions of the outputs R2A-R2C, DO1 and R1A-R1C.
 pub(super) const SN_20: u16 = 0x0114;
@@ -76,7 +76,7 @@ pub(super) const CN_26: u16 = 0x0219;
 pub(super) const CN_27: u16 = 0x021A;
 pub(super) const CN_32: u16 = 0x021F;
 pub(super) const CN_33: u16 = 0x0220;
-/// Frequency command 1; those of 2 to 8 follow.
+/// Frequency command 1; the commands 2 to 8 follow.
 pub(super) const AN_01: u16 = 0x0400;
 /// Jog frequency.
 pub(super) const AN_09: u16 = 0x0408;
@@ -155,7 +155,7 @@ const BN_16: (u16, u16, u16, u16) = (0x050F, 0, 100, 0);
 /// that the drive refuses values that cross; this is assumed.
 const LIMITS: [(u16, u16); 4] = [(CN_14, CN_14 + 1), (0x0216, 0x0217), (0x022C, 0x022E), (0x022D, 0x022F)];
 
-/// cos phi of the motor; no parameter holds it.
+/// cos phi of the motor, which no parameter holds.
 const COS_PHI: f64 = 0.85;
 
 /// Properties of a register of the parameters.
@@ -271,7 +271,7 @@ impl Parameters {
         self.copy();
     }
 
-    /// The motor and its ramps.
+    /// Ratings of the motor and its ramps, from the parameters.
     pub(super) fn ratings(&self) -> Ratings {
         let frequency = self.tenths(CN_04);
         Ratings {

@@ -15,7 +15,7 @@ pub(super) const CHECK_ERROR: Exception = Exception(0x00);
 const DATA_ERROR: Exception = Exception(0x21);
 /// 22H: Sn, Cn or On written in DRIVE mode, or saving while the drive runs.
 const WRITE_ERROR: Exception = Exception(0x22);
-/// Writing to it saves the parameters.
+/// Register that saves the parameters when it is written.
 const SAVE: u16 = 0x0900;
 /// Greatest frequency reference, 0.01 Hz.
 const MOST_FREQUENCY: u16 = 18_000;
@@ -144,7 +144,7 @@ impl TecoDrive {
         }
     }
 
-    /// All values of one message are taken, or none.
+    /// Takes either all values of a message or none.
     fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
         let count = u16::try_from(values.len()).map_err(|_| Exception::VALUE)?;
         let addresses = span(start, count)?;

@@ -63,7 +63,7 @@ impl TecoDrive {
     }
 
     fn near(&self, frequency: f64) -> bool {
-        // An output that is just there counts with a width of 0 too.
+        // Even with a width of 0, an output at the frequency counts as near.
         let width = self.width().max(AT_REFERENCE_BAND);
         (self.body.motor.output.abs() - frequency).abs() < width
     }

@@ -435,7 +435,7 @@ fn broadcasts_reach_two_registers_only() {
     assert_eq!((rig.one(0x0400), rig.one(0x0500)), (0, 30));
 }
 
-/// Cn-31 supervises the link between the drive and its card only.
+/// Cn-31 only supervises the link between the drive and its card.
 #[test]
 fn a_lost_master_changes_nothing() {
     let mut rig = TecoInTime::plain();

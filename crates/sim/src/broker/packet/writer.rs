@@ -8,7 +8,7 @@ use super::{Message, Qos, Version, property, reason};
 /// CONNACK with that reason code; an acceptance lists what the broker does not serve (section 3.2.2.3).
 pub(in super::super) fn connack(version: Version, reason: u8, assigned: Option<&str>) -> Vec<u8> {
     if version == Version::V311 {
-        // 3.1.1 table 3.1; what it has no code for is "server unavailable".
+        // See table 3.1 of MQTT 3.1.1; a reason without a code there becomes "server unavailable".
         let code = match reason {
             reason::SUCCESS => 0,
             reason::CLIENT_ID_NOT_VALID => 2,
@@ -44,7 +44,7 @@ pub(in super::super) fn publish(version: Version, message: &Message, retain: boo
     if version == Version::V5 {
         let mut section = Vec::new();
         if let Some(left) = message.left(now) {
-            // Rounded up, so that it is not delivered with 0 before its time.
+            // The time is rounded up, so that a message is not delivered with 0 before it expires.
             let seconds = left.as_secs() + u64::from(left.subsec_nanos() > 0);
             section.push(property::MESSAGE_EXPIRY);
             section.extend(u32::try_from(seconds).unwrap_or(u32::MAX).to_be_bytes());
@@ -106,7 +106,7 @@ pub(super) fn variable(mut value: usize) -> Vec<u8> {
     }
 }
 
-/// Text with its length; nothing longer than what a client sent is written.
+/// Text preceded by its length; the broker writes no text longer than what a client sent.
 fn prefixed(text: &str) -> Vec<u8> {
     let mut bytes = (text.len() as u16).to_be_bytes().to_vec();
     bytes.extend_from_slice(text.as_bytes());
