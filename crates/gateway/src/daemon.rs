@@ -46,7 +46,7 @@ const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
-/// Time limit for clients of the local socket to take their last answers.
+/// Time limit for clients of the local socket to receive their last answers.
 const STOP_LOCAL: Duration = Duration::from_secs(1);
 /// Time limit for the audit file, and for events and counters, to be written.
 const STOP_AUDIT: Duration = Duration::from_secs(1);
@@ -103,7 +103,7 @@ pub struct Daemon {
     keeper: Option<Keeper>,
     /// The starts of all drives.
     guards: Arc<Guards>,
-    /// Keeps them on disk.
+    /// Keeps the starts of drives on disk.
     starts: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
@@ -180,7 +180,7 @@ impl Daemon {
         daemon.apply_audit(&settings).await;
         // MQTT starts after the buses; subscribing it now lets its first messages include their events.
         daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
-        // Before the first start is counted.
+        // This must happen before the first start is counted.
         daemon.apply_guards(&settings).await;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
@@ -199,7 +199,7 @@ impl Daemon {
         Ok(daemon)
     }
 
-    /// All buses with their images and queues.
+    /// The plant: all buses with their images and queues.
     pub fn plant(&self) -> SharedPlant {
         self.plant.clone()
     }
@@ -215,7 +215,7 @@ impl Daemon {
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }
 
-    /// Path of the local socket, if it is open.
+    /// Path of the local socket if the socket is open.
     pub fn socket(&self) -> Option<&std::path::Path> {
         self.local.server().map(local::Local::path)
     }
@@ -244,7 +244,7 @@ impl Daemon {
             self.abort_servers(servers).await;
             return Err(error);
         }
-        // Before the first start is counted.
+        // This must happen before the first start is counted.
         self.apply_guards(&settings).await;
         self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
@@ -327,7 +327,7 @@ impl Daemon {
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
         }
-        // Stops to drives that are there no more, or are only monitored.
+        // Ends the stops to drives that no longer exist or are only monitored.
         for bus in &stopped {
             bus.queue.close(Outcome::ShuttingDown, Instant::now());
         }
@@ -369,7 +369,7 @@ impl Daemon {
         self.buses = kept;
     }
 
-    /// From now on these buses are the plant.
+    /// Makes these buses the plant from now on.
     fn show(&self, settings: &Settings, buses: &[(BusSettings, BusTask)]) {
         self.watch(buses);
         self.plant.store(Arc::new(Plant {
@@ -443,7 +443,7 @@ impl Daemon {
         within(STOP_BUSES, "buses", async {
             at_once(buses, BusTask::stop).await;
             if let Some(recorder) = recorder {
-                // A thread of it that panicked has logged that.
+                // If its thread panicked, the panic is logged already.
                 let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
             }
         })
@@ -480,7 +480,7 @@ impl Daemon {
             let stops = settings.shutdown_time();
             let time = match stops.drives {
                 0 => Duration::ZERO,
-                // Before them, the transaction that is on the line.
+                // The transaction on the line ends before the stops begin.
                 _ => settings.options.response_timeout + stops.unanswered,
             };
             let missing = task.handle().queue.begin_shutdown(now + time, now);
@@ -514,7 +514,7 @@ impl Daemon {
         }
     }
 
-    /// Publishes that a drive was not stopped, and counts it.
+    /// Publishes and counts that a drive was not stopped.
     fn stop_failed(&self, bus: &BusHandle, missing: &NotStopped) {
         let NotStopped { drive, why } = missing;
         let image = bus.image.drives.iter().find(|image| image.spec.name == *drive);

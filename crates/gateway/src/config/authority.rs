@@ -13,12 +13,12 @@ use super::together::Clients;
 use crate::document::{Finding, Reader, nearest};
 use crate::permit::{Mode, Principal, Rules};
 
-/// Where the system keeps its users.
+/// File with the users of the system.
 const PASSWD: &str = "/etc/passwd";
 
 /// `[authority]` as read.
 pub(super) struct Authority {
-    /// None where it is off.
+    /// The rules of authority; `None` if authority is off.
     pub(super) rules: Result<Option<Arc<Rules>>, Unusable>,
 }
 

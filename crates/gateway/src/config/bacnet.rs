@@ -25,7 +25,7 @@ pub(super) struct Bacnet {
     pub(super) commands: bool,
 }
 
-/// Reads the section; `buses` are the names that it can select.
+/// Reads the section; `buses` are the names of buses that the section can select.
 pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, buses: &[&str]) -> Bacnet {
     let listen = BACNET.listen.read(reader).and_then(|listen| ipv4(reader, listen));
     let allow = BACNET.allow.get(reader);
@@ -116,7 +116,7 @@ fn ipv4(reader: &Reader<'_>, listen: SocketAddr) -> Option<SocketAddrV4> {
     }
 }
 
-/// The password; none where there is no file.
+/// Reads the password; `None` if no file is configured.
 fn read_password(reader: &Reader<'_>, base: &Path) -> Result<Option<Secret>, Unusable> {
     let key = &BACNET.dcc_password_file;
     let Some(file) = key.written(reader).filter(|file| !file.as_os_str().is_empty()) else {

@@ -18,7 +18,7 @@ use crate::process_image::{Access, BusSpec, DriveSpec, is_modbus_tcp};
 /// A longer `response_timeout` causes a warning.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The settings of a bus, as far as they are valid.
+/// The valid settings of a bus.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) port: Option<(String, Place)>,

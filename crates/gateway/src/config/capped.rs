@@ -15,7 +15,7 @@ pub(super) struct Capped {
     pub(super) before: Duration,
     /// Why no longer, after the value.
     pub(super) why: &'static str,
-    /// The version that refuses it, such as `0.2`.
+    /// The version that will refuse the key, such as `0.2`.
     pub(super) until: &'static str,
 }
 

@@ -26,7 +26,7 @@ const MOST_NAMED: usize = 4;
 
 type Limits = BTreeMap<String, RangeInclusive<f64>>;
 
-/// The settings of a drive, as far as they are valid.
+/// The valid settings of a drive.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
@@ -221,7 +221,7 @@ pub fn addresses(protocol: Protocol) -> RangeInclusive<u8> {
     *range.start() as u8..=*range.end() as u8
 }
 
-/// The unit id; the address if there is none.
+/// The unit id; if absent, the address.
 fn read_unit(reader: &Reader<'_>, address: Option<u8>) -> Option<u8> {
     if !reader.has(DRIVE.unit.name)
         && let Some(address @ (0 | 255)) = address

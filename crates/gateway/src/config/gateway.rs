@@ -11,7 +11,7 @@ use crate::north::local::SocketPath;
 /// The default state directory.
 const STATE_DIR: &str = "/var/lib/drivegate";
 
-/// `[gateway]`, as far as it is valid.
+/// The valid settings of `[gateway]`.
 pub(super) struct Gateway {
     pub(super) name: Option<String>,
     pub(super) socket: SocketPath,

@@ -10,10 +10,10 @@ use crate::document::{Finding, Place, Reader};
 use crate::north::http::{self, Credential, Credentials, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
-/// An address that a server listens on, and its place.
+/// An address that a server listens on, with its place in the file.
 pub(super) type Listener = (SocketAddr, Place);
 
-/// `[http]`, as far as it is valid.
+/// The valid settings of `[http]`.
 pub(super) struct Http {
     pub(super) options: Option<http::Options>,
     pub(super) listener: Option<Listener>,

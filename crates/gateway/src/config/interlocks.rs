@@ -49,7 +49,7 @@ pub(super) fn check(document: &Document, buses: &[bus::Found]) {
     }
 }
 
-/// Why a point is not a boolean that is polled.
+/// Why a point cannot be an interlock; `None` if it is a polled boolean.
 fn unfit(profile: &Profile, name: &str) -> Option<(String, String)> {
     let plan = Plan::of(profile);
     let is_bit = |index: PointIndex| {

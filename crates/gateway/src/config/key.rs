@@ -10,9 +10,9 @@ use super::values::{self, NAME_LENGTH};
 use crate::codec::Protocol;
 use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration, parse_size};
 
-/// A number and a unit, as [`crate::document::parse_duration`] reads it.
+/// Pattern of a duration, a number and a unit, as [`crate::document::parse_duration`] reads it.
 pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|m|h)\s*$";
-/// As [`crate::document::parse_size`] reads it.
+/// Pattern of a size, as [`crate::document::parse_size`] reads it.
 const SIZE: &str = r"^\s*\d+\s*(B|KiB|MiB|GiB)\s*$";
 
 /// A key whose value is a `T`.
@@ -26,7 +26,7 @@ pub(super) struct Key<T: 'static> {
 
 /// The value of an absent key.
 pub(super) enum Preset {
-    /// The key must be there.
+    /// The key is required.
     Required,
     /// This value, in notation that is both TOML and JSON.
     Value(&'static str),
@@ -61,7 +61,7 @@ impl<T> Key<T> {
         self.read_default()
     }
 
-    /// The default, if there is one.
+    /// The default value, if the key has one.
     pub(super) fn read_default(&self) -> Option<T> {
         match self.default {
             Preset::Value(text) => self.read_text(text),
@@ -112,7 +112,7 @@ impl<T> Key<T> {
         reader.place_of(self.name)
     }
 
-    /// The value of a key without default, with its place.
+    /// The value of a key without default, with its place in the file.
     pub(super) fn placed(&self, reader: &Reader<'_>) -> Option<(T, Place)> {
         Some((self.read(reader)?, self.place(reader)))
     }
@@ -219,7 +219,7 @@ impl Form<String> for Name {
     }
 
     fn schema(&self) -> Value {
-        // A hyphen is last in the class, where it means itself.
+        // In the class of characters, the hyphen is last, where it stands for itself.
         let joints: String = self.0.chars().rev().collect();
         json!({ "type": "string", "pattern": format!("^[a-z0-9][a-z0-9{joints}]{{0,{}}}$", NAME_LENGTH - 1) })
     }
@@ -450,7 +450,7 @@ impl<T: Clone> Form<T> for Words<T> {
 /// A list of strings, each parsed; every bad item is a problem.
 pub(super) struct List<T> {
     pub(super) parse: fn(&str) -> Result<T, Finding>,
-    /// The remedy for an empty list, if it may not be empty.
+    /// What to do about an empty list, if the list may not be empty.
     pub(super) empty: Option<&'static str>,
     pub(super) range: &'static str,
 }

@@ -19,7 +19,7 @@ use crate::process_image::Access;
 /// The outcome of loading a configuration file.
 #[derive(Debug)]
 pub struct Loaded {
-    /// The settings; absent when there is any error.
+    /// The settings; absent if the configuration has any error.
     pub settings: Option<Settings>,
     /// The errors.
     pub errors: Vec<Problem>,
@@ -62,7 +62,7 @@ impl Settings {
 
 /// Default path of the configuration.
 pub const DEFAULT_FILE: &str = "/etc/drivegate/drivegate.toml";
-/// The remedy if there is no configuration yet.
+/// What to do if no configuration exists yet.
 const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
 
 impl Settings {

@@ -31,7 +31,7 @@ pub struct Memory {
 /// Memory of the past of a bus at most.
 #[derive(Debug)]
 pub struct BusMemory {
-    /// Trends of its drives and the last hour of the line, bytes.
+    /// Memory for the trends of the bus's drives and the last hour of the line, bytes.
     pub trends: usize,
     /// Trends of the drive with the most points, bytes.
     pub drive_trends: usize,
@@ -66,7 +66,7 @@ impl Memory {
         }
     }
 
-    /// All of it, bytes.
+    /// Memory for all data, bytes.
     pub fn total(&self, settings: &Settings) -> usize {
         let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
         let past: usize = self

@@ -18,7 +18,7 @@ use crate::north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
 /// Where the short form listens if `listen` is not written.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
 
-/// Name and place of a `default_drive`, and the buses that its listener shows.
+/// Name and place of a `default_drive`, with the buses that its listener shows.
 pub(super) type DefaultDrive = (String, Place, Option<Vec<String>>);
 
 /// `[modbus_tcp]` as read.

@@ -13,7 +13,7 @@ use crate::document::{Finding, FromNode, Reader, format_duration};
 use crate::north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
-/// Most brokers: all of them are tried within 10 s, three a second.
+/// Most brokers: at three attempts a second, all of them are tried within 10 s.
 const MOST_BROKERS: usize = 16;
 
 /// `url` and `urls`, in this order.
@@ -42,7 +42,7 @@ fn read_brokers(reader: &Reader<'_>) -> Option<Vec<Broker>> {
     Some(brokers)
 }
 
-/// `gateway` and `state_dir` are those of the gateway.
+/// Reads the section; `gateway` and `state_dir` are the settings of the gateway.
 pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, state_dir: &Path) -> Option<Options> {
     let brokers = read_brokers(reader);
     let all = || brokers.iter().flatten();

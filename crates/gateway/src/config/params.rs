@@ -16,11 +16,11 @@ use crate::process_image::Machine;
 /// How parameters are read and kept.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParamsSettings {
-    /// Where readings are kept.
+    /// Directory of the readings.
     pub dir: PathBuf,
     /// Interval at which all parameters are read; none: only on request.
     pub every: Option<Duration>,
-    /// Names that go before those of the profiles, by profile.
+    /// Names of parameters that replace the names in the profiles, by profile.
     pub names: BTreeMap<String, Arc<Names>>,
     /// Drives of the configuration that this process does not serve, with their names; none of a gateway.
     pub others: Vec<(Machine, String)>,
@@ -50,7 +50,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, profiles:
     settings
 }
 
-/// A list of names, and the profile that it is for.
+/// Reads a list of names; returns the profile of the list and the names.
 fn read_names(path: &Path, profiles: &Profiles) -> Result<(String, Names), String> {
     let shown = path.display();
     let profile = path

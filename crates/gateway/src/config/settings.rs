@@ -23,7 +23,7 @@ use crate::process_image::{BusSpec, DriveSpec};
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(super) const ENVIRONMENT: &str = "DRIVEGATE";
 
-/// A valid configuration. Parts compare equal when a reload changes nothing in them.
+/// A valid configuration. Parts that a reload does not change compare equal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// Name of the gateway.
@@ -48,7 +48,7 @@ pub struct Settings {
     pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
-    /// Slots of all buses; absent: there is none.
+    /// Slots of all buses; absent if no bus has a slot.
     pub slots: Option<slot_server::Options>,
     /// Absent: not started.
     pub modbus_tcp: Option<modbus_tcp_server::Options>,

@@ -12,7 +12,7 @@ use crate::process_image::{Access, DriveSpec, OnShutdown, Timing};
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
 pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
-/// The part of it that servers, broker and ports may take.
+/// The part of the stop time that servers, broker and ports may take.
 pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
 /// How long the stops of one bus take, one after another, from the end of the current transaction.
@@ -20,9 +20,9 @@ pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 pub struct ShutdownTime {
     /// Drives to stop.
     pub drives: usize,
-    /// Every one of them answers, after its turnaround.
+    /// Time if every drive answers, after its turnaround.
     pub answered: Duration,
-    /// None of them answers: each takes `response_timeout` and wire time for every try.
+    /// Time if no drive answers: each try takes `response_timeout` and the time on the wire.
     pub unanswered: Duration,
 }
 

@@ -11,11 +11,11 @@ use crate::document::{Place, Reader};
 use crate::north::slot::{Slot, SlotAccess};
 use crate::process_image::Access;
 
-/// The settings of a slot, as far as they are valid.
+/// The valid settings of a slot.
 pub(super) struct Found {
     pub(super) listeners: Vec<Listener>,
     pub(super) pty: Option<(PathBuf, Place)>,
-    /// Whether its tools may write.
+    /// Whether the slot's tools may write.
     pub(super) writes: bool,
     pub(super) slot: Option<Slot>,
 }
@@ -26,7 +26,7 @@ pub(super) struct Surroundings<'s> {
     pub(super) protocol: Protocol,
     pub(super) format: Option<LineFormat>,
     pub(super) mode: Mode,
-    /// Access to its drives, as far as they are known.
+    /// Access to the drives of the slot's bus, as far as it is valid.
     pub(super) drives: Vec<Access>,
 }
 

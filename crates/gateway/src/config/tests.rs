@@ -377,7 +377,7 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     }
 }
 
-/// Every family that ships reports whether it runs, and whether it is there.
+/// Every built-in family reports whether its drive runs and whether it is present.
 #[test]
 fn every_family_can_be_supervised() {
     let tells = |profile: &&Arc<Profile>| profile.model_index(ModelPoint::Run).is_some();

@@ -134,7 +134,7 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
 /// the drive only.
 const FAULT_TIME: Duration = Duration::from_secs(1);
 
-/// Drives that may trip because they are polled too seldom.
+/// Warns of drives that may trip because they are polled too seldom.
 fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
     let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
     let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {

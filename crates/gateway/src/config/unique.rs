@@ -234,7 +234,7 @@ fn collide(one: SocketAddr, other: SocketAddr) -> bool {
         && (one.ip() == other.ip() || everywhere(one, other) || everywhere(other, one))
 }
 
-/// A `default_drive` is a drive of a bus that its listener shows.
+/// Checks that each `default_drive` is a drive of a bus that its listener shows.
 pub(super) fn check_default_drives(document: &Document, buses: &[Found], wanted: &[DefaultDrive]) {
     for (name, place, shown) in wanted {
         let is_shown = |bus: &&Found| match (shown, &bus.name) {

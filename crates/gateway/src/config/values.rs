@@ -19,7 +19,7 @@ pub(super) fn any_of<'a>(words: impl Iterator<Item = &'a str>) -> String {
     }
 }
 
-/// ``unknown word `x` ``, and the nearest word, or all of them.
+/// The message ``unknown word `x` ``, with the nearest word or all words.
 pub(super) fn unknown_word<'a>(text: &str, words: impl Iterator<Item = &'a str> + Clone) -> Finding {
     let remedy = match nearest(text, words.clone()) {
         Some(near) => format!("did you mean \"{near}\"?"),
@@ -70,17 +70,17 @@ pub(super) fn network(text: &str) -> Result<IpNet, Finding> {
     })
 }
 
-/// Any text.
+/// Accepts any text.
 pub(super) fn any_text(text: &str) -> Result<String, Finding> {
     Ok(text.to_string())
 }
 
-/// Any path.
+/// Accepts any path.
 pub(super) fn path(text: &str) -> Result<PathBuf, Finding> {
     Ok(PathBuf::from(text))
 }
 
-/// `host:port` or `[v6]:port`; the port may be omitted where there is a default.
+/// Parses `host:port` or `[v6]:port`; the port may be omitted if `default` is given.
 pub(super) fn host_port(text: &str, default: Option<u16>) -> Option<(String, u16)> {
     let (host, port) = match text.strip_prefix('[') {
         Some(rest) => {
@@ -108,7 +108,7 @@ pub(super) fn host_port(text: &str, default: Option<u16>) -> Option<(String, u16
     Some((host.to_string(), port))
 }
 
-/// Reports one of two keys that is there without the other.
+/// Reports that one of two keys is present without the other.
 pub(super) fn both_or_none(reader: &Reader<'_>, names: [&str; 2]) {
     for [present, missing] in [names, [names[1], names[0]]] {
         if reader.has(present) && !reader.has(missing) {

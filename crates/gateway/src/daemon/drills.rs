@@ -84,7 +84,7 @@ type Writing = tokio::task::JoinHandle<(u64, Result<(), String>)>;
 #[derive(Default)]
 struct Writer {
     writing: Option<Writing>,
-    /// When a write that failed is tried again.
+    /// When a failed write is tried again.
     again: Option<Instant>,
 }
 
@@ -103,7 +103,7 @@ impl Writer {
                 Err(error) => self.failed(drills, &error.to_string()),
             }
         }
-        // A drill that waits for it is a reason to try at once.
+        // If a drill waits for the write, the write is tried at once.
         let waits = self.again.is_some_and(|again| Instant::now() < again) && !drills.waits_for_disk();
         if self.writing.is_none() && !waits {
             self.writing = begin_to_write(drills, file);

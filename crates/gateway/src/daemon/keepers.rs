@@ -135,7 +135,7 @@ impl Daemon {
         }
     }
 
-    /// Keeps reservations where the gateway keeps its state.
+    /// Keeps reservations on disk if the gateway keeps its state.
     pub(super) fn apply_reservations(&self, settings: &Settings) {
         let kept = settings.keeps_history && settings.authority.is_some();
         let dir = kept.then_some(settings.state_dir.as_path());
@@ -159,7 +159,7 @@ impl Daemon {
         .await;
     }
 
-    /// Drills as they are configured, kept where the gateway keeps its state.
+    /// Applies the configured drills, which are kept on disk if the gateway keeps its state.
     pub(super) async fn apply_drills(&self, settings: &Settings) {
         let drills = &self.north.drills;
         let kept = settings.keeps_history && settings.drill.is_some();

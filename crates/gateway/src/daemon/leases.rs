@@ -13,7 +13,7 @@ use crate::event::{Event, EventKind};
 use crate::plant::BusHandle;
 use crate::process_image::{Access, DriveSpec, Machine};
 
-/// How long what a drive had is kept that a reload left out.
+/// Time for which the lease of a drive is kept after a reload left the drive out.
 const RETURN: Duration = Duration::from_secs(120);
 /// Buses of which that is kept, the latest ones.
 const MOST_BUSES: usize = 64;
@@ -25,11 +25,11 @@ pub(super) struct Leases {
     parted: BTreeMap<Machine, (Instant, Carried)>,
 }
 
-/// A lease, and what the drive was called that had it.
+/// A lease, with the name of the drive that had it.
 #[derive(Debug)]
 struct Left {
     carried: Carried,
-    /// By which it was commanded.
+    /// The control by which the drive was commanded.
     control: Option<Control>,
     bus: String,
     drive: String,
@@ -77,12 +77,12 @@ impl Parted {
         (leases, kept.buses.iter().rev().map(|(_, bus)| bus.clone()).collect())
     }
 
-    /// The buses that reloads have stopped, as far as they are still known.
+    /// The buses that reloads have stopped and that are still known.
     pub(super) fn buses(&self) -> Vec<BusHandle> {
         self.lock().buses.iter().map(|(_, bus)| bus.clone()).collect()
     }
 
-    /// After it: what no bus continued, and the buses that were stopped.
+    /// Keeps, after a reload, the leases that no bus continued and the buses that were stopped.
     pub(super) fn keep(&self, leases: &Leases, stopped: &[BusHandle], now: Instant) {
         let mut kept = self.lock();
         kept.leases.clone_from(&leases.parted);

@@ -11,7 +11,7 @@ pub struct Pulse(Arc<Mutex<Vec<Watched>>>);
 struct Watched {
     bus: String,
     beats: Arc<AtomicU64>,
-    /// At the last check.
+    /// The counter at the last check.
     before: Option<u64>,
 }
 
@@ -20,7 +20,7 @@ impl Pulse {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// From now on these buses are watched, no others.
+    /// Watches exactly these buses from now on.
     pub(super) fn watch(&self, buses: impl Iterator<Item = (String, Arc<AtomicU64>)>) {
         let before = None;
         *self.watched() = buses.map(|(bus, beats)| Watched { bus, beats, before }).collect();

@@ -9,7 +9,7 @@ use crate::files::{self, Patience};
 use crate::permit::KeptReservation;
 use crate::plant::{Plant, SharedPlant};
 
-/// How often they are looked at.
+/// Interval of the checks for changed reservations.
 const LOOK: Duration = Duration::from_millis(50);
 /// A file that is longer is none of these.
 const LONGEST: u64 = 1 << 20;
@@ -20,13 +20,13 @@ pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
 /// The kept reservations, as far as a change of them changes the file.
 type Seen = Vec<(Instant, String, u8)>;
 
-/// From now on they are in that state directory.
+/// Keeps the reservations in this state directory from now on.
 pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
     let path = state_dir.map(|dir| dir.join(RESERVATIONS));
     *file.lock().unwrap_or_else(PoisonError::into_inner) = path;
 }
 
-/// Goes on with those of before the start.
+/// Continues with the reservations from before the start.
 pub(super) async fn restore(file: &ReservationsFile, patience: &Patience, plant: &Plant) {
     let Some(path) = path(file) else { return };
     let found = patience.read({
@@ -53,7 +53,7 @@ fn load(path: &Path) -> Result<Vec<KeptReservation>, String> {
     }
 }
 
-/// Writes them whenever they change.
+/// Writes the reservations whenever they change.
 pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         let mut seen = Seen::new();

@@ -14,7 +14,7 @@ const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_mi
 /// Result of [`ServerSlot::prepare`].
 #[derive(Default)]
 pub(super) enum Prepared<S: Reconfigure> {
-    /// The server stays as it is.
+    /// The server stays unchanged.
     #[default]
     Same,
     /// The server stops.
@@ -43,7 +43,7 @@ impl<S: Server> Default for ServerSlot<S> {
 }
 
 impl<S: Server> ServerSlot<S> {
-    /// The server, if it runs.
+    /// The server if it is running.
     pub(super) fn server(&self) -> Option<&S> {
         self.0.as_ref().map(|running| &running.server)
     }
@@ -76,7 +76,7 @@ impl<S: Server> ServerSlot<S> {
         }
     }
 
-    /// Stops the server if it runs.
+    /// Stops the server if it is running.
     pub(super) async fn stop(&mut self) {
         if let Some(running) = self.0.take() {
             running.stop().await;
@@ -109,7 +109,7 @@ impl<S: Reconfigure + Send + 'static> Running<S>
 where
     S::Options: Send + Sync,
 {
-    /// Stops it after the requests that its clients have started, without waiting.
+    /// Stops the server after the requests that clients have started, without waiting for that.
     async fn retire(mut self) {
         self.server.retire().await;
         if self.server.is_drained() {
@@ -168,7 +168,7 @@ where
         }
     }
 
-    /// Leaves the server as it was before it was prepared.
+    /// Leaves the server as it was before the preparation.
     pub(super) async fn abort(&mut self, prepared: Prepared<S>) {
         match (prepared, &mut self.0) {
             (Prepared::Started(running), _) => running.stop().await,
@@ -178,7 +178,7 @@ where
     }
 }
 
-/// Waits for `end`; logs a warning when it takes longer than `limit`.
+/// Waits for `end`; logs a warning if that takes longer than `limit`.
 pub(super) async fn within(limit: Duration, what: &str, end: impl Future<Output = ()>) {
     if tokio::time::timeout(limit, end).await.is_err() {
         tracing::warn!(target: "drivegate::daemon::server", "{what} did not stop within {limit:?}; continuing without waiting");

@@ -15,7 +15,7 @@ pub(super) struct PreparedServers {
 }
 
 impl Daemon {
-    /// Prepares the servers that listen on the network: all of them or none.
+    /// Prepares the servers that listen on the network: either all of them or none.
     pub(super) async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let mut prepared = PreparedServers::default();
         match self.prepare_each(settings, &mut prepared).await {

@@ -3,7 +3,7 @@ use drivegate_testkit::mqtt as packets;
 use super::*;
 use crate::event::EventKind;
 
-/// A gateway with so many buses, none of which has its adapter.
+/// A gateway with this number of buses, none of which has an adapter.
 fn without_adapters(buses: usize) -> Settings {
     let bus = |n| {
         format!(

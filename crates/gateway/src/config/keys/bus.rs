@@ -10,7 +10,7 @@ use crate::document::format_duration;
 use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::slot::SlotAccess;
 
-/// Longest fixed silence.
+/// Longest fixed silence that a bus can have.
 pub(super) const MOST_SILENCE: Duration = Duration::from_secs(1);
 pub(super) const SHORTEST_TIMEOUT: Duration = Duration::from_millis(1);
 pub(super) const LONGEST_TIMEOUT: Duration = Duration::from_secs(5);

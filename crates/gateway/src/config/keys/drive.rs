@@ -16,7 +16,7 @@ pub(in crate::config) const RESERVED: u8 = 248;
 pub(in crate::config) const WITH_RESERVED: Number = Number(1..=RESERVED as i64, BROADCAST);
 /// Unit ids behind `modbus-tcp://`.
 pub(in crate::config) const UNIT_IDS: Number = Number(0..=255, None);
-/// Addresses on a line of N2; each family has its own range within.
+/// Addresses on an N2 line; each drive family has its own range within these.
 pub(in crate::config) const N2_ADDRESSES: Number = Number(1..=255, BROADCAST);
 /// The actions that are words.
 pub(in crate::config) const ACTIONS: Words<LeaseAction> =

@@ -39,7 +39,7 @@ pub(super) const IDLE_TIMEOUT: Parsed<Option<Duration>> = Parsed {
     range: "\"off\", or \"1s\" to \"168h\"",
 };
 
-/// How often what was ordered is written again.
+/// How often orders are written again.
 pub(super) const REPEATED: Parsed<Option<Duration>> = Parsed {
     parse: parse_refresh,
     words: &["off"],

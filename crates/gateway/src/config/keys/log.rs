@@ -49,7 +49,7 @@ keys! {
     }
 }
 
-/// `level` or `target=level`, joined by commas, as `tracing` reads them.
+/// Parses `level` or `target=level`, joined by commas, as `tracing` does.
 ///
 /// # Errors
 /// A part is neither.

@@ -156,12 +156,12 @@ pub(in crate::config) enum TelemetryTopic {
     Points,
 }
 
-/// Where a broker is.
+/// Address of a broker.
 pub(in crate::config) struct Broker {
     pub(in crate::config) host: String,
     pub(in crate::config) port: u16,
     pub(in crate::config) tls: bool,
-    /// Path of MQTT over WebSocket; plain TCP where there is none.
+    /// Path of MQTT over WebSocket; absent for plain TCP.
     pub(in crate::config) path: Option<String>,
 }
 

@@ -89,7 +89,7 @@ fn revocations_are_checked_before_they_refuse_everybody() {
     let (usual, dir) = (certificates().join("ca.crl"), tempfile::tempdir().unwrap());
     let dir = dir.path();
     assert_eq!(said_of(&usual), "");
-    // As CAs publish it.
+    // DER is the form in which CAs publish the list.
     openssl(dir, &format!("crl -outform DER -in {} -out der.crl", usual.display()));
     assert_eq!(said_of(&dir.join("der.crl")), "");
     let bytes = std::fs::read(dir.join("der.crl")).unwrap();

@@ -104,7 +104,7 @@ fn a_listener_for_each_line() {
         .modbus_tcp
         .unwrap();
     assert_eq!(off.idle_timeout, None);
-    // Together they would share their units.
+    // In one listener, the two buses would share their units.
     let (both, _) = load(&split.replace("buses = [\"line2\"]", "buses = [\"line1\", \"line2\"]"));
     assert_eq!(both.errors.len(), 2, "{:?}", both.errors);
     assert!(

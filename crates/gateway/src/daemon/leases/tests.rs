@@ -4,7 +4,7 @@ use super::*;
 use crate::bus::supervision::Lease;
 use crate::config::Settings;
 
-/// A lease that runs since then.
+/// A lease that has been running since then.
 fn held(since: Instant) -> Carried {
     Carried {
         lease: Lease::held(since),
