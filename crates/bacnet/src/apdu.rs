@@ -3,7 +3,7 @@
 use crate::encoding::Writer;
 use crate::types::{Abort, Error, Reject};
 
-/// Longest message that goes into a datagram of BACnet/IP.
+/// Longest message that fits into a datagram of BACnet/IP.
 pub const MAX_APDU: usize = 1476;
 
 /// The responses that a client accepts.
@@ -11,7 +11,7 @@ pub const MAX_APDU: usize = 1476;
 pub struct Accepts {
     /// Segments, and at most how many.
     pub segments: Option<usize>,
-    /// Octets of one message.
+    /// Longest message, octets.
     pub size: usize,
 }
 
@@ -84,7 +84,7 @@ impl Accepts {
     }
 }
 
-/// Reads a message; `None` where it is none.
+/// Reads a message; `None` if the bytes are no message.
 pub fn decode(bytes: &[u8]) -> Option<Apdu<'_>> {
     let (first, rest) = bytes.split_first()?;
     let flag = |bit: u8| first >> bit & 1 == 1;

@@ -14,7 +14,7 @@ pub enum Bvlc<'a> {
     Unicast(&'a [u8]),
     /// A message to all hosts of this network.
     Broadcast(&'a [u8]),
-    /// A broadcast that a BBMD passes on, with the host that sent it.
+    /// A broadcast that a BBMD forwards, with the host that sent it.
     Forwarded(SocketAddrV4, &'a [u8]),
     /// A foreign device registers for so many seconds.
     Register(u16),
@@ -105,7 +105,7 @@ pub fn register(seconds: u16) -> Vec<u8> {
     datagram(0x05, &seconds.to_be_bytes())
 }
 
-/// A message that is passed on for the host that sent it.
+/// The datagram that forwards a message for the host that sent it.
 pub fn forwarded(origin: SocketAddrV4, npdu: &[u8]) -> Vec<u8> {
     datagram(0x04, &[&octets(origin)[..], npdu].concat())
 }

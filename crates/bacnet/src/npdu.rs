@@ -12,7 +12,7 @@ const HOPS: u8 = 0xFF;
 pub struct Npdu<'a> {
     /// Network and station that it is for, with the hops left; none: this network.
     pub to: Option<(u16, Mac, u8)>,
-    /// Network and station that sent it; none: the host itself.
+    /// Network and station that sent the message; `None` if the host itself sent it.
     pub from: Option<(u16, Mac)>,
     /// An answer is expected.
     pub expects: bool,
@@ -51,7 +51,7 @@ fn address(bytes: &[u8], may_be_all: bool) -> Option<((u16, Mac), &[u8])> {
     Some(((network, Mac::new(mac)?), rest))
 }
 
-/// Reads a message; `None` where it is none.
+/// Reads a message; `None` if the bytes are no message.
 pub fn decode(bytes: &[u8]) -> Option<Npdu<'_>> {
     let [1, control, rest @ ..] = bytes else {
         return None;

@@ -36,9 +36,9 @@ pub struct Object {
     pub name: Arc<str>,
     /// Text for the Description property of the object.
     pub description: Arc<str>,
-    /// The kind of its values.
+    /// The kind of the object's values.
     pub kind: Kind,
-    /// How it is written.
+    /// How the object can be written.
     pub access: Access,
 }
 
@@ -49,7 +49,7 @@ pub enum Access {
     Read,
     /// Clients may write Present_Value; the object has no priority array.
     Write,
-    /// By sixteen priorities.
+    /// Writes have one of sixteen priorities.
     Command,
 }
 
@@ -62,19 +62,19 @@ pub enum Kind {
         units: u32,
         /// The smallest difference between two values.
         resolution: f32,
-        /// Smallest and greatest value, where they are known.
+        /// Smallest and greatest value, if known.
         range: Option<(f32, f32)>,
         /// The change that is worth a notification, unless a client sets another.
         increment: f32,
     },
     /// Inactive or active.
     Binary {
-        /// Their texts.
+        /// Texts of the two states.
         texts: [Arc<str>; 2],
     },
     /// A value that is one of several states, numbered from 1.
     MultiState {
-        /// Their texts.
+        /// Texts of the states.
         texts: Arc<[String]>,
     },
     /// A text.
@@ -105,18 +105,18 @@ pub enum Reliability {
     CommunicationFailure = 12,
 }
 
-/// A value with what is known of it.
+/// A value, with its time and quality.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// The last one; none was ever there.
+    /// The last value; `None` if no value was ever read.
     pub value: Option<Datum>,
     /// Whether the value can be relied on, and if not, why.
     pub reliability: Reliability,
-    /// When it was read.
+    /// When the value was read.
     pub at: Option<DateTime>,
 }
 
-/// Who wrote a value.
+/// The writer of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ValueSource {
     /// The writer is not known.
@@ -124,7 +124,7 @@ pub enum ValueSource {
     None,
     /// A client.
     Address(Address),
-    /// A device, by its instance.
+    /// A device by its instance.
     Device(u32),
 }
 
@@ -135,7 +135,7 @@ pub struct Slot {
     pub value: Datum,
     /// Who wrote the value.
     pub source: ValueSource,
-    /// When.
+    /// When the slot was written.
     pub at: DateTime,
 }
 
@@ -144,13 +144,13 @@ pub struct Slot {
 pub struct Commands {
     /// The value of each slot, priority 1 first.
     pub slots: [Option<Slot>; 16],
-    /// The priority that governs.
+    /// The priority in effect.
     pub current: Option<u8>,
     /// The value when all slots are empty.
     pub default: Option<Datum>,
     /// The source of the present value.
     pub source: ValueSource,
-    /// When.
+    /// When the present command was written.
     pub at: Option<DateTime>,
 }
 
@@ -195,7 +195,7 @@ impl Device {
         self.by_id.get(&id).copied()
     }
 
-    /// The identifiers of all objects, itself and its port included.
+    /// The identifiers of all objects, including the device and its port.
     pub fn object_list(&self) -> impl Iterator<Item = ObjectId> + '_ {
         let own = [self.id(), ObjectId::new(ObjectType::NETWORK_PORT, 1)];
         own.into_iter().chain(self.objects.iter().map(|object| object.id))
@@ -241,7 +241,7 @@ fn revision(name: &str, objects: &[Object]) -> u32 {
 }
 
 impl Kind {
-    /// Whether that value is one of this kind.
+    /// Whether a value is of this kind.
     pub(crate) fn takes(&self, datum: &Datum) -> bool {
         matches!(
             (self, datum),

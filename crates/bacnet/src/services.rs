@@ -34,7 +34,7 @@ pub mod unconfirmed {
 /// Unconfirmed services that the server only sends are not listed.
 pub const SUPPORTED: [usize; 11] = [5, 12, 14, 15, 16, 17, 32, 33, 34, 36, 38];
 
-/// A property, or an element of it.
+/// A property, or one element of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PropertyRef {
     /// The property.
@@ -76,12 +76,12 @@ pub fn who_is(data: &[u8]) -> Read<Range> {
     Ok(range)
 }
 
-/// What Who-Has searches for.
+/// What a Who-Has message searches for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Sought {
-    /// An object by its identifier.
+    /// An object with this identifier.
     Object(ObjectId),
-    /// An object by its name.
+    /// An object with this name.
     Name(String),
 }
 
@@ -145,16 +145,16 @@ pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRe
     }
 }
 
-/// One write.
+/// One write of a request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WriteItem {
     /// The object.
     pub object: ObjectId,
     /// The property.
     pub property: PropertyRef,
-    /// The value; none where it is not a single primitive one.
+    /// The value; `None` if it is not a single primitive value.
     pub value: Option<Data>,
-    /// The priority, as it came.
+    /// The priority in the request.
     pub priority: Option<u32>,
 }
 
@@ -236,7 +236,7 @@ fn value(reader: &mut Reader<'_>, number: u8) -> Read<Option<Data>> {
 /// A subscription, or the end of one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Subscribe {
-    /// The number that the client gives it.
+    /// The number that the client gives the subscription.
     pub process: u32,
     /// The object.
     pub object: ObjectId,

@@ -74,12 +74,12 @@ impl ObjectId {
         ObjectId { kind, instance }
     }
 
-    /// As it stands on the wire.
+    /// The identifier as encoded on the wire.
     pub fn bits(self) -> u32 {
         (u32::from(self.kind.0) << 22) | (self.instance & 0x3F_FFFF)
     }
 
-    /// From the wire.
+    /// The identifier that these bits encode.
     pub fn from_bits(bits: u32) -> ObjectId {
         let kind = ObjectType(u16::try_from(bits >> 22).unwrap_or_default());
         ObjectId::new(kind, bits & 0x3F_FFFF)
@@ -140,7 +140,7 @@ pub enum ErrorClass {
     Communication = 7,
 }
 
-/// An error as a confirmed service is answered with it.
+/// An error in the form in which a confirmed service returns it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Error {
     /// Class of the error.
@@ -182,7 +182,7 @@ pub enum Reject {
     UnrecognizedService = 9,
 }
 
-/// Why an exchange ends.
+/// The reason why an exchange ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Abort {
@@ -194,7 +194,7 @@ pub enum Abort {
     ApduTooLong = 11,
 }
 
-/// The address of a station on its own network, up to eight octets.
+/// The address of a station on its own network, at most eight octets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Mac {
     len: u8,
@@ -299,7 +299,7 @@ pub struct DateTime {
 }
 
 impl DateTime {
-    /// Nothing is known.
+    /// A time of which no part is known.
     pub const UNSPECIFIED: DateTime = DateTime {
         date: [0xFF; 4],
         time: [0xFF; 4],
@@ -339,7 +339,7 @@ impl DateTime {
     }
 }
 
-/// A primitive value as a client writes it.
+/// A primitive value that a client writes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Data {
     /// Gives a slot back.

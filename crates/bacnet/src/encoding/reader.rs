@@ -12,7 +12,7 @@ pub enum Tag {
     Context(u8, usize),
     /// Begins a constructed value.
     Open(u8),
-    /// Ends it.
+    /// Closing tag with this number.
     Close(u8),
 }
 
@@ -74,7 +74,7 @@ impl<'a> Reader<'a> {
         self.clone().tag()
     }
 
-    /// The next tag; its value comes next.
+    /// Reads the next tag; the value of the tag follows.
     ///
     /// # Errors
     /// There is none, or none that is valid.
@@ -129,7 +129,7 @@ impl<'a> Reader<'a> {
         self.exactly(Tag::Open(number))
     }
 
-    /// Closes it.
+    /// Reads the closing tag with this number.
     ///
     /// # Errors
     /// Another tag comes.
@@ -159,7 +159,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// As [`Reader::context`], where that context comes next.
+    /// Reads a value like [`Reader::context`], if that context comes next.
     ///
     /// # Errors
     /// The encoding is not valid.
@@ -186,7 +186,7 @@ impl<'a> Reader<'a> {
         self.optional(number)?.map(u32_of).transpose()
     }
 
-    /// BOOLEAN in a context, where it comes next.
+    /// Reads a BOOLEAN in a context, if that context comes next.
     ///
     /// # Errors
     /// The encoding is not valid.
@@ -219,7 +219,7 @@ impl<'a> Reader<'a> {
         self.context_u32(number).map(PropertyId)
     }
 
-    /// REAL in a context, where it comes next.
+    /// Reads a REAL in a context, if that context comes next.
     ///
     /// # Errors
     /// The encoding is not valid.

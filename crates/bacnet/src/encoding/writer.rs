@@ -26,7 +26,7 @@ impl Writer {
         self.bytes
     }
 
-    /// Octets as they are.
+    /// Appends octets unchanged.
     pub fn raw(&mut self, bytes: &[u8]) -> &mut Writer {
         self.bytes.extend_from_slice(bytes);
         self
@@ -71,7 +71,7 @@ impl Writer {
         self
     }
 
-    /// Closes it.
+    /// Appends the closing tag with this number.
     pub fn close(&mut self, number: u8) -> &mut Writer {
         self.bytes.push(number << 4 | 0x0F);
         self

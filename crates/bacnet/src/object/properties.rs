@@ -26,7 +26,7 @@ pub(crate) struct Environment {
 pub(crate) struct Port {
     pub(crate) address: SocketAddrV4,
     pub(crate) prefix: u8,
-    /// The BBMD at which it registers, and for how long.
+    /// The BBMD at which the port registers, and for how many seconds.
     pub(crate) bbmd: Option<(SocketAddrV4, u16)>,
 }
 
@@ -87,7 +87,7 @@ const DEVICE: [P; 29] = [
     P::DAYLIGHT_SAVINGS_STATUS,
     P::ACTIVE_COV_SUBSCRIPTIONS,
 ];
-/// How many of them the standard requires.
+/// Number of the properties above that the standard requires.
 const DEVICE_REQUIRED: usize = 21;
 
 const PORT: [P; 10] = [
@@ -189,7 +189,7 @@ fn of_object(object: &Object) -> (Vec<P>, Vec<P>) {
     (required, optional)
 }
 
-/// An array, or an element of it.
+/// Writes an array or one element of it.
 fn array(
     out: &mut Writer,
     index: Option<u32>,
@@ -413,7 +413,7 @@ fn of_port(out: &mut Writer, device: &Device, property: P, environment: &Environ
     true
 }
 
-/// A value as an object of that type shows it.
+/// Writes a value in the form that an object of this type has.
 fn datum(out: &mut Writer, kind: ObjectType, value: &Datum) {
     match value {
         Datum::Number(number) => out.real(*number as f32),
@@ -534,7 +534,7 @@ fn time_stamp(out: &mut Writer, at: Option<DateTime>) {
     out.open(2).date_time(at.unwrap_or(DateTime::UNSPECIFIED)).close(2);
 }
 
-/// The content of a notification of an object: its value and its flags.
+/// The properties in a notification of an object: its value and its flags.
 pub(crate) fn cov_value(of: &Context<'_>) -> &'static [P] {
     match of {
         Context::Device { .. } => &[P::SYSTEM_STATUS],

@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use crate::bvlc;
 
-/// Seconds for which it registers.
+/// Time for which the server registers, s.
 pub(crate) const LIFETIME: u16 = 60;
 const RENEWED: Duration = Duration::from_secs(30);
-/// When it is tried again without an answer.
+/// Pause before a registration without an answer is tried again.
 const AGAIN: Duration = Duration::from_secs(5);
 
 /// Whether a BBMD passes broadcasts on.
@@ -31,7 +31,7 @@ pub(super) struct Foreign {
     bbmd: Option<SocketAddrV4>,
     next: Instant,
     pub(super) state: Registration,
-    /// Since when no answer came.
+    /// Time since which no answer came.
     asked: Option<Instant>,
 }
 
@@ -53,7 +53,7 @@ impl Foreign {
         self.bbmd == Some(host)
     }
 
-    /// The BBMD, while it passes broadcasts on.
+    /// The BBMD, if it passes broadcasts on.
     pub(super) fn passes_on(&self) -> Option<SocketAddrV4> {
         self.bbmd.filter(|_| self.state == Registration::Registered)
     }

@@ -33,7 +33,7 @@ pub(super) struct Key {
 pub(super) struct Told {
     /// The number, where the value is one.
     pub(super) number: Option<f64>,
-    /// Everything else, as it stands on the wire.
+    /// Everything except the value, as encoded on the wire.
     pub(super) rest: Vec<u8>,
 }
 
@@ -60,13 +60,13 @@ pub(super) struct Subscription {
     pub(super) increment: Option<f32>,
     until: Option<Instant>,
     told: Option<Told>,
-    /// Waits for its turn since that number.
+    /// Number since which the subscription waits for its turn.
     due: Option<u64>,
     lost: u8,
 }
 
 impl Subscription {
-    /// Seconds until it ends; 0 without end.
+    /// Time until the subscription ends, s; 0 for a subscription without end.
     pub(super) fn left(&self, now: Instant) -> u64 {
         self.until
             .map_or(0, |until| until.saturating_duration_since(now).as_secs().max(1))
@@ -84,7 +84,7 @@ struct Outstanding {
     until: Instant,
 }
 
-/// All subscriptions.
+/// All subscriptions of the clients.
 #[derive(Debug, Default)]
 pub(super) struct Cov {
     one_device: bool,
@@ -95,7 +95,7 @@ pub(super) struct Cov {
     invoke: u8,
 }
 
-/// The present values of a subscription, and the increment of its object.
+/// Looks up the present values of a subscription, and the increment of its object.
 pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Told, f64)>;
 
 impl Cov {
@@ -114,7 +114,7 @@ impl Cov {
         }
     }
 
-    /// Subscribes, or renews; false where there is no room.
+    /// Adds or renews a subscription; returns false if no room is left.
     pub(super) fn subscribe(
         &mut self,
         device: u32,
@@ -153,7 +153,7 @@ impl Cov {
         true
     }
 
-    /// Ends a subscription, whether or not there is one.
+    /// Ends a subscription, if it exists.
     pub(super) fn cancel(&mut self, device: u32, key: &Key) {
         self.retain(|of, subscription| of != device || subscription.key != *key);
     }
@@ -182,7 +182,7 @@ impl Cov {
         self.hosts.retain(|_, count| *count > 0);
     }
 
-    /// How many there are.
+    /// Number of subscriptions.
     pub(super) fn len(&self) -> usize {
         self.hosts.values().sum()
     }
@@ -276,7 +276,7 @@ impl Cov {
         };
         subscription.lost = if lost { subscription.lost + 1 } else { 0 };
         if lost {
-            // The client does not have it.
+            // The client has not received the notification.
             subscription.told = None;
         }
         if subscription.lost >= LOST && subscription.until.is_none() {

@@ -3,14 +3,14 @@
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
 
-/// An entry ends so long after its time.
+/// Time after which an entry ends, in addition to its own time.
 const GRACE: Duration = Duration::from_secs(30);
 
 /// A foreign device.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     host: SocketAddrV4,
-    /// Seconds for which it registered.
+    /// Time for which the device registered, s.
     time: u16,
     ends: Instant,
 }
@@ -31,7 +31,7 @@ impl ForeignDevices {
         }
     }
 
-    /// Registers, or renews; false where there is no room.
+    /// Registers or renews a device; returns false if no room is left.
     pub(super) fn register(&mut self, host: SocketAddrV4, time: u16, now: Instant) -> bool {
         self.forget(now);
         let ends = now + Duration::from_secs(time.into()) + GRACE;
@@ -47,7 +47,7 @@ impl ForeignDevices {
         has_room
     }
 
-    /// Forgets a device; whether it was there.
+    /// Removes a device; returns whether it was registered.
     pub(super) fn delete(&mut self, host: SocketAddrV4, now: Instant) -> bool {
         self.forget(now);
         let before = self.entries.len();
@@ -55,7 +55,7 @@ impl ForeignDevices {
         self.entries.len() < before
     }
 
-    /// Whether that device has registered.
+    /// Whether a device is registered.
     pub(super) fn has(&mut self, host: SocketAddrV4, now: Instant) -> bool {
         self.hosts(now).any(|known| known == host)
     }

@@ -39,7 +39,7 @@ use writing::Exchanges;
 pub struct Options {
     /// UDP address of the server.
     pub address: SocketAddrV4,
-    /// Bits of the mask of its network.
+    /// Number of bits in the network mask.
     pub prefix: u8,
     /// The number of the virtual network, 1..=65534; none where all objects belong to the device of the host.
     pub network: Option<u16>,
@@ -47,24 +47,24 @@ pub struct Options {
     pub vendor: (u16, Arc<str>),
     /// The version of the program.
     pub version: Arc<str>,
-    /// The BBMD at which it registers as a foreign device.
+    /// The BBMD at which the server registers as a foreign device.
     pub bbmd: Option<SocketAddrV4>,
-    /// Most foreign devices that it serves as a BBMD.
+    /// Most foreign devices that the server serves as a BBMD.
     pub foreign_devices: usize,
 }
 
 /// The application behind the server.
 pub trait Application {
-    /// Whether that host may say anything at all.
+    /// Whether the server accepts messages from this host.
     fn admits(&self, host: Ipv4Addr) -> bool;
 
-    /// Whether that host may write.
+    /// Whether this host may write.
     fn may_write(&self, host: Ipv4Addr) -> bool;
 
     /// The clock of the day, UTC.
     fn clock(&self) -> DateTime;
 
-    /// Whether that device answers.
+    /// Whether this device answers.
     fn answers(&self, device: u32) -> bool;
 
     /// The value of the object at that place.
@@ -82,11 +82,11 @@ pub trait Application {
     /// Orders to that device so far, from whomever: another number when somebody ordered something.
     fn orders(&self, device: u32) -> u64;
 
-    /// Whether that is the password; false also where there is none.
+    /// Whether `given` is the password; false if no password is configured.
     fn password(&self, given: &str) -> bool;
 }
 
-/// Numbers of what happened.
+/// Counters of events.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
     /// Datagrams that came from admitted hosts.
@@ -97,9 +97,9 @@ pub struct Counters {
     pub refused: u64,
     /// Requests that were carried out.
     pub done: u64,
-    /// Datagrams that were not sent: their address had its share.
+    /// Datagrams that were not sent because their address had used up its share.
     pub dropped: u64,
-    /// Notifications that were sent.
+    /// Notifications sent.
     pub notifications: u64,
     /// Subscriptions at the moment.
     pub subscriptions: u64,
@@ -191,7 +191,7 @@ impl Server {
             .cloned()
     }
 
-    /// Announces itself and its network.
+    /// Announces the server and its network.
     pub fn start(&mut self, app: &dyn Application, now: Instant) {
         self.announce_network(None, now);
         if let Some(own) = self.devices.first().cloned() {
@@ -230,7 +230,7 @@ impl Server {
         self.traffic.next()
     }
 
-    /// The next write to carry out; its answer goes to [`Server::written`].
+    /// The next write to carry out; its result is given to [`Server::written`].
     pub fn take_job(&mut self) -> Option<Job> {
         self.jobs.pop_front()
     }
@@ -276,19 +276,19 @@ impl Server {
     }
 }
 
-/// Where a message came from, and how.
+/// Where a message came from, and by which way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Source {
     address: Address,
     way: Way,
 }
 
-/// How a message came.
+/// The way of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
-    /// To this host alone.
+    /// The message was sent to this host alone.
     Unicast,
-    /// To all hosts.
+    /// The message was sent to all hosts.
     Broadcast,
 }
 

@@ -16,7 +16,7 @@ const UNKNOWN_MESSAGE: u8 = 3;
 const OTHER: u8 = 0;
 
 impl Server {
-    /// A datagram came.
+    /// Processes a datagram that arrived.
     pub fn receive(&mut self, from: SocketAddrV4, bytes: &[u8], app: &dyn Application, now: Instant) {
         // An own broadcast comes back.
         if from == self.options.address {
@@ -153,7 +153,7 @@ impl Server {
             (message::WHO_IS_ROUTER, asked) if *asked == network => self.announce_network(Some(source), now),
             // Another router answers, or what comes is not for us.
             (message::WHO_IS_ROUTER | message::I_AM_ROUTER | message::REJECT, _) => {}
-            // A question for the table; nothing is written into it.
+            // The message asks for the table and does not change it.
             (message::INITIALIZE_TABLE, [0]) if source.way == Way::Unicast => {
                 let table = [1, network[0], network[1], 1, 0];
                 self.between(source, message::INITIALIZE_TABLE_ACK, &table, now);
@@ -284,7 +284,7 @@ impl Server {
         self.distribute(self.options.address, npdu, now);
     }
 
-    /// Whether that is the virtual network.
+    /// Whether the number is that of the virtual network.
     fn is_own(&self, network: u16) -> bool {
         self.options.network == Some(network)
     }

@@ -20,7 +20,7 @@ const NEVER_TOLD: [PropertyId; 6] = [
     PropertyId::LOCAL_TIME,
     PropertyId::ACTIVE_COV_SUBSCRIPTIONS,
 ];
-/// Longest value of a notification, which comes in one message.
+/// Longest value of a notification, because a notification is a single message.
 const LONGEST: usize = 1024;
 
 /// The properties that a subscription reports.

@@ -10,7 +10,7 @@ use crate::object::{Context, Device, list, property};
 use crate::services::{self, PropertyRef, confirmed};
 use crate::types::{Abort, Address, Error, ObjectId, ObjectType, PropertyId, Reject, WILDCARD};
 
-/// Longest answer, in all its segments.
+/// Longest answer, all segments together.
 const LONGEST: usize = 64 * 1024;
 /// Longest time for which a device sends no notification by itself.
 const QUIET: Duration = Duration::from_secs(300);
@@ -74,7 +74,7 @@ impl Server {
             return self.write_request(from, device, (invoke, service), data, app, now);
         }
         self.exchanges.next_request(from, device.instance);
-        // As one that is switched off.
+        // The device does not answer, like one that is switched off.
         if !answers {
             return;
         }
@@ -102,7 +102,7 @@ impl Server {
         }
     }
 
-    /// Sends an answer, in segments where it does not fit into one message.
+    /// Sends an answer, in segments if it does not fit into one message.
     fn answer(
         &mut self,
         from: Address,
@@ -158,7 +158,7 @@ impl Server {
         self.send(from, device.instance, &apdu, now);
     }
 
-    /// Calls `with` for an object of a device as it is now.
+    /// Calls `with` for an object of a device in its present state.
     pub(super) fn with_object<T>(
         &self,
         device: &Device,
@@ -281,7 +281,7 @@ impl Server {
                 let time = given.filter(|time| !time.is_zero()).unwrap_or(QUIET).min(QUIET);
                 self.quiet.insert(device.instance, now + time);
             }
-            // Disabling was withdrawn from the standard: it would take stops away.
+            // Disabling was withdrawn from the standard, and would block stops.
             _ => return Err(Error::SERVICE_REQUEST_DENIED.into()),
         }
         Ok(None)
@@ -300,7 +300,7 @@ impl Server {
     }
 }
 
-/// One result of ReadPropertyMultiple.
+/// Writes one result of ReadPropertyMultiple.
 fn result(content: &mut Writer, one: PropertyRef, read: impl FnOnce(&mut Writer) -> Result<(), Error>) {
     content.context_property(2, one.property);
     if let Some(index) = one.index {

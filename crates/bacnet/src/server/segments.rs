@@ -13,7 +13,7 @@ const TRIES: u8 = 3;
 const MOST_ANSWERS: usize = 32;
 const MOST_OF_ONE: usize = 8;
 
-/// One answer under way.
+/// An answer that is being sent.
 #[derive(Debug)]
 struct Sending {
     to: Address,
@@ -25,7 +25,7 @@ struct Sending {
     size: usize,
     /// The first segment that is not acknowledged.
     first: usize,
-    /// Segments that were sent.
+    /// Number of segments sent so far.
     sent: usize,
     window: u8,
     tries: u8,
@@ -136,7 +136,7 @@ impl Segments {
         }
     }
 
-    /// The client ended it, or begins anew.
+    /// Ends an answer, because the client ended it or begins anew.
     pub(super) fn end(&mut self, from: Address, device: u32, invoke: u8) {
         self.sending
             .retain(|s| (s.to, s.device, s.invoke) != (from, device, invoke));

@@ -199,7 +199,7 @@ impl ServerWithClients {
         self.datagram(from, &bvlc::unicast(&npdu));
     }
 
-    /// A request with the usual header, and the APDUs that came of it.
+    /// Sends a request with the usual header; returns the APDUs that follow.
     fn ask(&mut self, from: u8, station: Option<u8>, invoke: u8, service: u8, content: &[u8]) -> Vec<Vec<u8>> {
         let mut apdu = vec![0x02, 0x05, invoke, service];
         apdu.extend(content);

@@ -17,14 +17,14 @@ const WAITING_IN_ALL: usize = 1024 * 1024;
 const BROADCASTS: u64 = 100;
 /// Addresses that are known at once.
 const ADDRESSES: usize = 1024;
-/// A second, in the steps in which it is reckoned.
+/// Step in which a second of traffic is counted.
 const STEP: Duration = Duration::from_millis(100);
 const STEPS: usize = 11;
 
-/// Where a datagram goes.
+/// Destination of a datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum To {
-    /// To that host.
+    /// To this host.
     Host(SocketAddrV4),
     /// To all hosts of the network.
     Broadcast,
@@ -152,7 +152,7 @@ impl Traffic {
         }
     }
 
-    /// Sends an answer, now or later, or drops it.
+    /// Sends an answer, at once or later, or drops it.
     pub(super) fn answer(&mut self, to: SocketAddrV4, bytes: Vec<u8>, now: Instant) {
         let (step, held) = (self.step(now), self.held);
         let len = bytes.len();
@@ -193,7 +193,7 @@ impl Traffic {
         }
     }
 
-    /// Lets go what may.
+    /// Sends the held answers that may be sent now.
     pub(super) fn poll(&mut self, now: Instant) {
         let step = self.step(now);
         while self.sent.sum(step) < BROADCASTS

@@ -26,13 +26,13 @@ const FOR_STOPS: usize = 256;
 /// A write to carry out.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
-    /// Names it in [`Server::written`].
+    /// Identifies the job in [`Server::written`].
     pub token: u64,
     /// The writer.
     pub from: Address,
-    /// To which device.
+    /// Instance of the device that is written.
     pub device: u32,
-    /// To which of its objects, by its place.
+    /// The object that is written, by its place in the device.
     pub place: usize,
     /// The object.
     pub object: ObjectId,
@@ -40,7 +40,7 @@ pub struct Job {
     pub value: Option<Datum>,
     /// The slot, of an object with priorities.
     pub priority: Option<u8>,
-    /// When its request came.
+    /// When the request of the write arrived.
     pub asked: Instant,
     /// When its turn came: with the request, or when the write before it in that was answered.
     pub since: Instant,
@@ -152,7 +152,7 @@ impl Server {
         let instance = device.instance;
         let answers = app.answers(instance);
         let stops = items.iter().flatten().any(|item| app.stops(instance, item));
-        // As one that is switched off, except that it can be stopped.
+        // The device does not answer, like one that is switched off, but it can be stopped.
         if !answers && !stops {
             return;
         }
@@ -427,7 +427,7 @@ fn shortest(number: f32) -> f64 {
     number.to_string().parse().unwrap_or_else(|_| f64::from(number))
 }
 
-/// The answer to a request that failed, and at which of its writes.
+/// The answer to a failed request, with the write that failed.
 fn failure(invoke: u8, service: u8, why: Failure, at: Option<(ObjectId, PropertyRef)>) -> Vec<u8> {
     let error = match why {
         Failure::Error(error) => error,

@@ -12,7 +12,7 @@ fn who_is(to: Option<(u16, Mac)>, from: Option<(u16, Mac)>, range: Option<(u64, 
     npdu::encode(to, from, false, Payload::Application(&apdu))
 }
 
-/// Instances of the devices that say that they are there, and how.
+/// Instances of the devices that announce themselves, with where and how.
 fn present(out: &[Out]) -> Vec<(u32, To, Option<u8>)> {
     out.iter()
         .filter(|(.., apdu)| apdu.starts_with(&[0x10, 0]))
@@ -245,7 +245,7 @@ fn messages_between_routers_that_are_not_known_are_rejected() {
     }
 }
 
-/// Datagrams as they leave, each with where it goes.
+/// The datagrams that the server sends, each with its destination.
 fn raw(rig: &mut ServerWithClients) -> Vec<(To, Vec<u8>)> {
     std::iter::from_fn(|| rig.server.transmit()).collect()
 }
@@ -276,7 +276,7 @@ fn foreign_devices_have_what_is_broadcast_on_both_sides() {
             .filter(|(to, bytes)| *to == To::Host(host(foreign)) && bytes.ends_with(&[0x91, 1, 0x21, 0]));
         assert_eq!(answers.count(), 1, "{out:?}");
     }
-    // From a foreign device: to this network and to the others.
+    // A message of a foreign device goes to this network and to the others.
     rig.later(Duration::from_secs(1));
     rig.datagram(7, &bvlc::distribute(&npdu));
     let out = raw(&mut rig);
