@@ -20,7 +20,7 @@ const SEEN: WatchFlags = WatchFlags::CREATE
 #[derive(Debug)]
 pub struct Arrival {
     inotify: OwnedFd,
-    /// Each watched directory, and the name that is to appear there.
+    /// Each watched directory, with the name that may appear there.
     watched: Vec<(i32, PathBuf)>,
 }
 
@@ -53,7 +53,7 @@ impl Arrival {
         self.inotify.as_fd()
     }
 
-    /// Whether what has appeared concerns the device; forgets it.
+    /// Whether anything that appeared concerns the device; clears what has appeared.
     pub fn take(&self) -> bool {
         let mut buffer = [MaybeUninit::uninit(); 4096];
         let mut reader = Reader::new(&self.inotify, &mut buffer);

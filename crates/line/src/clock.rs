@@ -19,7 +19,7 @@ const NICE: i32 = -10;
 /// Time since the machine was started, also that for which it was suspended: then the clock of [`Instant`] stands.
 pub fn since_boot() -> Duration {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
-    // Never negative.
+    // The time since boot is never negative.
     let (seconds, nanoseconds) = (u64::try_from(time.tv_sec), u32::try_from(time.tv_nsec));
     Duration::new(seconds.unwrap_or_default(), nanoseconds.unwrap_or_default())
 }
@@ -105,7 +105,7 @@ pub(super) struct WakeUps {
     deviation: Duration,
 }
 
-/// No processor spins for longer than that, ...
+/// Longest time for which a processor spins, ...
 const MOST_SPIN: Duration = Duration::from_micros(120);
 /// ... and a wake-up that is this late met a busy processor: spinning more would make it busier.
 const BUSY: Duration = Duration::from_micros(250);

@@ -53,7 +53,7 @@ impl Datagrams {
         }
     }
 
-    /// Reads a datagram that answers the last request; 0 if there is none.
+    /// Reads a datagram that answers the last request; returns 0 if none has arrived.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         match self.socket.borrow().recv(buffer) {
             Ok(count) => Ok(count),

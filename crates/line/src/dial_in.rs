@@ -19,9 +19,9 @@ use super::{Lost, Names, OpenError, UNACKNOWLEDGED, clock, poll_until, read, wri
 const PATIENCE: Duration = Duration::from_secs(10);
 /// Most connections that may owe their text at one time; another one is hung up on.
 const MOST_PENDING: usize = 32;
-/// Longest text.
+/// Longest text that identifies a device.
 pub const LONGEST_ID: usize = 64;
-/// A bus waits that long for its device before it counts as down.
+/// Time that a bus waits for its device before the bus counts as down.
 const WAIT: Duration = Duration::from_secs(2);
 /// Waiting threads look again after that time.
 const STEP: Duration = Duration::from_millis(100);
@@ -45,7 +45,7 @@ struct Shared {
 
 struct State {
     lines: Vec<Entry>,
-    /// When a bus let go of the address last, while none has it.
+    /// When a bus last released the address; `None` while a bus has it.
     free_since: Option<Instant>,
 }
 
@@ -53,11 +53,11 @@ struct State {
 struct Entry {
     id: Vec<u8>,
     allow: Vec<IpNet>,
-    /// The bus of this line is there.
+    /// Whether the bus of this line exists.
     wanted: bool,
-    /// A connection that its bus has not taken yet.
+    /// A connection that the line's bus has not taken yet.
     waiting: Option<TcpStream>,
-    /// The connection that its bus serves.
+    /// The connection that the line's bus serves.
     served: Option<TcpStream>,
 }
 
@@ -208,7 +208,7 @@ impl Dialled {
         write_all(self.stream.as_fd(), frame)
     }
 
-    /// Reads the available bytes; 0 if there are none.
+    /// Reads the available bytes; returns 0 if there are none.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         read(self.stream.as_fd(), buffer)
     }
@@ -264,7 +264,7 @@ fn listen(address: SocketAddr) -> io::Result<Arc<Shared>> {
     Ok(shared)
 }
 
-/// A connection that owes its text.
+/// A connection whose text has not arrived yet.
 struct Pending {
     stream: TcpStream,
     from: SocketAddr,
@@ -295,7 +295,7 @@ fn accept_all(listener: &TcpListener, shared: &Shared) {
             }
         }
         if is_unwanted(shared, now) {
-            // No bus may find an address that is about to be let go.
+            // A bus must not find an address that is about to be released.
             let mut places = PLACES.lock().unwrap_or_else(PoisonError::into_inner);
             if is_unwanted(shared, now) {
                 places.retain(|place| place.upgrade().is_some_and(|other| other.address != shared.address));

@@ -68,7 +68,7 @@ impl FirstBytes {
         self.came.is_empty()
     }
 
-    /// Bytes were received; `None` while their kind is open.
+    /// Notes received bytes; returns `None` while the kind of server is not decided.
     pub(super) fn came(&mut self, bytes: &[u8]) -> Option<Server> {
         let room = ENOUGH - self.came.len().min(ENOUGH);
         self.came.extend(bytes.iter().take(room));

@@ -74,7 +74,7 @@ pub enum OpenError {
         /// The system's error.
         reason: io::Error,
     },
-    /// The device server is there, but cannot set up its port.
+    /// The device server answers, but cannot set up its port.
     #[error("cannot use {port}: {reason}")]
     Remote {
         /// Address.
@@ -82,7 +82,7 @@ pub enum OpenError {
         /// The reason and the remedy.
         reason: String,
     },
-    /// Devices cannot dial in there.
+    /// Devices cannot connect to this address.
     #[error("cannot listen for {port}: {reason}; check the address, and which program has it")]
     Listen {
         /// Address.
@@ -117,7 +117,7 @@ impl OpenError {
     }
 }
 
-/// The port is lost: the bus closes it and opens it again.
+/// The port is lost; the bus then closes it and opens it again.
 #[derive(Debug, thiserror::Error)]
 #[error("the port is lost: {why}")]
 pub struct Lost {
@@ -154,7 +154,7 @@ pub enum Woken {
     Readable,
     /// A command arrived.
     Command,
-    /// The time is there.
+    /// The time to wait for has come.
     Time,
 }
 
@@ -293,7 +293,7 @@ impl Line {
         }
     }
 
-    /// Reads the available bytes, without waiting; 0 if there are none.
+    /// Reads the available bytes without waiting; returns 0 if there are none.
     ///
     /// # Errors
     /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be no raw port.
@@ -388,7 +388,7 @@ fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
     Ok(())
 }
 
-/// Reads the available bytes; 0 if there are none.
+/// Reads the available bytes; returns 0 if there are none.
 fn read(port: BorrowedFd<'_>, buffer: &mut [u8]) -> Result<usize, Lost> {
     match rustix::io::read(port, buffer) {
         Ok(0) => Err(Lost {

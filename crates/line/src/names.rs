@@ -36,7 +36,7 @@ pub struct Names {
     pub(super) other: OtherServer,
     /// Networks from which devices may dial in.
     pub(super) allow: Vec<IpNet>,
-    /// Where devices dial in.
+    /// The address to which devices connect.
     pub(super) dial_in: Option<Place>,
 }
 
@@ -55,7 +55,7 @@ impl Default for Names {
 }
 
 impl Names {
-    /// For a line whose device may dial in from these networks.
+    /// Names for a line whose device may connect from these networks.
     pub fn allowing(allow: &[IpNet]) -> Names {
         Names {
             allow: allow.to_vec(),

@@ -29,7 +29,7 @@ pub enum Level {
 /// Whether the end of a short wait is met by watching the clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Spin {
-    /// On a machine with more than one processor.
+    /// Spin on a machine with more than one processor.
     #[default]
     Auto,
     /// Always.
@@ -60,11 +60,11 @@ pub struct LineOptions {
     pub rts_before_send: Duration,
     /// Time between the last bit and switching back, likewise.
     pub rts_after_send: Duration,
-    /// Whether the port receives what it sends.
+    /// Whether the port receives its own transmission.
     pub rx_during_tx: bool,
     /// Whether the driver switches the terminating resistor on.
     pub termination: bool,
-    /// Level of RTS; not together with RS-485 by the kernel, which switches it.
+    /// Level of RTS; not possible if the kernel switches RTS for RS-485.
     pub rts: Level,
     pub dtr: Level,
     /// How precisely waits end.
@@ -73,7 +73,7 @@ pub struct LineOptions {
     pub receives_only: bool,
 }
 
-/// Longest delay that Linux takes (`RS485_MAX_RTS_DELAY` of `serial_core.c`).
+/// Longest delay that Linux accepts (`RS485_MAX_RTS_DELAY` of `serial_core.c`).
 pub const MOST_RTS_DELAY: Duration = Duration::from_millis(100);
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 /// A connection is silent when nothing has come for so long.
 const SILENT: Duration = Duration::from_secs(5);
-/// Between two questions.
+/// Time between two questions to a server.
 const AGAIN: Duration = Duration::from_secs(3600);
 /// Longest wait for the connection, and for the answer.
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -86,7 +86,7 @@ impl OtherServer {
         let asking = move || {
             if answers(server, unit) {
                 known.recognised(unit);
-                // Wakes all waiting callers, and reports to those that open it again.
+                // This wakes all waiting callers; the error then reaches those that open the connection again.
                 let ended = silent.map(|silent| silent.shutdown(Shutdown::Both));
                 tracing::debug!(target: "drivegate::line", ?ended, "a Modbus TCP server answers instead of a line");
             }

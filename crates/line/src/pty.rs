@@ -9,7 +9,7 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::{fchown, symlink};
 use std::path::{Path, PathBuf};
 
-/// Where the system has its pseudo-terminals.
+/// Directory in which the system has its pseudo-terminals.
 const TERMINALS: &str = "/dev/pts";
 
 /// A pseudo-terminal; dropping it takes path and link away. As a file descriptor it is its own end.
@@ -24,7 +24,7 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// A new pseudo-terminal in raw mode; `link` becomes a symbolic link to it.
+    /// Opens a new pseudo-terminal in raw mode; `link` becomes a symbolic link to it.
     ///
     /// # Errors
     /// No pseudo-terminal is available, or the link cannot be made. Anything but a symbolic link to a pseudo-terminal at its
@@ -52,7 +52,7 @@ impl Pty {
         })
     }
 
-    /// Lets the group of this process open it, too: mode 0660.
+    /// Lets the group of this process open the terminal as well: mode 0660.
     ///
     /// # Errors
     /// The system refuses it.
@@ -70,7 +70,7 @@ impl Pty {
         Ok(rustix::io::read(&self.master, buffer)?)
     }
 
-    /// Writes as much as there is room for, without waiting.
+    /// Writes as many bytes as there is room for, without waiting.
     ///
     /// # Errors
     /// There is no room, or the system reports another error.
@@ -78,7 +78,7 @@ impl Pty {
         Ok(rustix::io::write(&self.master, bytes)?)
     }
 
-    /// The path that the other program opens: the link if there is one.
+    /// The path that the other program opens: the link, if one exists.
     pub fn path(&self) -> &Path {
         self.link.as_deref().unwrap_or(&self.path)
     }

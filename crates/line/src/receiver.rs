@@ -33,7 +33,7 @@ impl Receiver {
         Receiver::open_by(&mut Names::default(), port, format, &|| true)
     }
 
-    /// As [`Line::open_by`].
+    /// Opens a receiver like [`Line::open_by`].
     ///
     /// # Errors
     /// As [`Line::open`].
@@ -47,7 +47,7 @@ impl Receiver {
         Ok((Receiver(line), warnings))
     }
 
-    /// Reads the available bytes, without waiting; 0 if there are none.
+    /// Reads the available bytes without waiting; returns 0 if there are none.
     ///
     /// # Errors When the port is lost.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {

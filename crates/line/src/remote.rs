@@ -13,7 +13,7 @@ use super::other_server::OtherServer;
 use super::rfc2217::{Session, Settings, State, escape};
 use super::{Lost, OpenError, poll_port, read, write_all};
 
-/// Time for the server to agree and to set up its port.
+/// Time limit for the server to agree and to set up its port.
 const NEGOTIATION: Duration = Duration::from_secs(3);
 /// Interval at which `go_on` of waiting callers is called.
 const STEP: Duration = Duration::from_millis(100);
@@ -61,7 +61,7 @@ impl Raw {
         write_all(self.stream.as_fd(), frame)
     }
 
-    /// Reads the data that is there; 0 is nothing.
+    /// Reads the available data; returns 0 if there is none.
     ///
     /// # Errors
     /// When the port is gone, or no raw one: frames would never arrive, stops among them.
@@ -118,7 +118,7 @@ pub(super) struct Remote {
 }
 
 impl Remote {
-    /// Has the server set up its port; the texts are warnings.
+    /// Makes the server set up its port; the returned texts are warnings.
     ///
     /// # Errors
     /// When the server cannot be set up, does not answer within three seconds, or `go_on` returned false.
@@ -186,7 +186,7 @@ impl Remote {
             return Err(Lost::new(*why));
         }
         write_all(self.stream.as_fd(), &replies)?;
-        // The data is never longer than what it was decoded from.
+        // Decoded data is never longer than the bytes that it was decoded from.
         for (place, byte) in buffer.iter_mut().zip(&data) {
             *place = *byte;
         }

@@ -65,7 +65,7 @@ struct SerialStruct {
     iomap_base: usize,
 }
 
-/// Sets how the driver switches the direction; `config` becomes what it settled on.
+/// Sets how the driver switches the direction; `config` becomes the driver's actual settings.
 ///
 /// # Errors
 /// ENOTTY where the driver cannot.
@@ -109,7 +109,7 @@ pub(super) fn low_latency(port: impl AsFd) -> io::Result<()> {
     }
 }
 
-/// Takes the descriptor out of its owner.
+/// Takes over the descriptor of a port.
 pub(super) fn own(port: impl IntoRawFd) -> OwnedFd {
     // SAFETY: `into_raw_fd` gives up ownership of an open descriptor, which is taken over here and nowhere else.
     unsafe { OwnedFd::from_raw_fd(port.into_raw_fd()) }

@@ -17,7 +17,7 @@ pub(super) const SET_CONTROL: u8 = 5;
 pub(super) const SET_LINE_STATE_MASK: u8 = 10;
 pub(super) const SET_MODEM_STATE_MASK: u8 = 11;
 pub(super) const PURGE: u8 = 12;
-/// The server's reply to a command has its number plus this.
+/// The server's reply to a command has the number of the command plus this value.
 pub(super) const ANSWER: u8 = 100;
 
 const NO_FLOW_CONTROL: u8 = 1;
@@ -36,11 +36,11 @@ pub(crate) struct Settings {
 /// How far the negotiation is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum State {
-    /// The server has not yet reported whether it has the option.
+    /// The server has not yet answered whether it supports the option.
     Asked,
     /// The server has the option; replies to settings are missing.
     Setting,
-    /// All is set; from now on what comes from the line is data.
+    /// All settings are made; from now on, bytes from the server are data of the line.
     Ready,
     /// The port cannot be used: the reason and the remedy.
     Refused(&'static str),
@@ -52,7 +52,7 @@ pub(crate) struct Session {
     settings: Settings,
     decoder: Decoder,
     state: State,
-    /// Settings without an answer: the command, and the name of what it sets.
+    /// Settings without an answer so far: the command, and the name of the setting.
     missing: Vec<(u8, &'static str)>,
     /// Settings that the server confirmed: baud rate, data bits, parity, stop bits, as in the answers.
     took: [u32; 4],
@@ -209,7 +209,7 @@ pub(super) fn parity_code(parity: Parity) -> u8 {
     }
 }
 
-/// Appends a command, or the reply to one, with its value.
+/// Appends a command with its value, or the reply to a command.
 pub(super) fn set(replies: &mut Vec<u8>, command: u8, value: &[u8]) {
     replies.extend([IAC, SB, COM_PORT, command]);
     replies.extend(escape(value));

@@ -185,7 +185,7 @@ mod tests {
     }
 
     proptest! {
-        /// A hostile program gets few bytes for its own.
+        /// Even a hostile program gets only few bytes in reply to its own.
         #[test]
         fn any_program_is_borne(bytes in prop::collection::vec(prop_oneof![Just(IAC), 240..=255u8, Just(44u8), 0..14u8, any::<u8>()], 0..400)) {
             let (mut server, _) = ServedPort::new(format());

@@ -1,6 +1,6 @@
 //! Telnet as far as RFC 2217 needs it: data and commands in one stream of bytes (RFC 854, 855).
 
-/// "Interpret as command"; duplicate it is the byte 255 itself.
+/// "Interpret as command"; sent twice, it stands for the byte 255.
 pub(super) const IAC: u8 = 255;
 pub(super) const SE: u8 = 240;
 pub(super) const SB: u8 = 250;
@@ -51,7 +51,7 @@ pub(super) enum Command {
 enum State {
     #[default]
     Data,
-    /// After IAC.
+    /// After the byte IAC.
     Command,
     Option(Verb),
     Sub,
@@ -59,7 +59,7 @@ enum State {
     SubCommand,
 }
 
-/// Takes the stream apart, in whatever pieces it comes.
+/// Separates data and commands of a stream that arrives in pieces of any size.
 #[derive(Debug, Default)]
 pub(super) struct Decoder {
     state: State,
@@ -115,7 +115,7 @@ impl Decoder {
     }
 }
 
-/// Data as it is sent: each 255 duplicate.
+/// Data in the form in which it is sent: each 255 twice.
 pub fn escape(data: &[u8]) -> Vec<u8> {
     let mut escaped = Vec::with_capacity(data.len() + 4);
     for &byte in data {
