@@ -49,7 +49,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let Some(frame) = end.and_then(|end| rest.get(..end)) else {
         return match unfinished(rest) {
             Ok(()) if bytes.len() < LONGEST => Decoded::Incomplete,
-            // Noise may be longer than a frame that has only started after it.
+            // Noise before the frame may make the bytes longer than the longest frame.
             Ok(()) if rest.first() == Some(&BEGIN) && rest.len() < LONGEST => Decoded::Incomplete,
             Ok(()) => Decoded::Corrupt("no end of a frame in the characters of the longest one"),
             Err(why) => Decoded::Corrupt(why),

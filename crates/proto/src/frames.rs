@@ -56,7 +56,7 @@ enum Look {
     Nothing,
 }
 
-/// The bytes that are not cut yet, with their times.
+/// Bytes that are not cut into frames yet, with their times.
 #[derive(Debug)]
 pub struct Frames {
     protocol: Protocol,
@@ -253,7 +253,7 @@ fn rtu_request(bytes: &[u8]) -> Look {
     if address > 247 || !rtu::is_known(function) {
         return Look::Nothing;
     }
-    // Bytes that must agree with a count before them.
+    // These bytes must agree with a count before them.
     let counted = match function {
         15 => (usize::from(word(bytes, 4)).div_ceil(8), 6),
         16 => (2 * usize::from(word(bytes, 4)), 6),

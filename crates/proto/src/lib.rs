@@ -46,7 +46,7 @@ impl Request {
 pub enum Decoded {
     /// Not yet a whole frame; read on until the deadline.
     Incomplete,
-    /// The reply to the request; `used` bytes belong to it.
+    /// The reply to the request; `used` bytes belong to its frame.
     Reply {
         /// Bytes of the buffer that the frame takes.
         used: usize,
@@ -184,7 +184,7 @@ impl Protocol {
         }
     }
 
-    /// Whether its frames are text that people can read.
+    /// Whether the protocol's frames are text that people can read.
     pub fn is_text(self) -> bool {
         match self {
             Protocol::ModbusRtu => false,

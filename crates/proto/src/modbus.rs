@@ -42,7 +42,7 @@ impl Table {
         }
     }
 
-    /// Whether its items are bits.
+    /// Whether the items of the table are bits.
     pub fn is_bits(self) -> bool {
         matches!(self, Table::Coil | Table::DiscreteInput)
     }
@@ -64,7 +64,7 @@ impl Table {
             .find(|t| t.name() == name)
     }
 
-    /// Most items that one request of the protocol may read.
+    /// Most items of the table that one request may read in the protocol.
     pub fn max_read(self) -> u16 {
         if self.is_bits() { 2000 } else { 125 }
     }

@@ -50,7 +50,7 @@ pub enum Session {
     Identify,
     /// Poll for changes.
     Poll {
-        /// Acknowledges the report before.
+        /// Whether the poll acknowledges the previous report.
         again: bool,
     },
     /// Gives an overridden object back to the drive's own control.
@@ -62,7 +62,7 @@ pub enum Session {
     },
 }
 
-/// The master's command that a request means; `None` where it means no object.
+/// The N2 command for a request; `None` if the request means no object.
 pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
     match pdu {
         RequestPdu::Read { table, start, count } => {
@@ -154,7 +154,7 @@ pub enum Form {
     Identity,
     /// Change records, or none.
     Changes,
-    /// Nothing.
+    /// No data: an acknowledgement.
     Acknowledgement,
     /// Whatever a request that is not decoded is answered with.
     Any,
@@ -224,7 +224,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// A line without its CR: read on, unless it cannot become a reply.
+/// A line without its CR: more bytes may follow, unless the line cannot become a reply.
 fn unended(frame: &[u8]) -> Decoded {
     if frame.len() > LONGEST {
         return Decoded::Corrupt("no CR in the longest reply's characters");
@@ -319,7 +319,7 @@ pub fn least_reply_chars(request: &RequestPdu) -> usize {
     })
 }
 
-/// Lead, digits with their checksum, CR.
+/// Length of a frame: lead, digits with their checksum, CR.
 fn framed(digits: usize) -> usize {
     if digits == 0 { 2 } else { 1 + digits + 2 + 1 }
 }

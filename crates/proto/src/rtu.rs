@@ -4,7 +4,7 @@ use super::checksum::crc16;
 use super::modbus::{MAX_PDU, Reply, RequestPdu};
 use super::{Decoded, Request};
 
-/// Characters that a frame adds to its PDU: address and two of CRC.
+/// Characters that a frame adds to its PDU: one of address and two of CRC.
 pub const OVERHEAD: usize = 3;
 /// Characters of the longest frame (MODBUS over Serial Line 1.02, 2.5.1).
 pub const LONGEST: usize = MAX_PDU + OVERHEAD;
@@ -111,7 +111,7 @@ fn device_identification_len(bytes: &[u8]) -> Option<usize> {
     let objects = usize::from(*bytes.get(7)?);
     let mut at = 8;
     for missing in (1..=objects).rev() {
-        // Each that is missing takes two bytes at least.
+        // Each missing object takes at least two bytes.
         let least = at + 2 * missing + 2;
         if least > LONGEST {
             return Some(least);
@@ -144,7 +144,7 @@ pub fn request_len(bytes: &[u8]) -> Option<usize> {
 /// The request that a slave received, or its function and the exception that answers it.
 pub type ReceivedPdu = Result<RequestPdu, (u8, super::Exception)>;
 
-/// The request in a whole frame, as a slave reads it.
+/// Decodes the request in a whole frame, as a slave does.
 ///
 /// # Errors
 /// `None` when the CRC is wrong (a slave stays silent); the exception with the function when the
@@ -197,7 +197,7 @@ mod tests {
         out
     }
 
-    /// Worked requests of reference/drives.md, section 7 (misprints corrected there) and 7.4.
+    /// Checks the example requests of reference/drives.md, section 7 (without its misprints) and 7.4.
     #[test]
     fn requests_of_the_reference() {
         let coil = |address, on| Request {

@@ -7,15 +7,15 @@ use std::time::Duration;
 /// Parity bit of a character.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Parity {
-    /// No parity bit.
+    /// The characters have no parity bit.
     None,
-    /// Even parity.
+    /// The characters have even parity.
     Even,
     /// Odd parity.
     Odd,
 }
 
-/// Baud rate and character format of a line, as `8N1` writes them.
+/// Baud rate and character format of a line; `8N1` is such a format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct LineFormat {
     /// Bits a second, 300 and more.

@@ -313,7 +313,7 @@ fn requests() -> impl Strategy<Value = RequestPdu> {
     ]
 }
 
-/// A regular reply to it, its values from `seed`.
+/// A regular reply to the request, with values from `seed`.
 fn regular(pdu: &RequestPdu, seed: u16) -> Reply {
     let words = |count: u16| Reply::Registers((0..count).map(|i| seed.wrapping_mul(i | 1)).collect());
     match pdu {
@@ -407,7 +407,7 @@ proptest! {
             frame.remove(at);
         }
         let decoded = decode_reply(&request, &frame);
-        // A second colon begins the same frame anew.
+        // A doubled colon starts the same frame again.
         let sound = matches!(decoded, Decoded::Reply { .. });
         prop_assert_eq!(sound, doubled && at == 0, "{:?}", decoded);
     }

@@ -23,7 +23,7 @@ pub enum Kind {
 pub struct Part {
     /// Kind of this part.
     pub kind: Kind,
-    /// Where it stands among the bytes.
+    /// Place of the part among the bytes.
     pub range: Range<usize>,
 }
 
@@ -45,7 +45,7 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
             }
         };
         echo_seen |= kind == Kind::Echo;
-        // Never empty, so that the loop ends.
+        // A part is never empty, so the loop ends.
         let end = (at + used.max(1)).min(bytes.len());
         parts.push(Part { kind, range: at..end });
         at = end;

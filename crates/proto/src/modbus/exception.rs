@@ -15,7 +15,7 @@ impl Exception {
     pub const VALUE: Exception = Exception(0x03);
     /// 04: the device failed.
     pub const DEVICE_FAILURE: Exception = Exception(0x04);
-    /// 05: the device has taken the request and still works on it.
+    /// 05: the device has accepted the request and still works on it.
     pub const ACKNOWLEDGE: Exception = Exception(0x05);
     /// 06: the device is busy.
     pub const BUSY: Exception = Exception(0x06);

@@ -31,7 +31,7 @@ impl Reply {
         self.clone().into_words()
     }
 
-    /// As [`Reply::words`].
+    /// The words of the reply, like [`Reply::words`].
     pub fn into_words(self) -> Option<Vec<u16>> {
         match self {
             Reply::Registers(words) => Some(words),
@@ -76,7 +76,7 @@ impl Reply {
         }
     }
 
-    /// The reply in `pdu`, if it fits `request`.
+    /// Decodes the reply in `pdu`, if it fits `request`.
     ///
     /// # Errors
     /// [`Misfit`] when function, byte count or echo do not fit: the frame answers something else.

@@ -8,7 +8,7 @@ use super::{Exception, Table, be, counted, pack, put, unpack, words};
 pub enum RequestPdu {
     /// Functions 1 to 4.
     Read {
-        /// Which table.
+        /// The table that is read.
         table: Table,
         /// First PDU address.
         start: u16,
@@ -52,7 +52,7 @@ pub enum RequestPdu {
         /// Bits to set where not kept.
         or_mask: u16,
     },
-    /// Function 23: writes, then reads.
+    /// Function 23: first writes, then reads.
     ReadWrite {
         /// First PDU address to read.
         read_start: u16,
@@ -229,7 +229,7 @@ impl RequestPdu {
         }
     }
 
-    /// The request in `pdu`, as a slave reads it.
+    /// Decodes the request in `pdu`, as a slave does.
     ///
     /// # Errors
     /// The exception that the slave answers: 01 for a function that is not known, 03 for a wrong
@@ -295,7 +295,7 @@ fn read(table: Table, body: &[u8]) -> Result<RequestPdu, Exception> {
     Ok(RequestPdu::Read { table, start, count })
 }
 
-/// The words at the beginning of `body`, if it is long enough.
+/// The words at the beginning of `body`; an error if `body` is too short.
 fn head<const N: usize>(body: &[u8]) -> Result<[u16; N], Exception> {
     let mut head = [0; N];
     for (i, word) in head.iter_mut().enumerate() {
@@ -304,7 +304,7 @@ fn head<const N: usize>(body: &[u8]) -> Result<[u16; N], Exception> {
     Ok(head)
 }
 
-/// The words of `body`, if it is just as long.
+/// The words of `body`; an error if `body` has another length.
 fn exact<const N: usize>(body: &[u8]) -> Result<[u16; N], Exception> {
     if body.len() == 2 * N {
         head(body)

@@ -14,7 +14,7 @@ pub const CHECKSUM: u8 = 0x02;
 pub const OVERRUN: u8 = 0x03;
 /// A field has the wrong size for the command.
 pub const SIZE: u8 = 0x05;
-/// A field is out of its range.
+/// A field of the command is out of its range.
 pub const DATA: u8 = 0x10;
 /// The command is not allowed for that type of data.
 pub const TYPE: u8 = 0x11;
@@ -33,7 +33,7 @@ pub enum Command {
     ReadMemory,
     /// 0/4 without, 0/5 with acknowledge of the report before.
     Poll {
-        /// Acknowledges the report before.
+        /// Whether the poll acknowledges the previous report.
         again: bool,
     },
     /// 0/8.
@@ -42,30 +42,30 @@ pub enum Command {
     Status,
     /// 1.
     Read {
-        /// Whose attribute.
+        /// The object whose attribute is read.
         object: Object,
-        /// Which one.
+        /// The attribute that is read.
         attribute: u8,
     },
     /// 2.
     Write {
-        /// Whose attribute.
+        /// The object whose attribute is written.
         object: Object,
-        /// Which one; internal objects have their value only.
+        /// The attribute that is written; internal objects only have their value.
         attribute: u8,
-        /// As many bytes as came.
+        /// The bytes of the value, as many as were received.
         data: Vec<u8>,
     },
     /// 7/2.
     Override {
-        /// Which object.
+        /// The object that is overridden.
         object: Object,
         /// The value: a float, an integer or a byte.
         data: Vec<u8>,
     },
     /// 7/3.
     Release {
-        /// Which object.
+        /// The object that is released.
         object: Object,
     },
     /// 7/7, 7/8, 8/x, 9/x: commissioning, upload, download; not used here.
@@ -260,7 +260,7 @@ impl Answer {
         }
     }
 
-    /// The answer in a line, without its CR.
+    /// Decodes the answer in a line without its CR.
     ///
     /// # Errors
     /// Why it is none.
@@ -282,7 +282,7 @@ impl Answer {
     }
 }
 
-/// Digits whose checksum stands behind them.
+/// The digits before the checksum, which must be correct.
 fn open(text: &[u8]) -> Result<&[u8], &'static str> {
     let short = "the reply is too short for a checksum";
     let length = text.len().checked_sub(2).filter(|length| *length > 0).ok_or(short)?;

@@ -116,7 +116,7 @@ impl Object {
         }
     }
 
-    /// Registers or bits that it takes.
+    /// Number of registers or bits that the object takes.
     pub fn items(self) -> u16 {
         match self.region {
             Region::Ai | Region::Ao | Region::Adf => 2,
