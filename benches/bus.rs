@@ -82,7 +82,7 @@ struct Run {
     /// Requests that began before 3.5 characters of silence, or during a reply.
     too_early: u64,
     unanswered: u64,
-    /// How late the simulator itself handed its replies over, median.
+    /// Median lateness of the simulator itself when it hands over its replies.
     late: Duration,
 }
 
@@ -203,7 +203,7 @@ fn run(
     Ok(result(&line, before))
 }
 
-/// Begins to record the line for `time`; the counters before it.
+/// Begins to record the line for `time`; returns the counters before that.
 fn record(line: &SimulatedBus, time: Duration, format: LineFormat) -> Statistics {
     // A frame cannot be shorter than its characters: room for all that can come.
     let frames = 2.0 * time.as_secs_f64() / format.chars(8).as_secs_f64();

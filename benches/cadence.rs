@@ -64,7 +64,7 @@ fn record(baud: u32, drives: u8, time: Duration) -> Result<(Vec<Recorded>, u64),
     Ok((frames, early(after) - early(before)))
 }
 
-/// How the rounds lie on their grid.
+/// Prints how exactly the rounds keep to their grid.
 fn grid(frames: &[Recorded], time: Duration) {
     let rounds: Vec<f64> = frames
         .iter()

@@ -251,7 +251,7 @@ impl Drop for Process {
 struct Site {
     daemon: Process,
     http: SocketAddr,
-    /// Standard error of the daemon, if it is read.
+    /// Standard error of the daemon, if the bench reads it.
     log: Option<ChildStderr>,
     _simulator: Process,
     _directory: tempfile::TempDir,
@@ -337,7 +337,7 @@ impl Site {
     }
 }
 
-/// How often threads of the process went to sleep so far.
+/// Number of times that threads of the process went to sleep so far.
 fn switches(process: u32) -> Result<f64, Box<dyn Error>> {
     let mut all = 0.0;
     for thread in fs::read_dir(format!("/proc/{process}/task"))? {

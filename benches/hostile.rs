@@ -36,7 +36,7 @@ fn main() -> ExitCode {
     common::exit(measure())
 }
 
-/// Where the gateway serves.
+/// Addresses of the gateway's servers.
 #[derive(Clone, Copy)]
 struct North {
     modbus: SocketAddr,
@@ -148,7 +148,7 @@ async fn connect(from: Ipv4Addr, to: SocketAddr) -> io::Result<TcpStream> {
     Ok(stream)
 }
 
-/// Writes the speed reference of drive 1 over a connection of its own.
+/// Writes the speed reference of drive 1 over a new connection.
 async fn command(modbus: SocketAddr, value: u16) -> io::Result<()> {
     let mut stream = connect(OPERATOR, modbus).await?;
     let [high, low] = value.to_be_bytes();
@@ -193,7 +193,7 @@ async fn read_model(stream: &mut TcpStream) -> io::Result<()> {
     stream.read_exact(&mut answer).await.map(|_| ())
 }
 
-/// How many of the operator's commands with these values the audit has.
+/// Number of the operator's commands with these values in the audit.
 async fn audited(http: SocketAddr, first: u16, last: u16) -> Result<usize, Box<dyn Error>> {
     let mut stream = connect(OPERATOR, http).await?;
     let request = format!("GET /api/v1/audit HTTP/1.1\r\nHost: {http}\r\nConnection: close\r\n\r\n");
@@ -277,7 +277,7 @@ impl Attack {
             Attack::ReadsNothing => {
                 let mut stream = connect(ATTACKER, north.modbus).await?;
                 let many = [0, 1, 0, 0, 0, 6, 1, 3, 0x80, 0, 0, 19].repeat(100);
-                // Until its buffers and the gateway's are full.
+                // The attacker sends until its own buffers and the gateway's are full.
                 while timeout(PATIENCE, stream.write_all(&many))
                     .await
                     .is_ok_and(|sent| sent.is_ok())

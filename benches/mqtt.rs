@@ -62,7 +62,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The gateway with its plant.
+/// The gateway under test with its plant.
 struct Gateway {
     plant: SharedPlant,
     stats: Arc<NorthState>,

@@ -112,7 +112,7 @@ fn run(buses: usize, baud: u32, time: Duration) -> Result<Run, Box<dyn Error>> {
     let daemon = Process::start(&["run"], &config)?;
     wait("the daemon", || ready(http))?;
     let readers = Readers::start(None, http, 0, SCRAPE);
-    // The class `once` is read first, and the clients find their pace.
+    // During this time the class `once` is read, and the clients reach their usual pace.
     std::thread::sleep(Duration::from_secs(4));
     let before = (
         exchanges(http, buses)?,

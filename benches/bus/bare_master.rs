@@ -22,7 +22,7 @@ pub(crate) struct BareOptions {
     pub(crate) silence: Duration,
     /// Time for a reply after the request's last character.
     pub(crate) timeout: Duration,
-    /// Part of the silence in which it watches the clock instead of sleeping.
+    /// Part of the silence in which the master watches the clock instead of sleeping.
     pub(crate) spin: Duration,
 }
 

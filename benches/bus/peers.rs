@@ -48,7 +48,7 @@ pub(crate) struct Libmodbus {
 }
 
 impl Libmodbus {
-    /// Compiles it.
+    /// Compiles the program with libmodbus.
     pub(crate) fn build() -> Result<Libmodbus, String> {
         let directory = tempfile::tempdir().map_err(|error| error.to_string())?;
         let libmodbus = Libmodbus { directory };
@@ -60,7 +60,7 @@ impl Libmodbus {
         self.directory.path().join("master")
     }
 
-    /// Runs it for `time`, with a `pause` after each reply.
+    /// Runs the program for `time`, with a `pause` after each reply.
     pub(crate) fn run(&self, port: &str, baud: u32, pause: Duration, time: Duration) -> Result<(), Box<dyn Error>> {
         let numbers = [
             u64::from(baud),

@@ -23,7 +23,7 @@ pub fn line(baud: u32, drives: u8) -> Result<SimulatedBus, Box<dyn Error>> {
     Ok(SimulatedBus::start(SimulatedBusOptions::new("bench", rules, drives))?)
 }
 
-/// A bus of the configuration; its drives are named by it: `line-1`.
+/// A bus of the configuration; its drives have its name and a number: `line-1`.
 pub struct Bus<'a> {
     pub name: &'a str,
     pub port: &'a str,
@@ -51,7 +51,7 @@ impl Bus<'_> {
 /// Both north sides that are read, on free ports.
 pub const NORTH: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\n[http]\nlisten = \"127.0.0.1:0\"\n";
 
-/// The settings of `[gateway]` with its name and what follows.
+/// Settings with a `[gateway]` section that has a name, and with the given rest.
 pub fn settings(rest: &str) -> Result<Settings, Box<dyn Error>> {
     let source = format!("[gateway]\nname = \"bench\"\n{rest}");
     let loaded = Settings::parse("bench.toml", &source, std::iter::empty());
@@ -88,7 +88,7 @@ impl Gateway {
         Ok(self.plant.buses.first().ok_or("no bus")?.image.clone())
     }
 
-    /// Reads its north sides ten times a second.
+    /// Reads the north sides of the gateway ten times a second.
     pub fn read(&self) -> Result<Readers, Box<dyn Error>> {
         let modbus = self.daemon.modbus_tcp_addresses().first().copied();
         let http = self.daemon.http_address().ok_or("no HTTP")?;
@@ -96,7 +96,7 @@ impl Gateway {
         Ok(Readers::start(modbus, http, units, Duration::from_millis(100)))
     }
 
-    /// Stops it.
+    /// Stops the gateway.
     pub fn stop(self) {
         self.runtime.block_on(self.daemon.stop());
     }

@@ -1,6 +1,6 @@
 //! Parts that the benches share: the gateway under test, clients of its north sides, medians, and the evaluation of a
 //! transcript.
-// Each bench uses its own part.
+// Each bench uses only some of these parts.
 #![allow(dead_code, unreachable_pub)]
 
 pub mod gateway;
@@ -63,7 +63,7 @@ pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
     Ok((ticks(11)? + ticks(12)?) / rustix::param::clock_ticks_per_second() as f64)
 }
 
-/// Waits up to two minutes until `there` holds.
+/// Waits at most two minutes until `there` holds.
 ///
 /// # Errors
 /// The condition is not met in time.
@@ -167,7 +167,7 @@ impl Readers {
         Readers { end, thread }
     }
 
-    /// Ends them.
+    /// Ends the readers.
     ///
     /// # Errors
     /// The servers never answered.
@@ -191,7 +191,7 @@ fn read_north(modbus: Option<SocketAddr>, http: SocketAddr, units: u8) -> std::i
             client.read_exact(&mut head)?;
             let body = body.get_mut(..usize::from(head[5])).unwrap_or_default();
             client.read_exact(body)?;
-            // Function 3, not its exception.
+            // The answer must have function 3 and be no exception.
             if body.get(1) != Some(&3) {
                 return Err(std::io::ErrorKind::InvalidData.into());
             }

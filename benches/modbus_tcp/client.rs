@@ -19,7 +19,7 @@ const ANSWER: usize = 31;
 pub(crate) struct Load {
     /// Requests answered in a second.
     pub(crate) rate: f64,
-    /// From sending a batch to its last answer, µs.
+    /// Time from sending a batch to its last answer, µs.
     pub(crate) p50: f64,
     pub(crate) p99: f64,
     /// Requests answered.

@@ -89,7 +89,7 @@ impl Process {
         processor_time(self.child.id()).unwrap_or_default()
     }
 
-    /// Sends it a line and returns its answer.
+    /// Sends the process a line and returns its answer.
     pub(crate) fn ask(&mut self, what: &str) -> Result<String, Box<dyn Error>> {
         writeln!(self.input, "{what}")?;
         let mut line = String::new();
@@ -107,7 +107,7 @@ impl Drop for Process {
 
 /// Runs the server `name` in this process until standard input ends.
 pub(crate) fn serve(name: &str) -> Result<(), Box<dyn Error>> {
-    // As the daemon has it.
+    // The runtime is of the same kind as in the daemon.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     match name {
         "drivegate" => runtime.block_on(drivegate()),
