@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::{Finding, Problem};
 
-/// Longest file that is read: no document is longer.
+/// Longest file that is read, bytes; no document is longer.
 const LONGEST: u64 = 16 << 20;
 
 /// Why bytes are not the text of a document.
@@ -64,7 +64,7 @@ fn text(bytes: Vec<u8>) -> Result<String, NotText> {
     let end = sound.min(zero);
     let (before, rest) = bytes.split_at_checked(end).unwrap_or((&bytes, &[]));
     let Some(&byte) = rest.first() else {
-        // All of it was checked above.
+        // All bytes were checked above.
         return Ok(String::from_utf8(bytes).unwrap_or_default());
     };
     let before = String::from_utf8_lossy(before);

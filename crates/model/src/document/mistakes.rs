@@ -2,7 +2,7 @@
 
 use super::Finding;
 
-/// The mistake in that line of `source`, if it is a common one.
+/// The mistake in this line of `source`, if it is a common one.
 pub(super) fn named(source: &str, line: Option<usize>) -> Option<Finding> {
     other_format(source).or_else(|| in_line(source.lines().nth(line?.checked_sub(1)?)?))
 }
@@ -61,7 +61,7 @@ fn decimal_comma(value: &str) -> Option<Finding> {
     })
 }
 
-/// A word without its quotes, or a number with its unit.
+/// The mistake of a word without quotes, or of a number with a unit.
 fn word(word: &str) -> Option<Finding> {
     if let Some(number) = word
         .strip_suffix('%')

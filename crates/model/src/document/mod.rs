@@ -24,12 +24,12 @@ pub use reader::{Reader, candidates, nearest};
 pub use tree::{Entry, Node, Raw};
 pub use value::{FromNode, ValueError, parse_duration, parse_size};
 
-/// A fault and its remedy.
+/// A fault, and what to do about it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     /// The fault.
     pub what: String,
-    /// The remedy; empty if there is nothing to add.
+    /// What to do about the fault; empty if there is nothing to add.
     pub remedy: String,
 }
 
@@ -44,7 +44,7 @@ impl Finding {
 }
 
 impl fmt::Display for Finding {
-    /// `what; what to do`.
+    /// The fault and the advice in the form `what; what to do`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.what)?;
         match self.remedy.as_str() {
@@ -56,16 +56,16 @@ impl fmt::Display for Finding {
 
 impl std::error::Error for Finding {}
 
-/// A finding and its place.
+/// A finding, with its place in a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Problem {
-    /// File, or the environment variable that overrides it.
+    /// Name of the file, or of the environment variable that overrides it.
     pub file: String,
-    /// Line of the file, from 1; absent where there is none.
+    /// Line of the file, counted from 1; absent if the problem has no line.
     pub line: Option<usize>,
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
-    /// The fault and its remedy.
+    /// The fault, and what to do about it.
     #[serde(rename = "message", serialize_with = "as_text")]
     pub finding: Finding,
 }
@@ -112,7 +112,7 @@ pub struct Place {
     pub key: String,
 }
 
-/// A parsed file and the problems found in it so far.
+/// A parsed file, with the problems found in it so far.
 #[derive(Debug, Clone)]
 pub struct Document {
     file: String,

@@ -27,7 +27,7 @@ impl<'d> Reader<'d> {
         }
     }
 
-    /// The document it belongs to.
+    /// The document that the reader belongs to.
     pub fn document(&self) -> &'d Document {
         self.document
     }
@@ -55,7 +55,7 @@ impl<'d> Reader<'d> {
         self.problem(key, what, remedy);
     }
 
-    /// The value, or `None` with its error as a problem at `key`.
+    /// The value of `outcome`; an error becomes a problem at `key`, and `None` is returned.
     pub fn accept<T, E: Into<Finding>>(&self, key: &str, outcome: Result<T, E>) -> Option<T> {
         outcome.map_err(|error| self.finding(key, error)).ok()
     }
@@ -70,7 +70,7 @@ impl<'d> Reader<'d> {
         self.entries.iter().map(|(key, _, _)| key.as_str()).collect()
     }
 
-    /// Whether the table has `key`; makes it known.
+    /// Whether the table has `key`; the key then counts as known.
     pub fn has(&self, key: &str) -> bool {
         self.know(key);
         self.find(key).is_some()
@@ -82,14 +82,14 @@ impl<'d> Reader<'d> {
         self.find(key)
     }
 
-    /// The value of `key`, if it is present and valid.
+    /// The value of `key` if the key is present and the value is valid.
     pub fn optional<T: FromNode>(&self, key: &str) -> Option<T> {
         self.know(key);
         let node = self.find(key)?;
         self.accept(key, T::from_node(node))
     }
 
-    /// The value of `key`; its absence is a problem.
+    /// The value of `key`; a missing key is a problem.
     pub fn required<T: FromNode>(&self, key: &str) -> Option<T> {
         if !self.has(key) {
             self.problem(key, format!("`{key}` is missing"), format!("write {}", T::WANTED));
@@ -97,7 +97,7 @@ impl<'d> Reader<'d> {
         self.optional(key)
     }
 
-    /// The value of `key`, or `default` if it is absent or wrong.
+    /// The value of `key`, or `default` if the value is absent or wrong.
     pub(crate) fn or<T: FromNode>(&self, key: &str, default: T) -> T {
         self.optional(key).unwrap_or(default)
     }
@@ -125,7 +125,7 @@ impl<'d> Reader<'d> {
         }
     }
 
-    /// The readers of the array of tables `key`; none when it is absent.
+    /// The readers of the array of tables `key`; empty if the array is absent.
     pub fn tables(&self, key: &str) -> Vec<Reader<'d>> {
         self.know(key);
         let Some(node) = self.find(key) else { return Vec::new() };
@@ -202,7 +202,7 @@ impl<'d> Reader<'d> {
         }
     }
 
-    /// The path as it is written in the header of a table.
+    /// The path in the form that the header of a table has.
     fn header(&self, key: &str) -> String {
         without_numbers(&self.path(key)).replace("[]", "")
     }
@@ -267,7 +267,7 @@ pub fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&
     having
 }
 
-/// Most words that a message proposes.
+/// Most words that a message suggests.
 const MOST_CANDIDATES: usize = 4;
 /// Shortest part of a word that identifies it.
 const LEAST_PART: usize = 3;

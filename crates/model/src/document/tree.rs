@@ -5,7 +5,7 @@ use toml::de::{DeTable, DeValue};
 /// A key of a table: the key, its line, the value.
 pub type Entry = (String, Option<usize>, Node);
 
-/// A value and its place.
+/// A value, with its place in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
     /// The value.
@@ -15,7 +15,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// The value of `key`, if this is a table that has it.
+    /// The value of `key`; `None` if this is no table or lacks the key.
     pub(crate) fn entry(&self, key: &str) -> Option<&Node> {
         entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
     }

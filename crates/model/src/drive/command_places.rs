@@ -16,12 +16,12 @@ impl Control {
         steps.into_iter().chain([self.stop]).chain(self.reverse).chain(reset)
     }
 
-    /// Whether a command is written there.
+    /// Whether a command is written to this place.
     fn is_place(&self, place: ControlItem) -> bool {
         place == self.at || self.settings().any(|setting| setting.place == Some(place))
     }
 
-    /// Whether a command sets one of these bits there.
+    /// Whether a command sets one of these bits at this place.
     fn takes(&self, place: ControlItem, bits: u16) -> bool {
         self.settings()
             .any(|setting| setting.place.unwrap_or(self.at) == place && setting.mask & bits != 0)

@@ -10,20 +10,20 @@ pub enum Step {
     Connect,
     /// Termination and bias.
     Terminate,
-    /// Protocol, address, baud rate, parity, timeout: where, and their factory settings.
+    /// Where protocol, address, baud rate, parity and timeout are set, and their factory settings.
     Settings,
     /// How to make the drive obey the bus.
     ControlPlace,
-    /// The drive's own timeout: where it is set, and what it counts.
+    /// Where the drive's own timeout is set, and what it counts.
     Timeout,
     /// Lamps and panel.
     Lamps,
-    /// How to test it.
+    /// How to test the drive.
     Test,
 }
 
 impl Step {
-    /// All steps, in their order.
+    /// All steps in their order.
     pub const ALL: [Step; 7] = [
         Step::Connect,
         Step::Terminate,
@@ -87,13 +87,13 @@ impl Commissioning {
         }
     }
 
-    /// Whether there is no line at all.
+    /// Whether no step has a line.
     pub fn is_empty(&self) -> bool {
         Step::ALL.iter().all(|step| self.lines(*step).is_empty())
     }
 }
 
-/// A line with the profiles that have it.
+/// A line, with the profiles that contain it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Shared<'p> {
     /// Names of the profiles, in the order given.

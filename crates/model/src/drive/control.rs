@@ -19,11 +19,11 @@ pub struct Control {
     pub always: Always,
     /// How the motor is started.
     pub run: Run,
-    /// How it is stopped, and how a stop is recognised.
+    /// How the motor is stopped, and how a stop is recognised.
     pub stop: Setting,
     /// Further words of the control register by which the drive stops by another of its own means: the gateway sends none of them.
     pub also_stop: Vec<Setting>,
-    /// How it is reversed, unless that is part of `run`.
+    /// How the motor is reversed, unless that is part of `run`.
     pub reverse: Option<Setting>,
     /// How a fault is reset.
     pub fault_reset: Option<Reset>,
@@ -82,20 +82,20 @@ impl Always {
         (word | self.set) & !self.clear
     }
 
-    /// Whether the word has all of them.
+    /// Whether the word has all these bits.
     pub fn holds(self, word: u16) -> bool {
         self.applied(word) == word
     }
 }
 
-/// Some bits of a word and their values.
+/// Some bits of a word, with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
     /// Where; none is the control word.
     pub place: Option<ControlItem>,
     /// The bits.
     pub mask: u16,
-    /// Their values.
+    /// Values of the bits.
     pub value: u16,
     /// Whether the setting acts once, when it is written; clearing it undoes nothing.
     pub once: bool,
@@ -107,7 +107,7 @@ impl Setting {
         word & !self.mask | self.value & self.mask
     }
 
-    /// Whether the word has them.
+    /// Whether the word has these bits with these values.
     pub fn holds(&self, word: u16) -> bool {
         word & self.mask == self.value
     }
@@ -127,7 +127,7 @@ impl Setting {
         }
     }
 
-    /// Whether a word can have these bits and those of another.
+    /// Whether a word can fulfil this setting and another one at the same time.
     pub fn agrees(&self, other: &Setting) -> bool {
         let both = self.mask & other.mask;
         self.place != other.place || self.value & both == other.value & both
@@ -143,7 +143,7 @@ pub enum Run {
     Pair {
         /// Forward.
         forward: Setting,
-        /// In reverse.
+        /// The setting that runs the motor in reverse.
         reverse: Setting,
     },
     /// A sequence of words; the last one runs.
@@ -153,9 +153,9 @@ pub enum Run {
 /// A word of a sequence.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// The word; the bits of `reverse` are set in it as commanded.
+    /// The word to write; the bits of `reverse` are set in it as commanded.
     pub write: Setting,
-    /// The condition that ends it.
+    /// The condition that ends the step.
     pub until: Until,
     /// After which the command fails.
     pub timeout: Duration,
@@ -166,7 +166,7 @@ pub struct Step {
 pub enum Until {
     /// The word was acknowledged.
     Written,
-    /// A time after that.
+    /// This time after the write.
     Time(Duration),
     /// A state.
     State(Mask),
@@ -177,9 +177,9 @@ pub enum Until {
 pub struct Mask {
     /// Index of the point.
     pub point: PointIndex,
-    /// Bits of it that count.
+    /// Bits of the register that count.
     pub mask: u64,
-    /// Their value.
+    /// Value of these bits.
     pub is: u64,
 }
 
@@ -195,12 +195,12 @@ impl Mask {
 pub struct Reset {
     /// The bits to set, and to invert afterwards.
     pub setting: Setting,
-    /// For how long.
+    /// Time for which the bits are held.
     pub hold: Duration,
 }
 
 impl Control {
-    /// Every setting that starts the motor: the last of a sequence.
+    /// Every setting that starts the motor; of a sequence, the last one.
     pub fn runs(&self) -> Vec<Setting> {
         match &self.run {
             Run::One(setting) => vec![*setting],
@@ -209,7 +209,7 @@ impl Control {
         }
     }
 
-    /// Whether that word, written there, stops the motor.
+    /// Whether the word, written to this place, stops the motor.
     pub fn is_stop(&self, place: ControlItem, word: u16) -> bool {
         self.is_own_stop(place, word) || self.is_also_stop(place, word)
     }
@@ -224,7 +224,7 @@ impl Control {
         place == self.at && self.also_stop.iter().any(|stop| stop.holds(word))
     }
 
-    /// Whether that word, written there, starts it or lets it run.
+    /// Whether the word, written to this place, starts the motor or lets it run.
     pub fn is_run(&self, place: ControlItem, word: u16) -> bool {
         let of = |setting: &Setting| setting.place.unwrap_or(self.at) == place && self.holds_run(setting, word);
         !self.is_stop(place, word) && self.runs().iter().any(of)
@@ -325,7 +325,7 @@ impl Control {
         }
     }
 
-    /// Where `run` is written.
+    /// The place to which `run` is written.
     pub fn run_place(&self) -> ControlItem {
         let first = self.runs().first().and_then(|setting| setting.place);
         first.unwrap_or(self.at)

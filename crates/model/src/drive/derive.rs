@@ -51,7 +51,7 @@ pub enum Derived {
     Equal {
         /// Point.
         of: PointIndex,
-        /// The other one.
+        /// The point to compare with.
         to: PointIndex,
         /// In the unit of the points.
         within: f64,
@@ -71,7 +71,7 @@ pub enum Derived {
     Sum {
         /// Points.
         of: Vec<PointIndex>,
-        /// As many.
+        /// Weights, as many as points.
         weights: Vec<f64>,
     },
     /// Number of the lowest set bit, counted from 1; 0 if none is set.
@@ -129,12 +129,12 @@ impl Derived {
         first.into_iter().chain(second).chain(more)
     }
 
-    /// All points that it depends on, including the ends of a band.
+    /// All points that the derived point depends on, including the ends of a band.
     pub fn rests_on(&self) -> Vec<PointIndex> {
         self.sources().chain(self.ends()).collect()
     }
 
-    /// The points that are the ends of its band.
+    /// The points that are the ends of the band.
     pub fn ends(&self) -> impl Iterator<Item = PointIndex> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {

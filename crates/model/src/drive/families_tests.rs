@@ -300,7 +300,7 @@ fn n2_maps_are_whole() {
     }
 }
 
-/// Words that a drive answers, and the values they mean.
+/// Checks the values that example replies of a drive mean.
 #[test]
 fn worked_replies() {
     let read = |name: &str, point: &str, words: &[u16]| {
@@ -565,7 +565,7 @@ fn process_data_in_by_application() {
                 .iter()
                 .filter(|point| point.name.starts_with("process_data_in"));
             assert_eq!(process_data.count(), 0, "{}: the rest is not used", own.name);
-            // All else is the family's.
+            // Everything else comes from the family.
             assert_eq!(own.points.len(), base.points.len() - 8 + points.len());
             assert_eq!((&own.ranges, &own.faults), (&base.ranges, &base.faults));
             assert_eq!(own.commissioning, base.commissioning);

@@ -91,7 +91,7 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
         self.elements.get_mut(index.into())
     }
 
-    /// Each element with its index.
+    /// Each element, with its index.
     pub fn enumerate(&self) -> impl DoubleEndedIterator<Item = (I, &T)> + ExactSizeIterator {
         self.elements
             .iter()
@@ -99,13 +99,13 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
             .map(|(place, one)| (I::from(place), one))
     }
 
-    /// Each element with its index, to be changed.
+    /// Each element with its index; elements can be changed.
     pub fn enumerate_mut(&mut self) -> impl DoubleEndedIterator<Item = (I, &mut T)> + ExactSizeIterator {
         let elements = self.elements.iter_mut().enumerate();
         elements.map(|(place, one)| (I::from(place), one))
     }
 
-    /// All indexes. They do not borrow the vector.
+    /// All indexes, which do not borrow the vector.
     pub fn indexes(&self) -> impl DoubleEndedIterator<Item = I> + ExactSizeIterator + use<I, T> {
         (0..self.elements.len()).map(I::from)
     }

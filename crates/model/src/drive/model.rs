@@ -17,7 +17,7 @@ pub enum Value {
     Integer(i64),
     /// A number in the point's unit; always finite.
     Number(f64),
-    /// A whole number above those of `Integer`.
+    /// A whole number that is too large for `Integer`.
     Unsigned(u64),
     /// A text.
     Text(Text),
@@ -122,7 +122,7 @@ pub enum Quality {
     Good,
     /// Older than allowed, or the drive is offline.
     Stale,
-    /// The drive refused the point, or it was never read.
+    /// The drive refused the point, or the point was never read.
     Bad,
 }
 
@@ -147,26 +147,26 @@ impl Quality {
     }
 }
 
-/// A value with its quality and its time of reading.
+/// A value, with its quality and the time when it was read.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// The last value read; absent when there never was one.
+    /// The last value; absent if no value was ever read.
     pub value: Option<Value>,
     /// Quality of the sample.
     pub quality: Quality,
-    /// End of the reply that contained it.
+    /// Time of the end of the reply that contained the value.
     pub at: Option<Instant>,
 }
 
 impl Sample {
-    /// Nothing is known.
+    /// A sample without a value.
     pub const NONE: Sample = Sample {
         value: None,
         quality: Quality::Bad,
         at: None,
     };
 
-    /// The value, if it is good.
+    /// The value if it is good.
     pub fn good(&self) -> Option<Value> {
         if self.quality == Quality::Good {
             self.value
@@ -180,7 +180,7 @@ impl Sample {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Does not answer, never answered, or its values are too old.
+    /// The drive does not answer, has never answered, or its values are too old.
     Offline,
     /// Answers, is not ready to run.
     NotReady,
@@ -193,7 +193,7 @@ pub enum State {
 }
 
 impl State {
-    /// All states in the order of their codes at 0x8001.
+    /// All states, in the order of their codes at 0x8001.
     pub const ALL: [State; 5] = [
         State::Offline,
         State::NotReady,
@@ -267,7 +267,7 @@ macro_rules! model_points {
         }
 
         impl ModelPoint {
-            /// All points, in their public order.
+            /// All points in their public order.
             pub const ALL: &'static [ModelPoint] = &[$(ModelPoint::$variant,)*];
 
             /// The public name.
@@ -280,7 +280,7 @@ macro_rules! model_points {
                 match self { $(ModelPoint::$variant => $unit,)* }
             }
 
-            /// The kind of its values.
+            /// The kind of the point's values.
             pub fn kind(self) -> Kind {
                 match self { $(ModelPoint::$variant => Kind::$kind,)* }
             }

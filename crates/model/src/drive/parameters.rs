@@ -19,7 +19,7 @@ pub struct ParameterList {
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
     pub identification: Vec<PointIndex>,
-    /// The rules for writing them back.
+    /// The rules for writing the parameters back.
     pub rules: WriteRules,
 }
 
@@ -28,9 +28,9 @@ pub struct ParameterList {
 pub struct Span {
     /// First PDU address of a holding register.
     pub first: u16,
-    /// Last PDU address.
+    /// Last PDU address of the span.
     pub last: u16,
-    /// How they are numbered.
+    /// How the parameters of the span are numbered.
     pub numbering: Numbering,
 }
 
@@ -77,9 +77,9 @@ impl Numbering {
 /// A parameter that is known by name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// As the family calls it: `Cn-02`, `102`, `1.2`, `AO 3`.
+    /// The family's own name of the parameter: `Cn-02`, `102`, `1.2`, `AO 3`.
     pub id: String,
-    /// PDU address of its (first) holding register.
+    /// PDU address of the parameter's (first) holding register.
     pub address: u16,
     /// Name and unit of the parameter.
     pub label: Label,
@@ -142,7 +142,7 @@ fn with_unit(number: &str, unit: &str) -> String {
     }
 }
 
-/// The value of a parameter as the drive gives it.
+/// The value of a parameter in the form that the drive gives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RawValue {
     /// The value of a register.
@@ -197,7 +197,7 @@ impl Profile {
         range.is_some_and(|range| range.write >= words) && !self.commands_in(address, words)
     }
 
-    /// Registers of a parameter: two where it is an object of N2.
+    /// Number of registers of a parameter; an N2 object has two.
     pub fn parameter_words(&self) -> u16 {
         if self.protocols.contains(&Protocol::N2) { 2 } else { 1 }
     }
@@ -223,7 +223,7 @@ impl ParameterList {
         self.named.is_empty() && self.spans.is_empty()
     }
 
-    /// The parameter at an address, if it is known by name.
+    /// The parameter at an address, if its name is known.
     pub fn at(&self, address: u16) -> Option<&Parameter> {
         let index = self.named.binary_search_by_key(&address, |parameter| parameter.address);
         index.ok().and_then(|index| self.named.get(index))

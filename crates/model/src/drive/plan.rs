@@ -52,7 +52,7 @@ const STATUS_BITS: [ModelPoint; 5] = [
     ModelPoint::Remote,
 ];
 
-/// All requests of one drive, fast ones first.
+/// All requests to one drive, the fast ones first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Plan {
     /// In the order class, table, address.
@@ -238,7 +238,7 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
             continue;
         };
         let piece_end = u32::from(address) + u32::from(items);
-        // The registers of a value behind its first.
+        // These are the registers of a value after its first register.
         let inner = low_bits(items) & !1;
         // The last read of another table may lie above this address.
         if let Some(last) = reads.last_mut().filter(|last| last.table == table) {

@@ -31,7 +31,7 @@ pub struct Profile {
     pub source: String,
     /// Whether the profile is part of the program; else it came from a file.
     pub built_in: bool,
-    /// The profile that its file is based on.
+    /// The profile that the file of this profile is based on.
     pub base: Option<String>,
     /// Protocols of the family.
     pub protocols: Vec<Protocol>,
@@ -41,11 +41,11 @@ pub struct Profile {
     pub formats: Vec<String>,
     /// Addresses a drive can have.
     pub addresses: RangeInclusive<u8>,
-    /// Time a drive takes to begin its reply, for the prediction only.
+    /// Time that a drive takes to begin its reply; used only for the prediction.
     pub turnaround: Duration,
     /// Update period of the drive's process data; a reset pulse is held for two of them.
     pub update_period: Duration,
-    /// Time after an acknowledged command within which a read must show its effect.
+    /// Time after an acknowledged command within which a read must show the command's effect.
     pub confirm_within: Duration,
     /// Function 04 reads the same registers as function 03.
     pub input_is_holding: bool,
@@ -55,7 +55,7 @@ pub struct Profile {
     pub n2: N2Options,
     /// Name of the simulated drive that behaves like the family.
     pub simulator: Option<String>,
-    /// Address ranges with their limits per request, ascending.
+    /// Address ranges in ascending order, each with its limits per request.
     pub ranges: Vec<AddressRange>,
     /// The functions by which single items and bits are written.
     pub functions: WriteFunctions,
@@ -84,7 +84,7 @@ pub struct Profile {
     pub identified: String,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<PointIndex>>,
-    /// The text of the file, without its base.
+    /// The text of the profile's file, without the text of its base.
     pub text: Cow<'static, str>,
     /// The file merged with its base, for profiles based on this one. None for built-in ones: their texts say it all, in a
     /// fifth of the memory.
@@ -98,13 +98,13 @@ pub struct Profile {
 pub struct FaultText {
     /// The text of the fault.
     pub text: String,
-    /// The panel's display; empty if no available manual gives it.
+    /// The text on the drive's panel; empty if no available manual gives it.
     pub panel: String,
     /// Cause of the fault; empty if no available manual gives it.
     pub cause: String,
     /// Remedy for the fault; empty if no available manual gives it.
     pub remedy: String,
-    /// Whether an available manual confirms it.
+    /// Whether an available manual confirms the text.
     pub verified: bool,
 }
 
@@ -129,7 +129,7 @@ pub struct AddressRange {
     pub note: String,
 }
 
-/// The functions by which a family is written where there is a choice.
+/// The functions that write to a family, where several are possible.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct WriteFunctions {
     /// Whether a register is written by function 16, the only one that the drive takes.
@@ -213,15 +213,15 @@ impl Probe {
 pub enum PollClass {
     /// Process data, every `cycle`.
     Fast,
-    /// Every `slow_cycle`.
+    /// Polled every `slow_cycle`.
     Slow,
     /// When the drive comes online.
     Once,
     /// Once after a new fault: see [`Profile::on_fault`].
     Fault,
-    /// When the drive comes online and when a comparison needs it: see [`Point::monitor`].
+    /// Read when the drive comes online and when a comparison needs it: see [`Point::monitor`].
     Monitor,
-    /// Never by itself.
+    /// Never read without a request.
     Never,
 }
 
@@ -244,13 +244,13 @@ impl PollClass {
 pub struct Point {
     /// Public name.
     pub name: String,
-    /// The point of the common model that it is.
+    /// The point of the common model that this point provides.
     pub model: Option<ModelPoint>,
     /// Unit, empty for states and codes.
     pub unit: String,
     /// Where the value comes from.
     pub source: Source,
-    /// How often it is read.
+    /// How often the point is read.
     pub class: PollClass,
     /// A slow point that is read in the fast class on lines that carry it.
     pub fast_if_carried: bool,
@@ -286,7 +286,7 @@ pub struct Point {
 pub struct Blocks {
     /// The cause in one word, for programs.
     pub cause: String,
-    /// The state in which it does: true or not zero, or false.
+    /// The state in which the point blocks: true or not zero, or false.
     pub when: bool,
     /// The remedy.
     pub remedy: String,
@@ -297,7 +297,7 @@ pub struct Blocks {
 pub enum Source {
     /// From registers or bits of the drive.
     Raw(Raw),
-    /// Derived from other points.
+    /// The point is derived from other points.
     Derived(Derived),
 }
 
@@ -326,7 +326,7 @@ impl Point {
         }
     }
 
-    /// Whether users can command it.
+    /// Whether users can command the point.
     pub fn is_commanded(&self) -> bool {
         self.write && !self.hidden
     }
@@ -336,7 +336,7 @@ impl Point {
         self.raw().is_none() || self.class != PollClass::Never
     }
 
-    /// Kind of its values.
+    /// Kind of the point's values.
     pub fn kind(&self) -> Kind {
         use Derived::{All, Equal, LowestBit, State, Zero};
         match (&self.source, self.model) {
@@ -578,7 +578,7 @@ impl Profiles {
         self.0.insert(profile.name.clone(), Arc::new(profile));
     }
 
-    /// The warnings about all of them.
+    /// The warnings about all profiles.
     pub fn warnings(&self) -> impl Iterator<Item = &Problem> {
         self.0.values().flat_map(|profile| &profile.warnings)
     }
@@ -588,12 +588,12 @@ impl Profiles {
         self.0.get(name)
     }
 
-    /// All, by name.
+    /// All profiles, sorted by name.
     pub fn iter(&self) -> impl Iterator<Item = &Arc<Profile>> {
         self.0.values()
     }
 
-    /// All names.
+    /// Names of all profiles.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.0.keys().map(String::as_str)
     }

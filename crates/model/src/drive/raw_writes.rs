@@ -8,10 +8,10 @@ use std::ops::RangeInclusive;
 use super::Profile;
 use crate::codec::Table;
 
-/// The raw writes that a drive's configuration allows beyond its writable points.
+/// The raw writes that a drive's configuration allows in addition to its writable points.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum RawWrites {
-    /// Nothing.
+    /// No other raw writes.
     #[default]
     Points,
     /// Only these PDU addresses, of registers and coils alike.
@@ -160,7 +160,7 @@ mod tests {
             Some(0x23)
         );
         assert_eq!(refused(&RawWrites::Points, &teco, Table::Holding, 2..=2), None);
-        // Without a run command there is no control word.
+        // Without a run command, the drive has no control word.
         for point in &mut Arc::make_mut(&mut teco).points {
             point.write = false;
         }

@@ -15,9 +15,9 @@ use super::profile::{Point, Profile};
 /// A DC link below this, in V, is not charged: the least supply of these families is 200 V, rectified 280 V.
 const UNCHARGED: f64 = 50.0;
 
-/// No cause is known.
+/// Word for an unknown cause.
 const NOT_KNOWN: &str = "not_known";
-/// Control place, as `blocks` of a point names it.
+/// Word for local control, as `blocks` of a point names it.
 const LOCAL_CONTROL: &str = "local_control";
 /// Interlock, likewise.
 const INTERLOCKED: &str = "interlocked";
@@ -40,14 +40,14 @@ pub struct Cause {
 pub struct Explanation {
     /// Whether the motor runs; `None` while that is not known.
     pub runs: Option<bool>,
-    /// Why it does not, the most significant first; empty while it runs.
+    /// Why the drive does not run, the most significant cause first; empty while it runs.
     pub causes: Vec<Cause>,
     /// States that the family does not report, so that they cannot be ruled out.
     pub not_told: Vec<String>,
 }
 
 impl Explanation {
-    /// The causes with their evidence, in one line, if any.
+    /// The causes with their evidence in one line; `None` if there are none.
     pub fn blocked_by(&self) -> Option<String> {
         let cause = |Cause { cause, evidence, .. }: &Cause| match evidence.starts_with(cause.as_str()) {
             true => evidence.clone(),
@@ -63,7 +63,7 @@ impl Explanation {
         self.causes.push(cause);
     }
 
-    /// The causes in one word each, in their order, each once.
+    /// Each cause in one word, in the order of the causes and only once.
     pub fn words(&self) -> Vec<String> {
         let mut words: Vec<String> = Vec::new();
         for Cause { cause, .. } in &self.causes {
@@ -103,16 +103,16 @@ pub struct RunOrder {
     pub who: String,
     /// The outcome as text.
     pub text: String,
-    /// How long ago it ended.
+    /// Time since the order ended.
     pub age: Duration,
 }
 
 /// The purpose of a command for the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunWish {
-    /// To run.
+    /// The order was to run.
     Run,
-    /// To stop.
+    /// The order was to stop.
     Stop,
     /// To have no fault any more; a reset starts nothing.
     Reset,
@@ -121,9 +121,9 @@ pub enum RunWish {
 /// The result of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
-    /// The drive acknowledged it.
+    /// The drive acknowledged the order.
     Taken,
-    /// The gateway or the drive refused it.
+    /// The gateway or the drive refused the order.
     Refused,
     /// The order was accepted and not sent.
     NotSent,
@@ -136,9 +136,9 @@ pub enum Fate {
 pub enum Giver {
     /// A client.
     Client,
-    /// A lease that expired.
+    /// Supervision, because a lease expired.
     Supervision,
-    /// The gateway, when it stopped.
+    /// The gateway, when it was stopped.
     Shutdown,
     /// An interlock that does not hold.
     Interlock,
@@ -148,15 +148,15 @@ pub enum Giver {
 
 /// The situation, except the points.
 pub struct Situation<'s> {
-    /// When the reader looks.
+    /// The present time.
     pub now: Instant,
     /// Whether the drive can be reached.
     pub contact: Contact,
-    /// When its process data was last read.
+    /// When the drive's process data was last read.
     pub read_at: Option<Instant>,
-    /// Whether this gateway may command it.
+    /// Whether this gateway may command the drive.
     pub is_commandable: bool,
-    /// Why it accepts only stops, if so, and what ends that.
+    /// Why the drive accepts only stops, if so, and what ends that.
     pub held: Option<String>,
     /// The last command of the run point; requested only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,

@@ -33,14 +33,14 @@ pub struct WriteRules {
 pub struct Limit {
     /// PDU address of the one that is not below the other.
     pub upper: u16,
-    /// PDU address of the one that is not above it.
+    /// PDU address of the parameter that may not be greater.
     pub lower: u16,
 }
 
 /// Parameters that the drive takes in one mode only.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lock {
-    /// Which.
+    /// The addresses that the lock concerns.
     pub of: Addresses,
     /// Point (index in the profile) that is true only while the drive refuses them. While it is false the drive may still
     /// refuse them.

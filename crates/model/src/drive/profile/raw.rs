@@ -31,7 +31,7 @@ pub struct Raw {
     pub order: Order,
     /// Selected bits, shifted down to bit 0.
     pub mask: Option<u64>,
-    /// The count that means true; the point is true or false then.
+    /// The count that means true; with it, the values of the point are true and false.
     pub equals: Option<Equals>,
     /// Register contents, before `mask`, that mean "no value".
     pub invalid: Vec<u64>,
@@ -73,7 +73,7 @@ pub enum Unwritable {
         /// The requested value.
         value: f64,
     },
-    /// The drive would take it for no value.
+    /// The drive would take the value for "no value".
     #[error("{value} is a raw value that means \"not available\"")]
     Invalid {
         /// The requested value.
@@ -108,7 +108,7 @@ impl Raw {
         }
     }
 
-    /// Whether its values are true and false.
+    /// Whether the values are true and false.
     pub fn is_bool(&self) -> bool {
         self.equals.is_some() || matches!(self.form, Form::Bit { .. })
     }
@@ -150,14 +150,14 @@ impl Raw {
         }
     }
 
-    /// Whether there is a way back from a value to its registers.
+    /// Whether a value cannot be converted back to its registers.
     pub(in crate::drive) fn is_only_read(&self) -> bool {
         let derived = self.equals.is_some() || self.mask.is_some() || self.scaled_by().next().is_some();
-        // A byte is written only with the other byte of its register.
+        // A byte could be written only together with the other byte of its register.
         derived || matches!(self.form, Form::Text { .. } | Form::I8 { .. })
     }
 
-    /// The points whose values its own depends on.
+    /// The points that the value of this one depends on.
     pub fn scaled_by(&self) -> impl Iterator<Item = PointIndex> {
         self.scale_from.into_iter().chain(self.factor_from.iter().copied())
     }
@@ -301,7 +301,7 @@ impl Raw {
         Ok(self.order.split(bits, self.form.items()))
     }
 
-    /// The addresses of its registers or bits.
+    /// The addresses of the value's registers or bits.
     pub fn addresses(&self) -> impl Iterator<Item = u16> + Clone + use<> {
         let start = self.address;
         (0..self.form.items()).filter_map(move |item| start.checked_add(item))

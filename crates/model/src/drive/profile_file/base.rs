@@ -47,7 +47,7 @@ pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {
     (text("name"), text("base"))
 }
 
-/// Merges the document into the tree of its base, the profile `name`.
+/// Merges the document into the tree of its base, which is the profile `name`.
 pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
     let mut merged = base.with_source(&format!("profile {name}"));
     let own = document.root().clone();
@@ -217,7 +217,7 @@ fn merge_points(old: &mut Entry, new: Entry) {
     }
 }
 
-/// A point with a new source loses the keys of its old one.
+/// Merges a point; a point with a new source loses the keys of its old source.
 fn merge_point(point: &mut Node, own: Vec<Entry>) {
     let Raw::Table(into) = &mut point.value else { return };
     let text = |wanted: &str| {

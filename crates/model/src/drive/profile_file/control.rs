@@ -464,7 +464,7 @@ pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: u
     helpers.iter().cloned().chain(made).collect()
 }
 
-/// The control word, for the points that rest on it.
+/// The control word as a point, for the points that depend on it.
 fn helper(control: &Control, place: ControlItem) -> Point {
     let form = match place.table {
         Table::Coil | Table::DiscreteInput => Form::Bit { bit: 0, invert: false },

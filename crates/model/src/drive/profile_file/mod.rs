@@ -163,7 +163,7 @@ impl Waiting {
         }
     }
 
-    /// A file that replaces its own base waits for none.
+    /// Whether the file waits for one of these; a file that replaces its own base does not wait.
     fn waits_for_any_of(&self, files: &[Waiting]) -> bool {
         self.base.is_some() && self.base != self.name && files.iter().any(|other| other.name == self.base)
     }
@@ -362,7 +362,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     name.map(|_| profile)
 }
 
-/// The parameters of the base, of its base, and so on.
+/// The parameters of the base, of the base of that one, and so on.
 fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k ParameterList> {
     let first = base.and_then(|base| known.get(base));
     let next = |profile: &&'k Arc<Profile>| {
@@ -438,7 +438,7 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
     protocols
 }
 
-/// `formats`: character formats, as a bus has them.
+/// Reads `formats`: character formats, written as for a bus.
 fn read_formats(reader: &Reader<'_>) -> Vec<String> {
     let texts: Vec<String> = reader.or("formats", Vec::new());
     let formats = texts.iter().map(|text| match LineFormat::new(1, text) {

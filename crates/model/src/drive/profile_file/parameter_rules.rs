@@ -135,7 +135,7 @@ impl Rules<'_, '_> {
     }
 }
 
-/// A limit of a circle, if there is one.
+/// A limit that is part of a circle, if there is one.
 fn in_circle(limits: &[Limit]) -> Option<Limit> {
     let mut left = limits.to_vec();
     // A limit with nothing below it or nothing above it is not part of a circle; removing such limits repeatedly leaves

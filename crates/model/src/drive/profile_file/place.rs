@@ -186,7 +186,7 @@ fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: 
     }
 }
 
-/// Which byte of its register an `i8` is.
+/// Whether an `i8` is the high byte of its register.
 fn is_high_byte(reader: &Reader<'_>) -> bool {
     let byte = reader.parsed("byte", |text| match text {
         "high" => Ok(true),

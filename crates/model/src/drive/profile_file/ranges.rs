@@ -113,7 +113,7 @@ pub(super) fn read_functions(reader: &Reader<'_>, ranges: &[AddressRange]) -> Wr
     functions
 }
 
-/// A number, or a list of them.
+/// A number or a list of numbers.
 struct OneOrMore(Vec<u8>);
 
 impl FromNode for OneOrMore {

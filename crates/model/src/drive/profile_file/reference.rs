@@ -74,7 +74,7 @@ fn sign(point: &mut Point, signed: bool) {
     point.range = Some(low..=high);
 }
 
-/// The register holds a frequency: the two points swap their sources.
+/// Swaps the sources of the two points, because the register holds a frequency.
 fn in_hertz(points: &mut PerPoint<Point>, speed: PointIndex, frequency: PointIndex) {
     let Some(Source::Derived(Derived::Band { minimum, maximum, .. })) = points.get(frequency).map(|p| p.source.clone())
     else {

@@ -15,7 +15,7 @@ const KINDS: [ModelPoint; 6] = [
     ModelPoint::Remote,
 ];
 
-/// The points that the states make, in the order of their first.
+/// Reads the points that the states make, in the order of the first state of each.
 pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Vec<Point> {
     let mut made: Vec<Point> = Vec::new();
     for table in reader.tables("state") {

@@ -316,7 +316,7 @@ fn choices_of_the_reference() {
     assert_eq!(cx.ranges.last().unwrap().addresses, 9901..=9999);
 }
 
-/// Points that commands are converted by are polled, whatever their class.
+/// Points that convert commands are polled, whatever their class.
 #[test]
 fn ends_of_a_band_are_polled() {
     let source = HEAD.to_string()
@@ -403,7 +403,7 @@ fn the_page_names_every_key() {
         .any(|p| key.starts_with(p))
     });
     known.retain(|key| !key.contains("texts.") && !key.contains(".always.") && !key.contains(".until."));
-    // The forms of all commands have their keys in one table.
+    // One table contains the keys of all forms of commands.
     const FORMS: [&str; 5] = ["run", "stop", "also_stop[]", "reverse", "fault_reset"];
     let form = |key: String| {
         let of = FORMS.iter().find_map(|of| key.strip_prefix(&format!("control.{of}.")));

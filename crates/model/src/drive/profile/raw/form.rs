@@ -14,7 +14,7 @@ pub enum Form {
     Bits {
         /// Number of the least significant one.
         first: u8,
-        /// How many, 1..=16.
+        /// Number of bits, 1..=16.
         count: u8,
     },
     /// Signed 8 bit, two's complement: one byte of a register.
@@ -53,7 +53,7 @@ pub enum Form {
 /// CDAB is that of all words, the least significant first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Order {
-    /// High byte and high word first, as Modbus devices mostly have it.
+    /// High byte and high word first, as in most Modbus devices.
     #[default]
     Abcd,
     /// Low word first.
@@ -65,7 +65,7 @@ pub enum Order {
 }
 
 impl Order {
-    /// All of them.
+    /// All orders.
     pub const ALL: [Order; 4] = [Order::Abcd, Order::Cdab, Order::Badc, Order::Dcba];
 
     /// The name in profiles and output.
@@ -82,7 +82,7 @@ impl Order {
         matches!(self, Order::Cdab | Order::Dcba)
     }
 
-    /// The word with its high byte high.
+    /// The word with its bytes in the usual order: high byte first.
     pub(super) fn word(self, word: u16) -> u16 {
         match self {
             Order::Abcd | Order::Cdab => word,
@@ -168,7 +168,7 @@ impl Form {
         }
     }
 
-    /// Whether its counts have a sign.
+    /// Whether the form's counts have a sign.
     pub fn is_signed(self) -> bool {
         matches!(self, Form::I8 { .. } | Form::I16 | Form::I32 | Form::I64)
     }
@@ -178,7 +178,7 @@ impl Form {
         matches!(self, Form::U16 | Form::U32 | Form::U64)
     }
 
-    /// Bits of its registers.
+    /// Number of bits in the form's registers.
     pub fn width(self) -> u32 {
         16 * u32::from(self.items())
     }

@@ -7,7 +7,7 @@ use super::{EXACT, Equals, Form, Raw, low_mask, to_digits};
 pub struct Part {
     /// The bits.
     pub mask: u16,
-    /// Their values.
+    /// Values of the bits.
     pub value: u16,
 }
 
