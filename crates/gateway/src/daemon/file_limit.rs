@@ -97,7 +97,7 @@ impl Wanted {
         self.scaled(fewest)
     }
 
-    /// The same servers with this share of the connections, in thousandths.
+    /// All servers with this share of the connections, in thousandths.
     fn scaled(&self, thousandths: usize) -> Wanted {
         let scale = |connections: usize| (connections * thousandths / 1000).max(LEAST_CONNECTIONS.min(connections));
         let mut scaled = self.clone();

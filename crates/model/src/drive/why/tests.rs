@@ -56,7 +56,7 @@ fn stands(family: &str) -> Says {
 }
 
 impl Says {
-    /// The same drive with another value of a point, if the family has the point.
+    /// This drive with another value of a point, if the family has the point.
     fn with(mut self, point: &str, value: Value) -> Says {
         if let Some(index) = self.profile.point_index(point) {
             self.values.insert(index, value);

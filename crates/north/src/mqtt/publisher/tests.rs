@@ -334,7 +334,7 @@ fn the_values_of_an_outage_are_recorded() {
         let mut arrays = Vec::new();
         for value in [2500, 2500, 2501, 2501, 2501, 2502] {
             bench.read(0x0023, value);
-            // It is too early for another entry.
+            // Too little time has passed for another entry.
             for ms in [0, 50, 50] {
                 bench.now += Duration::from_millis(ms);
                 bench.wall += Duration::from_millis(ms);
