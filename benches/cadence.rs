@@ -100,7 +100,7 @@ fn grid(frames: &[Recorded], time: Duration) {
     println!("drift over the time:         {:.1} us", drift * 1e6);
 }
 
-/// How little a saturated line rests.
+/// Prints how little a saturated line rests.
 fn saturated(frames: &[Recorded], format: LineFormat, drives: u8) {
     let needed = format.silence_chars().as_secs_f64();
     let gaps = silences(frames);

@@ -13,7 +13,7 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// How the bare master measures.
+/// Options of the measurement with the bare master.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BareOptions {
     /// Format of the line.

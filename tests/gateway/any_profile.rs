@@ -127,7 +127,7 @@ fn the_examples_of_the_page_are_simulated() {
         });
         line.signal("USR1");
         site.until_state("drive", "fault");
-        // By the common model: reset, run, in reverse, stop.
+        // The common model gives the commands: reset, run, reverse, stop.
         let command = |word: u16| write_registers(site.modbus, 1, 0x8100, &[word]);
         command(0);
         command(4);

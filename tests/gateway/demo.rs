@@ -32,7 +32,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     until_ready(http);
     let drives: Vec<serde_json::Value> = serde_json::from_str(&get(http, "/api/v1/drives").unwrap().1).unwrap();
     assert_eq!(drives.len(), 10);
-    // By themselves the drives move.
+    // The drives of the demo move by themselves.
     until("a drive that runs by itself", || {
         ["pump-1", "pump-2", "fan-1"]
             .into_iter()

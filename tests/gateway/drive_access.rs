@@ -605,7 +605,7 @@ fn watch_shows_a_running_gateway_and_says_when_there_is_none() {
         let line = ran.out.contains("modbus-rtu 38400 8N1") && ran.out.contains("2 of 2");
         (ran.code == 0 && drives && line).then_some(())
     });
-    // At the socket of the configuration, too.
+    // The commands also work at the socket of the configuration.
     for arguments in [
         &["watch", "--once"][..],
         &["diagnose"],

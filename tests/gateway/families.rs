@@ -121,7 +121,7 @@ impl Rig {
         curl(&["--unix-socket", &socket, "-d", values, url])
     }
 
-    /// How often the motor has started to turn.
+    /// Number of times that the motor has started to turn.
     fn starts(&self) -> usize {
         let output = self.drive.output();
         output.matches("motor forward").count() + output.matches("motor reverse").count()
@@ -248,7 +248,7 @@ fn obeys_the_common_model(case: &Case) {
             rig.drive.output()
         )
     };
-    // By the sign of the reference otherwise.
+    // The drives of these two peers reverse by the sign of the reference.
     let turns_back = !["abb", "invertek"].contains(&case.peer);
     rig.order(&case.reference);
     done(command(true, false, false));

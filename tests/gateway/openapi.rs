@@ -31,7 +31,7 @@ fn every_answer_is_as_the_description_says() {
         assert!(output.status.success(), "{arguments:?}: {output:?}");
         String::from_utf8(output.stdout).unwrap().trim().to_string()
     };
-    // Something of each kind.
+    // The site has one of each kind of data.
     done(&["write", "pump-1", "run=true", "speed_reference=40"]);
     done(&["params", "read", "pump-1", "--brisk"]);
     let recording = done(&["record", "pump-1"]);

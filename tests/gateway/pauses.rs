@@ -395,7 +395,7 @@ fn a_new_connection_starts_a_motor_behind_a_pause_and_an_old_one_later() {
 fn nothing_is_told_as_younger_than_it_is() {
     let plant = Plant::new();
     for time in 0..TIMES as u32 {
-        // At any moment of a transaction.
+        // The pause begins at different moments of a transaction.
         std::thread::sleep(7 * MS * time);
         let silent = plant.stands(Duration::from_millis(2000), || {
             std::thread::sleep(200 * MS);

@@ -70,7 +70,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
     let capture = site.path("frames.pcapng");
     printed(&site, &["recordings", "export", &id, "--pcap", "--output", &capture]);
     assert_eq!(fs::read(&capture).unwrap()[..4], [0x0A, 0x0D, 0x0D, 0x0A]);
-    // From elsewhere, where the configuration is not.
+    // The commands run on a machine without the configuration.
     let url = format!("http://127.0.0.1:{}", site.http);
     for command in [
         &["recordings", "list", "--json"][..],

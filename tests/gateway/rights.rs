@@ -84,7 +84,7 @@ fn socket(site: &Site) -> Begun {
     start_over_http(stream, COMMANDS, START)
 }
 
-/// Half a frame that writes 1 to 0x8100.
+/// Sends half a frame that would write 1 to 0x8100.
 fn modbus(site: &Site) -> Begun {
     let mut stream = tcp(site.modbus);
     stream.write_all(&[0, 1, 0, 0, 0, 6, 1]).unwrap();

@@ -160,7 +160,7 @@ impl BacnetWorld {
         while self.step(until) {}
     }
 
-    /// Takes the answers to the clients.
+    /// Gives the answers to the clients.
     fn hear(&mut self) {
         while let Some((to, datagram)) = self.server.transmit() {
             let To::Host(to) = to else { continue };

@@ -347,7 +347,7 @@ impl WorldBus {
         }
     }
 
-    /// When the wire is to be looked at next.
+    /// When the wire must be processed next.
     pub fn wire_wakes(&self) -> Option<Instant> {
         self.wire.wake().map(|wake| self.began + wake.at)
     }

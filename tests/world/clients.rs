@@ -30,9 +30,9 @@ pub struct Client {
 pub enum Way {
     /// Orders given by the function that all north sides use.
     Plain(Vec<Waiting>),
-    /// By the id in the result.
+    /// Over MQTT; the id in the result identifies the order.
     Mqtt(Box<mqtt::Offline>, Broker),
-    /// By the id of the transaction.
+    /// Over Modbus TCP; the id of the transaction identifies the order.
     ModbusTcp(Box<modbus_tcp::Offline>, BTreeMap<u16, usize>, u16),
 }
 

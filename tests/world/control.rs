@@ -133,7 +133,7 @@ impl World {
         profile.model_index(ModelPoint::FaultReset).is_some()
     }
 
-    /// Without faults everything works as at first.
+    /// Checks that without faults everything works as in the beginning.
     fn heals(&mut self, seed: u64) {
         self.rig.set_faults(FaultPlan::new(Default::default(), seed));
         self.rig.run(Duration::from_secs(30));

@@ -169,7 +169,7 @@ fn a_drive_that_stops_by_itself_when_its_gateway_is_silent_passes_and_the_others
     });
     assert_eq!(report.state, DrillState::Passed, "{report:#?}");
     assert!(report.steps[0].upper_bound);
-    // By the first reading behind the silence.
+    // The time is that of the first reading after the silence.
     let took = report.steps[0].took_ms.unwrap();
     assert!((25_000..25_300).contains(&took), "{took} ms");
     // The exchange that was on the line when the silence began.

@@ -24,7 +24,7 @@ use super::orders::unique_reference;
 use super::rig::{Counts, Rig, line, write};
 
 const DRIVES: u8 = 3;
-/// How long faults come at a high rate.
+/// Time for which faults come at a high rate.
 const STORM: Duration = Duration::from_secs(30);
 /// The storm on N2, which is slow.
 const N2_STORM: Duration = Duration::from_secs(150);
@@ -95,7 +95,7 @@ enum Shows {
     Foreign,
     ForeignAndTimeouts,
     Exceptions,
-    /// Whatever, but the line goes on.
+    /// Any effect may show, but the line keeps working.
     All,
 }
 

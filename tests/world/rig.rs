@@ -256,7 +256,7 @@ impl Rig {
         self.with_drive(address, |drive, _| drive.set_alive(alive));
     }
 
-    /// Somebody writes a register at the drive itself.
+    /// Writes a register at the drive itself, as a person at its panel does.
     pub fn at_the_drive(&mut self, address: u8, register: u16, value: u16) {
         let write = RequestPdu::WriteRegister {
             address: register,

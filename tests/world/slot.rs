@@ -420,7 +420,7 @@ fn a_stop_waits_for_the_exchange_on_the_line_at_most() {
     for round in 0..40u64 {
         tool.ask(1 + round % 5);
         let address = 1 + (round % 3) as u8;
-        // At any moment of an exchange of the tool.
+        // The stop comes at different moments of a tool's exchange.
         tool.next = tool.rig.now;
         for _ in 0..=round % 17 {
             tool.step(true);

@@ -28,7 +28,7 @@ pub enum Action {
     Send,
     /// Wait for bytes, or until this time.
     Wait {
-        /// When to come back at the latest.
+        /// Latest time at which the caller must come back.
         until: Instant,
         /// Whether an arriving command ends the wait.
         commands: bool,

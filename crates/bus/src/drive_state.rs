@@ -136,7 +136,7 @@ impl DriveState {
         }
     }
 
-    /// Until when a started client command holds the lease.
+    /// Time until which a started client command holds the lease.
     pub(super) fn client_holds_until(&self) -> Option<Instant> {
         let of_client = self.runs.iter().flatten().filter(|run| run.is_heard());
         of_client.map(CommandRun::expires).max()

@@ -50,7 +50,7 @@ struct LateReply {
     late: Duration,
     /// When the last answered request was sent: if its reply was the older one, the next reply belongs to this request.
     before: Option<Instant>,
-    /// Until when the newer reply may come.
+    /// Time until which the newer reply may come.
     newer: Option<Instant>,
     /// Each reply belongs to its own request: the drive has replied to another request since.
     settled: bool,
@@ -185,7 +185,7 @@ impl LateReplies {
         same.map_or(now, |late| late.since.or(late.before).unwrap_or(now))
     }
 
-    /// Until when any reply may still come.
+    /// Time until which any reply may still come.
     pub fn until(&self) -> Option<Instant> {
         self.expected.iter().map(LateReply::ends).max()
     }

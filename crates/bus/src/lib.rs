@@ -97,6 +97,6 @@ pub enum Mode {
     /// The gateway is the master.
     #[default]
     Master,
-    /// Another master's: the gateway listens and never sends.
+    /// The bus belongs to another master: the gateway listens and never sends.
     Listen,
 }

@@ -33,7 +33,7 @@ pub struct BusTask {
     handle: BusHandle,
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
-    /// Present until the bus begins.
+    /// Hands over to the bus when the bus begins; present until then.
     begin: Option<SyncSender<Handover>>,
     thread: Option<std::thread::JoinHandle<Handover>>,
 }
@@ -42,7 +42,7 @@ impl BusTask {
     /// Starts the bus in a thread of its own.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// If the system gives no thread.
     pub fn start(
         handle: BusHandle,
         options: BusOptions,
@@ -57,7 +57,7 @@ impl BusTask {
     /// Gets all that a bus needs from the system; its thread waits for [`BusTask::begin`] and touches no port before.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// If the system gives no thread.
     pub fn prepare(
         handle: BusHandle,
         options: BusOptions,

@@ -250,7 +250,7 @@ impl LineState {
         self.underway.is_some()
     }
 
-    /// When the transaction in progress ends at the latest.
+    /// Latest time at which the transaction in progress ends.
     pub fn deadline(&self) -> Option<Instant> {
         self.underway.as_ref().map(|underway| underway.transaction.deadline())
     }

@@ -79,7 +79,7 @@ pub enum Purpose {
     Poll(Poll),
     /// A step of the started command in that slot, competing with that rank.
     Command {
-        /// Which of the drive's started commands.
+        /// The slot of the drive's started command.
         slot: Urgency,
         /// Rank with which the command competes for the line.
         rank: Urgency,
@@ -136,7 +136,7 @@ pub struct TurnEnd {
     pub at: Instant,
     /// Whether the thread was stalled meanwhile: the missing reply may be due to that.
     pub stood: bool,
-    /// How long the line was taken.
+    /// Time for which the line was in use.
     pub took: Duration,
     /// The invalid bytes were the drive's own reply, damaged.
     pub mangled: bool,

@@ -113,7 +113,7 @@ impl N2LateReplies {
         late.map(|late| late.asked)
     }
 
-    /// How many replies may still come.
+    /// Number of replies that may still come.
     pub(super) fn owed(&self, now: Instant) -> usize {
         self.0.iter().filter(|late| late.until > now).count()
     }
@@ -123,7 +123,7 @@ impl N2LateReplies {
         self.0.iter().any(|late| late.until > now)
     }
 
-    /// Until when any reply may still come.
+    /// Time until which any reply may still come.
     pub fn until(&self) -> Option<Instant> {
         self.0.iter().map(|late| late.until).max()
     }

@@ -47,7 +47,7 @@ pub enum Progress {
     Going,
     /// The drive is of another type than its profile has; reported once.
     Unlike(u8),
-    /// Something has changed: the drive is to be read.
+    /// Something has changed, so the drive must be read.
     Changed,
     /// The drive has restarted.
     Restarted,

@@ -105,7 +105,7 @@ impl Prober<'_> {
     /// Listens for `time` without a request.
     ///
     /// # Errors
-    /// When the port is gone.
+    /// If the port is lost.
     pub fn listen_for(&mut self, time: Duration) -> Result<(), Lost> {
         let until = Instant::now() + time;
         while Instant::now() < until {
@@ -117,7 +117,7 @@ impl Prober<'_> {
     /// Sends one request and returns its result.
     ///
     /// # Errors
-    /// When the port is gone.
+    /// If the port is lost.
     pub fn ask(&mut self, request: &Request) -> Result<Answer, Lost> {
         let since = Instant::now();
         while let Some(clear) =

@@ -424,7 +424,7 @@ impl Report {
         self.image.transactions.observe(took);
     }
 
-    /// Another master read a drive.
+    /// Reports that another master read a drive.
     pub(super) fn heard(
         &mut self,
         index: DriveIndex,

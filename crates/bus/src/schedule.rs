@@ -49,7 +49,7 @@ pub struct Poll {
     pub drive: DriveIndex,
     /// The read.
     pub read: PlannedRead,
-    /// Sent to find out whether the drive replies (again).
+    /// Whether the poll is a probe, which finds out whether the drive replies (again).
     pub probe: bool,
 }
 
@@ -110,7 +110,7 @@ pub struct RoundStart {
     pub cycle: Option<Duration>,
 }
 
-/// Why a poll has its turn.
+/// The reason why a poll has its turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
     Due,
@@ -139,7 +139,7 @@ pub struct Schedule {
     slow_share: f64,
     /// Why the poll that was chosen last has its turn.
     turn: Turn,
-    /// Until when the credit is calculated.
+    /// Time up to which the credit is calculated.
     earned_until: Instant,
     /// Time on the line taken by commands, and by reads they caused, since then.
     commanded: Duration,

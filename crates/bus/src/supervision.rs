@@ -171,7 +171,7 @@ impl Supervision {
         }
     }
 
-    /// Another action, or another lease.
+    /// Begins anew, because the action or the lease is another one.
     fn begin_anew(&mut self) {
         (self.refused, self.next_try) = (None, None);
         (self.failure, self.failures) = (None, 0);

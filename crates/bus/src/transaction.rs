@@ -144,7 +144,7 @@ impl Transaction {
         self.late = late;
     }
 
-    /// Takes the late replies that may still arrive.
+    /// Removes and returns the late replies that may still arrive.
     pub(crate) fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.late)
     }

@@ -336,7 +336,7 @@ pub struct RefusedCommand<'r> {
     pub text: String,
 }
 
-/// Where events are published and received.
+/// The place where events are published and received.
 #[derive(Debug, Clone)]
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,

@@ -85,7 +85,7 @@ pub struct Plant {
     pub gateway: String,
     /// Age from which a sample of process data is stale.
     pub stale_after: Duration,
-    /// In the order of the file.
+    /// The buses in the order of the file.
     pub buses: Vec<BusHandle>,
     /// The events.
     pub events: Events,

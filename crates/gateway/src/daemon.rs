@@ -132,7 +132,7 @@ impl Daemon {
     /// As [`Daemon::start`]; `control` takes the commands of local clients to the gateway itself.
     ///
     /// # Errors
-    /// As [`Daemon::start`].
+    /// The errors of [`Daemon::start`].
     pub async fn start_with(settings: Settings, control: Option<Control>) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
         let drives = settings.buses.iter().map(|bus| bus.drives.len()).sum();

@@ -111,7 +111,7 @@ const MOST_SPIN: Duration = Duration::from_micros(120);
 const BUSY: Duration = Duration::from_micros(250);
 
 impl WakeUps {
-    /// As on a virtual machine, until some were seen.
+    /// Initial values as on a virtual machine, until real wake-ups were measured.
     pub(super) const fn new() -> WakeUps {
         WakeUps {
             mean: Duration::from_micros(50),

@@ -3,7 +3,7 @@
 use super::rfc2217::is_greeting;
 use crate::codec::checksum::crc16;
 
-/// As many bytes decide: an exception of Modbus TCP.
+/// Number of bytes that decide: the length of an exception of Modbus TCP.
 const ENOUGH: usize = 9;
 /// Most requests of which the beginning is remembered.
 const ASKED: usize = 32;

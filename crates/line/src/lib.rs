@@ -170,7 +170,7 @@ enum Port {
 /// The descriptor of a port, to wait for.
 enum PortFd<'p> {
     Of(BorrowedFd<'p>),
-    /// Another one for each request.
+    /// A socket, which is another one for each request.
     Socket(Ref<'p, UdpSocket>),
 }
 
@@ -217,7 +217,7 @@ impl Line {
     /// server, and `go_on`, called at least once a second, returns whether the port is still needed.
     ///
     /// # Errors
-    /// As [`Line::open`].
+    /// The errors of [`Line::open`].
     pub fn open_by(
         names: &mut Names,
         port: &str,

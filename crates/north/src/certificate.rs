@@ -207,7 +207,7 @@ mod tests {
             &[UTF8, 9, b'o', b'p'],
             &[&[UTF8, 0x81, 8][..], b"operator"].concat(),
             &[&[UTF8, 0x80][..], b"operator", &[0, 0]].concat(),
-            // Something follows: a byte, or a second role.
+            // After the role follows another byte or a second role.
             &[&operator[..], &[0]].concat(),
             &[&operator[..], &operator[..]].concat(),
             &sequence(&[operator.clone(), element(UTF8, b"viewer")]),

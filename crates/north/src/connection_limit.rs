@@ -309,7 +309,7 @@ impl ConnectionLimit {
     /// misses no connection.
     ///
     /// # Errors
-    /// Why there is none.
+    /// Why the connection gets no place.
     pub(super) fn acquire(
         self: &Arc<Self>,
         newcomer: Newcomer<'_>,

@@ -142,7 +142,7 @@ impl ServerIdentity {
         Ok((identity, warnings))
     }
 
-    /// As [`ServerIdentity::load`], of a client, which needs no names.
+    /// Loads an identity like [`ServerIdentity::load`], for a client, which needs no names.
     ///
     /// # Errors
     /// All faults of the files.

@@ -114,7 +114,7 @@ impl Socket {
 /// Sockets for a new configuration, bound but not accepting yet.
 #[derive(Debug, Default)]
 pub(crate) struct NewSockets {
-    /// In the order of the configuration.
+    /// The listeners in the order of the configuration.
     wanted: Vec<(ListenerSpec, Socket)>,
     /// Indices of open listeners whose sockets were closed because a new one overlaps them.
     released: Vec<usize>,

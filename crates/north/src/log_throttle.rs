@@ -26,7 +26,7 @@ impl Default for LogThrottle {
 }
 
 impl LogThrottle {
-    /// At least `interval` between two lines.
+    /// A throttle with at least `interval` between two lines.
     pub(super) fn every(interval: Duration) -> LogThrottle {
         LogThrottle {
             interval,

@@ -165,7 +165,7 @@ fn verify_with_key(
     let bytes = key.subject_public_key.as_bytes().ok_or_else(bad_encoding)?;
     let fits = of_scheme
         .flat_map(|(_, algorithms)| algorithms.iter())
-        // Behind the head of the sequence.
+        // The identifier follows after the head of the sequence.
         .find(|algorithm| wanted.get(2..) == Some(algorithm.public_key_alg_id().as_ref()));
     let bad = || Error::from(CertificateError::BadSignature);
     let algorithm = fits.ok_or_else(bad)?;

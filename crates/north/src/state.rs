@@ -18,7 +18,7 @@ use crate::stop_all::StopAll;
 /// recordings.
 #[derive(Debug, Default)]
 pub struct NorthState {
-    /// How long starts and reloads wait for the disk.
+    /// Time that starts and reloads wait for the disk.
     pub patience: Patience,
     /// The recordings.
     pub recordings: Arc<Recordings>,

@@ -189,7 +189,7 @@ fn word_list(words: &[u16]) -> String {
     shown.join(" ") + more(words.len(), SHOWN)
 }
 
-/// In groups of eight, the first item first.
+/// The bits in groups of eight, the first item first.
 fn bit_list(bits: &[bool]) -> String {
     let shown = bits.get(..8 * SHOWN).unwrap_or(bits);
     let groups: Vec<String> = shown

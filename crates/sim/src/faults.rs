@@ -24,7 +24,7 @@ pub enum Foreign {
     Data,
 }
 
-/// Something that goes wrong with one exchange.
+/// A fault that happens to one exchange.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     /// The drive does not hear the request.

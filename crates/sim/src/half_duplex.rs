@@ -124,7 +124,7 @@ pub struct Wake {
 /// A request that a drive acted upon, whatever became of its reply on the line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Act {
-    /// When the request was whole.
+    /// When the last character of the request had arrived.
     pub at: SimTime,
     /// The drive.
     pub address: u8,

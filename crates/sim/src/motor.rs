@@ -5,9 +5,9 @@
 pub struct Ratings {
     /// Maximum frequency, to which the ramp times belong, Hz.
     pub maximum: f64,
-    /// From 0 to the maximum frequency, s.
+    /// Time from 0 to the maximum frequency, s.
     pub acceleration: f64,
-    /// From the maximum frequency to 0, s.
+    /// Time from the maximum frequency to 0, s.
     pub deceleration: f64,
     /// Nominal voltage, V.
     pub voltage: f64,

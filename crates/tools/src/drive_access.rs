@@ -56,7 +56,7 @@ struct Configured {
     spec: DriveSpec,
 }
 
-/// Which way a request went.
+/// The way that a request took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Way {
     /// Through the running gateway.

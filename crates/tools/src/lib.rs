@@ -146,7 +146,7 @@ macro_rules! commands {
     };
 }
 
-// In the order of the help.
+// The commands are in the order of the help.
 commands! {
     Run => run,
     Reload => reload,

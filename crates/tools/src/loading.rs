@@ -95,7 +95,7 @@ impl Drop for Reader {
 #[derive(Debug, Default)]
 pub(super) struct Loads {
     loading: Option<Loading>,
-    /// Another one was requested meanwhile.
+    /// Whether another load was requested meanwhile.
     again: bool,
     readers: Arc<AtomicUsize>,
 }

@@ -121,7 +121,7 @@ struct Frame {
     verdict: String,
 }
 
-/// How many frames a slow listener has lost.
+/// Number of frames that a slow listener has lost.
 #[derive(Debug, Deserialize)]
 struct Lagged {
     lost: u64,

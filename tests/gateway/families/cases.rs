@@ -5,7 +5,7 @@ use drivegate_testkit::{families, orders, rows};
 /// A write to the unit of the drive.
 #[derive(Debug)]
 pub(super) enum Order {
-    /// To the registers and coils of the drive.
+    /// The order writes registers and coils of the drive directly.
     Raw(drivegate_testkit::Order),
     /// The common model's command word, and the register and word that the drive gets for it.
     Model(u16, u16, u16),

@@ -27,11 +27,11 @@ weg-cfw            | 682    | 0x15 0x57 0x55
 toshiba-vf-s15     | 0xFA00 | 0xCC00 0xCE00 0xD400
 ls-g100            | 5      | 0x10 0x12";
 
-/// By which way a word comes.
+/// The way by which a word is sent.
 #[derive(Debug, Clone, Copy)]
 enum Way {
     Alone,
-    /// With the reference, by function 16.
+    /// The word is sent together with the reference by function 16.
     Block,
     Slot,
     Broadcast,

@@ -411,7 +411,7 @@ impl Prometheus {
         Prometheus::with(targets, "")
     }
 
-    /// With more settings than the targets.
+    /// Starts Prometheus with more settings than the targets.
     pub(super) fn with(targets: &[SocketAddr], more: &str) -> Prometheus {
         let directory = tempfile::tempdir().unwrap();
         let port = free_port();

@@ -424,7 +424,7 @@ fn the_primary_host_is_waited_for() {
     }
     let gateway = Gateway::start(options, plant(&["p1"]));
     gateway.wait_connected(true);
-    // Another host, and an older message: neither counts.
+    // Neither a message for another host nor an older message counts.
     broker.publish("spBv1.0/STATE/other", &state_message(true, 2_000), &["-r"]);
     broker.publish(STATE, &state_message(true, 999), &[]);
     assert!(Seen::of(&watcher).messages().is_empty(), "nothing before the host");

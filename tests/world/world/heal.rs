@@ -172,7 +172,7 @@ impl World {
             let truth = &self.truths[*bus][*drive];
             let profile = &self.buses[*bus].profile;
             let stop = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
-            // On N2 an output is written on change only.
+            // On N2, an output is written only when it changes.
             let reached = truth.did(since, stop) || !truth.run;
             assert!(
                 reached || self.now < *due,

@@ -26,7 +26,7 @@ pub struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    /// At the beginning of `bytes`.
+    /// A reader at the beginning of `bytes`.
     pub fn new(bytes: &'a [u8]) -> Reader<'a> {
         Reader { bytes }
     }
@@ -39,7 +39,7 @@ impl<'a> Reader<'a> {
     /// An error unless nothing is left.
     ///
     /// # Errors
-    /// Something is left.
+    /// If bytes are left.
     pub fn end(&self) -> Read<()> {
         match self.is_empty() {
             true => Ok(()),
@@ -124,7 +124,7 @@ impl<'a> Reader<'a> {
     /// Opens a constructed value.
     ///
     /// # Errors
-    /// Another tag comes.
+    /// If another tag comes next.
     pub fn open(&mut self, number: u8) -> Read<()> {
         self.exactly(Tag::Open(number))
     }
@@ -132,7 +132,7 @@ impl<'a> Reader<'a> {
     /// Reads the closing tag with this number.
     ///
     /// # Errors
-    /// Another tag comes.
+    /// If another tag comes next.
     pub fn close(&mut self, number: u8) -> Read<()> {
         self.exactly(Tag::Close(number))
     }
@@ -147,7 +147,7 @@ impl<'a> Reader<'a> {
     /// The octets of a primitive value in that context.
     ///
     /// # Errors
-    /// Another tag comes.
+    /// If another tag comes next.
     pub fn context(&mut self, number: u8) -> Read<&'a [u8]> {
         if self.is_empty() {
             return Err(Reject::MissingRequiredParameter);
@@ -173,7 +173,7 @@ impl<'a> Reader<'a> {
     /// Unsigned of at most 32 bits in a context.
     ///
     /// # Errors
-    /// Another tag or value comes.
+    /// If another tag or value comes next.
     pub fn context_u32(&mut self, number: u8) -> Read<u32> {
         u32_of(self.context(number)?)
     }
@@ -202,7 +202,7 @@ impl<'a> Reader<'a> {
     /// BACnetObjectIdentifier in a context.
     ///
     /// # Errors
-    /// Another tag or length comes.
+    /// If another tag or length comes next.
     pub fn context_object(&mut self, number: u8) -> Read<ObjectId> {
         let bytes: [u8; 4] = self
             .context(number)?
@@ -214,7 +214,7 @@ impl<'a> Reader<'a> {
     /// Property identifier in a context.
     ///
     /// # Errors
-    /// Another tag or value comes.
+    /// If another tag or value comes next.
     pub fn context_property(&mut self, number: u8) -> Read<PropertyId> {
         self.context_u32(number).map(PropertyId)
     }

@@ -12,7 +12,7 @@ use crate::types::{Address, ObjectId};
 const MOST_SUBSCRIPTIONS: usize = 4096;
 const MOST_OF_HOST: usize = 2048;
 const MOST_OF_DEVICE: usize = 128;
-/// How long an acknowledgement is awaited, and how often.
+/// Time for which an acknowledgement is awaited, and the number of tries.
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
 /// Undelivered notifications in a row that end a subscription without a lifetime.

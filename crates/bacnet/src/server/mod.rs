@@ -292,7 +292,7 @@ enum Way {
     Broadcast,
 }
 
-/// Which devices a message is for.
+/// The devices that a message is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Target {
     /// The device of the host.

@@ -10,7 +10,7 @@ use crate::bvlc::{self, Bvlc};
 use crate::npdu::{self, GLOBAL, Payload, message};
 use crate::types::{Address, Mac};
 
-/// Why a message to a network is refused.
+/// Reasons for refusing a message to a network.
 const UNKNOWN_NETWORK: u8 = 1;
 const UNKNOWN_MESSAGE: u8 = 3;
 const OTHER: u8 = 0;

@@ -15,7 +15,7 @@ use crate::object::{Access, Datum, Device, Kind, Object};
 use crate::services::{self, PropertyRef, WriteItem, confirmed};
 use crate::types::{Address, Data, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
 
-/// How long an answer is remembered.
+/// Time for which an answer is remembered.
 const REMEMBERED: Duration = Duration::from_secs(10);
 /// Requests under way or remembered: of one host, and in all. Stops find room beyond that.
 const MOST_OF_HOST: usize = 64;

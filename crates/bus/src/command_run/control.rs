@@ -88,7 +88,7 @@ pub(super) struct AwaitedState {
     raw: Raw,
     name: String,
     mask: Mask,
-    /// After which the sequence is given up.
+    /// Time after which the sequence is given up.
     pub(super) timeout: Duration,
     /// The step with its word, as text.
     step: String,
@@ -163,7 +163,7 @@ pub(super) struct Ordered {
 }
 
 impl Ordered {
-    /// Takes the value, if the point follows from `[control]`.
+    /// Notes the value, if the point follows from `[control]`.
     pub(super) fn takes(&mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         let is = |point: ModelPoint| {
             let model = profile.model_index(point);

@@ -41,7 +41,7 @@ pub(super) enum Wants {
     ResetElsewhere,
     /// The end of a reset, which is sent whatever happens.
     ResetEnd,
-    /// Other bits of the control word.
+    /// The order writes other bits of the control word.
     Others,
 }
 

@@ -177,7 +177,7 @@ fn a_stop_purges_what_was_begun() {
     // The run bit is not sent any more; the reference was.
     let cut_short = Outcome::Interrupted(Interruption::Stop);
     assert_eq!(start.purge(), Some(cut_short.clone()));
-    // On the wire, and the answer is waited for.
+    // The start is on the wire, and its answer is awaited.
     let (mut start, _a) = bench.begin(&points, Urgency::Command);
     let sent = sends(&bench, &mut start);
     start.sent(&sent);

@@ -58,7 +58,7 @@ fn count(seen: &mut Seen, what: impl Into<String>) {
 }
 
 impl N2Survey {
-    /// Takes note of what was received.
+    /// Adds what was received to the survey.
     pub fn add(&mut self, heard: &Heard) {
         match heard {
             Heard::Exchange(exchange) => self.exchange(exchange),

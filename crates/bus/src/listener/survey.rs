@@ -94,7 +94,7 @@ impl Address {
 /// The traffic of a line.
 #[derive(Debug, Default)]
 pub struct Survey {
-    /// By address; 0 is the broadcast.
+    /// The drives by address; 0 is the broadcast.
     pub addresses: BTreeMap<u8, Address>,
     /// Requests received.
     pub requests: u64,
@@ -105,7 +105,7 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Takes note of what was received.
+    /// Adds what was received to the survey.
     pub fn add(&mut self, protocol: Protocol, heard: &Heard) {
         let (began, at) = match heard {
             Heard::Stray { bytes, at, .. } => {
@@ -161,7 +161,7 @@ impl Survey {
         }
     }
 
-    /// For how long the line was monitored.
+    /// Time for which the line was monitored.
     pub fn time(&self) -> Duration {
         let ends = self.first.zip(self.last);
         ends.map_or(Duration::ZERO, |(first, last)| last.saturating_duration_since(first))

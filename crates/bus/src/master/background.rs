@@ -128,7 +128,7 @@ impl Master {
     /// The background transaction that goes now, in time that is left over (`idle`) or instead of a poll that is due.
     ///
     /// # Errors
-    /// When to look again; none where none waits.
+    /// When to look again; `None` if no request waits.
     pub(super) fn background(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
         self.drop_background_in_vain(now);
         let mut again: Option<Instant> = None;

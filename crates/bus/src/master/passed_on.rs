@@ -78,7 +78,7 @@ impl Master {
     /// The broadcast of the shutdown, if it may go: the line is free for it.
     ///
     /// # Errors
-    /// When to look again; none where none waits.
+    /// When to look again; `None` if no stop waits.
     pub(super) fn stop_the_line(&mut self, now: Instant) -> Result<Turn, Option<Instant>> {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();

@@ -79,7 +79,7 @@ impl Registers {
                 count,
             } => {
                 let run = self.holding.get(&2000).is_some_and(|word| word & 1 == 1);
-                // With a fault (bit 3) the motor stands.
+                // With a fault (bit 3), the simulated motor does not run.
                 let fault = self.holding.get(&2100).map_or(0, |word| word & 8);
                 self.holding.insert(2100, if run && fault == 0 { 3 } else { 1 | fault });
                 let word = |address| self.holding.get(&address).copied().unwrap_or(0);
@@ -201,7 +201,7 @@ impl Rig {
         }
     }
 
-    /// Another bus takes the place of this one.
+    /// Replaces the bus by a new one.
     fn begin_anew(&mut self, before: &Handover) {
         self.master = Master::new(
             self.bus.clone(),

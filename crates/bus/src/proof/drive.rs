@@ -8,7 +8,7 @@ use crate::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
 use crate::drive::{PointIndex, Profile};
 use crate::order::written;
 
-/// In which state a proof begins.
+/// The state in which a proof begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Start {
     /// Just switched on: every register holds 0.

@@ -54,7 +54,7 @@ pub(super) struct Item {
     pub(super) refused: bool,
     /// The drive answers others and not this one: that does not take it away.
     pub(super) mute: bool,
-    /// How often in a row.
+    /// Number of refusals in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
     /// Time of the last failed poll.

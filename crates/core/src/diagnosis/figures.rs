@@ -219,7 +219,7 @@ impl Figures {
         &self.running.contrast
     }
 
-    /// In the last minute, of all drives.
+    /// Sum of the sign over all drives in the last minute.
     pub fn sum(&self, sign: Sign) -> u32 {
         self.drives.iter().map(|drive| drive.sum(sign)).sum()
     }
@@ -500,7 +500,7 @@ impl Figures {
             let (mut count, mut closer) = (0.0, 0.0);
             for &[bad, bad_cosines, good, good_cosines] in sums.filter(|[bad, _, good, _]| *bad >= 1.0 && *good >= 1.0)
             {
-                // As certain as the smaller of the two.
+                // Each drive counts with the smaller of its two sums, which limits the certainty.
                 let weight = bad.min(good);
                 count += weight;
                 closer += weight * (bad_cosines / bad - good_cosines / good);

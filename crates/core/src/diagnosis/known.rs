@@ -8,7 +8,7 @@ use crate::drive::DriveIndex;
 const KNOWN: u32 = 15;
 /// Anything seen in fewer steps of 5 s is a passing disturbance.
 pub(super) const LASTING: usize = 3;
-/// Anything seen less often in a minute is chance.
+/// Number in a minute below which a sign counts as chance.
 pub(super) const FEW: u32 = 5;
 /// Number of standard deviations that rule out chance.
 pub(super) const SIGNIFICANT: f64 = 5.0;

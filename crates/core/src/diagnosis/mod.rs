@@ -126,7 +126,7 @@ impl Cause {
 pub enum Certainty {
     /// The cause would explain the symptoms, but so would other causes.
     Fits,
-    /// Other causes would show otherwise as a rule.
+    /// Other causes would usually show in another way.
     Likely,
     /// The cause itself was observed.
     Certain,

@@ -113,7 +113,7 @@ impl Drills {
     /// Arms a drill of these ways, at `speed` % or at `max_speed`.
     ///
     /// # Errors
-    /// Why it cannot be done; nothing was started.
+    /// Why the drill cannot be armed; nothing was started.
     pub fn arm(
         &self,
         drive: &DriveHandle,

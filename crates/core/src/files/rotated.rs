@@ -22,7 +22,7 @@ pub struct Rotated {
 struct Open {
     file: File,
     bytes: u64,
-    /// Something is not on disk for sure.
+    /// Whether something was written that is not certain to be on disk.
     unsynced: bool,
 }
 

@@ -34,7 +34,7 @@ pub struct Packet {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{what}, at byte {offset}")]
 pub struct CaptureError {
-    /// Where, from the beginning of the file.
+    /// Place of the error, counted from the beginning of the file.
     pub offset: usize,
     pub what: String,
 }
@@ -229,7 +229,7 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
         }
         at += length;
     }
-    // Other interfaces than the line are not described.
+    // Other interfaces are an error only if the capture has no packet of a serial line.
     not_serial.filter(|_| packets.is_empty()).map_or(Ok(()), Err)
 }
 

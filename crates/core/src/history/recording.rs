@@ -148,7 +148,7 @@ pub struct CommandNote {
     pub command: String,
     /// Result code.
     pub result: String,
-    /// From acceptance to result, ms.
+    /// Time from acceptance to result, ms.
     pub latency_ms: f64,
 }
 

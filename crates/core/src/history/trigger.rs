@@ -197,7 +197,7 @@ impl Watch {
 /// Failed transactions of a line.
 #[derive(Debug, Default)]
 pub(super) struct LineErrors {
-    /// When, and with which drive.
+    /// Times of the recent errors, each with its drive.
     recent: VecDeque<(Instant, DriveIndex)>,
 }
 

@@ -70,7 +70,7 @@ pub struct AuditRecord {
     pub result: &'static str,
     /// The outcome as text.
     pub text: String,
-    /// From acceptance to result, ms.
+    /// Time from acceptance to result.
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     #[schema(value_type = f64)]
     pub latency: Duration,
@@ -165,7 +165,7 @@ impl AuditRecord {
 pub struct Audit {
     records: Mutex<Records>,
     file: ArcSwapOption<AuditFile>,
-    /// For subscribers to each new record.
+    /// Sends each new record to subscribers.
     sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
 }
 

@@ -13,7 +13,7 @@ pub enum Asks {
     Steer,
     /// A fault reset, a parameter, any other raw write: passes if the drive is free, and takes no hold.
     Other,
-    /// Takes the run command away: always passes.
+    /// The write takes the run command away, so it always passes.
     Stop,
     /// Nothing: a read, or a write of a restore that has started and is not to be left half done.
     Nothing,

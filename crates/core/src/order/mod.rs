@@ -118,7 +118,7 @@ pub struct Stop {
     pub joined: Vec<(Ticket, Instant)>,
     /// Another bus accepted it before a reload: what follows for holds and priorities was noted there.
     pub is_inherited: bool,
-    /// Another bus had started it before a reload.
+    /// Whether another bus had started the stop before a reload.
     pub was_begun: bool,
 }
 

@@ -20,7 +20,7 @@ pub enum Interruption {
     Offline,
     /// The gateway stops, or its bus restarts.
     ShuttingDown,
-    /// Another client took the drive.
+    /// Another client took hold of the drive.
     Taken,
     /// A reload took the right of the client away.
     RightLost,

@@ -77,9 +77,9 @@ pub struct Restoration {
     /// The writes of the present direction, in their order.
     writes: Vec<ParameterWrite>,
     state: State,
-    /// Something may have been written.
+    /// Whether something may have been written.
     touched: bool,
-    /// Something was written that is not saved.
+    /// Whether something was written that is not saved yet.
     wrote: bool,
     saves: u32,
     /// Since when the restore cannot continue.

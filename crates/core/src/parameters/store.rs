@@ -43,7 +43,7 @@ impl Store {
     /// Keeps a reading. Of readings in a row with the same values the first and the last are kept, of all a hundred.
     ///
     /// # Errors
-    /// When the disk refuses it.
+    /// An error of the disk.
     pub fn keep(&self, file: &ParameterFile) -> io::Result<PathBuf> {
         let dir = self.dir.join(&file.drive);
         let name: String = file.time.chars().filter(|c| c.is_ascii_alphanumeric()).collect();
@@ -85,7 +85,7 @@ impl Store {
     /// The last reading of a drive.
     ///
     /// # Errors
-    /// When it cannot be read; which file, and why.
+    /// If the file cannot be read: which file, and why.
     pub fn latest(&self, drive: &str) -> Result<Option<ParameterFile>, String> {
         let all = self
             .of(drive)
@@ -96,7 +96,7 @@ impl Store {
     /// All readings, drive by drive, the oldest first.
     ///
     /// # Errors
-    /// When the directory cannot be read.
+    /// If the directory cannot be read.
     pub fn list(&self) -> io::Result<Vec<Kept>> {
         let entries = match fs::read_dir(&self.dir) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),

@@ -197,7 +197,7 @@ impl Vault {
         }
     }
 
-    /// Something is new of the reading of that drive.
+    /// Notes news about the reading of this drive.
     pub fn update(&self, drive: &Machine, change: impl FnOnce(&mut Status)) {
         if let Some(reading) = self.lock().readings.get_mut(drive) {
             change(reading);
@@ -267,7 +267,7 @@ impl Vault {
         Ok(restore.prepared.clone())
     }
 
-    /// Something is new of the restore of that drive.
+    /// Notes news about the restore of this drive.
     pub fn update_restore(&self, drive: &Machine, change: impl FnOnce(&mut RestoreStatus)) {
         if let Some(restore) = self.lock().restores.get_mut(drive) {
             change(restore);

@@ -19,7 +19,7 @@ const MOST: usize = 8;
 /// How an order names its drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum By {
-    /// By the name of the drive.
+    /// The order uses the name of the drive.
     Name,
     /// By the unit id, or by the BACnet device that follows from the unit id.
     Unit,

@@ -78,7 +78,7 @@ impl Placed {
         poll_fn(|cx| self.poll_answer(cx)).await
     }
 
-    /// As [`Placed::answered`], for anyone who waits for several things.
+    /// Polls for the answer, like [`Placed::answered`], for callers that wait for several things.
     pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
         let stop = answer_of(&mut self.answer, cx);
         let Some(rest) = &mut self.rest else { return stop };
@@ -131,7 +131,7 @@ impl Placed {
         }
     }
 
-    /// As [`Placed::confirmed`], for anyone who waits for several things.
+    /// Polls for the confirmation, like [`Placed::confirmed`], for callers that wait for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
         let stop = self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok));
         let Some(rest) = &mut self.rest else { return stop };

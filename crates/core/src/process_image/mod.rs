@@ -171,7 +171,7 @@ impl DriveImage {
         });
     }
 
-    /// How a reader at `now` looks at the drive.
+    /// A view of the drive for a reader at `now`.
     pub fn reading(&self, now: Instant, stale_after: Duration) -> Reading<'_> {
         let stale_after = stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed)));
         Reading::new(&self.spec, self.snapshot(), now, stale_after, self.slow_cycle).held(&self.hold)

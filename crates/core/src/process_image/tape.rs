@@ -78,7 +78,7 @@ pub struct TapedFrame {
 pub enum Taped {
     /// The drive at that place was read.
     Read(DriveIndex, TapedRead),
-    /// Something was on the line.
+    /// A frame that was on the line.
     Frame(TapedFrame),
 }
 
@@ -158,7 +158,7 @@ impl Tape {
         }
     }
 
-    /// Something was on the line; as [`Tape::read`].
+    /// Records a frame on the line, to be read by [`Tape::read`].
     pub fn frame(&self, frame: impl FnOnce() -> TapedFrame) {
         if self.takes(Taping::Everything) {
             self.append(Taped::Frame(frame()));
@@ -180,7 +180,7 @@ impl Tape {
     pub fn take(&self) -> (Vec<Taped>, u64) {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         let next = Waiting {
-            // Until the next call about as many come.
+            // Until the next call, about as many entries are expected.
             entries: Vec::with_capacity(waiting.entries.len()),
             ..Waiting::default()
         };

@@ -49,7 +49,7 @@ impl Background {
         self.waiting.get(number)
     }
 
-    /// Takes the request of that number.
+    /// Removes the request with this number and returns it.
     pub fn take(&mut self, number: usize) -> Option<BackgroundRequest> {
         self.waiting.remove(number)
     }
@@ -79,7 +79,7 @@ impl Background {
         self.closed = Some(outcome.clone());
     }
 
-    /// Takes requests again.
+    /// Accepts requests again.
     pub fn open(&mut self) {
         self.closed = None;
     }

@@ -33,7 +33,7 @@ impl CommandQueue {
     /// An empty queue.
     ///
     /// # Errors
-    /// When the system gives no event descriptor.
+    /// If the system gives no event descriptor.
     pub fn new() -> io::Result<CommandQueue> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(CommandQueue {
@@ -82,7 +82,7 @@ impl CommandQueue {
         [of_stop, of_rest]
     }
 
-    /// Takes a background request in and wakes the bus.
+    /// Adds a background request and wakes the bus.
     pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
         self.background().push(request, now);
         self.wake();
@@ -125,7 +125,7 @@ impl CommandQueue {
         missing
     }
 
-    /// Takes commands again.
+    /// Accepts commands again.
     pub fn open(&self) {
         let mut pending = self.lock();
         if pending.ending {

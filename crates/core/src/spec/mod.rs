@@ -138,7 +138,7 @@ pub struct PointTrigger {
     /// Index of the point in the profile.
     pub point: PointIndex,
     pub limit: TriggerLimit,
-    /// For how long without interruption.
+    /// Time for which the condition must hold without interruption.
     pub hold: Duration,
 }
 

@@ -92,7 +92,7 @@ impl Guards {
         self.around.store(Arc::new(next));
     }
 
-    /// Something changed that belongs on disk.
+    /// Notes that something changed that must be written to disk.
     pub(super) fn tell_change(&self) {
         self.changed.notify_one();
     }

@@ -374,7 +374,7 @@ impl Motor {
         Some(started.at + guard.min_run).filter(|until| runs && *until > now)
     }
 
-    /// Takes in starts of an earlier run.
+    /// Adds the starts of an earlier run of the gateway.
     pub(super) fn remember(&mut self, earlier: impl Iterator<Item = Instant>) {
         let mut all: Vec<Instant> = earlier.chain(self.starts.iter().copied()).collect();
         all.sort();

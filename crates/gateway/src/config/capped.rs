@@ -13,7 +13,7 @@ pub(super) struct Capped {
     pub(super) range: RangeInclusive<Duration>,
     /// Value that was allowed before.
     pub(super) before: Duration,
-    /// Why no longer, after the value.
+    /// The reason for the limit, as text that follows the value.
     pub(super) why: &'static str,
     /// The version that will refuse the key, such as `0.2`.
     pub(super) until: &'static str,

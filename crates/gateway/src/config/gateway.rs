@@ -64,7 +64,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path) -> Gateway {
     }
 }
 
-/// Where the local socket is.
+/// Reads where the local socket should be.
 pub(super) fn read_socket(reader: &Reader<'_>, base: &Path) -> SocketPath {
     match GATEWAY.socket.written(reader) {
         None => SocketPath::Default,

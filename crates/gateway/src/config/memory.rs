@@ -24,7 +24,7 @@ const LOGINS: usize = 14 << 20;
 pub struct Memory {
     /// How far back trends reach.
     pub reach: Reach,
-    /// In the order of the buses.
+    /// Memory of each bus, in the order of the buses.
     pub buses: Vec<BusMemory>,
 }
 

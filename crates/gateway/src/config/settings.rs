@@ -46,7 +46,7 @@ pub struct Settings {
     pub stale_after: Duration,
     /// Whether `stale_after` is configured, so that it applies to slow lines too.
     pub stale_after_written: bool,
-    /// In the order of the file.
+    /// The buses in the order of the file.
     pub buses: Vec<BusSettings>,
     /// Slots of all buses; absent if no bus has a slot.
     pub slots: Option<slot_server::Options>,
@@ -60,7 +60,7 @@ pub struct Settings {
     pub bacnet: Option<bacnet_server::Options>,
     /// Rules for the holders of drives; absent: off.
     pub authority: Option<Arc<Rules>>,
-    /// How stops are proven; absent: off.
+    /// Options of the proof of stops; absent if drills are off.
     pub drill: Option<DrillOptions>,
     /// File of all commands; absent: not written.
     pub audit: Option<AuditFileOptions>,
@@ -83,7 +83,7 @@ pub struct BusSettings {
     pub spec: BusSpec,
     /// The part used only by the bus itself.
     pub options: BusOptions,
-    /// In the order of the file.
+    /// The drives in the order of the file.
     pub drives: Vec<DriveSpec>,
 }
 

@@ -10,7 +10,7 @@ use crate::files::{self, Patience};
 use crate::order::{Origin, SourceKind};
 use crate::plant::SharedPlant;
 
-/// How often an armed drill is looked at.
+/// Interval of the looks at an armed drill.
 const IDLE: Duration = Duration::from_millis(500);
 /// Time between two tries to write the file.
 const AGAIN: Duration = Duration::from_secs(10);

@@ -234,7 +234,7 @@ mod tests {
         [&[IAC, SB, COM_PORT], content, &[IAC, SE]].concat()
     }
 
-    /// Where `part` is in `whole`.
+    /// Whether `part` is contained in `whole`.
     fn has(whole: &[u8], part: &[u8]) -> bool {
         whole.windows(part.len()).any(|window| window == part)
     }

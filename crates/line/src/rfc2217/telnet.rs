@@ -108,7 +108,7 @@ impl Decoder {
                     }
                     State::Data
                 }
-                // Another command ends a subnegotiation that has no end.
+                // Another command ends a subnegotiation that lacks its end.
                 (State::SubCommand, _) => Verb::of(byte).map_or(State::Data, State::Option),
             };
         }

@@ -101,7 +101,7 @@ fn as_text<S: Serializer>(finding: &Finding, serializer: S) -> Result<S::Ok, S::
     serializer.collect_str(finding)
 }
 
-/// Where a value comes from.
+/// The place where a value is written.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Place {
     /// Line of the file, from 1.

@@ -13,7 +13,7 @@ use crate::codec::Table;
 pub struct Control {
     /// The control word, or a coil.
     pub at: ControlItem,
-    /// How the word reads back.
+    /// How the control word reads back.
     pub own_word: OwnWord,
     /// Bits that every word carries.
     pub always: Always,
@@ -91,7 +91,7 @@ impl Always {
 /// Some bits of a word, with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
-    /// Where; none is the control word.
+    /// Place of the word; `None` for the control word.
     pub place: Option<ControlItem>,
     /// The bits.
     pub mask: u16,
@@ -157,7 +157,7 @@ pub struct Step {
     pub write: Setting,
     /// The condition that ends the step.
     pub until: Until,
-    /// After which the command fails.
+    /// Time after which the command fails.
     pub timeout: Duration,
 }
 

@@ -14,7 +14,7 @@ const ROUNDING: f64 = 1e-9;
 pub enum Bound {
     /// Index of a point of the profile.
     Point(PointIndex),
-    /// In the unit of the band.
+    /// A fixed bound, in the unit of the band.
     Fixed(f64),
 }
 
@@ -44,7 +44,7 @@ pub enum Derived {
     Zero {
         /// Point.
         of: PointIndex,
-        /// In the unit of the point.
+        /// Greatest distance from zero, in the unit of the point.
         within: f64,
     },
     /// True while the two points differ by at most `within`.
@@ -53,7 +53,7 @@ pub enum Derived {
         of: PointIndex,
         /// The point to compare with.
         to: PointIndex,
-        /// In the unit of the points.
+        /// Greatest difference, in the unit of the points.
         within: f64,
     },
     /// True while all of the points are true.

@@ -37,7 +37,7 @@ macro_rules! index {
             }
         }
 
-        /// As a plain number, for instance in tests.
+        /// Compares with a plain number, for instance in tests.
         impl PartialEq<usize> for $name {
             fn eq(&self, place: &usize) -> bool {
                 self.0 == *place

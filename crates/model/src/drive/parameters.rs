@@ -152,7 +152,7 @@ pub enum RawValue {
 }
 
 impl RawValue {
-    /// From the words of a read.
+    /// The value in the words of a read.
     pub fn of_words(words: &[u16]) -> Option<RawValue> {
         match words {
             [word] => Some(RawValue::Word(*word)),

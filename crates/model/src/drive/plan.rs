@@ -55,7 +55,7 @@ const STATUS_BITS: [ModelPoint; 5] = [
 /// All requests to one drive, the fast ones first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Plan {
-    /// In the order class, table, address.
+    /// The reads in the order of class, table, address.
     pub reads: Vec<PlannedRead>,
     /// Reads after a new fault that no fast read covers: once per fault, among the slow reads.
     pub on_fault: Vec<PlannedRead>,

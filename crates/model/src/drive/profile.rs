@@ -215,7 +215,7 @@ pub enum PollClass {
     Fast,
     /// Polled every `slow_cycle`.
     Slow,
-    /// When the drive comes online.
+    /// Read once, when the drive comes online.
     Once,
     /// Once after a new fault: see [`Profile::on_fault`].
     Fault,
@@ -295,7 +295,7 @@ pub struct Blocks {
 /// Where a value comes from.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
-    /// From registers or bits of the drive.
+    /// The value is in registers or bits of the drive.
     Raw(Raw),
     /// The point is derived from other points.
     Derived(Derived),

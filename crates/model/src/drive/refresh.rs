@@ -85,7 +85,7 @@ impl Profile {
     /// The parts that a refresh repeats, or why there are none.
     ///
     /// # Errors
-    /// Why nothing is repeated.
+    /// Why commands are not repeated.
     pub fn repeats(&self) -> Result<Repeats, &'static str> {
         if self.protocols.contains(&Protocol::N2) {
             return Err("an N2 drive stores what is written");

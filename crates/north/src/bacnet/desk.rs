@@ -59,7 +59,7 @@ pub(super) struct Desk {
     uncertain: BTreeSet<u32>,
     /// When datagrams were taken up that arrived earlier than that, and how they arrived.
     arrivals: VecDeque<(Instant, Arrival)>,
-    /// Over which the datagrams of [`Desk::receive`] come.
+    /// Connection on which the datagrams of [`Desk::receive`] arrive.
     connection: Connection,
 }
 

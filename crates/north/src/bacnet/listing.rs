@@ -27,7 +27,7 @@ pub struct Line {
 pub const COLUMNS: [&str; 7] = ["device", "device_name", "object", "name", "type", "unit", "access"];
 
 impl Line {
-    /// In the order of [`COLUMNS`].
+    /// The texts of the cells, in the order of [`COLUMNS`].
     pub fn cells(&self) -> [String; 7] {
         [
             self.device.to_string(),

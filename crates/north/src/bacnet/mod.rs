@@ -238,7 +238,7 @@ impl Reconfigure for Server {
         Ok(Change { options, sockets })
     }
 
-    /// Forgets prepared options.
+    /// Discards prepared options.
     fn abort(&mut self, change: Change) {
         drop(change);
     }

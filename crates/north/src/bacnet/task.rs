@@ -33,7 +33,7 @@ use crate::process_image::Snapshot;
 use crate::reading::{Reader, is_readable};
 use crate::stats::BacnetFigures;
 
-/// How often time is looked at.
+/// Interval in which the task does what is due.
 const TICK: Duration = Duration::from_millis(100);
 /// Shortest interval between reports of changes.
 const LOOK: Duration = Duration::from_millis(5);

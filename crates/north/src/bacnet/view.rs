@@ -357,7 +357,7 @@ impl Application for View {
             let last = all.last();
             let of_slot = governs.map(|(.., entry)| (&entry.origin, entry.at));
             let by = of_slot.or(last.map(|(origin, at)| (origin, *at)));
-            // Without a command a motor is stopped.
+            // Without a command, the motor counts as stopped.
             let is_bit = matches!(what, Commanded::Run | Commanded::Reverse);
             let default = if governs.is_some() && is_bit {
                 Some(Datum::Bool(false))

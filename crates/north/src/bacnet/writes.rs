@@ -49,7 +49,7 @@ pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) 
     origin.proven(proof).with_right(rights.of(from))
 }
 
-/// Takes up a write whose request came so.
+/// Begins a write whose request arrived in this way.
 pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
@@ -154,7 +154,7 @@ fn slot(
     let mut write = SlotWrite::new(what, priority, entry);
     loop {
         match handle.priorities(|all| all.plan(&write)) {
-            // Another side may have withdrawn what governed since.
+            // Another server may have withdrawn the governing entry meanwhile.
             Follows::Nothing => match stands(handle, &write, &origin, now) {
                 Some(begun) => return begun,
                 None => continue,

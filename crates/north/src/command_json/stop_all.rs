@@ -72,7 +72,7 @@ pub(crate) fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, 
     why
 }
 
-/// Why nothing is stopped, as a refusal.
+/// The reason why nothing is stopped, as a refusal.
 pub(crate) fn nothing_to_stop(why: &NothingToStop) -> Refusal {
     match why {
         NothingToStop::NotControlled => Refusal::NotAllowed(why.to_string()),

@@ -49,7 +49,7 @@ impl Access {
     /// Whether a request on a connection to the address `local` of this machine may be answered.
     ///
     /// # Errors
-    /// Why not.
+    /// Why the request is not answered.
     pub(super) fn check(&self, uri: &Uri, headers: &HeaderMap, local: IpAddr) -> Result<(), AccessError> {
         self.check_host(uri, headers, local)?;
         let (Some(tokens), Some(scope)) = (&self.tokens, scope(uri.path())) else {

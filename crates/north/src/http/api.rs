@@ -70,7 +70,7 @@ pub(super) struct Drive<'d> {
     /// Why the drive accepts no commands but stops.
     #[serde(skip_serializing_if = "Option::is_none")]
     held: Option<String>,
-    /// For how long an ordinary stop still waits.
+    /// Time for which an ordinary stop still waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     stop_waits_ms: Option<u64>,
     /// Whether what was ordered last is being written again for the drive's own timeout.

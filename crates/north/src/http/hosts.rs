@@ -12,7 +12,7 @@ const LONGEST_NAME: usize = 255;
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Host {
     Address(IpAddr),
-    /// In lower case, without a final dot.
+    /// A name in lower case, without a final dot.
     Name(String),
 }
 

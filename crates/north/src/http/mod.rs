@@ -237,7 +237,7 @@ impl ConnectionHandler for HttpConnections {
         set_socket_options(stream.stream());
         let reader = stream.reader().clone();
         let terms = self.terms.load_full();
-        // Without an own address the client is gone.
+        // If the own address is unknown, the client is gone.
         let Ok(local) = stream.stream().local_addr() else {
             return;
         };
@@ -304,7 +304,7 @@ impl HttpConnections {
                 matches!(*request.method(), hyper::Method::POST | hyper::Method::DELETE).then(|| commands.token());
             let reply = router.call(request);
             async move {
-                // Other clients have a turn between two pipelined requests.
+                // Gives other clients a turn between two pipelined requests.
                 tokio::task::yield_now().await;
                 let reply = reply.await;
                 drop(command);

@@ -42,7 +42,7 @@ impl From<QueryError> for Refused {
 /// The values of the parameters `known`, in their order; an empty value is none.
 ///
 /// # Errors
-/// Another parameter, or one twice.
+/// If another parameter is given, or one of them twice.
 pub(super) fn parameters<const N: usize>(
     query: Option<&str>,
     known: &'static [&'static str; N],

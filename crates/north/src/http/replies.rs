@@ -36,7 +36,7 @@ pub(super) fn refused(status: StatusCode, why: impl Into<String>) -> Refused {
     (status, Json(ErrorReply::new(why))).into_response().into()
 }
 
-/// With status 404; lists the known names.
+/// A reply with status 404 that lists the known names.
 pub(super) fn not_found(error: String, known: Vec<String>) -> Refused {
     let error = Json(ErrorReply { error, known });
     (StatusCode::NOT_FOUND, error).into_response().into()

@@ -187,7 +187,7 @@ fn event_id(number: u64) -> String {
 /// The recent events, for a client that polls.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub(super) struct RecentEvents<'e> {
-    /// For `Last-Event-ID` of the next request.
+    /// The id for `Last-Event-ID` in the next request.
     last: String,
     #[schema(value_type = Vec<Event>)]
     events: Vec<&'e RawValue>,

@@ -19,7 +19,7 @@ const PASSES: u32 = 3;
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
 /// Bytes of a salt.
 const SALT: usize = 16;
-/// How the hashes of a new user begin.
+/// Beginning of the hash of a new user.
 const COST: &str = "$argon2id$v=19$m=12288,t=3,p=1$";
 /// Salt and hash verified for unknown users, so timing reveals nothing.
 const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";

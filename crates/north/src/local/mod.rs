@@ -89,7 +89,7 @@ impl server::Server for Local {
     /// Starts the server at the first path that it can have. It runs until `cancel`, whatever clients do.
     ///
     /// # Errors
-    /// When the socket cannot be bound: what and where.
+    /// If the socket cannot be bound: what failed and where.
     async fn start(
         options: Options,
         plant: SharedPlant,

@@ -21,7 +21,7 @@ const BACKLOG: u32 = 16;
 const LOCK_TRIES: u32 = 50;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
-/// Where the socket is to be.
+/// Path where the local socket should be.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum SocketPath {
     /// The default name in the runtime directory.
@@ -116,7 +116,7 @@ impl Drop for Bound {
 /// Listens on the first of `paths` that no running gateway has.
 ///
 /// # Errors
-/// Why none can be had.
+/// Why no socket can be bound.
 pub(super) async fn bind_first(paths: &[PathBuf]) -> io::Result<Bound> {
     let mut error = io::Error::from(io::ErrorKind::NotFound);
     for path in paths {

@@ -89,7 +89,7 @@ pub(crate) struct Admission {
 }
 
 impl ConnectionHandler for Admission {
-    /// With TLS, of the handshakes only.
+    /// With TLS, these are only the places of the handshakes.
     type Permit = ConnectionPermit;
 
     fn admit(&self, client: IpAddr) -> Option<ConnectionPermit> {

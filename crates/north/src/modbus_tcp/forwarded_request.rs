@@ -124,7 +124,7 @@ impl Future for PendingRequest {
                 let Poll::Ready(all) = Pin::new(acknowledged).poll(cx) else {
                     return Poll::Pending;
                 };
-                // Without an answer nothing is known: the process ends.
+                // If no answer comes, the process ends and the result stays unknown.
                 let all = all.unwrap_or(false);
                 request.take().map_or(Poll::Pending, |(header, request)| {
                     Poll::Ready(AnsweredRequest::StopAll(header, request, all))

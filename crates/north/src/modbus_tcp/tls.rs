@@ -161,7 +161,7 @@ impl Requirements {
     /// Whether a client's certificates, its own first, are accepted at `now`.
     ///
     /// # Errors
-    /// Why they are not.
+    /// Why the certificates are not accepted.
     pub(super) fn check(&self, chain: &[CertificateDer<'_>], now: SystemTime) -> Result<(), rustls::Error> {
         let Some((own, intermediates)) = chain.split_first() else {
             return Err(rustls::Error::NoCertificatesPresented);
@@ -190,7 +190,7 @@ pub(super) struct TlsAuthenticator {
 pub(super) struct AuthenticatedClient {
     pub(super) name: String,
     pub(super) role: Role,
-    /// For as long as the client is connected.
+    /// Counts the client as connected until it is dropped.
     pub(super) certificate: CertificateGuard,
 }
 

@@ -39,9 +39,9 @@ pub(super) struct Commands {
     topics: Topics,
     /// Everything from the connection to the broker counts as one client.
     client: Arc<str>,
-    /// In the order of acceptance.
+    /// Accepted commands without an answer, in the order of acceptance.
     waiting: PendingCommands,
-    /// In the order of acknowledgement.
+    /// Acknowledged commands without a confirmation, in the order of acknowledgement.
     confirming: PendingCommands,
     stopping: Vec<PendingStop>,
     memory: SharedMemory,

@@ -34,7 +34,7 @@ use crate::order::Arrival;
 use crate::reading::{Dated, Reader};
 use crate::tls_words;
 
-/// Why a broker refuses filters with wildcards.
+/// The broker's reason for refusing filters with wildcards.
 pub(super) const NO_WILDCARDS: &str = "WildcardSubscriptionsNotSupported";
 /// Time limit for the broker to answer the subscription.
 pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -149,7 +149,7 @@ impl Aliases {
 #[derive(Debug)]
 struct Backlog {
     messages: AtomicUsize,
-    /// When rumqttc wrote its latest messages.
+    /// Times at which rumqttc wrote its latest messages.
     rate: Mutex<Rate>,
     /// What it wrote last.
     trail: Mutex<Trail>,

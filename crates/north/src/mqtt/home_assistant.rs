@@ -61,7 +61,7 @@ struct Announced {
 }
 
 impl Announcer {
-    /// For the discovery prefix of Home Assistant.
+    /// An announcer for the discovery prefix of Home Assistant.
     pub(super) fn new(prefix: &str, sources: Sources) -> Announcer {
         Announcer {
             prefix: prefix.to_string(),

@@ -199,7 +199,7 @@ impl BrokerLink {
     /// Starts to connect to the broker whose turn it is, with this last will.
     ///
     /// # Errors
-    /// Why it cannot.
+    /// Why the link cannot connect.
     pub(super) async fn connect(&mut self, will: Will) -> Result<(), String> {
         let options = self.options.clone();
         // Read for each attempt, so that renewed certificates and tokens are used without a restart.

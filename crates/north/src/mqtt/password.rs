@@ -65,7 +65,7 @@ impl Password {
     /// The password now.
     ///
     /// # Errors
-    /// Why its file holds none, with its path.
+    /// Why the password file holds no secret, with the path of the file.
     pub(super) fn read(&self) -> Result<Secret, String> {
         match self {
             Password::Fixed(secret) => Ok(secret.clone()),

@@ -160,7 +160,7 @@ impl Publisher {
         self.clear(old);
     }
 
-    /// Someone else publishes these retained topics from now on.
+    /// Notes that someone else publishes these retained topics from now on.
     pub(super) fn publish_besides(&mut self, besides: Vec<Arc<str>>) {
         let old = std::mem::replace(&mut self.besides, besides);
         self.clear(old);

@@ -11,7 +11,7 @@ use crate::plant::Shown;
 /// Maximum number of levels of a response topic.
 const LEVELS: usize = 128;
 
-/// Which response topics results may go to.
+/// The response topics that results may be published to.
 #[derive(Debug, Clone)]
 pub(super) struct ResponseTopics {
     /// The gateway's own topics, `{base}/{gateway}`.

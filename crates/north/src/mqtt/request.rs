@@ -24,7 +24,7 @@ pub struct Incoming {
     pub packet: u16,
     /// Topic where the client expects the result.
     pub response_topic: Option<String>,
-    /// Sent back with the result.
+    /// Correlation data that is sent back with the result.
     pub correlation: Option<Vec<u8>>,
     /// Remaining life of the message, s.
     pub expiry: Option<u32>,
@@ -96,7 +96,7 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
 /// The command in a message on a set topic; `point` is the point of a bare value.
 ///
 /// # Errors
-/// Why nothing of it is executed.
+/// Why the gateway executes nothing of the message.
 pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
     if incoming.retain {
         return Err(Refusal::NotAllowed(
@@ -162,7 +162,7 @@ mod tests {
     }
 
     struct SetRequest {
-        /// Also if the rest is refused.
+        /// The id, present even if the rest is refused.
         id: Option<Id>,
         order: Result<Asked, Refusal>,
     }

@@ -38,7 +38,7 @@ pub struct How {
 /// Begins to read a drive, unless a reading is in progress; the number of the reading.
 ///
 /// # Errors
-/// Why it cannot be read.
+/// Why the drive cannot be read.
 pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) -> Result<u64, String> {
     let spec = &drive.image.spec;
     if spec.profile.parameters.is_empty() {
@@ -97,7 +97,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     vault.end(&machine, result);
 }
 
-/// How far a reading is.
+/// Progress of a reading.
 struct Looks {
     /// Number of addresses requested so far, and of all.
     progress: (usize, usize),

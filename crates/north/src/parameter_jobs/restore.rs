@@ -116,7 +116,7 @@ fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
 /// Starts writing the prepared restore of that number.
 ///
 /// # Errors
-/// Why not; nothing was written.
+/// Why the restore is not carried out; nothing was written.
 pub fn carry_out(
     plant: &SharedPlant,
     vault: &Arc<Vault>,
@@ -178,10 +178,10 @@ fn unmet_need(drive: &DriveHandle, journal: &Journal) -> Option<String> {
     (shows != need.value).then(|| format!("{}; nothing was written", need.remedy))
 }
 
-/// Takes up a restore that was cut off.
+/// Continues a restore that was interrupted.
 ///
 /// # Errors
-/// Why it cannot be.
+/// Why the restore cannot be continued.
 pub async fn take_up(
     plant: &SharedPlant,
     vault: &Arc<Vault>,
@@ -226,7 +226,7 @@ pub async fn take_up(
 /// goes on ends before its next parameter, and is to be released then.
 ///
 /// # Errors
-/// Why not.
+/// Why the drive is not released.
 pub async fn release(
     plant: &SharedPlant,
     vault: &Arc<Vault>,

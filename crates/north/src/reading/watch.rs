@@ -315,7 +315,7 @@ mod tests {
         let (watch, start) = watching(false);
         WORKER_RAN.set(watch.nanos(start));
         let now = start + 1200 * MS;
-        // Other workers ran the task.
+        // Other workers of the runtime ran the task.
         for n in 1..12 {
             let at = start + n * 100 * MS;
             watch.ran_at(at, boot(&watch, at));

@@ -251,7 +251,7 @@ impl Dialogue {
             _ => frame_of(protocol, &pending.request, &pending.pdu, outcome),
         };
         let Some(answer) = answer else {
-            // As on a line: whatever the reason, nothing comes.
+            // As on a line, nothing is sent, whatever the reason.
             return self.tool.count(SlotOutcome::NoAnswer);
         };
         if now >= pending.deadline {
@@ -361,7 +361,7 @@ mod tests {
             (failed(Outcome::BusDown), None, None),
             (failed(Outcome::Exception(Exception::VALUE)), Some(3), None),
             (failed(refused(Refusal::NotAllowed)), Some(1), Some(11)),
-            // As a line is silent.
+            // In these cases the slot stays silent, like a line.
             (Outcome::TimedOut, None, None),
             (Outcome::Purged, None, None),
         ] {

@@ -75,7 +75,7 @@ impl Framing {
         self.protocol.is_text() && bytes.iter().all(u8::is_ascii_whitespace)
     }
 
-    /// When incomplete bytes are given up.
+    /// Time at which incomplete bytes are given up.
     pub(super) fn patience(&self) -> Option<Instant> {
         self.frames.patience()
     }

@@ -73,7 +73,7 @@ pub struct Slot {
     pub format: LineFormat,
     /// Address where the slot takes frames as they are on the line.
     pub listen: Option<SocketAddr>,
-    /// Where a COM port is served by RFC 2217.
+    /// Address where a COM port is served by RFC 2217.
     pub rfc2217: Option<SocketAddr>,
     /// Link to a pseudo-terminal.
     pub pty: Option<PathBuf>,
@@ -109,7 +109,7 @@ impl Slot {
 /// All slots of the gateway.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Options {
-    /// In the order of the file.
+    /// The slots in the order of the file.
     pub slots: Vec<Slot>,
 }
 
@@ -231,7 +231,7 @@ impl TcpService<Options> for Slots {
             })
         };
         let all: Vec<Arc<Terms>> = options.slots.iter().map(terms).collect();
-        // In the order of the listeners.
+        // The order is that of the listeners.
         let mut served = all.iter().flat_map(|terms| {
             let addresses = terms.slot.addresses();
             addresses.map(|(_, telnet)| Served {

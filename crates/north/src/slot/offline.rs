@@ -18,7 +18,7 @@ use crate::plant::SharedPlant;
 pub struct Offline {
     terms: Arc<Terms>,
     dialogue: Dialogue,
-    /// Over which all comes, once something has.
+    /// The connection over which all bytes come, once the first ones have come.
     connection: Option<Connection>,
 }
 
@@ -73,7 +73,7 @@ impl Offline {
         std::mem::take(&mut self.dialogue.output)
     }
 
-    /// When the next call is due at the latest.
+    /// Latest time of the next call.
     pub fn wake_at(&self) -> Option<Instant> {
         self.dialogue.wake_at()
     }

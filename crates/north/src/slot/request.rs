@@ -116,7 +116,7 @@ fn of_n2(frame: &[u8]) -> Option<ToolRequest> {
         Err(n2::command::CHECKSUM) => return None,
         Err(code) => return Some(n2_request(address, Meaning::Faulty(Refused::Nak(code)))),
     };
-    // From the address to the checksum.
+    // The digits between the address and the checksum.
     let lead = frame.iter().rposition(|byte| *byte == b'>')?;
     let digits = frame.get(lead + 3..frame.len().checked_sub(3)?)?.to_vec();
     let pdu = n2::pdu_of(&command);

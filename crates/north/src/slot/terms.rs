@@ -52,7 +52,7 @@ impl Work {
     }
 }
 
-/// When a request may go.
+/// The conditions of time for sending a request.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
     pub(super) not_before: Instant,
@@ -62,7 +62,7 @@ pub(super) struct Pace {
     pub(super) stops: u64,
 }
 
-/// When tools may write next, by bus.
+/// Times from which tools may write next, by bus.
 #[derive(Debug, Default)]
 pub(super) struct WritePaces(Mutex<BTreeMap<String, Instant>>);
 
@@ -93,7 +93,7 @@ pub(super) struct Terms {
 #[derive(Debug)]
 pub(super) struct Tool {
     terms: Arc<Terms>,
-    /// With the right to write.
+    /// Origin with the right to write.
     origin: Origin,
     /// Origin with the right to send requests that cannot be checked.
     raw: Origin,

@@ -5,17 +5,17 @@ use super::{Exception, RequestPdu, be, counted, pack, put, unpack, words};
 /// A reply of a slave.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Reply {
-    /// To functions 1 and 2, as many as requested.
+    /// Reply to functions 1 and 2: as many bits as requested.
     Bits(Vec<bool>),
-    /// To functions 3, 4 and 23.
+    /// Reply to functions 3, 4 and 23: the registers.
     Registers(Vec<u16>),
     /// To functions 5, 6, 15, 16 and 22: the echo fits the request.
     Written,
-    /// To function 8: the data word.
+    /// Reply to function 8: the data word.
     Diagnostics(u16),
-    /// To function 43/14: the bytes after the MEI type.
+    /// Reply to function 43/14: the bytes after the MEI type.
     DeviceIdentification(Vec<u8>),
-    /// To N2's Identify: the device type.
+    /// Reply to N2's Identify: the device type.
     Identified(u8),
     /// To a poll of N2: the digits of the report, none where nothing changed.
     Changes(Vec<u8>),

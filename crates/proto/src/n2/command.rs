@@ -263,7 +263,7 @@ impl Answer {
     /// Decodes the answer in a line without its CR.
     ///
     /// # Errors
-    /// Why it is none.
+    /// Why the line is no answer.
     pub fn decode(line: &[u8]) -> Result<Answer, &'static str> {
         let (lead, text) = line.split_first().ok_or("the reply is empty")?;
         if !text.iter().all(u8::is_ascii_hexdigit) {

@@ -18,11 +18,11 @@ pub enum Region {
     Ao = 3,
     /// Binary output.
     Bo = 4,
-    /// Internal float.
+    /// Internal objects that are floats.
     Adf = 5,
-    /// Internal integer, 16 bits.
+    /// Internal objects that are integers of 16 bits.
     Adi = 6,
-    /// Internal byte.
+    /// Internal objects that are bytes.
     Bd = 7,
 }
 

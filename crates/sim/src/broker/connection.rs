@@ -106,7 +106,7 @@ struct Client<'a> {
     silence: Duration,
     input: Vec<u8>,
     output: Vec<u8>,
-    /// Last whole packet of the client.
+    /// When the last whole packet of the client arrived.
     heard: Instant,
     /// Last byte that the client took, or last time that there was nothing to take.
     progress: Instant,
@@ -279,7 +279,7 @@ impl<'a> Client<'a> {
         }
     }
 
-    /// Takes all whole packets from the input.
+    /// Reads all whole packets from the input.
     fn read_packets(&mut self, now: Instant) -> Result<(), End> {
         let input = std::mem::take(&mut self.input);
         let mut rest = input.as_slice();

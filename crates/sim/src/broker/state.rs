@@ -47,7 +47,7 @@ pub(super) struct Delivery {
 pub(super) enum Leave {
     /// The client sent a DISCONNECT, so no will is published.
     Clean,
-    /// Anything else: the will is published.
+    /// The connection ended in any other way, so the will is published.
     Lost,
 }
 
@@ -159,7 +159,7 @@ impl State {
         codes
     }
 
-    /// Takes subscriptions back; a reason code for each filter.
+    /// Ends subscriptions; returns a reason code for each filter.
     pub(super) fn unsubscribe(&mut self, number: u64, filters: &[String]) -> Vec<u8> {
         let Some(client) = self.clients.get_mut(&number) else {
             return vec![reason::PROTOCOL_ERROR; filters.len()];

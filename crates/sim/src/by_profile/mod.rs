@@ -47,7 +47,7 @@ pub struct ProfileOptions {
 /// The value of a point as given.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Given {
-    /// In the unit of the point; 1 is true.
+    /// A number in the unit of the point; 1 is true.
     Number(f64),
     Text(String),
 }

@@ -11,7 +11,7 @@ pub(super) enum Does {
     /// The drive has come to this position in its start sequence; the motor is not fed.
     Prepares(usize),
     Runs {
-        /// In reverse, apart from the sign of the reference.
+        /// Whether the motor runs in reverse, without regard to the sign of the reference.
         reverse: bool,
     },
     /// The drive ramps the motor down; its start sequence starts again.

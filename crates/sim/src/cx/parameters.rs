@@ -101,7 +101,7 @@ impl Parameters {
     /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
     ///
     /// # Errors
-    /// As [`Parameters::set`].
+    /// The errors of [`Parameters::set`].
     pub(super) fn write(&mut self, address: u16, value: u16, fed: bool) -> Result<(), Refused> {
         self.set.write(address, value, fed)?;
         self.set.record_kept(address);

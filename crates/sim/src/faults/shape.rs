@@ -88,7 +88,7 @@ impl FaultPlan {
 pub enum Kind {
     /// The burst comes where the reply is expected.
     Regular,
-    /// As regular, but delivered character by character.
+    /// The regular reply, delivered character by character.
     Split,
     /// The master cannot expect it: a request that meets it is not the master's doing.
     Provoked,
@@ -148,7 +148,7 @@ fn garble(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     let at = random.within(1..=digits.max(1)) as usize;
     let Some(digit) = reply.get_mut(at) else { return reply };
     match random.within(0..=2) {
-        // Another digit, so that the LRC is wrong.
+        // The digit is changed, so that the LRC is wrong.
         0 => *digit = if *digit == b'0' { b'1' } else { b'0' },
         1 => *digit |= 0x80,
         // An odd number of digits.

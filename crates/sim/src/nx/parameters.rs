@@ -99,7 +99,7 @@ impl Parameters {
     /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
     ///
     /// # Errors
-    /// As [`Parameters::set`].
+    /// The errors of [`Parameters::set`].
     pub(super) fn write(&mut self, id: u16, value: u16, fed: bool) -> Result<(), Refused> {
         self.0.write(id, value, fed)?;
         self.0.record_kept(id);

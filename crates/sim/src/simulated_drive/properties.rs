@@ -49,7 +49,7 @@ fn request() -> impl Strategy<Value = RequestPdu> {
     ]
 }
 
-/// Something that happens to a drive.
+/// An event of a drive in a test.
 #[derive(Debug, Clone)]
 enum Event {
     Ask(RequestPdu),

@@ -43,7 +43,7 @@ struct Node {
 }
 
 impl Service {
-    /// As the system has the unit.
+    /// The properties of the service's unit, as the system reports them.
     fn of_unit() -> Service {
         let asked = "User,DynamicUser,Group,SupplementaryGroups,LoadState,ProtectHome,PrivateTmp";
         let output = Command::new("systemctl")

@@ -28,7 +28,7 @@ Ctrl-C ends the demo.",
     )
 }
 
-/// As a word of the shell.
+/// The word, quoted for the shell where necessary.
 fn quoted(word: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "/._-+:".contains(c);
     match word.chars().all(is_plain) {

@@ -15,7 +15,7 @@ impl Conversation {
     /// Sends the first request to the gateway or, where there is none, opens the port; returns the reply.
     ///
     /// # Errors
-    /// Why there is none, as a message.
+    /// Why no conversation begins, as a message.
     pub(super) async fn begin(
         target: &Target,
         asked: &Asked,

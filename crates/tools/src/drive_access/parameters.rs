@@ -14,7 +14,7 @@ impl Target {
     /// Reads all parameters of the drive; the text of the file. `progress` gets how far it is.
     ///
     /// # Errors
-    /// Why there is none, as a message.
+    /// Why the parameters are not read, as a message.
     pub(crate) fn read_parameters(
         &self,
         how: ReadParameters,

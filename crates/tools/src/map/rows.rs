@@ -89,7 +89,7 @@ pub(super) fn drive_rows(drive: &DriveHandle, access: Access, registers: Registe
         .iter()
         .filter(|p| !p.hidden)
         .filter_map(|p| Some((p, p.raw()?)))
-        // Others are hidden by the common model.
+        // Other addresses are hidden by the common model.
         .filter(|(_, raw)| raw.table.is_bits() || registers.shows_the_drives(raw.address, raw.form.items()))
         .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));

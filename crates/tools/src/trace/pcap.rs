@@ -31,7 +31,7 @@ impl Capture<File> {
     /// Creates the file; an existing file is emptied.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// If the file cannot be written.
     pub(super) fn create(path: &Path) -> io::Result<Capture<File>> {
         Capture::new(File::create(path)?)
     }
@@ -55,7 +55,7 @@ impl<W: Write> Capture<W> {
     /// Adds a frame.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// If the file cannot be written.
     pub(super) fn frame(&mut self, time: SystemTime, direction: Direction, bytes: &[u8]) -> io::Result<()> {
         let event = match direction {
             Direction::Request => SENT,
@@ -68,7 +68,7 @@ impl<W: Write> Capture<W> {
     /// Notes that frames are missing here.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// If the file cannot be written.
     pub(super) fn lost(&mut self, time: SystemTime) -> io::Result<()> {
         self.packet(time, LOST, &[])
     }
@@ -95,7 +95,7 @@ impl<W: Write> Capture<W> {
     /// Writes what was added to the file.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// If the file cannot be written.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

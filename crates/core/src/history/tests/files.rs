@@ -68,7 +68,7 @@ fn what_is_broken_is_told_of_with_its_place() {
         told(&more).to_string(),
         format!("there is data after the end line, at byte {}", bytes.len())
     );
-    // Other files, and other versions.
+    // The files are of another kind or of another version.
     for foreign in [
         &b""[..],
         b"\n",

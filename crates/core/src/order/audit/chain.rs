@@ -235,7 +235,7 @@ impl Verifier {
         self.chain
     }
 
-    /// Takes the next line, without its line end.
+    /// Processes the next line, given without its line end.
     ///
     /// # Errors The fault; the next line can still be checked.
     pub fn line(&mut self, line: &[u8]) -> Result<(), Fault> {

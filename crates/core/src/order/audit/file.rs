@@ -159,7 +159,7 @@ impl AuditFile {
         &self.options
     }
 
-    /// Takes a record; never waits for the disk.
+    /// Queues a record; never waits for the disk.
     pub(super) fn push(&self, record: Arc<AuditRecord>, sent: bool) {
         let mut queues = self.shared.queues();
         let Queues {

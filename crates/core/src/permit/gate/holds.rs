@@ -221,7 +221,7 @@ impl Gate {
     /// Applies a client's action to a hold. Orders of other clients that wait or have started are refused when they go on.
     ///
     /// # Errors
-    /// Why it may not; none while `[authority]` is off.
+    /// Why the client may not do that; never while `[authority]` is off.
     pub(crate) fn hold_act(
         &mut self,
         drive: DriveIndex,

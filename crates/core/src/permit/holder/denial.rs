@@ -10,7 +10,7 @@ use crate::order::{Holder, Refusal};
 pub enum Denial {
     /// The client is not a principal.
     Nobody,
-    /// Another one holds the drive.
+    /// Another client holds the drive.
     Held(Claim, Duration),
     /// The stop of another client reserved the drive.
     Reserved(Claim, Duration),

@@ -17,7 +17,7 @@ const MOST_STOOD: usize = 256;
 /// An action on the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verb {
-    /// Takes a free drive, or renews.
+    /// Takes a free drive, or renews a hold.
     Take,
     /// Renews the client's hold.
     Renew,
@@ -359,7 +359,7 @@ impl Holding {
     /// Applies a client's action to the hold.
     ///
     /// # Errors
-    /// Why it may not.
+    /// Why the client may not do that.
     pub fn act(
         &mut self,
         who: Option<&Claim>,

@@ -40,7 +40,7 @@ struct Rig {
     gate: Gate,
     image: Arc<DriveImage>,
     right: Arc<AtomicBool>,
-    /// When the orders come, and when they are judged.
+    /// Times at which the orders come and at which they are judged.
     asked: Instant,
     now: Instant,
 }

@@ -23,7 +23,7 @@ enum Does {
     Stop,
     /// The order can make a standing motor turn.
     Start,
-    /// Anything else, such as setting a reference.
+    /// Does anything else, such as setting a reference.
     Other,
     /// The order only reads.
     Read,

@@ -394,7 +394,7 @@ pub(in crate::http) async fn heartbeat(
 /// Renews the lease of a drive if this login gave the drive its last command.
 ///
 /// # Errors
-/// Why not.
+/// Why the lease is not renewed.
 fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &'static str> {
     let spec = &drive.image.spec;
     if spec.access != Access::Control {

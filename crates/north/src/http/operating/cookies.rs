@@ -6,7 +6,7 @@ use ring::hmac;
 use super::super::users::User;
 use crate::hex;
 
-/// How long a browser is known, s.
+/// Time for which a browser stays known, s.
 const KNOWN: u32 = 90 * 86_400;
 
 /// The cookies of this gateway on a connection with TLS or without.

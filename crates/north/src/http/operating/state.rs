@@ -41,7 +41,7 @@ pub(in crate::http) struct Operating {
     pub(super) users: Arc<ArcSwapOption<Users>>,
     state: Mutex<State>,
     verifier: Verifier,
-    /// For names as keys of the throttle.
+    /// Hashes names into keys of the throttle.
     pub(super) hasher: RandomState,
     /// For passwords in memory; `None` if the system has no random numbers: nothing is kept then.
     key: Option<hmac::Key>,

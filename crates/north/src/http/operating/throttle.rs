@@ -57,7 +57,7 @@ impl Throttle {
     /// same time are limited too. Returns how many failures its source has: who has fewer goes first.
     ///
     /// # Errors
-    /// How long to wait; the attempt does not count.
+    /// Time to wait; the attempt then does not count.
     pub(super) fn begin(&mut self, source: Source, user: u64, now: Instant) -> Result<u32, Duration> {
         let failures = current(&self.sources, &source, now);
         let of_user = current(&self.users, &user, now);

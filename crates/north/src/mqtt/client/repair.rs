@@ -14,7 +14,7 @@ pub(super) struct Repair {
 }
 
 impl Repair {
-    /// Someone else published a status.
+    /// Notes that someone else published a status.
     pub(super) fn ask(&mut self) {
         self.wanted = true;
     }

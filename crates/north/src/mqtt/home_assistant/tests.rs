@@ -268,7 +268,7 @@ fn a_broker_with_small_packets_gets_a_device_in_parts() {
     let topics: BTreeSet<&str> = parts.iter().map(|part| part.topic.as_ref()).collect();
     assert_eq!(topics.len(), parts.len());
     assert!(topics.contains("homeassistant/device/drivegate_hall/drive_p1__2/config"));
-    // With larger packets the further topics are cleared.
+    // If packets may be larger, the further topics are cleared.
     announcer.restart(usize::MAX);
     let again = all(&mut announcer, now);
     assert_eq!(

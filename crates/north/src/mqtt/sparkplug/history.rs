@@ -45,7 +45,7 @@ impl Recorder {
         Some(surplus as u64)
     }
 
-    /// Takes the oldest, up to `most`.
+    /// Removes and returns the oldest entries, at most `most`.
     pub(super) fn take(&mut self, most: usize) -> Vec<(usize, Sample)> {
         let count = self.entries.len().min(most);
         self.entries.drain(..count).collect()

@@ -29,7 +29,7 @@ impl Host {
     /// Takes a STATE message; older ones than the last count for nothing.
     ///
     /// # Errors
-    /// Why it is none.
+    /// Why the payload is no state.
     pub(super) fn take(&mut self, form: StateForm, payload: &[u8]) -> Result<(), String> {
         let state: State = match form {
             StateForm::Object => serde_json::from_slice(payload).map_err(|error| error.to_string())?,

@@ -23,7 +23,7 @@ pub(super) struct Device {
     /// Whether the device went away since its birth, even if it is back.
     pub(super) gone: bool,
     pub(super) now_is: Vec<Sample>,
-    /// As last published or recorded.
+    /// The metrics as last published or recorded.
     pub(super) sent: Vec<Option<Sample>>,
     /// Metrics that are published although they did not change.
     pub(super) repeat: Vec<usize>,
