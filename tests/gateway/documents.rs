@@ -47,7 +47,8 @@ fn every_command_with_a_list_or_a_result_prints_it_as_json() {
         ("write", vec!["write", "pump-1", "run=true"]),
         ("watch", vec!["watch", "--once"]),
     ]);
-    // Refusals are documents too. `write` opens the port itself where no gateway runs, and there is none.
+    // Refusals are documents as well. Without a gateway, `write` opens the port itself, and here the port does not
+    // exist.
     for (name, command) in &commands {
         let (code, document, said) = with(command);
         assert_eq!(code, Some(1), "{name}: {document}");

@@ -450,7 +450,7 @@ fn what_a_search_prints_passes_check() {
     assert!(Path::new(&line.port()).exists());
 }
 
-/// A read that reaches a gateway in the moment of its end is done all the same.
+/// A read that reaches a gateway at the moment of its end is still done.
 #[test]
 fn a_gateway_that_just_ends_is_asked_again() {
     let line = Line::start();

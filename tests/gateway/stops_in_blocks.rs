@@ -149,7 +149,7 @@ enum Way {
     Slot(usize, Vec<u8>, u8),
 }
 
-/// The stop with so much junk around.
+/// The stop with this number of other words before and after it.
 fn around(before: usize, stop: u16, after: usize) -> Vec<u16> {
     [vec![77; before], vec![stop], vec![77; after]].concat()
 }

@@ -16,7 +16,7 @@ use super::rig::{Rig, Setup};
 enum Rule {
     /// After this number of replies.
     Behind(u32),
-    /// Upon the request that follows so many replies, which is lost.
+    /// At the request that follows this number of replies; the request is lost.
     Upon(u32),
     /// After a pause of this length without requests.
     Pause(Duration),

@@ -183,7 +183,7 @@ fn simulated_drives_in_ascii_run_and_meet_faults() {
     let gap: u64 = replied.split_whitespace().nth(1).unwrap().parse().unwrap();
     assert!(gap > 14_000, "the turnaround stands as the gap: {replied}");
 
-    // The line goes away and comes back with faults: read and commanded all the same.
+    // The line goes away and comes back with faults; reads and commands still work.
     line.signal("TERM");
     line.ended();
     until("the drive to be missed", || {

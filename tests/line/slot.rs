@@ -191,7 +191,7 @@ fn tools_that_misbehave_harm_nobody() {
     });
     let abandoned = rig.counted("abandoned");
     assert!(abandoned >= 1.0, "the flood gave its own requests up");
-    // No more is taken of it than a fast line brings, 50,000 bytes a second, and what one read takes.
+    // The gateway takes no more from the tool than a fast line brings, 50,000 bytes a second, and what one read takes.
     let most = (begun.elapsed().as_secs_f64() * 50_000.0 + 1024.0) / request.len() as f64;
     assert!(abandoned <= most, "{abandoned} of {most}");
     rig.site.until_state("pump-1", "ready");

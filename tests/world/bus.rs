@@ -206,7 +206,7 @@ impl WorldBus {
         }
     }
 
-    /// The bus as a reload starts it anew, with the same drives on the same line.
+    /// Starts the bus anew, as a reload does, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.handle.queue.begin_handover(Vec::new(), now);
         let leaving: Vec<_> = self.handle.image.drives.iter().cloned().collect();
@@ -439,7 +439,8 @@ impl WorldBus {
             };
             let spec = &image.spec;
             if spec.address != act.address {
-                // A reply that came twice was taken for that of a later request, and the bus started anew behind it.
+                // A repeated reply was accepted as the reply to a later request, and the bus was started anew after
+                // that.
                 assert!(self.late, "drive {} acted that was not asked", act.address);
                 continue;
             }

@@ -68,14 +68,14 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     assert_eq!(all(&[(&mangled, 5), (&one, 200), (&said, 5)]), []);
     let answered = [(&mangled[..], 5), (&said, 5), (&one, 200), (&said, 5)];
     assert_eq!(all(&answered), std::slice::from_ref(&first));
-    // A frame of a function that is not known is sound all the same.
+    // A frame with an unknown function is nevertheless sound.
     let unknown = framed(1, &[0x41, 9]);
     assert_eq!(all(&[(&unknown, 5), (&one, 200), (&said, 5)]), [first]);
 }
 
 #[test]
 fn a_reply_of_bits_that_could_be_a_request_is_not_believed() {
-    // 24 bits: the reply has as many bytes as a request.
+    // With 24 bits, the reply has as many bytes as a request.
     let ask = framed(1, &[1, 0, 0, 0, 24]);
     let reply = framed(1, &[1, 3, 0x12, 0x00, 0x10]);
     assert_eq!(believed(Protocol::ModbusRtu, &[(&ask, 5), (&reply, 5)]), []);

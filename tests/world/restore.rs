@@ -405,7 +405,7 @@ impl RestoreWorld {
         }
     }
 
-    /// The gateway is started anew, and holds the drive if there is a journal.
+    /// Starts the gateway again, which holds the drive if a journal exists.
     fn start_anew(&mut self) {
         self.cuts += 1;
         (self.cut_at, self.stands) = (None, None);
@@ -415,7 +415,7 @@ impl RestoreWorld {
         self.next = self.rig.now;
     }
 
-    /// Restores, cut off so many times, to its end: whether the drive has the new values.
+    /// Carries out a restore that is cut off `cuts` times; returns whether the drive then has the new values.
     fn restore(&mut self, mut cuts: u64) -> bool {
         for _ in 0..50 {
             let parsed = self.disk.as_deref().map(|text| {

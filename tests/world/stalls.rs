@@ -38,7 +38,7 @@ use super::scenario::{Habit, Line};
 const FIXED: u64 = 240;
 /// A running thread shows at least this often that it runs.
 const BEAT: Duration = Duration::from_millis(100);
-/// The motors are looked at this often.
+/// Interval in which the motors are checked.
 const LOOK: Duration = Duration::from_millis(50);
 /// Longest time of a request with its reply on the slowest wire.
 const ON_THE_WIRE: Duration = Duration::from_millis(250);
@@ -198,7 +198,7 @@ impl World {
         self.heal();
     }
 
-    /// No more faults: stops are carried out, and everything is good.
+    /// Checks that after the last fault stops are carried out and all values are good.
     fn heal(&mut self) {
         self.calm = true;
         let quiet = self

@@ -553,7 +553,7 @@ fn ready(spec: fn(&mut DriveSpec)) -> Rig {
     rig
 }
 
-/// A PLC writes its run word ten times a second for that long: how many were refused.
+/// Writes the run word ten times a second for this time, as a PLC does; returns the number of refusals.
 fn holds_run(rig: &mut Rig, time: Duration) -> u32 {
     let until = rig.now + time;
     let mut refused = 0;

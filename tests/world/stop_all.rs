@@ -126,7 +126,8 @@ fn what_is_said_to_stand_stands_and_all_stands_in_the_end() {
     }
 }
 
-/// The stops of single drives on the wire since so many requests; with `broadcasts`, those to all too.
+/// The stops of single drives on the wire after the first `before` requests; with `broadcasts`, also those of all
+/// drives.
 fn stops_since(rig: &Rig, before: usize, broadcasts: bool) -> usize {
     let requests = rig.requests();
     let is_stop = |frame: &&Recorded| {

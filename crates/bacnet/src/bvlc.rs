@@ -16,7 +16,7 @@ pub enum Bvlc<'a> {
     Broadcast(&'a [u8]),
     /// A broadcast that a BBMD forwards, with the host that sent it.
     Forwarded(SocketAddrV4, &'a [u8]),
-    /// A foreign device registers for so many seconds.
+    /// A foreign device registers for this number of seconds.
     Register(u16),
     /// A question for the foreign devices.
     ReadForeign,
@@ -100,7 +100,7 @@ pub fn distribute(npdu: &[u8]) -> Vec<u8> {
     datagram(0x09, npdu)
 }
 
-/// Registers as a foreign device for so many seconds.
+/// The message that registers a foreign device for this number of seconds.
 pub fn register(seconds: u16) -> Vec<u8> {
     datagram(0x05, &seconds.to_be_bytes())
 }

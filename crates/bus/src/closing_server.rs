@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 const SOON: Duration = Duration::from_millis(60);
 /// Wait for the server to close, beyond twice the time that it took before.
 const MARGIN: Duration = Duration::from_millis(10);
-/// After so many further replies over one connection the server is taken to stay.
+/// Number of further replies over one connection after which the server counts as one that stays connected.
 const STAYED: u32 = 3;
 
 /// Knowledge of a device server and of its present connection.
@@ -20,7 +20,7 @@ pub(super) struct ClosingServer {
     habit: Option<Habit>,
 }
 
-/// The server closes a connection after so many replies, within that time.
+/// The server closes a connection after this number of replies and within this time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Habit {
     replies: u32,

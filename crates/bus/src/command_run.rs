@@ -391,7 +391,7 @@ impl CommandRun {
         self.overtaken = self.overtaken.saturating_add(1);
     }
 
-    /// Whether the end of its pulse goes before the next stop, because so many stops went first.
+    /// Whether the end of the pulse goes before the next stop, because enough stops went first.
     pub fn is_put_off(&self) -> bool {
         !self.may_write_on() && self.overtaken >= MOST_STOPS
     }

@@ -24,7 +24,7 @@ use crate::stalls::Stalls;
 /// Next action on the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
-    /// Read the received bytes; if there are none, write what [`BusCore::sending`] returns to the port.
+    /// Read the received bytes; if none are there, write what [`BusCore::sending`] returns to the port.
     Send,
     /// Wait for bytes, or until this time.
     Wait {

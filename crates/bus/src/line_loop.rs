@@ -24,7 +24,7 @@ const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from
 /// Longest wait for the transaction on the line when the bus is to stop: a present drive replies within it, an absent
 /// one must not delay a stop or a reload for its full `response_timeout`.
 const LAST_EXCHANGE: Duration = Duration::from_secs(1);
-/// The thread shows that it is alive at least this often, also while it waits for a reply.
+/// Longest time between two signs of life of the thread, even while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
 
 /// A running bus.

@@ -20,7 +20,7 @@ const ALMOST: f64 = 0.9;
 /// replies of such a line are early; so they are weighed, and each regular reply takes 1 back. From this weight on, early
 /// replies are believed.
 const WITHOUT_WIRE_TIME: u32 = 64;
-/// Most that early replies weigh together: so many regular replies bring a line back to its protection.
+/// Greatest weight of early replies: this number of regular replies restores the protection of a line.
 const MOST_WEIGHT: u32 = 256;
 /// An early reply that can hardly belong to another request. One is enough, until the next regular reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
@@ -267,7 +267,7 @@ impl LineState {
         }
     }
 
-    /// Something was on the line, a reply or garbage: the silence before the next request begins anew.
+    /// Starts the silence before the next request again, because a reply or garbage was on the line.
     fn begin_silence(&mut self, now: Instant) {
         self.quiet_since = now.max(self.quiet_since);
     }

@@ -50,7 +50,7 @@ use crate::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Ur
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Timing};
 
-/// The bus looks around at least this often.
+/// Longest time between two looks of the bus at its drives and queue.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 /// Response timeouts for which an N2 reply may come late.
 const N2_LATE: u32 = 3;
@@ -59,7 +59,7 @@ const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
 /// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
 /// slower: probed every 10 s, it costs less than 2 % of the line by that.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
-/// Every so many probes of a drive one waits as long as any request: the drive may be slow.
+/// One in this number of probes waits as long as any request, because the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
 /// A transaction: drive, purpose and request.

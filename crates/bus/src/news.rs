@@ -11,7 +11,7 @@ use crate::queue::Denied;
 /// A result of the master. Drives are named by their place on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub enum News {
-    /// A round of the fast class was started, so long after the one before.
+    /// A round of the fast class was started, this time after the previous one.
     FastRound(Option<Duration>),
     /// A round of the slow class was started.
     SlowRound(Option<Duration>),
@@ -56,7 +56,7 @@ pub enum News {
         /// Reason of the failure, as text.
         why: Option<String>,
     },
-    /// The action of a lease that expired was acknowledged after so many tries that failed.
+    /// The action of an expired lease was acknowledged after this number of failed tries.
     ActionTaken {
         /// Place of the drive.
         drive: DriveIndex,

@@ -287,7 +287,7 @@ impl Refresh {
         end.and_then(|end| self.end(end))
     }
 
-    /// When the next round is due; none while there is none to wait for.
+    /// When the next round is due; `None` if no round is awaited.
     pub(super) fn due(&self) -> Option<Instant> {
         let going = self.repeated.going?;
         // A run command is repeated to a motor that was seen to run by it.

@@ -9,7 +9,7 @@ use crate::order::written;
 
 /// Times after the stop at which it is written again.
 const AGAIN: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(3)];
-/// A write that was not answered may still arrive for so long.
+/// Time for which a write without an answer may still arrive.
 const MAY_ARRIVE: Duration = Duration::from_secs(30);
 
 /// The stops of a drive that are still to be written again.
@@ -55,7 +55,7 @@ impl RepeatedStops {
         *self != RepeatedStops::default()
     }
 
-    /// Whether a stop is due again; each is so once.
+    /// Whether a stop is due again; each stop is repeated only once.
     pub(super) fn take_due(&mut self, now: Instant) -> bool {
         let mut due = self.due.iter_mut();
         due.any(|due| due.take_if(|due| *due <= now).is_some())

@@ -69,7 +69,8 @@ impl Tap {
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
         let parts = describe::parts(protocol, &self.request, &self.frame, &self.hearing.bytes, answered);
-        // The outcome stands at its own part; where there is none (nothing came, or only foreign frames) at nothing.
+        // The outcome belongs to its own part; without such a part (nothing or only foreign frames came), it belongs to
+        // none.
         let its_kind = if answered { Kind::Reply } else { Kind::Garbage };
         let its_part = parts.iter().rposition(|part| part.kind == its_kind);
         let mut quiet_since = self.hearing.sent;

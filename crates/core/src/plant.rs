@@ -165,7 +165,7 @@ impl Plant {
 }
 
 impl DriveHandle {
-    /// For how long the stop that waits for the drive still does so, by `min_run`.
+    /// Time for which a stop of the drive still waits because of `min_run`.
     pub fn stop_waits(&self, now: Instant) -> Option<Duration> {
         let until = self.bus.queue.lock().stop_waits(self.index, now)?;
         Some(until.saturating_duration_since(now))

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 pub use self::pauses::{Heartbeat, Pauses};
 
-/// A thread that reads runs at least this often.
+/// Longest time between two runs of a reading thread.
 pub const TICK: Duration = Duration::from_millis(100);
 /// Longest time between two turns of a thread that is not a stall. A tick is late by some milliseconds on any machine;
 /// by half of its time only where the thread did not get the processor. Any stall of 150 ms or more is detected.

@@ -528,7 +528,8 @@ impl Daemon {
     }
 }
 
-/// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
+/// Stops buses, all at the same time and outside the runtime, because each takes up to a second. Returns what the buses
+/// leave.
 async fn at_once<B: Send + 'static, T: Send + 'static>(
     buses: Vec<(BusSettings, B)>,
     end: fn(B) -> T,

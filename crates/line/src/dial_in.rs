@@ -17,7 +17,7 @@ use super::{Lost, Names, OpenError, UNACKNOWLEDGED, clock, poll_until, read, wri
 
 /// A connection without the text is hung up on after that time.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Most connections that may owe their text at one time; another one is hung up on.
+/// Most connections at one time whose text has not arrived; further ones are closed.
 const MOST_PENDING: usize = 32;
 /// Longest text that identifies a device.
 pub const LONGEST_ID: usize = 64;
@@ -86,7 +86,7 @@ pub fn split(place: &str) -> (&str, &str) {
 }
 
 impl Place {
-    /// Listens at the address, unless another bus does so already.
+    /// Listens at the address, unless another bus already listens there.
     fn of(address: &str, id: &str, allow: &[IpNet]) -> io::Result<Place> {
         let address: SocketAddr = address
             .parse()

@@ -42,7 +42,7 @@ impl Mbap {
         write_all(self.stream.as_fd(), &sent)
     }
 
-    /// Reads the reply to the last request, as an RTU frame; 0 if there is none.
+    /// Reads the reply to the last request as an RTU frame; returns 0 if there is none.
     ///
     /// # Errors
     /// When the port is gone, or the bytes are not Modbus TCP.

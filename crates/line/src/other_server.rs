@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// A connection is silent when nothing has come for so long.
+/// Time without a byte after which a connection counts as silent.
 const SILENT: Duration = Duration::from_secs(5);
 /// Time between two questions to a server.
 const AGAIN: Duration = Duration::from_secs(3600);
@@ -45,7 +45,7 @@ impl OtherServer {
         self.0.found.load(Ordering::Relaxed)
     }
 
-    /// Whether what was recognised is there no more: it may have been set up again.
+    /// Whether the recognised server is no longer there: another one may have been set up.
     pub(super) fn is_gone(&self, stream: &TcpStream) -> bool {
         let unit = self.0.unit.load(Ordering::Relaxed);
         let still = stream.peer_addr().is_ok_and(|server| answers(server, unit));

@@ -206,7 +206,8 @@ impl ConnectionPlace {
         self.why.get().copied()
     }
 
-    /// Ends the connection; the first reason counts. Its client may write no more, unless the place only goes to another.
+    /// Ends the connection; the first reason counts. The client may no longer write, unless the place only goes to
+    /// another client.
     pub(super) fn close(&self, why: CloseReason) {
         if why != CloseReason::Displaced {
             self.rights.set(Authority::ReadOnly);

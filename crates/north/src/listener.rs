@@ -195,7 +195,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         Ok(new)
     }
 
-    /// Closes the sockets that are not `kept` and overlap `address`; false if there are none.
+    /// Closes the sockets that are not `kept` and overlap `address`; returns false if no socket does.
     async fn release(&mut self, address: SocketAddr, kept: &[bool], released: &mut Vec<usize>) -> bool {
         let mut any = false;
         for (index, (listener, kept)) in self.open.iter_mut().zip(kept).enumerate() {

@@ -314,7 +314,7 @@ impl<'r> DriveView<'r> {
         self.reading.model(point).good().map(Value::as_f64)
     }
 
-    /// A bit of the model; `None` if the family has it but it is not good.
+    /// A bit of the model; `None` if the family has the bit but its value is not good.
     fn bit(&self, point: ModelPoint) -> Option<bool> {
         self.reading.bit(point).filter(|_| !self.stale)
     }

@@ -317,7 +317,7 @@ pub struct MqttStats {
     lost: [AtomicU64; MqttKind::ALL.len()],
 }
 
-/// A kind of message that the MQTT client keeps until the broker has it; what it gives up is counted.
+/// A kind of message that the MQTT client keeps until the broker has it; messages that it gives up are counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttKind {
     Event,

@@ -130,7 +130,7 @@ fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
     }
 }
 
-/// Address, PDU and LRC between the colon of a frame and its line feed, or why there are none.
+/// Address, PDU and LRC between the colon of a frame and its line feed, or why the frame has none.
 fn body(frame: &[u8]) -> Result<Vec<u8>, &'static str> {
     let line = frame.strip_prefix(b":").ok_or("it does not start with a colon")?;
     let line = line.strip_suffix(b"\n").ok_or("it does not end with a line feed")?;

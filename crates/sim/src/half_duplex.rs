@@ -22,7 +22,8 @@ use std::time::Duration;
 pub enum Delivery {
     /// All at the end of the last character: a master that ends a reply by its length sees no difference.
     Whole,
-    /// In chunks of so many characters, as a UART empties its FIFO (14 of 16 is usual); 1 is one by one.
+    /// In chunks of this number of characters, as a UART empties its FIFO (14 of 16 is usual); 1 delivers them one by
+    /// one.
     Chunks(u8),
     /// Whole, at the next multiple of this time: the latency timer of a USB adapter.
     Steps(Duration),

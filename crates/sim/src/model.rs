@@ -219,7 +219,7 @@ pub enum Beyond {
 }
 
 impl Beyond {
-    /// Whether a message may hold so many items.
+    /// Checks that a message may hold this number of items.
     ///
     /// # Errors
     /// The exception for none and for too many.

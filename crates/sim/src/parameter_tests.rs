@@ -163,7 +163,7 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
     assert!(written > 1000, "{written}");
 }
 
-/// Function 08 behind the parameters, where the family counts; without it the reading is whole all the same.
+/// The reading continues with function 08 if the family has counters; without them, the reading is whole as well.
 #[test]
 fn the_counters_of_a_drive_are_read_behind_its_parameters() {
     for (profile, known) in families() {

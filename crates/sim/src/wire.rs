@@ -271,7 +271,7 @@ impl SimulatedBus {
         self.shared.line().set_faults(faults);
     }
 
-    /// Calls `act` with a drive as it is now; `None` when there is none with that address.
+    /// Calls `act` with the drive at this address in its present state; returns `None` if no drive has the address.
     pub fn with_drive<R>(&self, address: u8, act: impl FnOnce(&mut SimulatedDrive, SimTime) -> R) -> Option<R> {
         let mut line = self.shared.line();
         let now = self.shared.now();
@@ -281,7 +281,7 @@ impl SimulatedBus {
         })
     }
 
-    /// Takes a drive off the line or puts it back; false when there is none with that address.
+    /// Takes a drive off the line or puts it back; returns false if no drive has the address.
     pub fn set_alive(&self, address: u8, alive: bool) -> bool {
         self.with_drive(address, |drive, _| drive.set_alive(alive)).is_some()
     }

@@ -32,7 +32,7 @@ pub fn take_next(queue: &CommandQueue, now: Instant) -> Option<Command> {
     next_command(&mut queue.lock(), Urgency::Read, now)
 }
 
-/// When a command came that comes at `now`, over a connection of its own, and may be sent for that long.
+/// The time window of a command that arrives at `now` over a new connection and may be sent until `expiry` has passed.
 pub fn window(now: Instant, expiry: Duration) -> Window {
     Window {
         arrival: Arrival::now(now),

@@ -73,7 +73,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// Removes that of a name.
     ///
     /// # Errors
-    /// There is none, or what is wrong with the file.
+    /// If the name does not exist, or what is wrong with the file.
     pub(super) fn remove(&self, name: &str) -> Result<(), String> {
         let (shown, kind) = (self.path.display(), C::KIND);
         self.change(|text| match parsed::<C>(&self.path, text)?.named(name) {

@@ -305,7 +305,7 @@ fn configuration(place: &DemoPlace, sides: &Sides) -> String {
         let ([cycle, slow_cycle], protocol) = (line.cadence, line.protocol.name());
         text += &format!("\n[[bus]]\nname = \"{name}\"\nport = {port:?}\nprotocol = \"{protocol}\"\nbaud = {baud}\n");
         text += &format!("format = \"{format}\"\ncycle = \"{cycle}\"\nslow_cycle = \"{slow_cycle}\"\n");
-        // The drives are programs: on a busy machine they answer late, and are there all the same.
+        // The drives are programs: on a busy machine they answer late, but they do answer.
         text += "response_timeout = \"1s\"\nretries = 3\n";
         if line.protocol == Protocol::ModbusRtu {
             text += "silence = \"chars\"\n";

@@ -146,7 +146,7 @@ impl Target {
 /// Index of the point of that name.
 ///
 /// # Errors
-/// The message when there is none.
+/// The message if the profile has no such point.
 pub(super) fn point(profile: &Profile, name: &str) -> Result<PointIndex, String> {
     profile.point_index(name).ok_or_else(|| {
         let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {

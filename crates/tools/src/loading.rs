@@ -101,7 +101,7 @@ pub(super) struct Loads {
 }
 
 impl Loads {
-    /// Begins to read the configuration in `path`, or does so after the one that is being read.
+    /// Begins to read the configuration in `path`, after the present load if one is in progress.
     ///
     /// # Errors
     /// The configuration cannot be read now.

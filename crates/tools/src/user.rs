@@ -101,7 +101,7 @@ fn password() -> Result<String, String> {
     }
 }
 
-/// The first line, of which a password has at most so many bytes.
+/// The first line; a password has at most this number of bytes.
 fn piped() -> io::Result<String> {
     let mut line = String::new();
     let most = u64::try_from(MAX_PASSWORD + 2).unwrap_or(u64::MAX);

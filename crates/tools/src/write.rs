@@ -174,7 +174,7 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
 /// The reply as the gateway sent it, and in words: what was acknowledged, or why the command failed.
 ///
 /// # Errors
-/// The reply is not one to a command, or there is none.
+/// If there is no reply, or the reply is not one to a command.
 fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String, String>), String> {
     let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
     let what = format!("{} {}", target.drive, shown.join(" "));

@@ -164,7 +164,7 @@ fn commands_need_users_and_a_private_way() {
     assert!(gateway.runs());
 }
 
-/// A reload that starts a bus anew keeps who commanded its drives last, as it keeps their leases.
+/// A bus that a reload starts anew keeps the last commander of each drive, as it keeps the leases.
 #[test]
 fn a_bus_that_starts_anew_knows_who_commanded_last() {
     let site = site();

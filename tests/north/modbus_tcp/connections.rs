@@ -57,7 +57,7 @@ async fn connections_are_kept_alive() {
     let mut client = rig.client().await;
     client.ask(1, &words(3, &[2102, 1])).await;
     let ends = [rig.address(), client.stream.local_addr().unwrap()].map(|end| format!(":{:04X}", end.port()));
-    // The timer of the server's side as proc(5) has it: which (02 is keepalive), and its rest in 1/100 s.
+    // The timer of the server's side, as in proc(5): its kind (02 is keepalive) and its rest in 1/100 s.
     let timer = || {
         let table = std::fs::read_to_string("/proc/net/tcp").unwrap();
         let mut rows = table.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());

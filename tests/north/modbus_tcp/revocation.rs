@@ -138,7 +138,7 @@ async fn other_rights_of_a_role_disconnect_its_clients() {
     rig.end().await;
 }
 
-/// Signs a certificate for hmi's key that expires in so many seconds.
+/// Signs a certificate for hmi's key that expires in `seconds` seconds.
 fn sign_for(dir: &Path, seconds: u64) {
     let end = humantime::format_rfc3339_seconds(SystemTime::now() + Duration::from_secs(seconds)).to_string();
     let end: String = end
@@ -184,7 +184,8 @@ async fn a_connection_ends_with_its_certificate() {
     rig.end().await;
 }
 
-/// openssl makes no certificate with two extensions of a kind, so one with another extension is changed and signed anew.
+/// openssl makes no certificate with two extensions of one kind, so a certificate with another extension is changed and
+/// signed again.
 fn sign_with_two_roles(dir: &Path) {
     sh(
         dir,

@@ -305,7 +305,7 @@ async fn who_is_not_known_is_refused() {
 async fn who_never_ends_the_handshake_is_closed() {
     let rig = Rig::with(tls_options()).await;
     let address = rig.server.tls_addresses()[0];
-    // A handshake record of 512 bytes, of which no more than these ever come.
+    // The head of a handshake record of 512 bytes, of which only these bytes are ever sent.
     for (round, begun) in [&[][..], &[0x16, 3, 1, 2, 0, 1, 0, 1, 0xFC]].into_iter().enumerate() {
         let round = round as u64;
         let mut slow = Client::connect(address).await;

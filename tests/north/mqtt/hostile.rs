@@ -18,7 +18,7 @@ const STATE: &str = "drivegate/hall/drive/p1/state";
 struct Manners {
     /// Properties of the broker's CONNACK.
     properties: Vec<u8>,
-    /// Topics below this get this reason code, so many times.
+    /// Topics below this one receive this reason code, this number of times.
     refused: Option<(&'static str, u8, usize)>,
     /// Whether the broker sends each byte separately.
     piecemeal: bool,

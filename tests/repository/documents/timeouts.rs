@@ -8,7 +8,7 @@ use drivegate::drive::profile::Profiles;
 /// Text of a profile whose timeout counts unknown requests; the page has it once.
 const UNKNOWN: &str = "; which requests count is not known";
 
-/// A row for each timeout, with the families that have it and are not based on another.
+/// A row for each timeout, with the families that have it and are not based on another of these families.
 pub(crate) fn table() -> String {
     let mut rows: Vec<(Vec<String>, String)> = Vec::new();
     for profile in Profiles::built_in().iter().filter(|profile| profile.base.is_none()) {

@@ -354,7 +354,8 @@ impl World {
         }
     }
 
-    /// A client hangs up in the middle of a request, and is back: what it ordered is carried out all the same.
+    /// Closes a client's connection in the middle of a request and opens it again; the orders that it gave are carried
+    /// out in any case.
     fn hang_up(&mut self, client: usize) {
         let now = self.now;
         let Way::ModbusTcp(offline, open, _) = &mut self.clients[client].way else {

@@ -7,7 +7,7 @@ use drivegate_world::drive::PollClass;
 use super::*;
 use crate::bus::Parts;
 
-/// A late reply may come for so long; what could be mistaken for it waits.
+/// Time for which a late reply may arrive; requests that it could be mistaken for wait.
 const FORGOTTEN: Duration = Duration::from_secs(1);
 /// A slow request that was not answered on a troubled line is tried again after that.
 const MUTE: Duration = Duration::from_secs(4);
@@ -153,7 +153,7 @@ impl World {
                     0 => Duration::ZERO,
                     _ => FLOODED,
                 };
-                // A bus that was just started anew leaves the line alone until no late reply can come.
+                // A bus that was started anew sends nothing until no late reply can arrive.
                 let rests = if self.scenario.reloads {
                     FORGOTTEN
                 } else {

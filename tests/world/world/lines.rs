@@ -190,7 +190,7 @@ impl World {
     /// Checks a write that no client ordered: the lease must have expired, and no client be back.
     pub(super) fn supervision_acts(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         let now = self.now;
-        // An order that ended in this step waits no more.
+        // An order that ended in this step no longer waits.
         self.collect();
         let supervision = self.buses[bus].line.supervision.clone();
         let supervision = supervision.unwrap_or_else(|| panic!("a stop that nobody ordered, drive {}", drive + 1));

@@ -69,7 +69,7 @@ impl<'a> Reader<'a> {
     /// The next tag, which stays.
     ///
     /// # Errors
-    /// There is none.
+    /// If no tag is left.
     pub fn peek(&self) -> Read<Tag> {
         self.clone().tag()
     }
@@ -77,7 +77,7 @@ impl<'a> Reader<'a> {
     /// Reads the next tag; the value of the tag follows.
     ///
     /// # Errors
-    /// There is none, or none that is valid.
+    /// If no tag is left, or the next one is not valid.
     pub fn tag(&mut self) -> Read<Tag> {
         let first = self.octet()?;
         let number = match first >> 4 {

@@ -235,7 +235,7 @@ impl Server {
         self.go_on(token, app, now);
     }
 
-    /// Takes up the writes of a request, one behind the other; behind one that failed only the stops.
+    /// Carries out the writes of a request one after the other; after a failed write, only its stops.
     fn go_on(&mut self, token: u64, app: &dyn Application, now: Instant) {
         loop {
             let Some(exchange) = self.exchanges.running(token) else {

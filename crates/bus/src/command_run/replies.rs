@@ -201,7 +201,7 @@ impl CommandRun {
         Some(refused)
     }
 
-    /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.
+    /// The value remains written: a supervisor that looks away only misses changes at the panel.
     fn not_released(&mut self, why: &str) -> Option<Outcome> {
         tracing::warn!(target: "drivegate::bus::command_run", "an output was written but not released to the drive's own control: {why}");
         self.tries.failures = 0;
@@ -219,7 +219,7 @@ impl CommandRun {
         let over = self.tries.failures > retries;
         if let Some(run) = self.parameter() {
             if step.purpose == StepPurpose::Release && over {
-                // The value stands all the same.
+                // The value remains written.
                 run.released();
                 self.tries.failures = 0;
                 return None;

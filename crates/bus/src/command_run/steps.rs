@@ -18,7 +18,7 @@ use crate::order::{Refusal, written};
 pub(super) enum Action {
     /// A raw request, or a write of a whole register.
     Send(RequestPdu),
-    /// A write of a value that the drive stores: left out where a read shows that the drive already has it.
+    /// A write of a value that the drive stores; it is left out if a read shows that the drive already has the value.
     Change {
         pdu: RequestPdu,
         table: Table,

@@ -36,7 +36,7 @@ impl DoublingLine {
         self.answers(&[(after, &reply)])
     }
 
-    /// Whether a reply is believed where this comes so long after the request.
+    /// Whether a reply is accepted if these bytes arrive at these times after the request.
     fn answers(&mut self, what: &[(Duration, &[u8])]) -> bool {
         let table = match self.protocol {
             Protocol::N2 => Table::DiscreteInput,

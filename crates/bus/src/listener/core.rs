@@ -19,7 +19,7 @@ use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
 use crate::transaction::Ended;
 
-/// A drive that has not replied for that long, and for three of its usual pauses, is offline.
+/// A drive is offline after this time without a reply, or after three of its usual pauses if that is longer.
 const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);

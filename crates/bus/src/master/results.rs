@@ -224,7 +224,7 @@ impl Master {
             }
             // The stall may have lost the reply: the drive does not count as away before another request.
             Ended::Silent if end.stood => Polled::Garbled,
-            // The drive is there, though a reply that came so early is not believed yet.
+            // The drive is present, although a reply that came so early is not accepted yet.
             Ended::Silent if end.doubted => Polled::Garbled,
             Ended::Silent => Polled::Failed,
             Ended::Corrupt(_) => Polled::Garbled,

@@ -13,7 +13,7 @@ const STEPS: [u64; 17] = [
 ];
 /// Slow cadences to choose from, ms.
 const SLOW_STEPS: [u64; 7] = [1000, 2000, 5000, 10_000, 20_000, 30_000, 60_000];
-/// A slow cadence is at most so many times the fast one, or the shortest.
+/// Greatest ratio of a slow cycle to the fast one, unless the slow cycle is the shortest possible.
 const MOST_RATIO: u32 = 10;
 /// `cycle` and `slow_cycle` for that bus: the shortest cadences that leave a fifth of the line free, with the
 /// points that are [read in the fast class where that is possible](super::faster_points). `None` if the line does

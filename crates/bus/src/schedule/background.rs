@@ -10,7 +10,7 @@ use crate::order::Pace;
 #[derive(Debug, Default)]
 pub(super) struct BackgroundShare {
     balance: [f64; 2],
-    /// The longest transaction that was wanted: so much is saved up at most.
+    /// The longest transaction that was wanted, which limits the saved time.
     longest: Duration,
     /// By how much transactions took longer than calculated of late: drives are slower than their profiles say.
     overrun: Duration,

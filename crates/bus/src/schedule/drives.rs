@@ -37,7 +37,7 @@ const TRIED_AGAIN: u32 = 3;
 /// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
-/// Process data without a failure for that long shows that the line is healthy.
+/// Time of process data without a failure that shows a healthy line.
 const SOUND_FOR: Duration = Duration::from_secs(10);
 /// Pause before a slow request is tried again that the drive was too busy for.
 const BUSY_PAUSE: Duration = Duration::from_secs(1);

@@ -20,7 +20,7 @@ pub const BYTES_PER_DRIVE: usize = 512;
 const ABSENCE: u16 = 12;
 /// A reply within this time behind a request that got none may be a late one.
 const LATE: Duration = Duration::from_secs(5);
-/// The rest of a damaged reply may be on the line for so long.
+/// Time for which the rest of a damaged reply may be on the line.
 const LEFT_OVER: Duration = Duration::from_millis(50);
 /// Bytes between two transactions that are kept until it is known whether they are a frame.
 const MOST_IDLE: usize = 300;

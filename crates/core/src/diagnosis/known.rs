@@ -14,7 +14,7 @@ pub(super) const FEW: u32 = 5;
 pub(super) const SIGNIFICANT: f64 = 5.0;
 /// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
 pub(super) const ENOUGH: f64 = 6.0;
-/// A drive is bad whose errors are so many times as frequent as those of the others.
+/// A drive is bad if its errors are this many times as frequent as those of the other drives.
 const TIMES: f64 = 5.0;
 
 /// The known rates of one drive.

@@ -90,7 +90,7 @@ fn shape(protocol: Protocol, request: &Request, frame: &[u8], heard: &[u8], answ
     }
 }
 
-/// Whether a reply to the request cannot have so many characters; N2 has numbers of two lengths.
+/// Whether a reply to the request cannot have this number of characters; N2 has numbers of two lengths.
 fn is_overlong(protocol: Protocol, request: &Request, count: usize) -> bool {
     let (least, most) = (
         protocol.least_reply_chars(&request.pdu),

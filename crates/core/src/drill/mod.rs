@@ -195,7 +195,7 @@ impl Drills {
     /// Ends a drill, which stops the motor. One that is over stays as it is.
     ///
     /// # Errors
-    /// There is none of that name.
+    /// If no drill has this id.
     pub fn abort(&self, id: &str, who: &Origin, now: Instant, time: SystemTime) -> Result<DrillReport, DrillRefusal> {
         let mut state = self.state();
         if let Some(run) = state.run.as_mut().filter(|run| run.report().id == id) {

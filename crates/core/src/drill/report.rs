@@ -148,7 +148,7 @@ impl DrillReport {
 pub struct StopProof {
     /// Way to stop.
     pub kind: Kind,
-    /// Whether the motor stopped in time in the last test; `null` if there was none.
+    /// Whether the motor stopped in time in the last test; `null` before the first test.
     pub passed: Option<bool>,
     /// Age of the last test, s.
     pub age_s: Option<u64>,

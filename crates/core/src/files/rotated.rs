@@ -91,7 +91,7 @@ impl Rotated {
         self.open = None;
     }
 
-    /// Whether the file is too large for so many bytes more.
+    /// Whether the file is too large to receive `more` bytes.
     pub fn is_full(&self, more: usize) -> bool {
         let bytes = self.open.as_ref().map_or(0, |open| open.bytes);
         bytes > 0 && bytes + more as u64 > self.most

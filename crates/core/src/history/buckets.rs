@@ -19,7 +19,7 @@ impl<T: Copy + Default> Buckets<T> {
         }
     }
 
-    /// Keeps so many steps from now on; the newest stay.
+    /// Keeps this number of steps from now on; the newest steps stay.
     pub(super) fn resize(&mut self, steps: usize) {
         let mut new = Buckets::new(steps);
         let oldest = (self.newest + 1).saturating_sub(self.len());

@@ -80,7 +80,7 @@ impl Counters {
         }
     }
 
-    /// The running bit was read at `at`, and what was read before was good for so long.
+    /// Processes a reading of the running bit at `at`; the reading before was good for this time.
     fn see(&mut self, running: bool, at: Instant, good_for: impl Fn() -> Duration) {
         if let Some((before, ran)) = self.ran {
             let Some(passed) = at.checked_duration_since(before).filter(|passed| !passed.is_zero()) else {

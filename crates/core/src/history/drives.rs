@@ -142,7 +142,8 @@ impl DriveHistory {
         lock(&self.counters).totals()
     }
 
-    /// The drive was read, and reads as `reading` right after it; `known` is the drive as its image has it.
+    /// Processes a read of the drive, which shows `reading` right after it; `known` is the reading of the drive's
+    /// image.
     pub(super) fn read(&self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
         self.trend().read(read, reading, known);
         lock(&self.counters).read(reading, known);

@@ -12,7 +12,7 @@ use crate::process_image::{BusImage, DriveImage, Outcome};
 pub const STEPS: usize = 60;
 /// Length of a step.
 pub const STEP: Duration = Duration::from_secs(60);
-/// The counters are looked at that often.
+/// Interval in which the counters are read.
 pub const LOOK: Duration = Duration::from_secs(1);
 
 /// Memory of a line, and of each of its drives, bytes.
@@ -138,7 +138,7 @@ impl LineHistory {
     }
 }
 
-/// The steps of the last hour, always as many: those before the beginning are unknown.
+/// The steps of the last hour; their number is fixed, so steps before the beginning are unknown.
 fn hour<T: Copy + Default, R>(buckets: &Buckets<T>, now: u64, show: impl Fn(T) -> Option<R>) -> Vec<Option<R>> {
     let step = |place: u64| {
         let number = (now + 1 + place).checked_sub(STEPS as u64)?;

@@ -27,12 +27,12 @@ pub(super) trait Packed: Sized {
     fn unpack(at: Instant, bytes: &[u8]) -> Option<Self>;
 }
 
-/// Bytes of memory that a read of so many words takes.
+/// Bytes of memory that a read of `words` words takes.
 pub(super) const fn packed_read(words: usize) -> usize {
     HEAD + 3 + 2 * words
 }
 
-/// Bytes of memory that a frame of so many bytes takes.
+/// Bytes of memory that a frame of `bytes` bytes takes.
 pub(super) const fn packed_frame(bytes: usize) -> usize {
     HEAD + 5 + bytes
 }
@@ -139,7 +139,7 @@ impl<T: Packed> PackedRing<T> {
         self.bytes.extend(&self.entry);
     }
 
-    /// Keeps at most so many bytes from now on; `gone` gets the entries that have to go for it, packed.
+    /// Keeps at most this number of bytes from now on; `gone` receives the packed entries that are removed for this.
     pub(super) fn limit(&mut self, most_bytes: usize, mut gone: impl FnMut(Instant, &[u8])) {
         self.most_bytes = most_bytes;
         if let Some(start) = self.start {

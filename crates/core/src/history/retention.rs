@@ -5,7 +5,7 @@
 
 use std::time::{Duration, SystemTime};
 
-/// Recordings closer than this to the one before belong to its storm.
+/// Recordings closer than this to the previous one belong to the same storm.
 pub const STORM: Duration = Duration::from_secs(60);
 /// Recordings of a storm that are kept first.
 pub const FIRST_OF_STORM: usize = 8;

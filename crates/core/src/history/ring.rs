@@ -47,7 +47,7 @@ impl<T: Timed> Ring<T> {
         }
     }
 
-    /// Keeps at most so many bytes from the next entry on.
+    /// Keeps at most this number of bytes from the next entry on.
     pub(super) fn limit(&mut self, most_bytes: usize) {
         self.most_bytes = most_bytes;
     }

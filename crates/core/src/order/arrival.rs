@@ -56,7 +56,8 @@ pub struct Arrival {
     pub connection: Connection,
     /// The stall of the reading thread during which its first byte may have come.
     pub stall: Option<Stall>,
-    /// The last pause of the reading thread, as long as orders of before may still come over connections of before.
+    /// The last pause of the reading thread, as long as orders from before that pause may still arrive over old
+    /// connections.
     pub pause: Option<Stall>,
 }
 

@@ -192,7 +192,7 @@ struct Records {
     /// By drive the last command that concerns its run command, or that reset its fault, and when it ended. As many as
     /// there are drives.
     runs: HashMap<String, (Arc<AuditRecord>, Instant)>,
-    /// By drive the last order to run or to stop that was sent. As many as there are drives.
+    /// For each drive, the last order to run or to stop that was sent. There are no more entries than drives.
     ordered: HashMap<String, RunOrdered>,
     refusals: RefusalLimit<AuditRecord>,
 }

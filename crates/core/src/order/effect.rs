@@ -9,7 +9,7 @@ use crate::drive::{DriveIndex, ModelPoint, Profile};
 pub enum Asks {
     /// An order that may start the motor: needs the hold, takes a free drive.
     Run,
-    /// A reference or a direction needs the hold and takes a free drive likewise, but starts nothing.
+    /// A reference or a direction needs the hold and takes a free drive as well, but starts nothing.
     Steer,
     /// A fault reset, a parameter, any other raw write: passes if the drive is free, and takes no hold.
     Other,

@@ -165,7 +165,7 @@ impl Ticket {
             self.stats.note(self.origin.kind, &answer);
             self.note_run(&answer.outcome, now);
         }
-        // The client may have gone: the command was answered all the same.
+        // Even if the client is gone, the command counts as answered.
         let _ = sender.send(answer);
     }
 

@@ -13,7 +13,7 @@ use crate::codec::{Exception, Reply};
 use crate::drive::parameters::RawValue;
 use crate::order::{Outcome, ParameterOrder, Refusal};
 
-/// A restore that cannot continue for that long ends.
+/// Time without progress after which a restore ends.
 const MOST_WAIT: Duration = Duration::from_secs(3600);
 /// Pause before a request to a busy drive is repeated.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);

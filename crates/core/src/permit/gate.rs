@@ -40,9 +40,9 @@ pub(super) struct DriveGate {
     pub(super) last_stops: LastStops,
     /// Origin of the last stop.
     stopped_by: Option<Origin>,
-    /// The number of the last command accepted that may start the drive; 0 where there was none.
+    /// The number of the last accepted command that may start the drive; 0 before the first one.
     last_starter: u64,
-    /// The login of the last client command; none if there was none, or its client has no login.
+    /// The login of the last client command; `None` before the first command, or if its client has no login.
     commander: Option<Arc<str>>,
     /// The clients that commanded the drive, the last one last.
     clients: Vec<Arc<str>>,
@@ -279,7 +279,7 @@ impl Gate {
         self.drives.get(&drive)?.stopped_by.as_ref()
     }
 
-    /// The number of the last command accepted that may start the drive; 0 where there was none.
+    /// The number of the last accepted command that may start the drive; 0 before the first one.
     pub(crate) fn last_starter(&self, drive: DriveIndex) -> u64 {
         self.drives.get(&drive).map_or(0, |drive| drive.last_starter)
     }

@@ -140,7 +140,7 @@ impl DriveHandle {
             .ok_or_else(|| Refusal::NotAllowed("[authority] was turned off".to_string()))
     }
 
-    /// The published state of the hold, and whether that client has it; none while `[authority]` is off.
+    /// The published state of the hold, and whether this client has it; `None` while `[authority]` is off.
     pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         match self.bus.queue.has_authority() {
             true => self.bus.queue.lock().gate.hold_view(self.index, origin, now),

@@ -152,7 +152,7 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
 }
 
 impl DriveHandle {
-    /// The machine that an order of that kind meant which came so, if its name means another one by now.
+    /// The machine that an order of this kind meant when it arrived, if its name means another machine by now.
     pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
         let former = self.bus.formerly.at(self.index, By::of(kind)?, arrival.asked)?;
         let there = former.machine.and_then(|served| {

@@ -83,7 +83,7 @@ impl OrderRequest {
         }
     }
 
-    /// Whether a start that must wait does so, up to its expiry; else it is refused.
+    /// Sets whether a start that must wait does wait, up to its expiry; otherwise it is refused.
     #[must_use]
     pub fn waiting(self, waits: bool) -> OrderRequest {
         OrderRequest { waits, ..self }
@@ -400,7 +400,7 @@ impl DriveHandle {
         (ticket.with_changes(sets), answer)
     }
 
-    /// The command made of an order that configuration, profile and limits let through, or why there is none.
+    /// The command for an order that configuration, profile and limits allow, or why the order is refused.
     fn command(
         &self,
         order: Order,

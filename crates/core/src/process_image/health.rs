@@ -36,7 +36,7 @@ impl Outcome {
 /// Cadence of a poll class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PollCycle {
-    /// Time from the start of the last round to the start of the one before, once two were started.
+    /// Time from the start of the round before the last one to the start of the last one, once two have started.
     pub last: Option<Duration>,
     /// Rounds started.
     pub rounds: u64,

@@ -32,7 +32,8 @@ pub struct Reading<'d> {
     fresh_from: [Fresh; 2],
 }
 
-/// The earliest time of a sample that is not stale yet; `None`: any, as the clock has not run for so long.
+/// The earliest time of a sample that is not stale yet; with `None` no sample is stale, because the clock has not run
+/// long enough.
 type Fresh = Option<Instant>;
 
 impl<'d> Reading<'d> {

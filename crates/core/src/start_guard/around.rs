@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::process_image::{DriveImage, Machine};
 
-/// For so long a drive whose bus was started anew, and that was not read since, counts as it counted before.
+/// Time for which a drive that was not read since its bus was started anew keeps its earlier state here.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The drives of all buses, by name.

@@ -12,7 +12,7 @@ use super::{Guard, Guarded, MOST_STARTS, Reason, Unable, shown};
 
 /// The window of `starts_per_hour`.
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
-/// For so long after its start a motor counts as running though it was not read since.
+/// Time after its start for which a motor counts as running although it was not read since.
 const UNREAD: Duration = Duration::from_secs(2);
 
 /// The motor's state in a reading.
@@ -138,7 +138,7 @@ impl Motor {
     fn too_often(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         let most = usize::try_from(guard.starts_per_hour?).ok()?;
         let within: Vec<Instant> = self.starts().filter(|at| *at + HOUR > now).collect();
-        // The oldest of the last so many leaves the window first.
+        // Of the last `most` starts, the oldest leaves the window first.
         let oldest = within.len().checked_sub(most).and_then(|place| within.get(place))?;
         let retry_after = (*oldest + HOUR).saturating_duration_since(now);
         Some(Guarded {

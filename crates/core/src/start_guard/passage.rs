@@ -8,7 +8,7 @@ use super::Seen;
 
 /// A motor that is seen to start later than that after its word started then, and not when the word was written.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
-/// For so long after a word that starts it a motor may still read as standing.
+/// Time after a word that starts it for which a motor may still read as standing.
 pub(super) const SETTLES: Duration = Duration::from_secs(1);
 
 /// Why a drive cannot start its motor.
@@ -27,7 +27,8 @@ pub enum ByRun {
     Runs,
     /// The repetition of a start that is under way, and counts already.
     Repeats,
-    /// The repetition of a run command that the drive could not follow: it does not count as long as that is so.
+    /// The repetition of a run command that the drive could not follow; it does not count while the drive cannot
+    /// follow.
     Vain,
     /// A start.
     Starts,

@@ -272,7 +272,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     assert_eq!((rig.refused(0, 30.9), rig.refused(0, 31.0)), (Some("min_off"), None));
     rig.start_and_stop(0, 1, 40.0);
     assert_eq!((rig.refused(0, 70.9), rig.refused(0, 71.0)), (Some("min_off"), None));
-    // A start and a stop between two reads: it is to be seen to stand anew.
+    // Start and stop come between two reads, so the motor must be seen standing again.
     assert_eq!(rig.clear(&[0], 2, 71.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(71.0));

@@ -38,7 +38,7 @@ impl Scope {
     /// The drives to stop, bus by bus.
     ///
     /// # Errors
-    /// There are none.
+    /// If the scope contains no drives.
     pub fn drives(&self, plant: &Plant) -> Result<Vec<DriveHandle>, NothingToStop> {
         let mut found = false;
         let mut drives: Vec<DriveHandle> = Vec::new();

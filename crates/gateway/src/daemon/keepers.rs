@@ -13,7 +13,8 @@ use crate::parameters::Store;
 use crate::start_guard;
 
 impl Daemon {
-    /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
+    /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are then on
+    /// disk.
     pub(super) async fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
         if self.recorder.is_some() && self.settings.recordings == settings.recordings {
             return Ok(());

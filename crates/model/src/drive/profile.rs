@@ -507,7 +507,7 @@ impl Profile {
         })
     }
 
-    /// Where the run command is written, and read as the drive has it where it can be.
+    /// The place where the run command is written; it is also read there if the drive allows that.
     pub fn run_place(&self) -> Option<ControlItem> {
         let control = self.control.as_ref().map(Control::run_place);
         control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(ControlItem::of))

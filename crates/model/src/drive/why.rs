@@ -19,7 +19,7 @@ const UNCHARGED: f64 = 50.0;
 const NOT_KNOWN: &str = "not_known";
 /// Word for local control, as `blocks` of a point names it.
 const LOCAL_CONTROL: &str = "local_control";
-/// Interlock, likewise.
+/// Word for an interlock, as `blocks` of a point names it.
 const INTERLOCKED: &str = "interlocked";
 
 /// A reason why a motor does not run.

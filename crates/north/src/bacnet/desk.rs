@@ -124,7 +124,7 @@ impl Desk {
         self.server.receive(from, datagram, &self.view, now);
     }
 
-    /// The datagrams that are taken up at `now` came so.
+    /// Notes how the datagrams arrived that are processed at `now`.
     pub(super) fn came(&mut self, arrival: Arrival, now: Instant) {
         if self.arrivals.len() >= MOST_KEPT {
             self.arrivals.pop_front();

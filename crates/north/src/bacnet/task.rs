@@ -69,7 +69,7 @@ pub(super) struct Task {
     /// The last snapshot of each drive with subscriptions.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: KeptFile,
-    /// Devices with a slot of before the restart against which the motor may run.
+    /// Devices with a slot from before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,
     /// Looks up the BBMD.
@@ -258,7 +258,7 @@ impl Task {
         keeps.then(|| self.options.state_dir.join(kept::FILE))
     }
 
-    /// Takes up the slots of before the start. A server that a reload starts takes up none: they were void before.
+    /// Loads the slots from before the start. A server that a reload starts loads none: they were void before.
     async fn load(&mut self) {
         let Some(path) = self.keep_file() else { return };
         if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {

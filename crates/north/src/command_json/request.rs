@@ -86,7 +86,7 @@ pub(crate) struct Asked {
     pub(crate) expiry: Duration,
     /// Why all but a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
-    /// A start that must wait does so.
+    /// Whether a start that must wait does wait.
     pub(crate) wait: bool,
 }
 
@@ -94,7 +94,7 @@ impl Asked {
     /// A command with `points`, where `refused` is the error of the part that is not understood.
     ///
     /// # Errors
-    /// The refusal, unless there is a stop among the points, which is carried out all the same.
+    /// The refusal, unless a stop is among the points, which is carried out in any case.
     pub(crate) fn new(
         points: Points,
         expiry: Duration,

@@ -76,7 +76,7 @@ fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
 }
 
 impl<'r> CommandResult<'r> {
-    /// The result at `time` of the command with that `id`, of which reads showed so much.
+    /// The result at `time` of the command with this `id`, after what reads have shown so far.
     pub(crate) fn new(
         id: Option<&'r Id>,
         drive: &'r str,

@@ -72,7 +72,7 @@ impl AppState {
     /// The drive of that name.
     ///
     /// # Errors
-    /// The reply where there is none.
+    /// The reply if no drive has this name.
     pub(super) fn drive(&self, name: &str) -> Replied<DriveHandle> {
         let plant = self.plant.load();
         plant.drive(name).ok_or_else(|| no_drive(&plant, name))

@@ -40,7 +40,7 @@ pub(super) struct Line<'b> {
     by_drive: Vec<DriveLine<'b>>,
 }
 
-/// Load and cycle of the last hour; each step is least, greatest and last value, `null` where there was none.
+/// Load and cycle of the last hour; each step is least, greatest and last value, or `null` without a value.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Hour {
     #[serde(serialize_with = "crate::event::rfc3339")]

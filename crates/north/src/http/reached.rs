@@ -45,7 +45,7 @@ pub(super) struct Client {
 pub(crate) struct LocalUser {
     /// The interface that the user came by, as the audit shows it.
     pub(crate) kind: SourceKind,
-    /// Likewise, the user.
+    /// Name of the user, as the audit shows it.
     pub(crate) who: Arc<str>,
     /// The proof of the user, from the connection.
     pub(crate) proof: Proof,

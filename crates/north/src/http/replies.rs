@@ -57,7 +57,7 @@ pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
 /// The bus of that name.
 ///
 /// # Errors
-/// The reply where there is none.
+/// The reply if no bus has this name.
 pub(super) fn find_bus<'p>(plant: &'p Plant, name: &str) -> Replied<&'p BusHandle> {
     let found = plant.buses.iter().find(|bus| bus.image.spec.name == name);
     found.ok_or_else(|| no_bus(plant, name))

@@ -183,7 +183,8 @@ pub(super) struct Shown<'p> {
     #[serde(serialize_with = "crate::event::rfc3339")]
     #[schema(value_type = String)]
     to: SystemTime,
-    /// Each step: its beginning, ms since 1970, the least, the greatest and the last value; `null` where there was none.
+    /// The steps, each with its beginning (ms since 1970) and the least, greatest and last value; `null` without a
+    /// value.
     #[schema(value_type = Vec<Option<Vec<f64>>>)]
     samples: Vec<Option<(u64, f32, f32, f32)>>,
 }

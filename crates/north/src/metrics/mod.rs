@@ -143,7 +143,7 @@ impl Scrape {
         type NoLabels = [(&'static str, &'static str); 0];
         match (figure, self.format) {
             (SeriesValue::Value(value), _) => gauge(*value, metric),
-            // The library appends `_total` to a counter; in the older format the name already has it.
+            // The library appends `_total` to a counter; in the older format the name already ends with that.
             (SeriesValue::Count(count), Format::Prometheus) => metric.encode_gauge(count),
             (SeriesValue::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
             (SeriesValue::Total(total), Format::Prometheus) => metric.encode_gauge(total),

@@ -78,7 +78,7 @@ impl Dialogue {
             .extend(self.session.finish(answered, now, &mut self.output));
     }
 
-    /// The free part of the input buffer was filled with `count` bytes, which came so.
+    /// Notes that `count` bytes arrived in this way in the free part of the input buffer.
     pub(super) fn received(&mut self, count: usize, arrival: Arrival) {
         self.arrivals.came(count, arrival);
         self.filled = (self.filled + count).min(self.input.len());

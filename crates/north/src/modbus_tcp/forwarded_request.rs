@@ -250,7 +250,7 @@ impl ForwardedRequest {
 /// The registers of the common model from this address on.
 ///
 /// # Errors
-/// Exception 02 where there are none.
+/// Exception 02 if the model has no such registers.
 pub(super) fn common(
     drive: &DriveHandle,
     client: &Client,

@@ -55,7 +55,7 @@ pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
     Some(certificate.role.map_err(|why| why.to_string()))
 }
 
-/// Clients that send RTU frames over TCP reconnect again and again: a log line this often.
+/// Least time between two log lines about clients that send RTU frames over TCP, which reconnect again and again.
 const SERIAL_LOGGED: Duration = Duration::from_secs(600);
 /// Section of the TLS listener.
 const TLS_SECTION: &str = "[modbus_tcp.tls]";

@@ -306,7 +306,7 @@ impl Commands {
         }
     }
 
-    /// The next command that finishes; pending while there is none. Cancel safe.
+    /// The next command that finishes; pending while no command is in progress. Cancel safe.
     pub(super) async fn finished(&mut self) -> Finished {
         poll_fn(|cx| self.poll_finished(cx)).await
     }

@@ -651,7 +651,8 @@ fn reason(error: &ConnectionError) -> String {
     format!("the broker refuses the connection ({code:?}){advice}")
 }
 
-/// Packets with these filters, in their order, of at most so many bytes, and of [`MOST_FILTERS`] unless they are too many.
+/// Packets with these filters in their order, each of at most `most` bytes and [`MOST_FILTERS`] filters, unless there are
+/// too many.
 fn packets(filters: Vec<Filter>, most: usize) -> Vec<Vec<Filter>> {
     let most_filters = MOST_FILTERS.max(filters.len().div_ceil(MOST_PACKETS));
     let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();

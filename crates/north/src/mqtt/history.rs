@@ -8,7 +8,7 @@ use super::connection::PACKET_OVERHEAD;
 use super::payload::StateContent;
 use super::publisher::Update;
 
-/// An array is complete with so many entries or bytes, or so long after its first entry.
+/// An array is complete with this number of entries or bytes, or this time after its first entry.
 const ENTRIES: usize = 50;
 const BYTES: usize = 32 << 10;
 const COMPLETE: Duration = Duration::from_secs(10);
@@ -41,7 +41,7 @@ impl Recorder {
         }
     }
 
-    /// The broker takes packets of so many bytes.
+    /// Sets the largest packet that the broker accepts.
     pub(super) fn limit(&mut self, max_packet: usize) {
         self.max_packet = max_packet;
     }

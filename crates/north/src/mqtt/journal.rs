@@ -254,7 +254,8 @@ impl Journal {
         Some(number)
     }
 
-    /// Takes messages in order, with their numbers: up to `most`, and no more once they have [`LOADED_BYTES`].
+    /// Removes and returns messages in order, with their numbers: at most `most`, and none after [`LOADED_BYTES`]
+    /// bytes.
     pub(super) fn take(&mut self, most: usize) -> Vec<(u64, Message)> {
         let (mut taken, mut bytes) = (Vec::new(), 0);
         let all_of_disk = loop {
@@ -287,7 +288,7 @@ impl Journal {
         taken
     }
 
-    /// Loads the next segment with records that were not loaded; false if there is none.
+    /// Loads the next segment with records that were not loaded; returns false if there is none.
     fn load(&mut self) -> bool {
         let Some(segment) = self.segments.iter_mut().find(|s| s.read < s.end) else {
             return false;
@@ -381,7 +382,7 @@ impl Journal {
         Ok(written)
     }
 
-    /// Writes messages into the last segment, as many as fit.
+    /// Writes messages into the last segment until it is full.
     fn write_some(&mut self) -> io::Result<()> {
         let Some(place) = &self.place else { return Ok(()) };
         let (max_bytes, full) = (place.max_bytes, segment_size(place.max_bytes));
@@ -441,7 +442,7 @@ impl Journal {
         Ok(())
     }
 
-    /// Deletes the oldest segment with its messages, which gives back its room; false if there is none.
+    /// Deletes the oldest segment with its messages, which frees its room; returns false if there is none.
     fn drop_oldest(&mut self) -> io::Result<bool> {
         if self.segments.front().is_none_or(|oldest| oldest.end == 0) {
             return Ok(false);

@@ -78,7 +78,7 @@ pub struct Broker {
     /// Host; an IPv6 address with or without brackets.
     pub host: String,
     pub port: u16,
-    /// Path of MQTT over WebSocket, from its `/` on; plain TCP where there is none.
+    /// Path of MQTT over WebSocket, beginning with `/`; `None` for plain TCP.
     pub path: Option<String>,
 }
 
@@ -193,7 +193,7 @@ pub struct Buffer {
 }
 
 impl Buffer {
-    /// The default in a service of systemd with a state directory; elsewhere there is none.
+    /// The default: a buffer in a systemd service with a state directory, elsewhere no buffer.
     fn of_system() -> Option<Buffer> {
         let dirs = std::env::var_os("STATE_DIRECTORY")?;
         let dir = std::env::split_paths(&dirs).next()?;

@@ -12,7 +12,7 @@ use super::Qos;
 use super::store::Number;
 use crate::MqttKind;
 
-/// Maximum number of waiting results and their size in bytes: beyond it, no more commands are received.
+/// Maximum number of waiting results, and their size in bytes; beyond it, no commands are received.
 const RESULTS: usize = 16_384;
 const RESULT_BYTES: usize = 32 << 20;
 /// Results that may wait on one topic; beyond it, commands that would be answered there are refused.
@@ -264,7 +264,7 @@ impl Outbox {
         self.results.entries.len() < RESULTS && self.results.bytes < RESULT_BYTES
     }
 
-    /// Whether so many results wait on that topic that commands answered there are refused.
+    /// Whether the results waiting on a topic are so many that commands answered there are refused.
     pub(super) fn is_crowded(&self, topic: &str) -> bool {
         self.results_of
             .get(topic)

@@ -73,7 +73,7 @@ impl PublishInterval {
 #[derive(Debug)]
 struct DriveTopics {
     drive: DriveHandle,
-    /// The snapshot that was looked at last, and when the drive is looked at again all the same.
+    /// The last snapshot that was processed, and when the drive is processed again even without a new one.
     seen: Option<Arc<Snapshot>>,
     look_at: Option<Instant>,
     /// `None`: only points are published.
@@ -362,7 +362,7 @@ impl DriveTopics {
         )
     }
 
-    /// The state object, without its last points if the broker takes only so many bytes.
+    /// The state object, without its last points if the broker only accepts smaller packets.
     fn state_object(
         &mut self,
         reading: &Reading<'_>,

@@ -18,7 +18,7 @@ pub(super) struct ResponseTopics {
     own: String,
     /// Topic below which other gateways have their topics.
     base: String,
-    /// Filters of topics below `base` that are allowed all the same.
+    /// Filters of topics below `base` that are nevertheless allowed.
     allowed: Vec<String>,
 }
 

@@ -39,7 +39,7 @@ impl BrokerRights {
         (self.topics.begin(options.commands), self.node.begin(node))
     }
 
-    /// A reload puts a client with the options `next` in the place of the one before, or none.
+    /// Notes that a reload replaces the client with the options `before` by one with the options `next`, or by none.
     pub(super) fn reload(&self, before: &Options, next: Option<&Options>) {
         let same_brokers = |next: &&Options| before.brokers.iter().any(|broker| next.brokers.contains(broker));
         let next = next.filter(|next| next.commands).filter(same_brokers);

@@ -38,7 +38,7 @@ enum Job {
     Append(Message, bool),
     /// Note that all messages up to this one are acknowledged.
     Acknowledge(Number),
-    /// Load up to so many messages.
+    /// Load at most this number of messages.
     Load(usize),
     /// The retained topics that the gateway publishes from now on.
     Topics(Vec<String>),

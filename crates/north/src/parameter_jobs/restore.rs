@@ -23,7 +23,7 @@ use crate::process_image::Machine;
 
 /// A command of a restore waits no longer than that for its turn; then it is given again.
 const EXPIRY: Duration = Duration::from_secs(30);
-/// Share of the time of a line that the writes of a restore take at most: one part in so many.
+/// The writes of a restore take at most one part in this number of a line's time.
 const SHARE: u32 = 5;
 
 /// Action on an interrupted restore.

@@ -202,7 +202,7 @@ impl Watch {
         self.stalls().date(floor, waited, now)
     }
 
-    /// Whether what a reader does not find now may be there all the same, since it came during a stall just now.
+    /// Whether a reader that finds nothing now may miss bytes that arrived during a stall just before.
     pub(super) fn just_stood(&self, now: Instant) -> bool {
         self.stalls().last().is_some_and(|stall| now <= stall.read_by())
     }

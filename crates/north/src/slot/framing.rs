@@ -45,7 +45,7 @@ impl Framing {
         }
     }
 
-    /// Bytes that came so are read at `now`.
+    /// Adds bytes that arrived in this way and are read at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) {
         self.frames.add(bytes, now);
         self.arrivals.came(bytes.len(), arrival);

@@ -108,7 +108,7 @@ struct Client<'a> {
     output: Vec<u8>,
     /// When the last whole packet of the client arrived.
     heard: Instant,
-    /// Last byte that the client took, or last time that there was nothing to take.
+    /// Time when the client last took a byte, or when the broker last had nothing to send.
     progress: Instant,
     leave: Leave,
 }

@@ -304,7 +304,7 @@ impl ProfileDrive {
         raw.decode(&words?, point.kind()).map(Value::as_f64)
     }
 
-    /// Gives the drive to its panel, which lets it stand, or back to the bus, which has to command it anew.
+    /// Gives the drive to its panel, which stops the motor, or back to the bus, which must command it again.
     fn give_to_bus(&mut self, on: bool) {
         if self.remote != on {
             (self.remote, self.position) = (on, 0);

@@ -18,7 +18,7 @@ pub(super) struct Wish {
     pub(super) want: bool,
 }
 
-/// Nodes of a search; no profile has so many states in one register.
+/// Most nodes of a search; no profile has this number of states in one register.
 const MOST_TRIES: usize = 4000;
 /// Ways to keep a state from being so that are followed.
 const MOST_WAYS: usize = 24;

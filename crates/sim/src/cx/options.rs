@@ -105,7 +105,8 @@ pub struct CxOptions {
     /// Parameters to start with: (group, number) and value; those that a drive does not have or not allow are passed
     /// over.
     pub parameters: Vec<((u16, u16), u16)>,
-    /// Makes PDU 9999 a holding register of the simulator: writing a number trips that fault. No real drive has it.
+    /// Whether PDU 9999 is a holding register of the simulator: writing a number trips the drive with that fault. No
+    /// real drive has this register.
     pub trip_register: bool,
 }
 

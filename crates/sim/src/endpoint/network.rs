@@ -121,7 +121,7 @@ impl Network {
         }
     }
 
-    /// The next frame of the master, or bytes of it where the way has no frames; 0 when there are none now.
+    /// Receives the next frame of the master, or bytes of it if the way has no frames; returns 0 if there are none now.
     pub(crate) fn receive(&mut self, buffer: &mut [u8]) -> usize {
         match &mut self.way {
             Way::ModbusTcp { listener, client, id } => {

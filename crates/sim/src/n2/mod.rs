@@ -101,7 +101,7 @@ impl Board {
         };
     }
 
-    /// The drive, which feeds the board, was switched on again that often so far.
+    /// Tells the board how often the drive, which feeds it, was switched on again so far.
     pub fn fed(&mut self, power_cycles: u32, now: SimTime) {
         if std::mem::replace(&mut self.power_cycles, power_cycles) != power_cycles {
             self.restart(now);

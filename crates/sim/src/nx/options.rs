@@ -69,7 +69,8 @@ pub struct NxOptions {
     pub values: Values,
     /// Parameters to start with: ID and value; those that a drive does not have or not allow are passed over.
     pub parameters: Vec<(u16, u16)>,
-    /// Makes ID 1999 (PDU 1998) a register of the simulator: writing a number trips that fault. No real drive has it.
+    /// Whether ID 1999 (PDU 1998) is a register of the simulator: writing a number trips the drive with that fault. No
+    /// real drive has this register.
     pub trip_register: bool,
 }
 

@@ -32,7 +32,7 @@ fn open(address: &str) -> File {
         .unwrap()
 }
 
-/// Reads `count` bytes, or as many as come within `time`.
+/// Reads `count` bytes, or the bytes that arrive within `time`.
 fn read(port: &mut (impl Read + AsFd), count: usize, time: Duration) -> Vec<u8> {
     let until = Instant::now() + time;
     let mut bytes = Vec::new();

@@ -31,7 +31,7 @@ impl Reloads<'_> {
         }
     }
 
-    /// Begins to read the configuration, or does so after the one that is being read.
+    /// Begins to read the configuration, after the present load if one is in progress.
     pub(super) fn begin(&mut self, order: Option<ReloadOrder>, watch: &mut Watch<'_>) {
         if let Some(order) = &order {
             tracing::info!(target: "drivegate::cli::run", who = order.who, "a local client requests a reload");

@@ -98,7 +98,7 @@ impl Plant {
         assert!(!self.drive().runs, "{}", self.name);
     }
 
-    /// The refreshes of the next so many seconds, each with its time, and what was on the wire right before.
+    /// The refreshes of the next `seconds` seconds, each with its time and with the turn right before it.
     fn refreshes(&mut self, seconds: u64) -> Vec<(Instant, RequestPdu, Turn)> {
         let from = self.rig.wire.len();
         self.rig.run(Duration::from_secs(seconds));
@@ -366,7 +366,7 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
     }
 }
 
-/// The thread of the bus stands still for so many ms.
+/// Lets the thread of the bus stand still for `ms` milliseconds.
 fn stands_still(rig: &mut Rig, ms: u64) {
     let began = rig.now;
     rig.now += Duration::from_millis(ms);

@@ -77,7 +77,8 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
     }
 }
 
-/// Each drive has the word of before, which is known, or that of the broadcast: both make the stop the same.
+/// Each drive has either its previous word, which is known, or the word of the broadcast: the stop is the same with
+/// both.
 #[test]
 fn a_stop_behind_the_broadcast_reads_no_word_that_was_known() {
     let mut rig = running(3);

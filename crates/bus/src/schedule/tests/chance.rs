@@ -73,7 +73,7 @@ struct Seen {
 }
 
 impl Seen {
-    /// A poll of a drive that is alive, `gap` after the one before.
+    /// Notes a poll of a drive that answers, `gap` after the previous poll.
     fn read(&mut self, poll: &Poll, took: Duration, gap: Duration) {
         let key = (poll.drive.place(), poll.read.start);
         match poll.read.class {

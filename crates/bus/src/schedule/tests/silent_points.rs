@@ -94,7 +94,7 @@ fn a_point_that_is_never_answered_is_found_in_its_block_and_takes_no_drive_away(
         .iter()
         .filter(|(_, read)| (read.start, read.count) == (2100, 11));
     assert!(whole.count() > 100, "{:?}", drive.asked.last());
-    // A drive that is away altogether is away, after as many tries as ever.
+    // A drive that does not answer at all goes offline, after the usual number of tries.
     drive.of = (Table::Holding, 2100);
     drive.rig.dead = vec![0];
     drive.rig.run(Duration::from_secs(2));

@@ -106,7 +106,7 @@ impl Run {
         }
     }
 
-    /// Whether reads after `since` show that the motor stood within the limit.
+    /// Whether reads after `since` show that the motor had stopped within the limit.
     fn seen_since(&self, cause: Instant, since: Instant, reading: &Reading<'_>, now: Instant) -> Seen {
         let (limit, due) = (self.options.limit.as_secs_f64(), cause + self.options.limit);
         let passed = now.saturating_duration_since(cause);

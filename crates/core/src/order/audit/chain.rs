@@ -291,7 +291,7 @@ impl Verifier {
     }
 }
 
-/// Whether a line follows the one before it.
+/// Whether a line continues the chain after the line before it.
 fn follows(head: &Head, before: Chain) -> Result<(), Fault> {
     if head.prev == before.last && head.seq == before.seq + 1 {
         return Ok(());

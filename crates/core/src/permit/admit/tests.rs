@@ -501,7 +501,7 @@ fn registers_without_a_writable_point_need_the_configuration() {
     assert!(asked(&open, write(100, 0)).is_err());
     // A refused part of the block refuses all of it.
     assert!(asked(&image, block(2001, &[0, 5000])).is_err());
-    // With the control word it goes out, and within the limits all the same. A stop is the control word alone.
+    // Together with the control word, the block is sent, but only within the limits. A stop is the control word alone.
     assert_eq!(asked(&image, block(2000, &[1, 0, 5000])), Ok(Urgency::Command));
     assert_eq!(asked(&image, block(2000, &[0, 0, 5000])), Ok(Urgency::Command));
     assert_eq!(asked(&image, write(2000, 0)), Ok(Urgency::Stop));

@@ -212,7 +212,7 @@ impl Gate {
         self.with_hold(drive, |holding, _, _| holding.stop_acknowledged(&who));
     }
 
-    /// Whether supervision follows that client: it holds the drive, or was the last holder, or there was none.
+    /// Whether supervision follows this client: it holds the drive, was the last holder, or the drive never had one.
     pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let known = self.rules.as_ref().and_then(|_| self.drives.get(&drive));
         known.is_none_or(|drive| drive.holding.is_whose_silence_counts(self.claim(origin).as_ref()))

@@ -26,7 +26,7 @@ impl GuardedDrives {
         BusGuards::of(&self.shared, &self.bus, &specs).unwrap()
     }
 
-    /// The bus of these drives is started anew: it ends and begins at these times.
+    /// Restarts the bus of these drives: it ends and begins at these times.
     fn restart(&mut self, drives: &[usize], ends: f64, begins: f64) {
         let leaving: Vec<Arc<DriveImage>> = drives.iter().map(|drive| self.images[*drive].clone()).collect();
         self.shared.expect(&leaving, self.at(ends));

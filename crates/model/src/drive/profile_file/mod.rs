@@ -76,7 +76,7 @@ const BUILT_IN: &[(&str, &str)] = files![
     "yaskawa-v1000.toml",
 ];
 
-/// Nested bases that are followed; no valid set of files has so many.
+/// Most nested bases that are followed; no valid set of files has that many.
 const MOST_BASES: usize = 16;
 
 impl Profiles {

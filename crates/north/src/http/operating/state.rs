@@ -24,7 +24,7 @@ use super::verifier::Verifier;
 use crate::NorthState;
 use crate::log_throttle::LogThrottle;
 use crate::order::{Authority, Grants, Proof, Right, SourceKind};
-/// A password that a program sends with each request is not hashed again for that long.
+/// Time for which a password that a program sends with each request is not hashed again.
 const VERIFIED: Duration = Duration::from_secs(300);
 /// Most of them, and most addresses that are known to belong to someone who may command.
 const MOST_REMEMBERED: usize = 256;
@@ -240,7 +240,7 @@ impl Operating {
         })
     }
 
-    /// The right of that user to write: as long as the file of users has it with this password.
+    /// The right of a user to write, which lasts as long as the file has the user with this password.
     fn right_of(&self, user: &str) -> Option<Right> {
         let user = self.users.load().as_ref()?.named(user)?.clone();
         let users = self.users.clone();
@@ -408,7 +408,7 @@ impl Grants for UserRight {
 
 impl State {
     fn remember(&mut self, mark: [u8; 32], user: &Arc<str>, now: Instant) {
-        // There are no more of them than users, each of which has one password.
+        // The table has no more entries than users, each of which has one password.
         if self.verified.len() < MOST_REMEMBERED {
             self.verified.insert(mark, (user.clone(), now + VERIFIED));
         }

@@ -56,7 +56,7 @@ impl PlainClient {
         }
     }
 
-    /// The plant that has the drives of an event: the newest, or the one before if a reload removed the bus.
+    /// The plant that has the drives of an event: the newest one, or the previous one if a reload removed the bus.
     fn plant_of(&self, event: &Event) -> Arc<Plant> {
         let newest = self.common.plant.load_full();
         let has_bus = |plant: &Plant| plant.buses.iter().any(|bus| bus.image.spec.name == event.bus);
@@ -174,7 +174,8 @@ pub(super) fn buffers(options: &Options) -> (Option<Buffer>, Option<Buffer>) {
     }
 }
 
-/// Refused commands are dropped while so many events wait: half of the room in memory, about half of that on disk.
+/// Number of waiting events at which refused commands are dropped: half of the room in memory, or about half of that on
+/// disk.
 pub(super) fn refusal_limit(options: &Options) -> u64 {
     let on_disk = options.buffer.as_ref().map(|buffer| buffer.max_bytes / EVENT_BYTES / 4);
     on_disk.unwrap_or(u64::MAX).min(BURST as u64 / 2)

@@ -39,7 +39,7 @@ impl SetTopics {
         self.commands = commands(&self.memory, &self.stop_all);
     }
 
-    /// A reload starts the client anew, which goes on with what the one before has left.
+    /// Starts the client anew, as a reload does; the new client continues with what the old one has left.
     fn succeed_client(&mut self) {
         let after = |left| {
             let topics = Topics::new("drivegate", "hall");

@@ -45,7 +45,7 @@ impl BdSeq {
     /// no broker accepted leaves its number to the next one.
     ///
     /// # Errors
-    /// Why the file does not have it; the number is valid all the same.
+    /// Why the number is not in the file; the number is valid in any case.
     pub(super) async fn next(&mut self) -> (u8, Result<(), String>) {
         if std::mem::take(&mut self.used) {
             (self.number, self.kept) = (self.number.wrapping_add(1), false);

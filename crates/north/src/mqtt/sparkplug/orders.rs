@@ -176,7 +176,7 @@ impl Orders {
         Ok(())
     }
 
-    /// The next order that ends; pending while there is none. Cancel safe.
+    /// The next order that ends; pending while no order is in progress. Cancel safe.
     pub(super) async fn finished(&mut self) -> Finished {
         poll_fn(|cx| self.poll_finished(cx)).await
     }

@@ -57,7 +57,7 @@ pub(super) enum MetricValue {
     String(String),
 }
 
-/// Properties of a metric: as many keys as values.
+/// Properties of a metric; there are as many keys as values.
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct PropertySet {
     #[prost(string, repeated, tag = "1")]

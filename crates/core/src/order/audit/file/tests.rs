@@ -52,7 +52,7 @@ fn faults(dir: &Path) -> Vec<String> {
     faults
 }
 
-/// Values of a field, of the lines that have it.
+/// Values of a field in the lines that contain the field.
 fn values(dir: &Path, field: &str) -> Vec<serde_json::Value> {
     let json = lines(dir)
         .into_iter()

@@ -292,7 +292,7 @@ fn births_come_first_and_only_of_devices_that_are_there() {
     bench.tell(2, true, 6.0);
     bench.send(9);
     assert_eq!(bench.kinds(), [of(Kind::DeviceBirth, "p2")]);
-    // Away and back before anything was sent: the death comes all the same.
+    // The drive goes away and returns before anything was sent; its death is sent in any case.
     bench.tell(2, false, 6.0);
     bench.tell(2, true, 6.0);
     bench.send(9);
