@@ -35,7 +35,7 @@ impl Schedule {
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online && !d.is_quiet(now))
         {
-            // Of the reads that may get no reply, one a round.
+            // Reads that may get no reply: one of them a round.
             let mut mute = 0;
             let due = drive
                 .items

@@ -138,7 +138,7 @@ impl Motor {
     fn too_often(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         let most = usize::try_from(guard.starts_per_hour?).ok()?;
         let within: Vec<Instant> = self.starts().filter(|at| *at + HOUR > now).collect();
-        // Of the last `most` starts, the oldest leaves the window first.
+        // The oldest of the last `most` starts leaves the window first.
         let oldest = within.len().checked_sub(most).and_then(|place| within.get(place))?;
         let retry_after = (*oldest + HOUR).saturating_duration_since(now);
         Some(Guarded {

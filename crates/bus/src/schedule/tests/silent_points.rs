@@ -101,7 +101,7 @@ fn a_point_that_is_never_answered_is_found_in_its_block_and_takes_no_drive_away(
     assert!(!drive.is_online());
 }
 
-/// Its only block: halves of it are asked among the probes, and all but the register is read.
+/// A drive with a single block: halves of the block are asked among the probes, and all but the register is read.
 #[test]
 fn a_register_in_the_only_block_of_a_drive_is_found() {
     let block = plan().reads.into_iter().next().expect("process data");
