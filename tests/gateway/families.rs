@@ -5,6 +5,7 @@ mod behind_its_back;
 mod cases;
 mod confirmed;
 mod other_stops;
+mod own_timeout;
 mod words;
 
 use std::io::{Read, Write};
@@ -42,13 +43,19 @@ impl Rig {
     }
 
     fn polled_every(cycle: &str, case: &Case, unprepared: bool) -> Rig {
+        let more = if unprepared { &["unprepared"][..] } else { &[] };
+        Rig::with(cycle, "", case, more)
+    }
+
+    /// `keys` are further keys of the drive in the configuration, `more` further arguments of the drive in Python.
+    fn with(cycle: &str, keys: &str, case: &Case, more: &[&str]) -> Rig {
         let (port, slot, raw_slot) = (free_port(), free_port(), free_port());
         let bus = LINE1
             .replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""))
             .replace("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
         let drive = format!(
             "cycle = \"{cycle}\"\nslow_cycle = \"200ms\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"{}\"\n\
-             access = \"control\"\n[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n\
+             access = \"control\"\n{keys}[[bus.slot]]\nlisten = \"127.0.0.1:{slot}\"\naccess = \"write\"\n\
              [[bus.slot]]\nlisten = \"127.0.0.1:{raw_slot}\"\naccess = \"raw\"\n",
             case.profile
         );
@@ -56,7 +63,7 @@ impl Rig {
         let program = root().join("tests/peers/families/run.py").display().to_string();
         let port = port.to_string();
         let mut arguments = vec![program.as_str(), case.peer, &port];
-        arguments.extend(unprepared.then_some("unprepared"));
+        arguments.extend(more);
         let drive = Running::start(&python(), &arguments);
         drive.until_printed("ready");
         let gateway = site.run_ready();

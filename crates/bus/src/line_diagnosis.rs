@@ -11,11 +11,14 @@ use crate::codec::{Reply, RequestPdu};
 use crate::diagnosis::figures::Sign;
 use crate::diagnosis::hold::{Change, Hold};
 use crate::diagnosis::{
-    Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules, unanswered,
+    Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, own_timeout, rules,
+    unanswered,
 };
 use crate::drive::{DriveIndex, PerDrive, PlannedRead};
 use crate::process_image::BusImage;
 
+/// Time for which a trip by a drive's own timeout is shown.
+const TRIP_SHOWN: Duration = Duration::from_secs(600);
 /// One failed request of so many makes a line unsound: what is not answered there may have been lost.
 const UNSOUND: u32 = 20;
 
@@ -29,6 +32,8 @@ pub(super) struct LineDiagnosis {
     gap: Duration,
     /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
     by_drive: PerDrive<Option<(CountedByDrive, CountedByDrive)>>,
+    /// The last trip of each drive by its own timeout, for [`TRIP_SHOWN`].
+    trips: PerDrive<Option<(Instant, Finding)>>,
     /// Reads to which each drive never replies, as of the last step.
     unanswered: PerDrive<Vec<PlannedRead>>,
     /// Since when each current verdict holds.
@@ -59,6 +64,7 @@ impl LineDiagnosis {
             hold: Hold::default(),
             by_drive: vec![None; image.drives.len()].into(),
             gap: Duration::ZERO,
+            trips: vec![None; image.drives.len()].into(),
             unanswered: vec![Vec::new(); image.drives.len()].into(),
             since: Vec::new(),
             image,
@@ -177,6 +183,15 @@ impl LineDiagnosis {
         reads.is_some_and(|reads| reads.iter().any(|read| read.pdu() == *pdu))
     }
 
+    /// A drive has a new fault: remembers it where the drive's own timeout seems to have tripped it.
+    pub(super) fn tripped(&mut self, drive: DriveIndex, trip: own_timeout::Trip, now: Instant) {
+        let profile = self.image.drives.get(drive).map(|image| &image.spec.profile);
+        let found = profile.and_then(|profile| own_timeout::finding(drive, profile, trip));
+        if let (Some(found), Some(last)) = (found, self.trips.get_mut(drive)) {
+            *last = Some((now, found));
+        }
+    }
+
     /// A verdict for each drive that never replies to some of its reads.
     fn registers(&self) -> impl Iterator<Item = Finding> {
         let all = self.unanswered.enumerate().zip(&self.image.drives);
@@ -213,6 +228,9 @@ impl LineDiagnosis {
         self.unanswered = unanswered();
         let mut found = rules::find(&self.figures, &self.names, now);
         found.extend(self.registers());
+        let recent = |(at, _): &&(Instant, Finding)| now.saturating_duration_since(*at) < TRIP_SHOWN;
+        let trips = self.trips.iter().filter_map(|trip| trip.as_ref().filter(recent));
+        found.extend(trips.map(|(_, finding)| finding.clone()));
         let changes = self.hold.take(found);
         self.show();
         self.figures.next_step(now);

@@ -17,6 +17,7 @@ use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
+use crate::diagnosis::own_timeout::Trip;
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
 use crate::event::{EventKind, Events};
 use crate::order::WriteStats;
@@ -40,6 +41,8 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last reported; `None` means no fault.
     faults: PerDrive<Option<i64>>,
+    /// When each drive acknowledged its last write.
+    written: PerDrive<Option<Instant>>,
     /// The other reported states of each drive, in the order of [`WATCHED`].
     watched: PerDrive<[Watched; WATCHED.len()]>,
     /// The known response of each drive to a silent master.
@@ -93,6 +96,7 @@ impl Report {
             responses: vec![Response::default(); drives].into(),
             watched: vec![[Watched::default(); WATCHED.len()]; drives].into(),
             faults: vec![None; drives].into(),
+            written: vec![None; drives].into(),
             up: false,
             down_reported: false,
         }
@@ -345,6 +349,14 @@ impl Report {
             Some(before) if *before != active => *before = active,
             _ => return false,
         }
+        if let Some((code, written)) = active.zip(self.written.get(index).copied().flatten()) {
+            let trip = Trip {
+                fault: code,
+                after: now.saturating_duration_since(written),
+                repeats: drive.spec.refresh.is_some(),
+            };
+            self.diagnosis.tripped(index, trip, now);
+        }
         match active {
             Some(0) => self.drive_event(index, EventKind::Fault, None, |name| {
                 format!("drive {name} has a fault with an unknown code")
@@ -463,6 +475,11 @@ impl Report {
             return;
         };
         drive.count(counted(&exchanged.ended));
+        if matches!(&exchanged.ended, Ended::Reply(Reply::Written))
+            && let Some(written) = self.written.get_mut(index)
+        {
+            *written = Some(now);
+        }
         let mut turnaround = None;
         if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
             // Where the driver hands a reply over whole, its first byte came a reply's time earlier.

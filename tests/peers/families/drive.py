@@ -13,6 +13,7 @@ import time
 
 RAMP = 100.0  # percent per second
 TURNAROUND = 0.01  # s; longer than a request takes on the line
+TIMEOUT = 0.0  # s without a write after which a running drive trips; 0: never
 
 
 def crc(data):
@@ -55,6 +56,7 @@ class Drive:
         self.speed = 0.0  # percent, signed
         self.target = 0.0  # percent, without the direction's sign
         self.turning = 0
+        self.fed = time.monotonic()
         self.lock = threading.RLock()
 
     # What a family defines.
@@ -129,6 +131,9 @@ class Drive:
 
     def tick(self, seconds):
         with self.lock:
+            if TIMEOUT and self.running and time.monotonic() - self.fed > TIMEOUT:
+                self.log("own timeout")
+                self.trip()
             aim = self.target * self.direction
             step = RAMP * seconds
             self.speed = aim if abs(aim - self.speed) <= step else self.speed + (step if aim > self.speed else -step)
@@ -147,6 +152,7 @@ class Drive:
             raise Refused(2)
         self.get(table, address)
         (self.coils if table == "coil" else self.holding)[address] = value
+        self.fed = time.monotonic()
         self.log(f"wrote {table} {address:04X} {value:04X}")
         self.wrote(table, address, value)
         self.moved()

@@ -41,7 +41,7 @@ fn patience(cause: Cause) -> u32 {
     match cause {
         Cause::Noise | Cause::RequestEndLost => 5,
         Cause::OneDrive | Cause::FromAddress => 3,
-        Cause::PortResets => 1,
+        Cause::PortResets | Cause::OwnTimeout => 1,
         _ => 2,
     }
 }

@@ -8,6 +8,7 @@
 //! - [`rules`]: one rule for each cause. A rule that compares drives finds nothing until most of them have had enough
 //!   requests.
 //! - [`hold`]: a verdict changes only on lasting evidence.
+//! - [`own_timeout`]: a drive that its own timeout tripped soon after a command.
 //! - [`unanswered`]: registers to which a drive never replies.
 //! - [`words`]: the texts of causes and remedies.
 
@@ -15,6 +16,7 @@ pub mod counters;
 pub mod figures;
 pub mod hold;
 mod known;
+pub mod own_timeout;
 pub mod rules;
 pub mod signature;
 pub mod unanswered;
@@ -68,13 +70,15 @@ pub enum Cause {
     FasterThanBaud,
     /// The drive answers, but never reads of certain registers.
     RegisterUnanswered,
+    /// The drive's own timeout tripped it soon after a command.
+    OwnTimeout,
     /// Errors without a pattern.
     Noise,
 }
 
 impl Cause {
     /// All causes, in the order of the documentation.
-    pub const ALL: [Cause; 18] = [
+    pub const ALL: [Cause; 19] = [
         Cause::AllSilent,
         Cause::OneDrive,
         Cause::FromAddress,
@@ -92,6 +96,7 @@ impl Cause {
         Cause::ConnectionCloses,
         Cause::FasterThanBaud,
         Cause::RegisterUnanswered,
+        Cause::OwnTimeout,
         Cause::Noise,
     ];
 
@@ -115,6 +120,7 @@ impl Cause {
             Cause::ConnectionCloses => "connection_closes",
             Cause::FasterThanBaud => "faster_than_baud",
             Cause::RegisterUnanswered => "register_unanswered",
+            Cause::OwnTimeout => "own_timeout",
             Cause::Noise => "noise",
         }
     }

@@ -30,6 +30,7 @@ impl Cause {
             Cause::ConnectionCloses => "the device server keeps closing its connection",
             Cause::FasterThanBaud => "replies arrive faster than the configured baud rate allows",
             Cause::RegisterUnanswered => "the drive answers, but never reads of certain registers",
+            Cause::OwnTimeout => "the drive's own timeout tripped it soon after a command",
             Cause::Noise => "errors without a pattern",
         }
     }
@@ -100,6 +101,7 @@ impl Cause {
                  counts as a late reply, are calculated from it"
             }
             Cause::RegisterUnanswered => "leave the registers out of the profile, or correct their addresses",
+            Cause::OwnTimeout => "compare the drive's own timeout with what the gateway writes and polls",
             Cause::Noise => {
                 "check termination at both ends, the reference conductor, and the cable's shield and route; trying a \
                  lower baud rate shows whether it is the cable"
@@ -111,6 +113,7 @@ impl Cause {
     pub const fn steps(self) -> &'static [Step] {
         match self {
             Cause::AllSilent | Cause::NeverAnswered => &[Step::Lamps, Step::Settings],
+            Cause::OwnTimeout => &[Step::Timeout],
             Cause::OneDrive | Cause::WhileRunning => &[Step::Connect],
             Cause::FromAddress | Cause::Bias | Cause::RequestEndLost | Cause::Noise => &[Step::Terminate],
             Cause::AddressTwice

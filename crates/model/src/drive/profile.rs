@@ -78,6 +78,8 @@ pub struct Profile {
     pub parameters: ParameterList,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
+    /// Fault codes by which a drive reports that its own timeout tripped it.
+    pub timeout_faults: Vec<u16>,
     /// Lines for the engineer at the cabinet.
     pub commissioning: Commissioning,
     /// The meaning of a match of the `identify` reads; empty if they prove the family.

@@ -339,6 +339,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         ranges,
         points,
         faults,
+        timeout_faults: reader.or("timeout_faults", Vec::new()),
         commissioning: commissioning::read(reader),
         identified: reader.or("identified", String::new()),
         model,
