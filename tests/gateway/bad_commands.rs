@@ -164,7 +164,8 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
     assert_eq!(rig.writes(), 0, "only reads are on the line");
-    // Each that names a drive, of Modbus each that names a function it has; refusals of one kind are counted.
+    // Each request that names a drive (with Modbus, also a function that the drive has) is audited; refusals of one
+    // kind are counted.
     until("all refusals in the audit", || {
         let audit = rig.site.audit();
         let of = |source: &str| {
@@ -174,7 +175,7 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
         ((of("mqtt"), of("modbus_tcp")) == (20, 16)).then_some(())
     });
 
-    // A good one that comes again, as QoS 1 allows: nothing more is written, the same result.
+    // A good command that comes again, as QoS 1 allows, is not written again and has the same result.
     let (again, first) = (1..)
         .map(|id| format!(r#"{{"id": "order-{id}", "speed_reference": 12.5}}"#))
         .map(|order| (order.clone(), rig.site.ask("pump/set", &order)))

@@ -109,7 +109,7 @@ fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
     site.until_point("pump-1", "speed_reference", 10.0);
     drop(broker);
     site.until_connected(false);
-    // A client whose library keeps the message until the broker is back; its life is over by then.
+    // The client's library keeps the message until the broker is back; the message has expired by then.
     let port = site.mqtt.to_string();
     let client = ["-h", "127.0.0.1", "-p", &port, "-t", SET];
     let message = ["-m", "{\"run\": true, \"expires_ms\": 100}"];

@@ -93,7 +93,7 @@ fn a_second_demo_takes_other_ports() {
     until_ready(port(&printed, "http://127.0.0.1:"));
 }
 
-/// Runs a line as it is pasted into a shell; what has no end is ended.
+/// Runs a line as if it were pasted into a shell; a command that does not end is ended.
 fn pasted(line: &str) -> Output {
     let own = [".tools/venv/bin", ".tools/bin"].map(|dir| root().join(dir).display().to_string());
     let path = format!("{}:{}", own.join(":"), std::env::var("PATH").unwrap_or_default());

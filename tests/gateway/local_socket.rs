@@ -188,7 +188,7 @@ fn gateways_of_one_user_are_told_apart() {
         direct.out,
         direct.err
     );
-    // The first goes, the second is still found.
+    // When the first gateway ends, the second is still found.
     let [first, _second] = gateways;
     drop(first);
     assert!(write(&lines[1]).out.contains("through the gateway"));

@@ -50,7 +50,7 @@ impl Plant {
         let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
         let broker = site.broker();
         let gateway = site.run_ready();
-        // The local socket comes last: what connects to it before is taken up later.
+        // The local socket comes last; connections made before are accepted later.
         gateway.until_printed("drivegate is running");
         site.until_connected(true);
         site.until_state("pump-1", "ready");
@@ -173,7 +173,7 @@ enum How {
     Http,
 }
 
-/// A client with a connection of its own; it gives up when it is dropped.
+/// A client with a connection of its own, which it closes when it is dropped.
 struct Client {
     stream: Box<dyn Stream>,
     how: How,
@@ -348,7 +348,8 @@ fn a_stop_in_a_pause_wins() {
     }
 }
 
-/// On a busy machine the gateway may stand still for longer than the hiccup: one in ten orders may be lost to that.
+/// On a busy machine, the gateway may stand still for longer than the hiccup: one in ten orders may be lost through
+/// that.
 #[test]
 fn a_healthy_client_loses_nothing_by_a_hiccup() {
     let (plant, mut lost, mut all) = (Plant::new(), Vec::new(), 0);

@@ -48,7 +48,7 @@ fn clients_stay_connected_over_a_reload() {
     let mut client = Client::connect(site.modbus);
     until("a write", || (client.ask(&WRITE) == WRITE).then_some(()));
 
-    // An address that cannot be bound: nothing is disconnected.
+    // A new address that cannot be bound disconnects nobody.
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let before = site.change(
         &format!("127.0.0.1:{}", site.http),

@@ -18,7 +18,7 @@ use crate::support::mqtt::{Subscriber, client_of};
 use crate::support::process::PATIENCE;
 use crate::support::tools::{python, run_well};
 
-/// Longest wait for something that has to happen. It happens at once, so this measures nothing.
+/// Longest wait for something that must happen. Usually it happens at once, so this measures nothing.
 const DEADLINE: Duration = PATIENCE;
 const VERSIONS: [&str; 2] = ["mqttv311", "mqttv5"];
 
@@ -90,7 +90,7 @@ impl DemoBroker {
         Raw(stream)
     }
 
-    /// A client of the library: nothing happens but by `next`.
+    /// A client of the library, which does nothing except in `next`.
     fn library_client(&self, id: &str) -> (AsyncClient, EventLoop) {
         let options = MqttOptions::new(id, ("127.0.0.1", self.port()));
         AsyncClient::builder(options).capacity(10).build()

@@ -115,8 +115,8 @@ fn the_unit_is_clean() {
     assert!(complaints.is_empty(), "{complaints:#?}");
 }
 
-/// 0 is locked up entirely, 100 not at all; what is left is the network, the serial ports and their group, and the real
-/// time of the line's thread.
+/// Exposure 0 is locked up entirely, 100 not at all; the remaining exposure is the network, the serial ports and their
+/// group, and the real time of the line's thread.
 #[test]
 fn the_unit_is_sandboxed() {
     let dir = TempDir::new().unwrap();

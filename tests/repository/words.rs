@@ -96,7 +96,7 @@ fn literals(code: &str) -> Vec<(usize, String)> {
             found.push((line, rest[1..=end].replace("\\n", " ")));
             end + 2
         } else if c == '\'' {
-            // A character, which may be a quotation mark; else a lifetime.
+            // A character, which may be a quotation mark; otherwise a lifetime.
             let is_char = |text: &str| rest[1..].starts_with(text) && rest[1 + text.len()..].starts_with('\'');
             ["\"", "\\\"", "\\'", "\\\\"]
                 .iter()

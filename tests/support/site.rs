@@ -125,7 +125,7 @@ impl Site {
         })
     }
 
-    /// Simulated drives at the port of `line1`, at 38400; what is on their line is written down.
+    /// Simulated drives at the port of `line1`, at 38400; the traffic on their line is recorded.
     pub(crate) fn line(&self, addresses: &[u8]) -> SimulatedBus {
         line_of(&self.file("line1"), addresses)
     }
@@ -232,7 +232,7 @@ pub(crate) fn curl(arguments: &[&str]) -> (u16, serde_json::Value) {
     (status.parse().unwrap(), reply)
 }
 
-/// Simulated drives behind a link, at 38400; what is on their line is written down.
+/// Simulated drives at the port `link`, at 38400; the traffic on their line is recorded.
 pub(crate) fn line_of(link: &Path, addresses: &[u8]) -> SimulatedBus {
     let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
     let drives = addresses.iter().map(|address| DriveOptions::nx(*address)).collect();

@@ -243,8 +243,8 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    /// The maximum frequency of a drive, in Hz, as it has it; set to `new` first, as at its panel. None where the
-    /// family has none in a register of its own, or the drive is off.
+    /// The maximum frequency in a drive, in Hz; set to `new` first, as at the drive's panel. `None` if the family has
+    /// no register of its own for it, or the drive is off.
     pub fn maximum_frequency(&mut self, address: u8, new: Option<f64>, now: Instant) -> Option<f64> {
         if self.line.protocol == Protocol::N2 {
             return None;
@@ -315,7 +315,8 @@ impl WorldBus {
         }
     }
 
-    /// The device server closes its connection; what is on the line then may be lost. The bus does what its thread would.
+    /// Lets the device server close its connection; bytes on the line may then be lost. The bus does what its thread
+    /// would do.
     pub fn close(&mut self, lose_reply: bool, now: Instant) -> Closed {
         if lose_reply {
             self.wire.cut();

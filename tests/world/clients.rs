@@ -71,7 +71,7 @@ impl Broker {
         self.away_until = Some(until);
     }
 
-    /// The session is resumed: what is delivered once more, marked as that.
+    /// Resumes the session; returns the messages that are delivered once more, marked as repetitions.
     pub fn resume(&mut self) -> Vec<(usize, Incoming)> {
         self.away_until = None;
         let again = |(_, id, message)| (id, Incoming { dup: true, ..message });
@@ -105,7 +105,8 @@ impl Servers {
         self.modbus_tcp.watch()
     }
 
-    /// A connection of a Modbus TCP client. Those of [`Habit::Shares`] are of two clients, one of them with a certificate.
+    /// A connection of a Modbus TCP client. Connections of [`Habit::Shares`] belong to two clients, one of them with a
+    /// certificate.
     pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Offline {
         let (host, name) = match habit {
             Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),

@@ -73,7 +73,8 @@ fn values_and_drives_stay_as_they_are_whenever_the_server_closes() {
         let drives = rig.bus.line.drives;
         let mut bad = 0;
         for turn in 0..300 {
-            // After the reply, or while the drive is to reply; then the reply is lost, or comes by the next connection.
+            // The connection closes after the reply, or before it; the reply is then lost, or comes by the next
+            // connection.
             let lose_reply = turn % 12 == 3;
             let closed = match turn % 4 {
                 2 | 3 => close_on(&mut rig, is_poll, lose_reply),
@@ -145,7 +146,7 @@ fn orders_survive_the_end_of_a_connection() {
         let outcome = rig.answered(&mut waits);
         assert!(outcome.is_ok(), "what waited is served: {outcome:?}");
         rig.until_good(1, ModelPoint::Running, Value::Bool(true));
-        // A stop, whose reply comes by the next connection; one whose reply never comes.
+        // The reply to the first stop comes by the next connection, the reply to the second never comes.
         for lose_reply in [false, true] {
             assert!(rig.set(1, &[("run", 1.0)]).is_ok());
             let order = rig.points(1, &[("run", 0.0)]);

@@ -131,7 +131,7 @@ fn stops_to_a_silent_drive_leave_the_others_their_data() {
     let image = &rig.bus.handle.image;
     let specs: Vec<DriveSpec> = image.drives.iter().map(|drive| drive.spec.clone()).collect();
     let round = predict(&image.spec, Silence::Spec, &specs).fast_cycle.unwrap();
-    // The first stops have half of the line, those of a flood a tenth.
+    // The first stops may use half of the line, those of a flood a tenth.
     let most = round * 5 / 2 + 2 * line.response_timeout;
     rig.bus.wire.slaves().drive(30).unwrap().set_alive(false);
     let (first, sent) = oldest(&mut rig, MINUTE, Some(Duration::from_millis(50)));

@@ -538,7 +538,8 @@ impl Disk {
     }
 }
 
-/// The gateway is killed at any moment of a drill and comes back: the motor stands. It never turned while nothing of it was on disk.
+/// The gateway is killed at any moment of a drill and comes back: the motor then stands. It never turned while nothing of the drill
+/// was on disk.
 #[test]
 fn a_kill_at_any_moment_leaves_no_motor_running() {
     let mut stopped = 0;

@@ -16,7 +16,7 @@ const KEPT: usize = 400;
 pub struct Truth {
     /// The run command in the drive.
     pub run: bool,
-    /// Until when a run may go onto the wire; none behind a stop.
+    /// Time until which a run may go onto the wire; `None` after a stop.
     pub may_run: Option<Instant>,
     /// Open orders that may change the run command the other way: stops, resets.
     pub last_stop_over: Option<Instant>,
@@ -159,7 +159,8 @@ impl Truth {
                 .any(|(_, pdu, words)| which(pdu, words.as_ref()))
     }
 
-    /// Whether the last write of these registers set just that, however long ago: what is stored is written on change only.
+    /// Whether the last write of these registers set just this, however long ago: stored values are written only when they
+    /// change.
     pub fn was_set_last(&self, unique: &Unique) -> bool {
         let (table, address, _) = unique;
         let touches = |pdu: &RequestPdu| {

@@ -50,7 +50,8 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     // In the middle of an exchange at the beginning, and two exchanges in one lump.
     let lump = [one.clone(), said.clone(), two.clone(), said.clone()].concat();
     assert_eq!(all(&[(&said[3..], 5), (&lump, 5)]), [first.clone(), (1, 20, vec![5])]);
-    // The other master gave the first one up: the reply may be the late one. To the same request it is true of either.
+    // The other master gave up the first request, so the reply may be the late one. For the same request, the reply is
+    // true either way.
     assert_eq!(all(&[(&one, 5), (&two, 200), (&said, 5)]), []);
     assert_eq!(all(&[(&one, 5), (&one, 200), (&said, 5)]), std::slice::from_ref(&first));
     assert_eq!(all(&[(&one, 5), (&two, 900), (&said, 5)]), []);

@@ -496,7 +496,7 @@ fn commands_of_the_other_master_are_told_when_they_change() {
         "{}",
         audited[1]
     );
-    // A reference that moves in every cycle: one a second.
+    // A reference that moves in every cycle is reported once a second.
     for step in 0..600 {
         scene.ask(1, &run(0, 1000 + step), 1);
         scene.now += Duration::from_millis(5);

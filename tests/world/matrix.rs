@@ -103,7 +103,7 @@ impl Shows {
     fn fits(self, c: &Counts) -> bool {
         let quiet = c.timeout == 0 && c.corrupt == 0;
         match self {
-            // The first write behind a change of the echo may have to recognise the echo by its time.
+            // The first write after a change of the echo may have to recognise the echo by its time.
             Shows::Nothing => quiet && c.exception == 0 && c.foreign <= 1,
             Shows::Timeouts => c.timeout > 0 && c.exception == 0,
             // A bit error may lengthen the reply, a cut one may be as short as nothing.

@@ -92,7 +92,7 @@ pub struct Record {
     pub sent: Option<Instant>,
     pub answer: Option<(String, Instant)>,
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
-    /// Orders to the same drive that waited when it was accepted: they go before it.
+    /// Number of orders to the same drive that waited when this one was accepted and that go before it.
     pub before: usize,
     /// Whether a newer reference took the order's place.
     pub succeeded: bool,
@@ -162,7 +162,7 @@ pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Optio
     Some((raw.table, raw.address, raw.encode(own, 0).ok()?))
 }
 
-/// The order that a wish is, with the words that only it writes; none where the family has no such thing.
+/// The order for a wish, with the words that only it writes; `None` if the family has no such order.
 pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, Option<Unique>)> {
     let run = |on: bool| (profile.model_index(ModelPoint::Run).unwrap(), Value::Bool(on));
     let (reference, value, unique) = unique_reference(profile, number);

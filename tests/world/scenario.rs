@@ -15,7 +15,7 @@ pub struct Scenario {
     pub time: Duration,
     pub buses: Vec<Line>,
     pub clients: Vec<Habit>,
-    /// Mean time between two incidents (a drive that trips, restarts, vanishes ...); none in a calm world.
+    /// Mean time between two incidents (a drive that trips, restarts, vanishes ...); `None` in a calm world.
     pub incidents: Option<Duration>,
     /// Whether the gateway loads a new configuration now and then.
     pub reloads: bool,

@@ -149,7 +149,8 @@ impl ToolRig {
         seen
     }
 
-    /// Bytes of the tool, or none, at the present time; what it is answered. The bus is woken where it was given something.
+    /// Gives the slot bytes of the tool, or none, at the present time; returns the answer. The bus is woken if it was given
+    /// something.
     fn pass(&mut self, bytes: &[u8]) -> Vec<u8> {
         let now = self.rig.now;
         let given = !bytes.is_empty() || self.slot.wake_at().is_some_and(|at| at <= now);
@@ -210,7 +211,7 @@ impl ToolRig {
         self.hear(&answer);
     }
 
-    /// The tool gets bytes: they are the whole answer to what it waits for.
+    /// Gives the tool bytes, which must be the whole answer to its request.
     fn hear(&mut self, bytes: &[u8]) {
         self.heard.extend_from_slice(bytes);
         if self.heard.is_empty() {

@@ -56,7 +56,7 @@ struct Connection {
     inbox: VecDeque<(Instant, Vec<u8>, Option<usize>)>,
     /// When the client closed the connection.
     closed: Option<Instant>,
-    /// The rest of a request that is sent later.
+    /// The rest of a request that the client sends later.
     rest: Option<(Instant, Vec<u8>, usize)>,
     transactions: Vec<(u16, usize)>,
     next: Instant,

@@ -230,7 +230,7 @@ impl Play {
         }
     }
 
-    /// The process is killed. What was being written may be on disk, or not.
+    /// Kills the process. State that was being written may or may not be on disk.
     fn kill(&mut self) {
         if let Some((_, saved, _)) = self.disk.writing.take()
             && self.dice.chance(0.5)
@@ -481,7 +481,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
     rig.until("it stands", PATIENCE, |rig| rig.state(1) == State::Ready);
 }
 
-/// A cyclic client writes its stop again and again: none of them is a second stop. One of another client is.
+/// A cyclic client writes its stop again and again, and none of these is a second stop. A stop of another client is.
 #[test]
 fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
     let of = Line {

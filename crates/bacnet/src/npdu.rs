@@ -10,7 +10,7 @@ const HOPS: u8 = 0xFF;
 /// A message of the network layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Npdu<'a> {
-    /// Network and station that it is for, with the hops left; none: this network.
+    /// Destination network and station, with the hops left; `None` for this network.
     pub to: Option<(u16, Mac, u8)>,
     /// Network and station that sent the message; `None` if the host itself sent it.
     pub from: Option<(u16, Mac)>,

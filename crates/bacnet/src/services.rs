@@ -240,7 +240,7 @@ pub struct Subscribe {
     pub process: u32,
     /// The object.
     pub object: ObjectId,
-    /// Confirmed or not, and the lifetime in seconds, 0 without end; none: it ends.
+    /// Whether notifications are confirmed, and the lifetime in seconds, 0 without end; `None` ends the subscription.
     pub terms: Option<(bool, u32)>,
     /// For SubscribeCOVProperty: the property and the increment.
     pub property: Option<(PropertyRef, Option<f32>)>,

@@ -301,7 +301,7 @@ impl CommandRun {
         self.tickets.iter().map(Ticket::origin)
     }
 
-    /// Whether a tool sent it: it then has the line share of background transactions.
+    /// Whether a tool sent the command, which then has the line share of background transactions.
     pub fn is_of_tool(&self) -> bool {
         self.tickets
             .iter()
@@ -396,7 +396,7 @@ impl CommandRun {
         !self.may_write_on() && self.overtaken >= MOST_STOPS
     }
 
-    /// `unbegun` where nothing of it was sent; else that it was cut short, its end being unknown.
+    /// `unbegun` if no part of the command was sent; otherwise the command was cut short, and its end is unknown.
     fn unless_begun(&self, unbegun: Outcome, why: Interruption) -> Outcome {
         if self.has_begun() {
             Outcome::Interrupted(why)

@@ -13,7 +13,8 @@ const WATCHED: usize = 8;
 /// ripple.
 const RIPPLE: f64 = 0.25;
 
-/// On a busy line the next read may come late: it is reported only after this multiple of the confirmation time.
+/// On a busy line, the next read may come late; a missing effect is reported only after this multiple of the
+/// confirmation time.
 const UNREAD: u32 = 5;
 
 /// The effect that a read must show.

@@ -265,7 +265,7 @@ impl BusCore {
         }
     }
 
-    /// Chooses what to send next; else until when nothing is sent.
+    /// Chooses what to send next; otherwise returns the time until which nothing is sent.
     fn choose(&mut self, now: Instant) -> Option<Instant> {
         let mut news = std::mem::take(&mut self.news);
         let next = self.master.next(now, &mut news);

@@ -26,7 +26,8 @@ pub(super) struct DriveState {
     pub(super) fresh: Duration,
     /// Command words of the drive.
     pub(super) words: KnownWords,
-    /// The places of what orders write, and of the command word where the drive shows its own: they are kept from every read.
+    /// Places that orders write, and the place of the command word if the drive shows its own: these are kept from every
+    /// read.
     pub(super) commanded: Vec<(Table, u16)>,
     /// Replies that the drive may still send.
     pub(super) late: LateReplies,
@@ -39,7 +40,7 @@ pub(super) struct DriveState {
     pub(super) refresh_ended: Option<End>,
     /// Commands that the drive acknowledged and has not shown yet.
     pub(super) confirmations: Confirmations,
-    /// Started commands: one of each rank, so that they keep their order.
+    /// Started commands, one of each rank, so that commands of a rank keep their order.
     runs: [Option<CommandRun>; 3],
     /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
@@ -53,7 +54,7 @@ pub(super) struct DriveState {
     pub(super) written: LastWritten,
     /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
     pub(super) acknowledged: Option<bool>,
-    /// Whether `[authority]` is on: then the senders of executed commands are kept, and whether these were stops.
+    /// Whether `[authority]` is on: the senders of executed commands are then kept, and whether these were stops.
     pub(super) has_authority: bool,
     pub(super) carried_out: Vec<(Origin, bool)>,
     /// Whether the drive is under local control; none while that is not known.
@@ -83,7 +84,7 @@ fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
 }
 
 impl DriveState {
-    /// A drive about which nothing is known; its status is read every `round` at best.
+    /// State of a drive about which nothing is known; its status is read every `round` at best.
     pub(super) fn new(spec: &DriveSpec, round: Duration) -> DriveState {
         let profile = &spec.profile;
         DriveState {
@@ -154,14 +155,15 @@ impl DriveState {
         }
         for urgency in order {
             loop {
-                // The motor state of a faulted drive may be from before the fault; it does not run by its run command.
+                // The motor state of a faulted drive may be from before the fault; the drive does not run by its run
+                // command.
                 let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
                 let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
                     break;
                 };
                 match run.next(&self.words, profile, running, now) {
                     Next::Send(step) => {
-                        // A stop does not wait: it is sent at once, even if a late reply may still arrive.
+                        // A stop does not wait for late replies: it is sent at once.
                         let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
                         if let Some(until) = blocked.filter(|_| run.waits_for_late()) {
                             run.hold_up();

@@ -54,7 +54,8 @@ impl BusTask {
         Ok(task)
     }
 
-    /// Gets all that a bus needs from the system; its thread waits for [`BusTask::begin`] and touches no port before.
+    /// Gets all that a bus needs from the system; the thread waits for [`BusTask::begin`] and touches no port before
+    /// that.
     ///
     /// # Errors
     /// If the system gives no thread.
@@ -101,7 +102,7 @@ impl BusTask {
         }
     }
 
-    /// Turns of the bus: it hangs if this does not advance for seconds.
+    /// Number of turns of the bus; a bus whose number does not advance for seconds hangs.
     pub fn beats(&self) -> Arc<AtomicU64> {
         self.beats.clone()
     }
@@ -295,7 +296,7 @@ impl Worker {
         }
     }
 
-    /// Connects to a device server that closed a connection. One that is still busy with that is tried twice.
+    /// Connects to a device server that closed a connection. A server that is still busy with that is tried twice.
     fn connect_anew<C: Core>(&self, names: &mut Names) -> Opened<C::Line> {
         let spec = &self.handle.image.spec;
         let go_on = || !self.stopping();

@@ -22,17 +22,18 @@ const ALMOST: f64 = 0.9;
 const WITHOUT_WIRE_TIME: u32 = 64;
 /// Greatest weight of early replies: this number of regular replies restores the protection of a line.
 const MOST_WEIGHT: u32 = 256;
-/// An early reply that can hardly belong to another request. One is enough, until the next regular reply.
+/// Weight of an early reply that can hardly belong to another request. A single one is enough, until the next regular
+/// reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
-/// An early reply that was not believed, with nothing after it: two are enough. One with the regular reply after it
-/// came twice or late, as on a wire: that takes all weight back.
+/// Weight of an early reply that was not believed, with nothing after it: two are enough. If the regular reply follows,
+/// the early one came twice or late, as on a wire: that takes all weight back.
 const WEIGHT_OF_DOUBTED: u32 = 40;
 /// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
 /// Weight that a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks like an
 /// early one: while fewer than one reply in four is early, the line keeps its protection.
 const REGULAR_ON_N2: u32 = 8;
-/// An early reply that could belong to another request and was believed. One in nine keeps the line as it is.
+/// Weight of an early reply that could belong to another request and was believed. One in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
 /// How a request is to be sent.
@@ -130,8 +131,8 @@ impl LineState {
         }
     }
 
-    /// The port was reopened. What was learned about the line is kept: a line without wire time would seem silent for
-    /// seconds, and replies correct what no longer holds.
+    /// Resets the state, because the port was reopened. What was learned about the line is kept: a line without wire
+    /// time would seem silent for seconds, and replies correct what no longer holds.
     pub fn reset(&mut self, now: Instant) {
         let learned = self.learned;
         *self = LineState {
@@ -184,7 +185,7 @@ impl LineState {
         self.silence
     }
 
-    /// Nothing is sent before `until`.
+    /// Sends nothing before `until`.
     pub(crate) fn leave_alone(&mut self, until: Instant) {
         self.left_alone = until;
     }

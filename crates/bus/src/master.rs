@@ -182,7 +182,7 @@ impl Carried {
 pub struct Handover {
     /// The leases of its drives, in their order, with what is refreshed under them.
     pub leases: Vec<Carried>,
-    /// Until when a reply to its request may arrive; none if no bus used the line before.
+    /// Time until which a reply to its request may arrive; `None` if no bus used the line before.
     pub quiet_until: Option<Instant>,
     /// Findings about the line.
     pub learned: Option<Learned>,
@@ -200,7 +200,7 @@ pub struct Master {
     drives: PerDrive<DriveState>,
     /// Conditions that a transaction may have to wait for.
     waits: Waits,
-    /// The last reply on the line, valid or damaged: it may be repeated.
+    /// The last reply on the line, valid or damaged, which may be repeated.
     last_answered: Option<(DriveIndex, RequestPdu)>,
     turns: Turns,
     /// The background request that has its turn, or is on the line.
@@ -215,7 +215,8 @@ pub struct Master {
     probes: PerDrive<u32>,
     /// A reply may have come late since before the transaction that is on the line.
     late_before: bool,
-    /// How much longer the line was taken by refreshes than by polls since: they have as much of it as polls at most.
+    /// How much longer refreshes have used the line than polls since then: refreshes may use it at most as long as
+    /// polls.
     refresh_debt: Duration,
 }
 
@@ -305,7 +306,7 @@ impl Master {
         self.abandon_background(Outcome::BusDown, Interruption::BusDown, now);
     }
 
-    /// The bus ends: started commands end. Returns the handover for the next bus. A transaction still on the line is
+    /// Ends the bus: started commands end. Returns the handover for the next bus. A transaction still on the line is
     /// aborted; it would have ended at `broken_off`.
     pub fn ended(&mut self, broken_off: Option<Instant>, now: Instant) -> Handover {
         if let Some(shutdown) = &mut self.shutdown {

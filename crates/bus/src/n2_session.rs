@@ -55,7 +55,7 @@ pub enum Progress {
     Failed,
 }
 
-/// The sessions with the drives of a bus; none on a bus of another protocol.
+/// The sessions with the drives of a bus; empty on a bus of another protocol.
 #[derive(Debug, Default)]
 pub struct N2Sessions {
     drives: PerDrive<Drive>,

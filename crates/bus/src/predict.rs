@@ -314,8 +314,8 @@ impl<'a> Line<'a> {
         Some(Shortage { fast, slow, remedies })
     }
 
-    /// A higher baud rate that carries everything; else the smallest number of buses, and the cycle at the highest baud
-    /// rate.
+    /// A higher baud rate that carries everything; otherwise the smallest number of buses, and the cycle at the highest
+    /// baud rate.
     fn other_lines(&self) -> Vec<Remedy> {
         let bauds = self.higher_bauds();
         if let Some(baud) = bauds.iter().find(|baud| self.carries(&self.total(**baud))) {

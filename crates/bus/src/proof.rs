@@ -208,7 +208,7 @@ struct Progress<'p> {
 }
 
 impl<'p> Case<'p> {
-    /// None where the profile has not all of the points, or a drive no such state.
+    /// A case; `None` if the profile lacks one of the points, or a drive has no such state.
     fn new(profile: &'p Profile, control: &'p Control, start: Start, known: bool, sets: Sets) -> Option<Case<'p>> {
         Drive::new(profile, control, start)?;
         let values = sets
@@ -356,7 +356,7 @@ impl<'p> Case<'p> {
         Ok(())
     }
 
-    /// One step of a command; the outcome, if it has ended.
+    /// Takes one step of a command; returns the outcome if the command has ended.
     fn step(
         &self,
         run: &mut CommandRun,

@@ -64,7 +64,7 @@ pub struct Repeated {
 pub(super) enum OrderEnd {
     /// A client's order was acknowledged.
     Done,
-    /// A drill's order was.
+    /// A drill gave the order.
     Drill,
     /// The speed reference of a lease that expired was.
     Action,

@@ -20,7 +20,7 @@ pub struct RepeatedStops {
     due: [Option<Instant>; AGAIN.len()],
 }
 
-/// Whether the write starts or stops the motor; none where it does neither.
+/// Whether the write starts or stops the motor; `None` if it does neither.
 fn runs_by(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
     let (table, items) = written(pdu)?;
     items

@@ -30,7 +30,7 @@ pub const COMMANDS_IN_A_ROW: u32 = 8;
 pub const SLOW_SHARE: f64 = 0.05;
 /// Largest share that slow polls get, however many they are.
 const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
-/// Share of what commands leave that slow polls get while something was never read: what is not known yet is worth more than what is known.
+/// Share of what commands leave that slow polls get while something was never read: unknown values are worth more than known ones.
 const FIRST_SHARE: f64 = 0.5;
 
 /// Share of a saturated line for slow polls whose cycle would need `demand`: with many requests (one per object on N2)
@@ -270,7 +270,7 @@ impl Schedule {
         self.share.commanded(urgency, took);
     }
 
-    /// A step of a refresh was on the line for `took`: it has the rank of a fast poll.
+    /// Notes that a step of a refresh was on the line for `took`; it has the rank of a fast poll.
     pub(crate) fn refreshed(&mut self, took: Duration) {
         self.share.polled(took);
     }
@@ -348,8 +348,8 @@ impl Schedule {
         }
     }
 
-    /// An online drive did not reply to a command: its process data is read next, to find out whether it is still there
-    /// before more is sent.
+    /// Notes that an online drive did not reply to a command: its process data is read next, to find out whether it is
+    /// still there before more is sent.
     pub(crate) fn doubted(&mut self, index: DriveIndex) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
@@ -382,7 +382,7 @@ impl Schedule {
         }
     }
 
-    /// No reply to that read proved it: its items are read singly, and it is tried again later.
+    /// Notes that no reply to this read proved it: its items are read singly, and the whole read is tried again later.
     pub(crate) fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.take_apart(read, now, pause);
@@ -486,8 +486,8 @@ impl Schedule {
         }
     }
 
-    /// A fault came up in a drive: what its profile names for that, and the slow reads that cover more of it, are due at
-    /// once. They take no more of the line than slow reads have anyway.
+    /// Makes the reads for a new fault due at once: those that the profile names for a fault, and the slow reads that
+    /// cover more of it. They take no more of the line than slow reads have anyway.
     pub(crate) fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         for item in items.into_iter().flatten() {

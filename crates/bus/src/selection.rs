@@ -259,7 +259,8 @@ impl Compared {
     }
 }
 
-/// A number that means something by itself, such as a fault code: it is the same or it is another.
+/// Whether the point is a number that has a meaning by itself, such as a fault code: two values are equal or different,
+/// never near.
 fn is_code(point: &Point) -> bool {
     point.unit.is_empty()
 }

@@ -235,8 +235,9 @@ impl Supervision {
         }
     }
 
-    /// The lease, which ran since `since`, has expired. Whether a silent drive, or one not read since, runs is unknown:
-    /// its lease stays until it is read. A drive that replies without reporting it is not waited for indefinitely.
+    /// Handles the expiry of a lease that ran since `since`. Whether a silent drive, or one not read since, runs is
+    /// unknown: its lease stays until it is read. A drive that replies without reporting that is not waited for
+    /// indefinitely.
     fn runs_out(
         &mut self,
         since: Instant,

@@ -78,7 +78,7 @@ pub struct Transaction {
     ignored_before: Option<Instant>,
     /// Late replies that may still arrive on an N2 line.
     late: N2LateReplies,
-    /// A frame that is the reply, unless another one comes until the deadline: then it was a late one.
+    /// A frame that is the reply, unless another one comes until the deadline: the first one was then a late reply.
     unless_another: Option<(Vec<u8>, Reply)>,
 }
 
@@ -118,8 +118,8 @@ impl Transaction {
         }
     }
 
-    /// A reply that is whole before `earliest`, when the request and a reply cannot both have been on the wire, is not
-    /// believed: it is the last reply once more, or the echo of a write.
+    /// Doubts a reply that is complete before `earliest`, when request and reply cannot both have been on the wire: it
+    /// is the last reply once more, or the echo of a write.
     pub(crate) fn doubt_before(&mut self, earliest: Instant) {
         self.doubted_before = Some(earliest);
     }
@@ -149,8 +149,8 @@ impl Transaction {
         std::mem::take(&mut self.late)
     }
 
-    /// Whether what could not be believed was the drive's reply, mangled: it begins as that, or is as long. Nothing else
-    /// is to come of it then.
+    /// Whether the bytes that could not be believed were the drive's reply, mangled: they begin like it or are as long.
+    /// No further reply is then expected.
     pub(crate) fn is_mangled_reply(&self) -> bool {
         self.protocol.begins_reply(&self.request, &self.received)
     }
@@ -235,7 +235,7 @@ impl Transaction {
                 }
                 Decoded::Incomplete => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
-                        // A new colon began a frame again: it has the time until the deadline.
+                        // A new colon began a frame again, which may be complete until the deadline.
                         self.garbage = None;
                         self.on_time(now)
                     });

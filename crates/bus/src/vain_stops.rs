@@ -23,7 +23,7 @@ pub(super) struct VainStops {
 }
 
 impl VainStops {
-    /// A transaction of a stop got no reply; it took the line for `took`.
+    /// Notes that a transaction of a stop got no reply and took the line for `took`.
     pub(super) fn not_answered(&mut self, took: Duration) {
         self.took += took;
     }

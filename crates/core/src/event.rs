@@ -268,7 +268,7 @@ pub struct RecordingMade {
 }
 
 impl Event {
-    /// An event of this run of the whole gateway; its number is set when it is published.
+    /// An event of the gateway as a whole, in this run; publishing sets the number of the event.
     pub fn new(kind: EventKind, time: SystemTime, text: String) -> Event {
         Event {
             id: 0,
@@ -344,7 +344,7 @@ pub struct Events {
     pauses: Pauses,
 }
 
-/// The latest events. Those of drives and buses are stored separately from refused commands, and no drive or kind
+/// The latest events. Events of drives and buses are stored separately from refused commands, and no drive or kind
 /// displaces another.
 ///
 /// Each is kept as its line of JSON, one block of memory: as an [`Event`] it is six blocks and twice the bytes, and as some
@@ -387,7 +387,7 @@ impl Events {
         self.store.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Publishes an event; its id is set here.
+    /// Publishes an event and sets its id.
     pub fn publish(&self, event: Event) {
         self.publish_in(&mut self.store(), event);
     }
@@ -412,7 +412,8 @@ impl Events {
         &self.pauses
     }
 
-    /// A thread had this pause, which has ended at `time` on the calendar. It is published once, whichever threads had it.
+    /// Publishes a pause of a thread, which has ended at `time` on the calendar. It is published once, whichever threads
+    /// had it.
     pub fn publish_pause(&self, pause: Stall, time: SystemTime) {
         if !self.pauses.note(pause) {
             return;
@@ -514,8 +515,8 @@ impl Store {
         }
     }
 
-    /// The lines of all that are kept with their numbers, oldest first. They are read without the lock: publishers do not
-    /// wait for that.
+    /// The lines of all kept events with their numbers, the oldest first. The lines are read without the lock, so that
+    /// publishers do not wait.
     fn lines(&self) -> Vec<(u64, Arc<str>)> {
         in_order(&self.kept, &self.refused)
     }

@@ -25,8 +25,8 @@ pub struct Arrival {
 }
 
 impl Arrival {
-    /// Watches for the device `port`; what appears from now on is noticed. `None` for device servers, and where the system
-    /// has no inotify left.
+    /// Watches for the device `port`; notices what appears from now on. `None` for device servers, and if the system has
+    /// no inotify left.
     pub fn of(port: &str) -> Option<Arrival> {
         if port.contains("://") {
             return None;

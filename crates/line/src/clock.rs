@@ -16,7 +16,8 @@ const REAL_TIME: u8 = 10;
 /// Priority on the scale of `nice`, where real time is not allowed.
 const NICE: i32 = -10;
 
-/// Time since the machine was started, also that for which it was suspended: then the clock of [`Instant`] stands.
+/// Time since the machine was started, including the time for which it was suspended, in which the clock of [`Instant`]
+/// stands.
 pub fn since_boot() -> Duration {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     // The time since boot is never negative.

@@ -35,7 +35,7 @@ impl Server {
     }
 }
 
-/// The first bytes that came, and how the requests before began.
+/// The first bytes received, and the beginnings of the requests before.
 #[derive(Debug, Default)]
 pub(super) struct FirstBytes {
     asked: Vec<[u8; 2]>,

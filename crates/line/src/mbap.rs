@@ -74,7 +74,7 @@ struct Session {
 }
 
 impl Session {
-    /// The frame for the network of an RTU frame; none where that is broken.
+    /// The frame for the network of an RTU frame; `None` if the RTU frame is broken.
     fn ask(&mut self, frame: &[u8]) -> Option<Vec<u8>> {
         let (unit, pdu) = rtu::open_frame(frame)?;
         let length = u16::try_from(pdu.len() + 1).ok()?;

@@ -50,7 +50,7 @@ impl Spin {
     }
 }
 
-/// How the port is set up and waited for. What the kernel does of RS-485 counts only with [`Rs485::Kernel`] and
+/// Settings of the port and of the waits. The settings of RS-485 by the kernel count only with [`Rs485::Kernel`] and
 /// [`Rs485::KernelInverted`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineOptions {
@@ -69,7 +69,7 @@ pub struct LineOptions {
     pub dtr: Level,
     /// How precisely waits end.
     pub spin: Spin,
-    /// Nothing is ever sent: a port without RTS needs none to be lowered.
+    /// Whether nothing is ever sent: a port without RTS then needs none to be lowered.
     pub receives_only: bool,
 }
 

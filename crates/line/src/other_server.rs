@@ -53,7 +53,8 @@ impl OtherServer {
         !still
     }
 
-    /// A request `frame` is about to be sent on `stream`, which is open since `opened`; nothing ever came on it.
+    /// Notes that a request `frame` is about to be sent on `stream`, which is open since `opened` and on which nothing
+    /// ever came.
     pub(super) fn nothing_came(&self, stream: &TcpStream, opened: Instant, frame: &[u8]) {
         let unit = frame.first().copied().unwrap_or_default();
         let now = Instant::now();

@@ -17,7 +17,8 @@ const TERMINALS: &str = "/dev/pts";
 pub struct Pty {
     /// The own end.
     master: OwnedFd,
-    /// The other program's end, kept open: without it reads at the own end fail while no program has the port open.
+    /// The other program's end, kept open: otherwise reads at our own end would fail while no program has the port
+    /// open.
     slave: OwnedFd,
     path: PathBuf,
     link: Option<PathBuf>,
@@ -65,7 +66,7 @@ impl Pty {
     /// Reads the available bytes, without waiting.
     ///
     /// # Errors
-    /// Nothing is there, or the system reports something else.
+    /// If nothing is there, or the system reports something else.
     pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         Ok(rustix::io::read(&self.master, buffer)?)
     }

@@ -28,8 +28,8 @@ impl Arrivals {
         }
     }
 
-    /// How the first bytes came, which are taken: dated from the first of them, with the last stall among them. None if there are
-    /// none.
+    /// Takes the arrival of the first `count` bytes: dated from the first of them, with the last stall among them. `None` if
+    /// there are none.
     pub(super) fn take(&mut self, mut count: usize) -> Option<Arrival> {
         let mut taken: Option<Arrival> = None;
         while count > 0 {

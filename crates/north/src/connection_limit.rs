@@ -349,7 +349,8 @@ impl ConnectionLimit {
         Ok((ConnectionPermit { limit, place }, displaced))
     }
 
-    /// Judges the open connections of one listener again: what they may do from now on, or `None` to close them.
+    /// Judges the open connections of one listener again: `judge` returns what they may do from now on, or `None` to
+    /// close them.
     pub(super) fn review(&self, listener: usize, judge: impl Fn(&ConnectionPlace) -> Option<Authority>) {
         let table = self.lock();
         for place in table.open.iter().filter(|place| place.listener == listener) {

@@ -140,7 +140,7 @@ pub enum Content {
     Holder,
     /// Time for which the hold still lasts.
     HoldLeft,
-    /// Whether the client holds it; takes, renews, releases or breaks the hold. Only where `[authority]` is on.
+    /// Whether the client holds the drive; a write takes, renews, releases or breaks the hold. Only with `[authority]`.
     Hold,
 }
 

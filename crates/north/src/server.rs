@@ -46,7 +46,7 @@ pub trait Reconfigure: Server {
     /// A prepared change.
     type Change;
 
-    /// Does all that can fail; nothing changes for any client.
+    /// Does all that can fail; changes nothing for any client.
     ///
     /// # Errors
     /// The server cannot run with these options: it runs as before.

@@ -46,7 +46,7 @@ pub struct NorthState {
     pub reload: ReloadStats,
     /// Recent commands.
     pub(super) commands: RememberedCommands,
-    /// The slots that BACnet clients had before the start were taken up, or are void: none of them comes back.
+    /// Whether the slots that BACnet clients had before the start were loaded, or are void: none of them comes back.
     pub(super) kept_slots_read: AtomicBool,
     /// State that an MQTT client leaves to the next one.
     pub mqtt_left: Handover,

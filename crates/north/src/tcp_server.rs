@@ -39,7 +39,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     /// The listeners, in the order of the configuration.
     fn listener_specs(options: &Options) -> Vec<ListenerSpec>;
 
-    /// Does everything that can fail, except binding; nothing changes for any client.
+    /// Does everything that can fail, except binding; changes nothing for any client.
     ///
     /// # Errors
     /// The certificates cannot be used.

@@ -89,7 +89,7 @@ pub fn request_len(bytes: &[u8]) -> Option<usize> {
     bytes.iter().position(|&b| b == END).map(|end| end + 1)
 }
 
-/// The address and PDU of a whole frame whose LRC is right. What stands before its (last) colon does not matter.
+/// The address and PDU of a whole frame whose LRC is right. Characters before its (last) colon do not matter.
 pub fn open_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     parse(frame.get(noise(frame)..)?).ok()
 }

@@ -44,7 +44,7 @@ impl Request {
 /// The bytes received so far, decoded against the outstanding request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Decoded {
-    /// Not yet a whole frame; read on until the deadline.
+    /// The frame is not complete yet; read on until the deadline.
     Incomplete,
     /// The reply to the request; `used` bytes belong to its frame.
     Reply {
@@ -111,7 +111,7 @@ impl Protocol {
         }
     }
 
-    /// The frame of `request`, appended to `out`; nothing where the protocol has no such request.
+    /// Appends the frame of `request` to `out`; nothing if the protocol has no such request.
     pub fn encode(self, request: &Request, out: &mut Vec<u8>) {
         match self {
             Protocol::ModbusRtu | Protocol::ModbusAscii if matches!(request.pdu, RequestPdu::N2(_)) => {}
@@ -121,7 +121,7 @@ impl Protocol {
         }
     }
 
-    /// A frame of that PDU, appended to `out`; nothing in N2, whose frames hold none.
+    /// Appends a frame of this PDU to `out`; nothing in N2, whose frames hold no PDU.
     pub fn encode_frame(self, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
         match self {
             Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
@@ -148,7 +148,7 @@ impl Protocol {
     }
 
     /// Whether a reply from `address` that begins with this character may be accepted although garbage preceded it.
-    /// Never in N2: its reply has no address, and its check code 8 bits.
+    /// Never in N2, whose replies have no address and a check code of only 8 bits.
     pub fn may_begin_behind_garbage(self, address: u8, character: u8) -> bool {
         match self {
             Protocol::ModbusRtu => character == address,

@@ -179,7 +179,7 @@ impl Form {
     }
 }
 
-/// The form of the regular reply to a request; none of one that means no object.
+/// The form of the regular reply to a request; `None` for a request that means no object.
 pub fn form(pdu: &RequestPdu) -> Option<Form> {
     if matches!(pdu, RequestPdu::Other(_)) {
         return Some(Form::Any);

@@ -100,7 +100,7 @@ fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
         22 => 7,
         43 => return device_identification_len(bytes),
         _ if own => request.pdu.reply_len(),
-        // A function that was not requested: its length is not known, take the shortest frame.
+        // The length of a function that was not requested is unknown, so the shortest frame is taken.
         _ => 2,
     };
     Some(pdu + OVERHEAD)

@@ -73,7 +73,7 @@ pub enum Fault {
     Mains(u8),
 }
 
-/// Every fault by its name, as an argument names it; one that takes a value stands with its usual one.
+/// Every fault by its name as an argument; a fault that takes a value has its usual one.
 const NAMED: [(&str, Fault); 27] = [
     ("deaf", Fault::Deaf),
     ("drop", Fault::Drop),
@@ -212,8 +212,8 @@ impl FaultPlan {
         }
     }
 
-    /// The fault for the request of that number. The first sound request to a drive that answers, counted from when
-    /// the plan takes effect, is number 1.
+    /// Sets the fault for the request with this number. The first sound request to a drive that answers, counted from
+    /// when the plan takes effect, is number 1.
     #[must_use]
     pub fn at(mut self, number: u64, fault: Fault) -> FaultPlan {
         self.script.insert(number, fault);

@@ -37,7 +37,7 @@ pub(crate) fn pieces(protocol: Protocol, characters: &[u8]) -> impl Iterator<Ite
     characters.chunk_by(move |&last, &next| !ends(protocol, last) && !begins(protocol, next))
 }
 
-/// Characters of a frame that a drive keeps; what follows until its end is thrown away.
+/// Number of characters of a frame that a drive keeps; further ones until the end of the frame are thrown away.
 pub(crate) fn kept(protocol: Protocol) -> usize {
     match protocol {
         Protocol::ModbusRtu | Protocol::N2 => 300,

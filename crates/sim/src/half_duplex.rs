@@ -145,11 +145,11 @@ pub struct HalfDuplex {
     said_until: BTreeMap<u8, SimTime>,
     /// End of the last frame that the master sent or could expect.
     last_end: Option<SimTime>,
-    /// End of the last reply that the master could expect; it may lie ahead.
+    /// End of the last reply that the master could expect; it may be in the future.
     reply_end: Option<SimTime>,
     /// Time from the last reply to the request received last.
     pause_before: Duration,
-    /// End of the last characters that fault injection put there; it may lie ahead.
+    /// End of the last characters that fault injection sent; it may be in the future.
     provoked_end: Option<SimTime>,
     statistics: Statistics,
     lateness: Lateness,
@@ -369,7 +369,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Two senders at once: what is still to come of the reply is garbage.
+    /// Spoils the rest of a reply, because two senders transmit at once.
     fn spoil(&mut self, from: SimTime) {
         let format = self.rules.format;
         for burst in self.outgoing.iter_mut().filter(|burst| burst.kind != Kind::Provoked) {
@@ -474,7 +474,7 @@ impl HalfDuplex {
         self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
         let own = self.slaves.drive(asked.address).and_then(|drive| drive.turnaround());
         let mut at = now + own.unwrap_or(self.rules.turnaround);
-        // A drive answers in order: what it still has to say goes before. On N2 the master relies on that; with Modbus late
+        // A drive answers in order, so its pending replies go first. On N2 the master relies on that; with Modbus late
         // replies overtake each other, which is harder for the master than what a drive does.
         if self.rules.protocol == Protocol::N2 {
             at = at.max(self.said_until.get(&asked.address).copied().unwrap_or_default());

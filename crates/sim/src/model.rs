@@ -298,7 +298,8 @@ impl Latch {
         self.fault
     }
 
-    /// The first fault stays; false when there is one already or `code` is none.
+    /// Trips with a fault; returns false if a fault is active already, because the first one stays, or if `code` is
+    /// none.
     pub(super) fn trip(&mut self, code: u16) -> bool {
         let fresh = self.fault == 0 && code != 0;
         if fresh {

@@ -32,7 +32,7 @@ pub struct Writes {
     pub taken: u32,
     /// Number of writes during which the inverter fed the motor.
     pub while_fed: u32,
-    /// Writes into the memory that keeps it without power; it stands a limited number of them.
+    /// Writes into the memory that keeps values without power; this memory endures a limited number of writes.
     pub kept: u32,
 }
 

@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-/// xorshift64* of Marsaglia and Vigna. Not for secrets.
+/// The generator xorshift64* of Marsaglia and Vigna. Not for secrets.
 #[derive(Debug, Clone)]
 pub struct Random(u64);
 

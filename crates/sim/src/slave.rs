@@ -416,8 +416,8 @@ mod tests {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
             assert_eq!(heard, Heard::BadFrame, "{protocol:?} {address}");
         }
-        // The check code is verified first (reference/drives.md 5.6): a message that lacks a byte fails there. What is not a frame
-        // gets no reply.
+        // The check code is verified first (reference/drives.md 5.6), so a message that lacks a byte fails there. Bytes that are
+        // no frame get no reply.
         let whole = damaged(ascii, 1, &read);
         let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());
         assert!(matches!(line.hear(ascii, &short, SimTime::ZERO), Heard::Damaged(..)));

@@ -429,7 +429,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
             self.settled = now;
             let mut line = self.shared.line();
             line.on_bytes(bytes, now);
-            // Nothing is due before the request's silence is over: time for a drive that is not polled.
+            // No action is due before the request's silence is over, which leaves time for a drive that is not polled.
             line.slaves().advance_next(now);
         }
         Ok(())

@@ -60,7 +60,7 @@ async fn a_burst_of_all_drives_is_not_lost() {
         .await
         .opened()
         .await;
-    // Nothing of it is sent before all are published: the server has one thread, this one.
+    // No event is sent before all are published: the server has one thread, which runs this test.
     for _ in 0..1000 {
         server
             .plant()

@@ -77,7 +77,7 @@ async fn half_frames_and_silence_hold_nobody_up() {
     }
     let mut other = rig.client().await;
     assert_eq!(other.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
-    // The rest comes after all.
+    // The rest of the requests comes after all.
     for (cut, client) in &mut idle {
         client.send(&frame(1, 1, &words(3, &[2102, 1]))[*cut..]).await;
         assert_eq!(client.answer().await, Some((1, 1, registers(3, &[5000]))));

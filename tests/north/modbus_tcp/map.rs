@@ -15,8 +15,8 @@ use serde_json::Value;
 use super::rig::{Rig, options, words};
 use crate::support::tools;
 
-/// A bus for each built-in profile, with a drive to command and one to look at. What stands in the registers makes no
-/// frequency range for every family, so that is configured.
+/// A bus for each built-in profile, with one drive to command and one to monitor. The register values do not give every
+/// family a frequency range, so the range is configured.
 fn configuration() -> String {
     let mut text = "[gateway]\nname = \"all\"\n[modbus_tcp]\nwrite = [\"127.0.0.1\"]\n".to_string();
     for (place, profile) in Profiles::built_in().iter().enumerate() {

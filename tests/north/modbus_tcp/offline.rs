@@ -138,7 +138,7 @@ fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
             session.now += Duration::from_millis(20);
             assert_eq!(session.receive(&start[cut..]), refused, "{cut}");
         }
-        // Sent again it is taken; what comes behind in the same piece has its own time.
+        // Sent again, the request is taken; the one after it in the same piece has its own time.
         session.now += Duration::from_millis(20);
         assert!(session.receive(&start[..3]).is_empty());
         session.now += Duration::from_millis(20);

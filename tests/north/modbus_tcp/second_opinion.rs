@@ -35,7 +35,7 @@ fn request() -> impl Strategy<Value = Request<'static>> {
     ]
 }
 
-/// The PDU that tokio-modbus makes of it, by its client: what it writes into a pipe.
+/// The PDU that tokio-modbus makes of the request: its client writes it into a pipe.
 fn encoded(request: Request<'static>) -> Vec<u8> {
     use tokio::io::AsyncReadExt;
     use tokio_modbus::client::Client;

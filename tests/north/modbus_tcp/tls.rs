@@ -69,7 +69,7 @@ pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
     make(&own, &["client", "late", "operator"], "-1");
     make(&own, &["client", "malformed", "operator"], "30");
     sign_with_printable_role(&own, "malformed");
-    // Nothing drops what is static: it is removed when this process ends and with it the pipe.
+    // Static values are never dropped, so the folder is removed when this process ends and its pipe closes.
     let mut sweeper = Command::new("sh");
     sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
     let sweeper = sweeper

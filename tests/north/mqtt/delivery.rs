@@ -36,7 +36,7 @@ fn a_broker_that_comes_later_is_found() {
     watcher.wait_payload("drivegate/hall/status", "online");
     gateway.wait_connected(true);
     wait_for("the event to be delivered", || (gateway.buffered() == 0).then_some(()));
-    // The watcher may have come too late for the event itself; its time is checked where a line is cut.
+    // The watcher may have come too late for the event itself, whose time is checked in the test that cuts a line.
     assert!(
         watcher
             .all()

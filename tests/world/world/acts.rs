@@ -97,7 +97,7 @@ impl World {
                 self.plain(index, bus, drive, wish, ms(2_000));
             }
             Habit::Operates => self.operate(index, bus, drive),
-            // The queue is full: one that is turned away is enough now and then.
+            // The queue is full, so a refused order now and then is enough.
             Habit::Floods | Habit::Crowds if self.clients[index].open > CAPACITY && self.dice.chance(0.95) => {}
             Habit::Crowds => {
                 let wishes = [

@@ -31,7 +31,8 @@ impl World {
         }
     }
 
-    /// Answers of orders that a newer one replaced come before the newer one is taken note of: it takes their place.
+    /// Processes answers to orders that a newer one replaced before the newer one is recorded, because it takes their
+    /// place.
     pub(super) fn replaced(&mut self) {
         self.collect();
         let Some((newest, before)) = self.records.split_last_mut() else {

@@ -31,7 +31,7 @@ pub struct Healing {
 }
 
 impl World {
-    /// Every fault ends; nothing may stay wrong.
+    /// Ends every fault, after which nothing may stay wrong.
     pub(super) fn heal(&mut self) {
         let online = self.end_faults();
         let stops = self.stop_at_once();
@@ -55,7 +55,7 @@ impl World {
         self.check_as_good_as_new();
     }
 
-    /// The time in which a drive that answers is as before: what may come late, what is tried again, three rounds.
+    /// Time after which a drive that answers is as before: late replies, repeated requests, three rounds.
     fn rounds(&self, bus: usize) -> Duration {
         let bus = &self.buses[bus];
         let round = bus.round.max(bus.line.cycle);
@@ -213,7 +213,7 @@ impl World {
         }
     }
 
-    /// Nothing is left of faults and commands.
+    /// Checks that nothing is left of faults and commands.
     fn check_remains(&mut self) {
         self.collect();
         let open: Vec<usize> = self.open.values().flatten().copied().collect();
@@ -297,7 +297,7 @@ fn ages_of(handle: &drivegate_world::plant::BusHandle) -> Ages {
     handle.image.drives.iter().map(reads).collect()
 }
 
-/// Takes note of how old each value is; one that was never read has no age.
+/// Records the age of each value; a value that was never read has no age.
 fn note_ages(ages: &mut Ages, handle: &drivegate_world::plant::BusHandle, now: Instant) {
     for (ages, image) in ages.iter_mut().zip(&handle.image.drives) {
         let snapshot = image.snapshot();

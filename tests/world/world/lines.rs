@@ -228,7 +228,7 @@ impl World {
         }
     }
 
-    /// Words that only one order writes: what may go out of it, and in which order.
+    /// Checks words that only one order writes: which of them may be sent, and in which order.
     pub(super) fn check_unique(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         let now = self.now;
         let waiting = self.open.get(&(bus, drive)).into_iter().flatten();
@@ -290,7 +290,7 @@ impl World {
         self.note_ordered(bus, drive, asked);
     }
 
-    /// An exchange is over: what the image has of it now is what the drive answered to it.
+    /// Checks, after an exchange, that the image has what the drive answered.
     pub(super) fn over(&mut self, bus: usize, asked: &Asked) {
         let (Some(RequestPdu::Read { table, start, count }), true) = (Some(asked.pdu.clone()), asked.is_poll) else {
             return;

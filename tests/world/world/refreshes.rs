@@ -105,7 +105,7 @@ impl World {
         }
     }
 
-    /// A drive acted upon a write: what an order set, and what fed its timeout.
+    /// Records the effects of a write that a drive acted upon: what an order set, and what fed the drive's timeout.
     pub(super) fn note_ordered(&mut self, bus: usize, drive: usize, asked: &Asked) {
         let (profile, now) = (self.buses[bus].profile.clone(), self.now);
         let truth = &mut self.truths[bus][drive];

@@ -41,7 +41,7 @@ pub struct Options {
     pub address: SocketAddrV4,
     /// Number of bits in the network mask.
     pub prefix: u8,
-    /// The number of the virtual network, 1..=65534; none where all objects belong to the device of the host.
+    /// The number of the virtual network, 1..=65534; `None` if all objects belong to the device of the host.
     pub network: Option<u16>,
     /// Identifier and name of the vendor.
     pub vendor: (u16, Arc<str>),

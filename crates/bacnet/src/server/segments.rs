@@ -23,7 +23,7 @@ struct Sending {
     content: Vec<u8>,
     /// Octets of content in each segment.
     size: usize,
-    /// The first segment that is not acknowledged.
+    /// The first segment that is not acknowledged yet.
     first: usize,
     /// Number of segments sent so far.
     sent: usize,

@@ -177,7 +177,7 @@ impl Traffic {
         self.ready.push_back((To::Host(to), bytes));
     }
 
-    /// Broadcasts, now or later; what waits already does not wait twice.
+    /// Broadcasts, at once or later; a broadcast that waits already does not wait twice.
     pub(super) fn broadcast(&mut self, bytes: Vec<u8>, now: Instant) {
         let step = self.step(now);
         if self.broadcasts.is_empty() && self.sent.sum(step) < BROADCASTS {

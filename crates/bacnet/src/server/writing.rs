@@ -36,7 +36,7 @@ pub struct Job {
     pub place: usize,
     /// The object.
     pub object: ObjectId,
-    /// The value; none gives the slot back.
+    /// The value; `None` releases the slot.
     pub value: Option<Datum>,
     /// The slot, of an object with priorities.
     pub priority: Option<u8>,
@@ -403,7 +403,7 @@ fn has(object: &Object, property: PropertyId) -> bool {
     }
 }
 
-/// The value in the kind of the object; none gives a slot back.
+/// The value in the kind of the object; `None` releases a slot.
 fn written(object: &Object, value: &Data) -> Result<Option<Datum>, Error> {
     Ok(Some(match (&object.kind, value) {
         (_, Data::Null) if object.access == Access::Command => return Ok(None),

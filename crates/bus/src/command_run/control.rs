@@ -33,7 +33,8 @@ pub(super) enum Word {
     Run(Option<bool>),
     /// The word of this number in the sequence.
     Sequence(usize, Option<bool>),
-    /// Before a pulse of these bits, a reset as a rule: they are not set, nor the run command of a motor that stands.
+    /// Before a pulse of these bits, usually a reset: the bits are not set, nor is the run command of a motor that
+    /// stands.
     ResetLow(Setting),
     /// The pulse.
     ResetHigh(Setting),
@@ -492,7 +493,7 @@ fn may_stand(
     }
 }
 
-/// The run command as it is known at the drive; none where it is known to have a stop.
+/// The run command as it is known at the drive; `None` if the drive is known to have a stop.
 fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option<Holds> {
     let place = control.run_place();
     let own = place == control.at;
@@ -569,7 +570,8 @@ pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
     matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())
 }
 
-/// The place of `[control]` whose word is learned as the drive reports it; none where it reports something else.
+/// The place of `[control]` whose word is learned from the drive's reports; `None` if the drive reports something else
+/// there.
 pub fn read_place(profile: &Profile) -> Option<ControlItem> {
     let control = profile.control.as_ref()?;
     (control.own_word == OwnWord::Read).then_some(control.at)

@@ -76,8 +76,8 @@ impl KnownWords {
         (fell & bits != 0).then_some(*at)
     }
 
-    /// The drive may have taken these words, or not: none of them is known from now on. A stop needs no word that is known where
-    /// it is the same by the control word of before and by this one.
+    /// Forgets these words, which the drive may or may not have taken. A stop needs no known word if it is the same with the
+    /// control word from before and with this one.
     pub(crate) fn in_doubt(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
         for (address, word) in items {
             let before = self.words.remove(&(table, *address));
@@ -134,7 +134,8 @@ impl KnownWords {
         self.direction.filter(|_| self.waits_for_start)
     }
 
-    /// The drive may have restarted, or taken an unanswered write: its words are read again before a bit is changed.
+    /// Forgets the words of a drive that may have restarted or taken an unanswered write: they are read again before a
+    /// bit is changed.
     pub fn forget(&mut self) {
         self.words.clear();
         self.stop = None;

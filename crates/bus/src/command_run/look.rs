@@ -51,7 +51,7 @@ impl Shown {
     }
 }
 
-/// A look at a drive: what is left to read, and what was read.
+/// A look at a drive: the reads that are left, and the words that were read.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Look {
     running: Shown,
@@ -65,7 +65,7 @@ pub(crate) struct Look {
 }
 
 impl Look {
-    /// Whether the motor runs; none where the family does not report that.
+    /// A look at whether the motor runs; `None` if the family does not report that.
     pub(super) fn at_running(profile: &Profile) -> Option<Look> {
         Look::of(profile, &[])
     }
@@ -129,7 +129,7 @@ impl Look {
         self.words.clear();
     }
 
-    /// Whether the motor runs; none where the replies do not say so.
+    /// Whether the motor runs; `None` if the replies do not say so.
     pub(super) fn runs(&self) -> Option<bool> {
         self.running.value(&self.words)
     }
@@ -147,7 +147,7 @@ impl Look {
 }
 
 impl CommandRun {
-    /// The request of a look at the motor; none where the family does not report whether it runs.
+    /// The request of a look at the motor; `None` if the family does not report whether it runs.
     pub(super) fn looks(&mut self, profile: &Profile) -> Option<Step> {
         if self.look.is_none() {
             self.look = Look::at_motor(profile);
@@ -172,7 +172,8 @@ impl CommandRun {
         self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
     }
 
-    /// A look brought nothing: nothing is written, but the end of a pulse, which then carries no run command.
+    /// Handles a look without a result: nothing is written except the end of a pulse, which then carries no run
+    /// command.
     pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
         self.look = None;
         if self.ends_pulse() {

@@ -120,7 +120,7 @@ impl CommandRun {
             StepPurpose::ReadWord | StepPurpose::Look => self.urgency != Urgency::Stop && !self.ends_pulse(),
             _ => false,
         };
-        // A read that the drive is still working on has changed nothing; it is repeated.
+        // A read that the drive is still working on has changed nothing, so it is repeated.
         let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
             || (*code == Exception::ACKNOWLEDGE && matches!(step.purpose, StepPurpose::ReadWord | StepPurpose::Look)));
         if !(is_busy && waits) || (!self.may_write_on() && self.tries.busy >= MOST_BUSY) {
@@ -143,8 +143,8 @@ impl CommandRun {
         self.actions.front().is_some_and(Action::ends_reset)
     }
 
-    /// The drive does not know the function of a write. Whether there is another one to try, once; nothing can stop a drive
-    /// that takes only functions 15 and 16 otherwise.
+    /// Notes that the drive does not know the function of a write. Returns whether another function can be tried, once;
+    /// nothing else can stop a drive that takes only functions 15 and 16.
     fn has_another_function(&mut self, step: &Step, words: &mut KnownWords) -> bool {
         if matches!(step.pdu, RequestPdu::MaskWrite { .. }) {
             words.functions.refused(&step.pdu);
@@ -270,7 +270,7 @@ impl CommandRun {
         self.tries.doubt = self.tries.doubt.max(Doubt::Unanswered);
     }
 
-    /// Whether the drive may have taken a write that it did not answer: its words are not known then.
+    /// Whether the drive may have taken a write that it did not answer: its words are then unknown.
     pub(crate) fn in_doubt(&self) -> bool {
         self.tries.doubt != Doubt::No
     }

@@ -52,7 +52,7 @@ pub(super) enum Verdict {
     AsItStands,
     /// The word without a run command.
     WithoutRun,
-    /// Nothing: the direction is kept for the next start.
+    /// Write nothing: the direction is kept for the next start.
     AtNextStart,
     Refused(Refusal),
 }

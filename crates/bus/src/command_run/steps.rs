@@ -117,7 +117,7 @@ pub(super) struct Known {
     pub(super) blind: bool,
     /// Whether the command decides whether the motor is to run.
     pub(super) names_run: bool,
-    /// A stop of the motor is on its way: nothing carries a run command any more, whatever the drive shows.
+    /// Whether a stop of the motor is on its way: nothing then carries a run command, whatever the drive shows.
     pub(super) stopped: bool,
     /// Whether the motor runs, as last reported.
     pub(super) running: bool,
@@ -138,7 +138,7 @@ pub(super) fn sets_all_bits(profile: &Profile, values: &[(PointIndex, Value)]) -
 }
 
 /// Why a command cannot be sent: a point without a register in the drive, or a value that does not fit its register.
-/// Admitted ones have neither; one that has must not end as if the drive had taken it.
+/// Admitted commands have neither; a command that has must not end as if the drive had taken it.
 pub(super) fn unsendable(profile: &Profile, values: &[(PointIndex, Value)]) -> Option<Refusal> {
     values.iter().find_map(|(index, value)| {
         let Some(point) = profile.points.get(*index) else {
@@ -186,7 +186,7 @@ fn bits_of(raw: &Raw) -> u16 {
     }
 }
 
-/// The actions of a command. `stopped`: it is the rest of a command whose stop went before it.
+/// The actions of a command. `stopped`: the command is the rest of one whose stop went before it.
 pub(super) fn actions(
     profile: &Profile,
     values: &[(PointIndex, Value)],
@@ -221,7 +221,7 @@ pub(super) fn actions(
                 }
             }
             Form::Bit { .. } | Form::Bits { .. } => {
-                // Admitted values fit; one that does not is left out rather than sent wrong.
+                // Admitted values fit; a value that does not fit is left out rather than sent wrong.
                 let Some(word) = raw.encode(*value, 0).ok().and_then(|words| words.first().copied()) else {
                     continue;
                 };

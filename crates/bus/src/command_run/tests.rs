@@ -484,7 +484,7 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
         assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
     }
     let order = [("run", 1.0), ("reverse", 1.0)];
-    // The rest of the word is the application's.
+    // The other bits of the word belong to the application.
     let (mut both, _a) = bench.begin(&order, Urgency::Command);
     let read = sends(&bench, &mut both);
     let ended = both.answered(&read, refused(), &mut bench.words);

@@ -38,8 +38,8 @@ fn echoes_of_writes() {
     assert!(late.blocks(&other, now).is_some());
 }
 
-/// A drive that answers each request 110 ms after it was sent, where the deadline is 105 ms: it is one reply behind
-/// all the time. Two reads that look alike are due all the time.
+/// A drive answers each request 110 ms after it was sent, while the deadline is 105 ms: it is one reply behind all the
+/// time. Two reads that look alike are always due.
 #[test]
 fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
     let (a, b) = (read(2100, 3), read(2104, 3));

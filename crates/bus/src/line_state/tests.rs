@@ -188,7 +188,7 @@ fn a_drive_has_its_own_silence_before_its_request_and_after_its_reply() {
     }
 }
 
-/// Every tenth reply comes twice and the one behind it is lost: its copy is alone in its exchange.
+/// Every tenth reply comes twice and the next one is lost, so its copy is alone in its exchange.
 #[test]
 fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
     let mut rig = DoublingLine::of(Protocol::N2);

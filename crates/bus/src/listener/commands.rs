@@ -43,7 +43,7 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// A write was received, from `began` to `at`; what is to be reported of it now.
+    /// Processes a write received from `began` to `at`; returns what must be reported of it now.
     pub fn heard(
         &mut self,
         (spec, protocol): (&DriveSpec, Protocol),
@@ -146,7 +146,7 @@ fn outcome(ended: Option<&Ended>) -> Outcome {
     }
 }
 
-/// The registers or coils that a write sets; none where that depends on what the drive has.
+/// The registers or coils that a write sets; empty if that depends on the values in the drive.
 fn items(pdu: &RequestPdu) -> (Table, Vec<(u16, u16)>) {
     match pdu {
         RequestPdu::ReadWrite {

@@ -317,7 +317,7 @@ impl ListenCore {
         let mut words = words;
         let mut start = start;
         let is_wide = |address: Option<u16>| address.is_some_and(|address| known.wide.contains(&(table, address)));
-        // The second half of a value, and the first one.
+        // The read begins with the second half of a value whose first half is before it.
         if is_wide(start.checked_sub(1)) {
             let Some(next) = start.checked_add(1) else { return };
             (start, words) = (next, words.get(1..).unwrap_or_default());

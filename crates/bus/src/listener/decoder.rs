@@ -69,7 +69,7 @@ pub struct Exchange {
     pub sent: Instant,
     /// All bytes that came after the request.
     pub heard: Vec<u8>,
-    /// When the first byte of the reply began; none where nothing came.
+    /// When the first byte of the reply began; `None` if nothing came.
     pub replied: Option<Instant>,
     /// When the transaction was over.
     pub at: Instant,

@@ -59,8 +59,8 @@ impl Address {
         Some(self.turnaround / answered)
     }
 
-    /// The profiles of that protocol whose registers all reads lie in that were answered, those first that name most of what was
-    /// read. None where nothing was read.
+    /// The profiles of this protocol whose registers contain all answered reads; first come the profiles that name most of the
+    /// registers read. Empty if nothing was read.
     pub fn fitting(&self, profiles: &Profiles, protocol: Protocol) -> Vec<String> {
         let answered = self.requests.values().filter(|asked| asked.answered > 0);
         let reads: Vec<(Table, u16, u16)> = answered.filter_map(|asked| asked.read).collect();

@@ -249,7 +249,7 @@ impl Master {
         !stopped && pending.gate.judge(Stage::Write, command, &facts, now) == Verdict::Go
     }
 
-    /// The background transaction is sent. It is a command to every drive that receives it.
+    /// Notes that the background transaction is sent, which counts as a command to every drive that receives it.
     pub(super) fn background_sent(&mut self, now: Instant) {
         let Some(begun) = &mut self.background else { return };
         begun.sent = true;
@@ -332,8 +332,8 @@ impl Master {
         begun.answer(outcome, frame, now);
     }
 
-    /// Stores read values in the process image, too. A drive that was identified, or polled for changes, may have
-    /// restarted or reported changes to the tool: it is read again.
+    /// Stores read values in the process image as well. A drive that was identified, or polled for changes, may have
+    /// restarted or reported changes to the tool, so it is read again.
     fn note_background_read(
         &mut self,
         turn: &Turn,
@@ -365,8 +365,8 @@ impl Master {
         }
     }
 
-    /// A write that is not checked: what it wrote is unknown of all drives that received it, and every command word where it is not
-    /// known what that was.
+    /// Forgets, for all drives that received an unchecked write, the words that it wrote, and every command word if the written
+    /// words are unknown.
     fn unchecked_write(&mut self, begun: &Begun, turn: &Turn, outcome: &Outcome, now: Instant) {
         let writes = written(&turn.pdu);
         for index in begun.command().into_iter().flat_map(Command::reach) {

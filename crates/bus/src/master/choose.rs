@@ -288,11 +288,11 @@ impl Master {
             return self.begin_passed_on(command, None, now).map(Ok);
         }
         self.begin(command, chosen.rank, now);
-        // Started commands are decided on again: one may wait, or another one may go first.
+        // The started commands are judged again: one may wait, or another may go first.
         None
     }
 
-    /// Begins a command that was taken from the queue. A stop goes to a drive that does not answer too: it is its probe.
+    /// Begins a command from the queue. A stop is sent even to a drive that does not answer: it serves as the probe.
     fn begin(&mut self, mut command: Command, rank: Urgency, now: Instant) {
         let index = command.intent.drive;
         let online = self.schedule.is_online(index) || command.is_stop();

@@ -46,8 +46,8 @@ pub(super) fn look_at_hold(
     }
 }
 
-/// The run command that stands is taken away, so that nothing starts when the local control place gives the drive back. Whether that
-/// was so at a start of the gateway is not known: then nothing is written.
+/// Takes the run command away, so that nothing starts when the local control place gives the drive back. If a local control place
+/// was found at the start of the gateway, nothing is written.
 fn stop_at_local(
     bus: &BusHandle,
     index: DriveIndex,

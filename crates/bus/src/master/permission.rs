@@ -94,7 +94,7 @@ pub(super) fn wanted(
     }
 }
 
-/// A started command goes no further; its refusal is reported as if it had come at once.
+/// Ends a started command; its refusal is reported as if it had come at once.
 fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outcome) {
     if let (Outcome::Refused(refusal), Some(ticket)) = (&outcome, run.first_ticket()) {
         let denied = Denied {

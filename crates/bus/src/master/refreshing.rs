@@ -53,14 +53,14 @@ impl Master {
         }
     }
 
-    /// The next step of a round that has read: nothing but stops, and orders to that drive, goes between its frames.
+    /// The next step of a round that has read: only stops, and orders to this drive, go between its frames.
     pub(super) fn refresh_goes_on(&mut self, now: Instant) -> Option<Turn> {
         let under_way = |(_, drive): &(DriveIndex, &DriveState)| drive.refresh.is_under_way() && !drive.has_runs();
         let (index, _) = self.drives.enumerate().find(under_way)?;
         self.refresh_step(index, now)
     }
 
-    /// The first step of the round that is due longest. Polls have the line for as long as refreshes had it, unless it is `idle`.
+    /// The first step of the round that is due longest. Polls get the line for as long as refreshes had it, unless it is `idle`.
     pub(super) fn refresh(&mut self, idle: bool, now: Instant) -> Option<Turn> {
         if !self.refresh_debt.is_zero() && !idle {
             return None;

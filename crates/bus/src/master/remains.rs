@@ -15,7 +15,7 @@ pub struct Remains {
     pub strangers: usize,
     /// Commands that were started and are not over.
     pub begun: usize,
-    /// Commands and forwarded reads that wait; one more where background requests do.
+    /// Number of waiting commands and forwarded reads; one more if background requests wait.
     pub waiting: usize,
     /// Acknowledged commands whose effect is waited for.
     pub unconfirmed: usize,

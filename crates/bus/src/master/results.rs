@@ -16,7 +16,7 @@ use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 
 impl Master {
-    /// The transaction of a turn has ended; what that changes.
+    /// Applies the effects of a turn's transaction that has ended.
     pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.note_late(turn, &end, now);
         match &turn.purpose {

@@ -22,7 +22,7 @@ pub(super) struct Waits {
     pub(super) n2_late: N2LateReplies,
     /// Replies that may still arrive from addresses without a configured drive.
     pub(super) strangers: BTreeMap<u8, LateReplies>,
-    /// Which starts may be written; none where nothing is guarded.
+    /// Which starts may be written; `None` if no drive is guarded.
     pub(super) starts: Option<StartGate>,
     /// A drive to which a drill sends nothing but stops, and until when.
     pub(super) quiet: Option<(DriveIndex, Instant)>,
@@ -56,7 +56,7 @@ impl Waits {
         (request.drive == quiet).then_some(until)
     }
 
-    /// Whether the drives that something passed on reaches are ready: nothing has started for any of them.
+    /// Whether the drives that a passed-on request reaches are ready: no command has started for any of them.
     pub(super) fn may_pass_on(&mut self, command: &Command, drives: &mut PerDrive<DriveState>, now: Instant) -> Ready {
         let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
         if command.reach().filter_map(|drive| drives.get(drive)).any(busy) {

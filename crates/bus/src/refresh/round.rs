@@ -50,7 +50,7 @@ impl Refresh {
         self.round.is_some()
     }
 
-    /// Another transaction goes first: what the round has read is read again.
+    /// Lets another transaction go first: the round then reads again what it has read.
     pub(crate) fn others_go_first(&mut self, profile: &Profile) {
         if let Some(round) = self.round.as_mut().filter(|round| round.stage != Stage::Reference) {
             round.stage = first_read(profile);
@@ -246,7 +246,8 @@ impl Refresh {
         }
     }
 
-    /// No reply to a step, or none that is believed: it goes on with the next period, by what the drive shows then.
+    /// Handles a step without an accepted reply: the refresh continues with the next period, by what the drive then
+    /// shows.
     pub(crate) fn not_answered(&mut self, now: Instant) {
         self.round = None;
         let Some((every, _)) = self.settings else { return };

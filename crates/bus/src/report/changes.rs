@@ -185,7 +185,7 @@ mod tests {
         let (mut bit, start) = (Watched::default(), Instant::now());
         let mut reported = Vec::new();
         for second in 0..100u32 {
-            // The first read is none.
+            // The first read is no change.
             let value = second / 20 % 2 == 0;
             if let Some(change) = bit.read(value, start + SECOND * second) {
                 reported.push((second, change));

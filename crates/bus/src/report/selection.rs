@@ -27,7 +27,7 @@ impl Report {
         wanted
     }
 
-    /// The drive does not have a monitoring register: its process data is served as it is.
+    /// Notes that the drive lacks a monitoring register: its process data is then served as it is.
     pub(super) fn monitor_refused(
         &mut self,
         (index, drive): (DriveIndex, &DriveImage),

@@ -28,8 +28,8 @@ pub enum Admission {
 }
 
 impl BackgroundShare {
-    /// Shares earn from the time that process data has, so that they are shares of its rate: what commands and slow polls take
-    /// is not process data's to give.
+    /// Earns shares from the time of process data, so that they are shares of its rate: the time of commands and slow polls is
+    /// not process data's to give.
     pub(super) fn earn(&mut self, passed: Duration) {
         for (pace, balance) in Pace::ALL.into_iter().zip(&mut self.balance) {
             // Share not used in an hour does not become a burst later.

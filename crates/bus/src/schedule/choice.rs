@@ -28,7 +28,8 @@ impl Schedule {
             return;
         }
         self.join_again(now);
-        // The first reads of all drives, then the second ones: a reply that comes twice meets another drive's request.
+        // The first reads of all drives come before the second ones, so a reply that comes twice meets another drive's
+        // request.
         let mut reads: Vec<(usize, DriveIndex, PlannedRead)> = Vec::new();
         for (index, drive) in self
             .drives
@@ -76,7 +77,7 @@ impl Schedule {
 
     pub(super) fn due_poll(&mut self, now: Instant) -> Option<Poll> {
         self.turn = Turn::Due;
-        // Many drives that are away must not keep the others waiting: one probe without success, then a fast poll.
+        // Many offline drives must not keep the others waiting: after one probe without success comes a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);

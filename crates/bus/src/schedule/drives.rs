@@ -63,7 +63,8 @@ pub(super) struct Item {
     pub(super) wanted: bool,
     /// Whether the read was never answered so far.
     pub(super) unread: bool,
-    /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
+    /// Time since which a command changed what the item reads: it is read before the round, so that the command is
+    /// confirmed soon.
     pub(super) asked: Option<Instant>,
     /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
     pub(super) whole_again: Option<Instant>,
@@ -144,8 +145,8 @@ impl EarlyProbes {
         self.outage = None;
     }
 
-    /// When the next one comes, after a request without success that took the line for `took`; none when they are used
-    /// up.
+    /// When the next early probe comes, after a request without success that took the line for `took`; `None` when the
+    /// probes are used up.
     fn next(&mut self, now: Instant, took: Duration) -> Option<Instant> {
         if let Some(since) = self.online_since.take() {
             let online = now.saturating_duration_since(since);
@@ -248,7 +249,7 @@ impl DriveSchedule {
         read.count > 1 && self.unproved.iter().any(|block| block.covers(read.table, read.start))
     }
 
-    /// The items of a read are read singly; it is tried again after the pause.
+    /// Reads the items of a read singly, and tries the whole read again after the pause.
     pub(super) fn take_apart(&mut self, read: &PlannedRead, now: Instant, pause: Duration) {
         let Some(index) = self.items.iter().position(|item| item.read == *read && read.count > 1) else {
             return;
@@ -301,8 +302,8 @@ impl DriveSchedule {
         };
     }
 
-    /// When a slow read is due. One that is postponed for long and was not answered while process data was not either
-    /// has the line to blame: it is due once process data came without a fault for a while.
+    /// When a slow read is due. If a read was postponed for long and failed together with process data, the line was to
+    /// blame: it is due once process data came without a fault for a while.
     pub(super) fn due(&self, item: &Item) -> Instant {
         let Some((failed_at, troubled)) = item.failed_at.zip(self.troubled).filter(|_| item.failures > 0) else {
             return item.due;
@@ -325,8 +326,8 @@ impl DriveSchedule {
         self.unanswered && self.items.iter().any(Item::is_process_data)
     }
 
-    /// Whether the answers to that read show that the drive is there. One that was split or joined since it was queued
-    /// shows nothing: what is read in its place does.
+    /// Whether the answers to this read show that the drive is present. A read that was split or joined since it was
+    /// queued shows nothing: the reads in its place do.
     pub(super) fn shows_presence(&self, read: &PlannedRead) -> bool {
         let Some(item) = self.items.iter().find(|item| item.read == *read) else {
             return false;

@@ -131,7 +131,8 @@ fn a_saturated_line_is_never_idle_and_fair() {
 
 #[test]
 fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
-    // Two fast polls take 24 of 30 ms: no slow one fits behind them. They would take 2.4 % of the line, which has room.
+    // Two fast polls take 24 of 30 ms, so no slow poll fits after them. A slow poll would take 2.4 % of the line, which
+    // has room.
     let mut rig = PolledLine::new(2, Duration::from_millis(30));
     rig.run(Duration::from_secs(5));
     rig.log.clear();

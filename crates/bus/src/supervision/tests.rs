@@ -418,7 +418,7 @@ fn an_action_that_is_due_outlives_the_bus() {
         "what was acknowledged last is not due again"
     );
     assert_eq!(rig.reported(), 1);
-    // Nothing is due to a drive that is only monitored from now on, nor where nothing is to be written.
+    // No action is due for a drive that is only monitored from now on, nor if nothing must be written.
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
         |spec| spec.supervision = None,

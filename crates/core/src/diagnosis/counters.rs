@@ -13,7 +13,7 @@ pub(super) const LONGEST_AGE: Duration = Duration::from_secs(10);
 pub const LATENCY: usize = 16;
 /// Frequencies of the mains, Hz.
 pub const MAINS: [f32; 2] = [50.0, 60.0];
-/// The phase of the mains is not kept for longer: it differs by some hundredths of a Hz.
+/// Longest time for which the phase of the mains is kept; their frequency differs by some hundredths of a Hz.
 const IN_PHASE: Duration = Duration::from_secs(3);
 
 /// Counters in steps.
@@ -124,7 +124,7 @@ impl Contrast {
     }
 }
 
-/// A contrast by whether a drive runs. What was counted shortly before a change belongs to neither: the state is read some time after it
+/// A contrast by whether a drive runs. Figures from shortly before a change belong to neither side: the state is read some time after it
 /// changes, and on a slow line some seconds.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Running {

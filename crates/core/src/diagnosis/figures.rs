@@ -176,7 +176,7 @@ impl Figures {
         (self.reconnects.sum(0), steps)
     }
 
-    /// A reply was too early for the configured baud rate; it could have come at `baud`.
+    /// Notes that a reply was too early for the configured baud rate and could have come at `baud`.
     pub fn beats(&mut self, baud: u32) {
         self.early.add(BAUDS.partition_point(|usual| *usual < baud), 1);
     }

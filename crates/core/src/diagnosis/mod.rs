@@ -262,7 +262,7 @@ impl CountedByDrive {
         }
     }
 
-    /// All five of them, in the order of their subfunctions; none while some are missing.
+    /// All five counters, in the order of their subfunctions; `None` while some are missing.
     pub fn complete(counters: &[u16]) -> Option<CountedByDrive> {
         let &[messages, damaged, exceptions, own, unanswered] = counters else {
             return None;
@@ -288,8 +288,8 @@ impl CountedByDrive {
         }
     }
 
-    /// The disturbed direction of the line, as text: from the messages the drive received damaged between two readings,
-    /// and the number of its replies damaged here. None if neither shows anything.
+    /// The disturbed direction of the line, as text: from the messages that the drive received damaged between two
+    /// readings, and the number of its replies damaged here. `None` if neither shows anything.
     pub fn direction(&self, name: &str, damaged_here: u32) -> Option<String> {
         let CountedByDrive { messages, damaged, .. } = self;
         match (*damaged, damaged_here) {

@@ -192,7 +192,7 @@ impl Drills {
         Ok(report)
     }
 
-    /// Ends a drill, which stops the motor. One that is over stays as it is.
+    /// Ends a drill, which stops the motor. A drill that is over stays as it is.
     ///
     /// # Errors
     /// If no drill has this id.

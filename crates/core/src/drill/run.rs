@@ -74,7 +74,7 @@ enum Step {
     Armed,
     /// The start is being written to disk in this generation, so that the next process knows of the running motor.
     Keeping(u64),
-    /// The start was refused; it is retried.
+    /// The start was refused and is retried.
     Waiting,
     /// The start was queued.
     Starting(Placed),

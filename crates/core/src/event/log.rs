@@ -17,7 +17,7 @@ pub enum Before {
 /// A search.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Search {
-    /// Any of these kinds; none: all kinds.
+    /// Kinds to search for; empty for all kinds.
     pub kinds: Vec<EventKind>,
     pub drive: Option<String>,
     pub bus: Option<String>,

@@ -41,8 +41,8 @@ impl<T> Default for RefusalLimit<T> {
 }
 
 impl<T> RefusalLimit<T> {
-    /// `client` was refused something for `reason`, by `drive` unless there is none of that name. Returns what passes now,
-    /// with the number of refusals that it stands for; what does not is returned by a later call, or by
+    /// Notes that `client` was refused something for `reason`, by `drive` if a drive of that name exists. Returns what may
+    /// pass now, with the number of refusals that it stands for; the rest is returned by a later call, or by
     /// [`RefusalLimit::due`].
     pub fn admit(
         &mut self,

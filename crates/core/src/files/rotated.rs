@@ -27,7 +27,7 @@ struct Open {
 }
 
 impl Rotated {
-    /// A file that shares `max_bytes` with those before it, `files` in all. Nothing is opened.
+    /// A file that shares `max_bytes` with the older files, `files` in all. Nothing is opened yet.
     pub fn new(path: PathBuf, max_bytes: u64, files: u64) -> Rotated {
         Rotated {
             path,
@@ -60,7 +60,7 @@ impl Rotated {
         self.open.is_some()
     }
 
-    /// Opens the file for this process alone, with its directory; its size in bytes.
+    /// Opens the file for this process alone, with its directory; returns the size of the file in bytes.
     ///
     /// # Errors
     /// The file cannot be opened, or another process has it open.
@@ -86,7 +86,7 @@ impl Rotated {
         Ok((&mut open.file, bytes))
     }
 
-    /// Closes the file; it is reopened on request.
+    /// Closes the file; a later write opens it again.
     pub fn close(&mut self) {
         self.open = None;
     }
@@ -125,7 +125,7 @@ impl Rotated {
         Ok(())
     }
 
-    /// Makes the current file the first of the older ones and removes the oldest; it is closed then.
+    /// Makes the current file the first of the older ones and removes the oldest one; the current file is then closed.
     ///
     /// # Errors
     /// A file cannot be renamed, or the current one not be brought to disk.

@@ -151,7 +151,7 @@ fn check_link(link: u32, offset: usize) -> Result<(), CaptureError> {
     ))
 }
 
-/// The content of a packet; none if it has no bytes.
+/// The content of a packet; `None` if the packet has no bytes.
 fn packet(link: u32, at: Duration, data: &[u8], offset: usize) -> Result<Option<Packet>, CaptureError> {
     let (sent, bytes) = if link == RTAC_SERIAL {
         let event = data
@@ -159,7 +159,8 @@ fn packet(link: u32, at: Duration, data: &[u8], offset: usize) -> Result<Option<
             .ok_or_else(|| error(offset, "a packet is shorter than its header"))?;
         let bytes = data.get(RTAC_HEADER..);
         let bytes = bytes.ok_or_else(|| error(offset, "a packet is shorter than its header"))?;
-        // Beginning and end of sending, beginning and end of receiving; else the state of the port.
+        // The events 1 to 4 are beginning and end of sending, and beginning and end of receiving; others are states of
+        // the port.
         match event {
             1 | 3 => (true, bytes),
             2 | 4 => (false, bytes),
@@ -175,7 +176,7 @@ fn packet(link: u32, at: Duration, data: &[u8], offset: usize) -> Result<Option<
     }))
 }
 
-/// An interface of a section: its link type, and how many of its ticks are a second.
+/// An interface of a section: its link type, and the number of its ticks in a second.
 #[derive(Debug, Clone, Copy)]
 struct Interface {
     link: u32,

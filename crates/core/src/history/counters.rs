@@ -100,7 +100,7 @@ impl Counters {
         self.ran = Some((at, running));
     }
 
-    /// The drive was offline: its state meanwhile is unknown.
+    /// Notes that the drive was offline, so that its state in that time is unknown.
     pub fn interrupt(&mut self) {
         self.ran = None;
     }

@@ -44,12 +44,12 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl History {
-    /// The past of the drive of that name; none before its bus was started.
+    /// The past of the drive with this name; `None` before its bus was started.
     pub fn drive(&self, name: &str) -> Option<Arc<DriveHistory>> {
         lock(&self.known).drives.get(name).cloned()
     }
 
-    /// The last hour of the bus of that name; none before it was started.
+    /// The last hour of the bus with this name; `None` before the bus was started.
     pub fn line(&self, bus: &str) -> Option<Arc<Mutex<LineHistory>>> {
         lock(&self.known).lines.get(bus).cloned()
     }
@@ -83,8 +83,8 @@ impl History {
         }
     }
 
-    /// The past of a drive, which it keeps over a reload: its counters for ever, its trends as long as bus, address and
-    /// profile are the same.
+    /// The past of a drive, kept over a reload: the counters for ever, the trends as long as bus, address and profile
+    /// are the same.
     pub(super) fn of(&self, spec: &DriveSpec, reach: Reach, clock: Clock) -> Arc<DriveHistory> {
         let mut known = lock(&self.known);
         let before = known.drives.get(&spec.name).cloned();

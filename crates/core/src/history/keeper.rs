@@ -22,7 +22,7 @@ use crate::files::{self, Keeper, Rotated};
 
 /// Events reach the disk within that time; a disk that failed is tried again at this interval.
 const TICK: Duration = Duration::from_secs(1);
-/// Counters reach it at this interval: what a power cut costs at most, with time for the write.
+/// Interval at which counters reach the keeper: with the time for the write, the most that a power cut costs.
 const COUNTERS_EVERY: Duration = Duration::from_secs(45);
 /// Size of all files of events, bytes, and their number.
 pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);

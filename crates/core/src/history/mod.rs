@@ -58,7 +58,7 @@ pub struct RecorderOptions {
     pub after: Duration,
     /// Size of all recordings on disk at most, bytes.
     pub max_bytes: u64,
-    /// Recordings on disk at most; 0: nothing is recorded.
+    /// Most recordings on disk; with 0, nothing is recorded.
     pub max_count: usize,
     /// Whether a warning of a drive makes a recording.
     pub warnings: bool,

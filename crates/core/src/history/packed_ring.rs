@@ -10,7 +10,7 @@ use crate::codec::Table;
 use crate::drive::DriveIndex;
 use crate::process_image::{TapedFrame, TapedRead, Verdict};
 
-/// Bytes in front of each entry: its length, and its time.
+/// Bytes before each entry: length and time of the entry.
 const HEAD: usize = 4 + 8;
 /// Number of steps in which the memory grows to its limit.
 pub(super) const STEPS: usize = 16;

@@ -22,7 +22,7 @@ const COMMENT: u16 = 1;
 const INTERFACE_NAME: u16 = 2;
 const SOFTWARE: u16 = 4;
 
-/// The bytes of the capture. A timeout has no bytes: it is a comment of an empty packet.
+/// The bytes of the capture. A timeout has no bytes, so it is the comment of an empty packet.
 pub fn pcapng(recording: &Recording) -> Vec<u8> {
     let header = &recording.header;
     let mut out = Vec::new();

@@ -80,7 +80,7 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     snapshot
 }
 
-/// A sample leaves its ring: its values become part of the base state.
+/// Adds the values of a sample that leaves its ring to the base state.
 fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
     if let Some(gone) = TapedRead::unpack(at, packed) {
         Arc::make_mut(base).store(gone.table, gone.start, &gone.words, at);
@@ -176,8 +176,8 @@ impl Recorder {
         }
     }
 
-    /// Records these buses from now on. Those that are there already keep their rings; what was recorded of the others ends
-    /// now. Process data is stale from `stale_after` on.
+    /// Records these buses from now on. Buses that are recorded already keep their rings; recordings of the others end now.
+    /// Process data is stale from `stale_after` on.
     pub fn adopt(&mut self, buses: &[Arc<BusImage>], stale_after: Duration, clock: Clock) -> Vec<Capture> {
         self.stale_after = stale_after;
         let captures = self.leave_all_but(buses, clock);

@@ -156,7 +156,7 @@ pub struct CommandNote {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedFrame)]
 pub struct Frame {
-    /// A request: when it was given to the port. Else when the last of it came.
+    /// For a request, the time when it was given to the port; otherwise the time of the last byte.
     pub t: f64,
     /// Place of the drive that was addressed.
     pub drive: Option<usize>,

@@ -224,8 +224,8 @@ impl Store {
         Ok(entry)
     }
 
-    /// Removes what is too much after `written`, which stays. Those of a time that is yet to come, as after the clock was set
-    /// back, count as the oldest: nothing else would ever get older than they.
+    /// Removes recordings beyond the limits, after `written`, which stays. Recordings with a time in the future, as after the
+    /// clock was set back, count as the oldest: nothing would ever be older than they are.
     fn make_room(&mut self, written: &Arc<Entry>, now: SystemTime) {
         let is_to_come = |entry: &Entry| humantime::parse_rfc3339(&entry.time).is_ok_and(|time| time > now);
         let mut order = self.entries.clone();

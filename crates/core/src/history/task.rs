@@ -69,7 +69,7 @@ impl Recordings {
         self.shared().entries.clone()
     }
 
-    /// Time before and after the trigger that a recording has; nothing while the recorder is off.
+    /// Time before and after the trigger that a recording has; zero while the recorder is off.
     pub fn span(&self) -> (Duration, Duration) {
         let shared = self.shared();
         shared
@@ -133,8 +133,8 @@ pub struct RecorderTask {
 }
 
 impl RecorderTask {
-    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`]. The channel ends when the recordings that are
-    /// on disk are known.
+    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`]. The channel ends when the recordings on disk
+    /// are known.
     ///
     /// # Errors
     /// The system gives no thread.

@@ -241,7 +241,7 @@ impl DriveTrend {
                 continue;
             }
             let sample = reading.sample(point.index);
-            // The words of a value may come in several reads: it is as old as the oldest.
+            // The words of a value may come in several reads; the value is as old as the oldest one.
             let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
                 continue;
             };
@@ -313,7 +313,8 @@ impl Kept {
         }
     }
 
-    /// A value was read `since` the beginning; the one before was good for `good_for`. That matters only if steps lie between the two.
+    /// Adds a value that was read `since` the beginning; the previous value was good for `good_for`, which matters only if steps lie
+    /// between the two.
     fn add(&mut self, since: Duration, value: f32, good_for: impl Fn() -> Duration) {
         let [finest, ..] = RANGES;
         let before = self

@@ -78,8 +78,8 @@ impl TriggerKind {
         }
     }
 
-    /// Time after a recording of that kind in which the same drive makes no other of it: what repeats by itself, or can be
-    /// repeated by a client, must not push out the rest.
+    /// Time after a recording of this kind in which the same drive makes no other one of the kind: what repeats by itself,
+    /// or can be repeated by a client, must not push out the other recordings.
     pub(super) fn pause(self) -> Duration {
         match self {
             TriggerKind::Fault | TriggerKind::Supervision | TriggerKind::Command => Duration::ZERO,

@@ -62,7 +62,7 @@ pub struct Arrival {
 }
 
 impl Arrival {
-    /// An order that came at `now` over a connection of its own: one of the gateway itself.
+    /// An order of the gateway itself, which came at `now` over a new connection.
     pub fn now(now: Instant) -> Arrival {
         Arrival::over(Connection::opened(now), now)
     }

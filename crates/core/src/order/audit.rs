@@ -246,7 +246,7 @@ impl Audit {
             .for_each(|passed| self.keep_counted(&mut records, passed, now));
     }
 
-    /// Records what a client did with a drive that was no command: what, and its result.
+    /// Records an act of a client on a drive that was no command, with the result of the act.
     pub fn note(
         &self,
         who: &super::Origin,
@@ -325,8 +325,7 @@ impl Audit {
         self.records().runs.get(drive).cloned()
     }
 
-    /// A reload gave names to other drives: what the drives of those for which `is_same` does not hold were ordered last was ordered
-    /// to others.
+    /// Forgets the last orders of all names for which `is_same` does not hold: a reload gave these names to other drives.
     pub fn keep_orders_of(&self, is_same: impl Fn(&str) -> bool) {
         let records = &mut *self.records();
         records.runs.retain(|drive, _| is_same(drive));

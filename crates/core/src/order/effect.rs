@@ -15,7 +15,7 @@ pub enum Asks {
     Other,
     /// The write takes the run command away, so it always passes.
     Stop,
-    /// Nothing: a read, or a write of a restore that has started and is not to be left half done.
+    /// Asks for nothing: a read, or a write of a restore that has started and must not be left half done.
     Nothing,
 }
 
@@ -53,7 +53,7 @@ pub struct Effect {
 }
 
 impl Effect {
-    /// Unknown effect: it may start the motor, and set a reference.
+    /// Unknown effect: the command may start the motor and set a reference.
     pub const UNKNOWN: Effect = Effect {
         stops: false,
         run: Some(true),

@@ -116,7 +116,8 @@ pub struct Stop {
     pub haste: Haste,
     /// Clients that wait for the same stop, and until when.
     pub joined: Vec<(Ticket, Instant)>,
-    /// Another bus accepted it before a reload: what follows for holds and priorities was noted there.
+    /// Whether another bus accepted the stop before a reload: the consequences for holds and priorities were noted
+    /// there.
     pub is_inherited: bool,
     /// Whether another bus had started the stop before a reload.
     pub was_begun: bool,
@@ -198,7 +199,7 @@ pub struct Command {
     pub(crate) overtaken: usize,
 }
 
-/// A number that no other command of the process has: what is kept of one never fits another.
+/// A number that no other command of the process has, so that data kept for one command never fits another one.
 fn next_number() -> u64 {
     static LAST: AtomicU64 = AtomicU64::new(0);
     LAST.fetch_add(1, Ordering::Relaxed) + 1
@@ -218,7 +219,7 @@ impl Intent {
         }
     }
 
-    /// Until when a start of it waits that must wait; none where it does not wait.
+    /// Time until which a start waits that must wait; `None` if the command does not wait.
     pub fn waits_until(&self) -> Option<Instant> {
         self.window.waits.then_some(self.window.expires)
     }
@@ -313,7 +314,7 @@ impl Command {
         matches!(self.work, Work::Stop(_))
     }
 
-    /// Whether another bus accepted it before a reload: what follows from that was noted there.
+    /// Whether another bus accepted the command before a reload and noted its consequences there.
     pub(crate) fn is_inherited(&self) -> bool {
         matches!(&self.work, Work::Stop(stop) if stop.is_inherited)
     }

@@ -53,7 +53,7 @@ pub enum Outcome {
     NotTaken(String),
     /// The command was started and interrupted: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
-    /// The rest of a command whose stop failed; not sent.
+    /// The rest of the command was not sent, because its stop failed.
     NotStopped,
     /// The drive acknowledged the stop of a command that also does more; the result of the rest.
     StopOnly(Box<Outcome>),

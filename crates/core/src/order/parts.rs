@@ -42,8 +42,8 @@ impl Parts {
     }
 }
 
-/// The stop part of a command: the values that are executed even if the rest is refused. None if it does not stop, or
-/// is contradictory.
+/// The stop part of a command: the values that are executed even if the rest is refused. `None` if the command does not
+/// stop, or is contradictory.
 pub fn stop_of(values: &[(PointIndex, Value)], profile: &Profile) -> Option<Vec<(PointIndex, Value)>> {
     let role = |(index, value): &(PointIndex, Value)| role(profile, *index, *value);
     let stops = values.iter().any(|value| role(value) == Role::Stop);
@@ -124,7 +124,7 @@ pub fn joined(stop: Option<Outcome>, rest: Option<Outcome>) -> Option<Outcome> {
         (stop, None) if stop.is_ok() => None,
         (stop, Some(rest)) if stop.is_ok() && rest.is_ok() => Some(stop),
         (stop, Some(rest)) if stop.is_ok() => Some(Outcome::StopOnly(Box::new(rest))),
-        // The rest is not sent, or was refused before.
+        // The rest is not sent, or was refused before the stop.
         (stop, _) => Some(Outcome::StopFailed(Box::new(stop))),
     }
 }

@@ -65,7 +65,7 @@ pub struct BackgroundRequest {
 }
 
 impl BackgroundRequest {
-    /// Whether the gateway reads something by itself, from time to time: it is left of no command and of no fault.
+    /// Whether the gateway itself reads something from time to time, so that no command or fault is the reason.
     pub fn is_of_gateway(&self) -> bool {
         self.ticket.origin().kind == SourceKind::Schedule
     }

@@ -89,7 +89,7 @@ pub struct SlotWrite {
     pub what: Commanded,
     /// 1..=16.
     pub priority: u8,
-    /// The new entry; none releases the slot.
+    /// The new entry; `None` releases the slot.
     pub entry: Option<Entry>,
     /// Slots released with it: their owners' commands were refused when they were to govern.
     pub also: Vec<(Commanded, u8)>,

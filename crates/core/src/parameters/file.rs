@@ -130,7 +130,7 @@ impl ParameterFile {
         format!("{} parameters, {mark}", self.values.len())
     }
 
-    /// The checksum of names and values; what is as text is not in it.
+    /// The checksum of names and values; the texts are not part of it.
     pub fn checksum(&self) -> String {
         let mut text = format!("{}\n", self.family);
         for (id, entry) in &self.values {
@@ -240,12 +240,12 @@ impl ParameterFile {
     }
 }
 
-/// The value in a file: one without a decimal point is a register.
+/// The value as in a file: a value without a decimal point is a register.
 fn shown(value: &Result<RawValue, String>) -> String {
     value.as_ref().map_or_else(|_| "?".to_string(), |value| text_of(*value))
 }
 
-/// A value as it is written down: one without a decimal point is a register.
+/// A value as it is written to a file: a value without a decimal point is a register.
 pub(super) fn text_of(value: RawValue) -> String {
     match value {
         RawValue::Word(word) => word.to_string(),

@@ -36,7 +36,7 @@ use crate::process_image::Machine;
 
 /// The first line.
 const HEAD: &str = "# drivegate restore 2";
-/// The first line of journals that say of the drive's place nothing but its name.
+/// First line of journals that contain only the name of the drive, not its place.
 const HEAD_WITHOUT_PLACE: &str = "# drivegate restore 1";
 /// Name of the file, in the directory of the drive's readings.
 const NAME: &str = "restore.journal";
@@ -82,7 +82,7 @@ pub struct Owner {
     pub bus: String,
     /// Name of the drive's profile.
     pub family: String,
-    /// The machine; none in journals of earlier versions, which know a name only.
+    /// The machine; `None` in journals of earlier versions, which only know a name.
     pub machine: Option<Machine>,
     /// The machine's identification.
     pub identification: String,

@@ -45,10 +45,10 @@ pub struct Need {
 /// How the drive takes and keeps parameters, from the profile.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Handling {
-    /// The condition for the first write; none if no write needs one.
+    /// The condition for the first write; `None` if no write needs one.
     pub needs: Option<Need>,
-    /// Register written once at the end so that the drive keeps the values: (PDU address, value). None where every write is
-    /// kept at once, or where nothing of what is written can be kept.
+    /// Register that is written once at the end, so that the drive keeps the values: (PDU address, value). `None` if every
+    /// write is kept at once, or if no value can be kept.
     pub save: Option<(u16, u16)>,
 }
 

@@ -166,7 +166,7 @@ impl Restoration {
         }
     }
 
-    /// The journal is on disk, or could not be written: then the drive is not written to any more.
+    /// Notes that the journal is on disk, or that it could not be written: the drive is then no longer written to.
     pub fn recorded(&mut self, result: Result<(), String>, now: Instant) {
         self.noted = now;
         match result {

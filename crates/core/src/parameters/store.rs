@@ -122,7 +122,8 @@ impl Store {
     }
 }
 
-/// The name of a reading made after that of the name `newest`: its own, if that is in order, else the next number of `newest`.
+/// The name of a reading made after the one named `newest`: its `own` name if that is in order, otherwise the number after
+/// `newest`.
 fn name_after(newest: &str, own: String) -> String {
     if own.as_str() > newest {
         return own;

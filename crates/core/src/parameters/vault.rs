@@ -111,7 +111,7 @@ impl Vault {
         (state.store, state.names) = (store, names);
     }
 
-    /// Drives of the configuration that this process does not serve: none of a gateway.
+    /// Sets the drives of the configuration that this process does not serve; a gateway has no such drives.
     pub fn set_others(&self, others: Vec<(Machine, String)>) {
         self.lock().others = others;
     }
@@ -209,7 +209,7 @@ impl Vault {
         self.lock().holds.entry(drive.clone()).or_default().clone()
     }
 
-    /// Where the journal of a restore that begins is, by the name of the drive; none without a store.
+    /// Path of the journal of a restore that begins, by the name of the drive; `None` without a store.
     pub fn journal(&self, drive: &str) -> Option<JournalFile> {
         let state = self.lock();
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
@@ -253,7 +253,7 @@ impl Vault {
         Ok(number)
     }
 
-    /// The restore of that number, which is prepared, begins to write; what.
+    /// Lets the prepared restore with this number begin to write; returns the prepared restore.
     ///
     /// # Errors
     /// The restore is not the last one, or not prepared.

@@ -27,7 +27,7 @@ const MOST_CLIENTS: usize = 64;
 pub struct DrillLock {
     /// The drill, as text.
     pub who: String,
-    /// Nothing but stops is sent until then, so that the drive's own supervision of the fieldbus acts.
+    /// Time before which only stops are sent, so that the drive's own supervision of the fieldbus acts.
     pub quiet_until: Option<Instant>,
 }
 

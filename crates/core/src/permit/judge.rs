@@ -60,7 +60,7 @@ pub trait Facts {
     fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>>;
 }
 
-/// Nothing is seen of any drive: no rule refuses an order for what it would see.
+/// Facts of no drives, so that no rule that needs a reading refuses an order.
 impl Facts for () {
     fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
         None

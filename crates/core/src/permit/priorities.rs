@@ -17,7 +17,7 @@ pub use void::VoidSlot;
 
 /// Priorities of an array.
 pub const PRIORITIES: usize = 16;
-/// The priorities that protect people: they refuse commands from other interfaces.
+/// Priorities up to this one protect people and refuse commands from other interfaces.
 pub const PROTECTING: u8 = 5;
 
 /// The consequence of a write to a slot.
@@ -343,7 +343,7 @@ impl Priorities {
         })
     }
 
-    /// A command is accepted: it withdraws what it overrules, unless it follows from a slot itself.
+    /// Notes an accepted command, which withdraws the entries that it overrules, unless it follows from a slot itself.
     pub fn accepted(&mut self, origin: &Origin, effect: Effect, write: Option<&SlotWrite>, now: Instant) {
         self.orders += 1;
         self.last = Some((origin.clone(), now));
@@ -358,8 +358,8 @@ impl Priorities {
             self.silenced();
         }
         for (what, priority, slot) in self.slots_mut() {
-            // A start and a reference leave what protects people, also where another slot governs. A stop ends every
-            // active: nothing starts later by itself.
+            // A start and a reference leave the entries that protect people, even if another slot governs. A stop ends
+            // every active entry, so that nothing starts later by itself.
             let protects = priority <= PROTECTING;
             match what {
                 Commanded::Run => match effect.run {

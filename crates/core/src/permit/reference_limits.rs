@@ -24,7 +24,7 @@ struct Standing<'a> {
     drive: &'a Reading<'a>,
     /// The points with their own address that the command sets.
     sets: &'a [(PointIndex, Value)],
-    /// None if the command has not started yet: readings that are too old are then ignored.
+    /// `None` if the command has not started yet: readings that are too old are then ignored.
     begun: Option<LastWritten>,
 }
 
@@ -146,7 +146,7 @@ fn judge(drive: &Reading<'_>, sets: &[(PointIndex, Value)], begun: Option<LastWr
 }
 
 impl<'a> Standing<'a> {
-    /// By what a point follows from the reference, and an end of the band of that which the order sets; nothing where it sets none.
+    /// How a point follows from the reference, with an end of its band that the order sets; `None` if the order sets none.
     fn changed(&self, point: PointIndex) -> Option<(&'a Derived, PointIndex)> {
         let point = self.drive.spec.profile.points.get(point)?;
         match (&point.source, point.write_to) {

@@ -46,7 +46,7 @@ pub struct Question {
 }
 
 impl Question {
-    /// A broadcast by the gateway itself at `now`, for itself or a client; it gets no reply.
+    /// A broadcast by the gateway itself at `now`, for itself or a client; no drive replies to it.
     pub fn broadcast(pdu: RequestPdu, origin: Origin, now: Instant, within: Duration) -> Question {
         Question {
             target: Target::Address(0),

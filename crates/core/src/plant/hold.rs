@@ -148,7 +148,7 @@ impl DriveHandle {
         }
     }
 
-    /// The name of that client among the principals, and the ranks below its own; nothing where it is none.
+    /// The name of the client among the principals, and the ranks below its own; `None` if it is no principal.
     pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
         let rules = match self.bus.queue.has_authority() {
             true => self.bus.queue.lock().gate.rules().cloned()?,
@@ -206,7 +206,8 @@ impl DriveHandle {
         }
     }
 
-    /// Whether a restore of parameters may begin for that client: it is judged once, so that none is left half done.
+    /// Whether a restore of parameters may begin for this client; this is judged once, so that no restore is left half
+    /// done.
     ///
     /// # Errors
     /// The refusal.
@@ -217,7 +218,7 @@ impl DriveHandle {
 }
 
 impl Plant {
-    /// The reservations that stand, with when they end: what is kept for the next start. `now` is `time` on the calendar.
+    /// The reservations in force, with their ends, to be kept for the next start. `now` is `time` on the calendar.
     pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
         let of_bus = |bus: &BusHandle| bus.reservations(now, time);
         let guarded = self.buses.iter().filter(|bus| bus.queue.has_authority());

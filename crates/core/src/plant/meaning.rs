@@ -26,7 +26,7 @@ enum By {
 }
 
 impl By {
-    /// How orders that come this way name their drive; none where they name the address on the line.
+    /// How orders of this kind name their drive; `None` if they name the address on the line.
     fn of(kind: SourceKind) -> Option<By> {
         match kind {
             SourceKind::ModbusTcp | SourceKind::Bacnet => Some(By::Unit),
@@ -98,7 +98,7 @@ impl Formerly {
         of_drive.push(former);
     }
 
-    /// A bus takes the place of another one: what is remembered of a machine goes with it.
+    /// Takes over what the previous bus remembers of a machine.
     pub(super) fn take_over(&self, drive: DriveIndex, before: &Formerly, place: DriveIndex) {
         if let Some(of_drive) = before.lock().get(&place) {
             self.lock().insert(drive, of_drive.clone());
@@ -173,7 +173,7 @@ impl DriveHandle {
         Some(there.map_or(Meant::Gone, |there| Meant::There(Box::new(there))))
     }
 
-    /// The stop for this machine that is in an order which was read for the drive that has its name by now; none if it does not stop.
+    /// The stop for this machine in an order that was read for the drive that has its name by now; `None` if the order does not stop.
     pub(super) fn stop_meant(&self, order: &Order, read_for: &DriveHandle) -> Option<Order> {
         let stops = match order {
             Order::Points(_) => is_stop(order.clone(), read_for),

@@ -35,7 +35,8 @@ pub struct OrderRequest {
 }
 
 impl OrderRequest {
-    /// The order of that client, with what the client may do at all. It is not sent later than 2 s after it came.
+    /// The order of this client, with what the client may do at all. The order is not sent later than 2 s after it
+    /// came.
     pub fn new(order: Order, origin: Origin, authority: Authority) -> OrderRequest {
         OrderRequest {
             order,
@@ -422,7 +423,7 @@ impl DriveHandle {
         let profile = &self.image.spec.profile;
         let mut command = Command::new(self.index, admitted, profile, part.window, part.ticket);
         command.intent.slot = part.slot;
-        // A stop goes to a drive that does not answer too: it may be back.
+        // A stop is sent even to a drive that does not answer, because the drive may be back.
         let unreachable = match (is_stop, self.bus_up(), online) {
             (true, ..) | (false, true, true) => None,
             (false, false, _) => Some(Outcome::BusDown),

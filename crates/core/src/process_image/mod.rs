@@ -110,7 +110,7 @@ impl DriveImage {
         written.extend(parameters.map(|(address, value)| (*address, (*value, now))));
     }
 
-    /// The image of the same drive before a reload: what was written since the parameters were read last is not forgotten.
+    /// Takes over from the image of the same drive before a reload what was written since the parameters were last read.
     pub(crate) fn take_over(&self, before: &DriveImage) {
         let before = before.written.lock().unwrap_or_else(PoisonError::into_inner).clone();
         *self.written.lock().unwrap_or_else(PoisonError::into_inner) = before;

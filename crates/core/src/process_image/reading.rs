@@ -1,4 +1,4 @@
-//! A drive as a reader sees it at one time: its points in units, how old and how good they are. Pure: time is an argument.
+//! A drive as a reader sees it at one time: its points in units, with their age and quality. Pure: time is an argument.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -28,7 +28,7 @@ pub struct Reading<'d> {
     pub stale_after: Duration,
     /// Cadence of the slow class.
     pub slow_cycle: Duration,
-    /// From when on a sample is not stale yet: one of the fast class, and one of the slow class.
+    /// Times from which on samples are not stale yet, for the fast and for the slow class.
     fresh_from: [Fresh; 2],
 }
 
@@ -328,7 +328,8 @@ impl Reading<'_> {
         self.model(point).good().is_some_and(Value::as_bool)
     }
 
-    /// A bit of the model; `None` where the family has it and it is not good. What the family lacks is not set.
+    /// A bit of the model; `None` if the family has the bit but its value is not good. A bit that the family lacks is
+    /// not set.
     pub fn bit(&self, point: ModelPoint) -> Option<bool> {
         match self.spec.profile.model_index(point) {
             Some(index) => self.sample(index).good().map(Value::as_bool),
@@ -356,8 +357,8 @@ impl Reading<'_> {
         self.decided().ok()
     }
 
-    /// The state by the deciding points, in their order; else the quality of the first that is not good. A point that
-    /// the family lacks decides nothing.
+    /// The state by the deciding points, in their order; otherwise the quality of the first one that is not good. A
+    /// point that the family lacks decides nothing.
     fn decided(&self) -> Result<State, Quality> {
         const DECIDING: [(ModelPoint, State); 3] = [
             (ModelPoint::Fault, State::Fault),

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use arc_swap::ArcSwapOption;
 
-/// Set while the parameters of a drive are being restored, or were left half restored. One drive has the same hold under
-/// whatever image a reload gives it.
+/// Set while the parameters of a drive are being restored, or were left half restored. A drive keeps the same hold under
+/// every image that a reload gives it.
 #[derive(Debug, Default)]
 pub struct Hold(ArcSwapOption<String>);
 
@@ -15,7 +15,7 @@ impl Hold {
         self.0.store(why.map(Arc::new));
     }
 
-    /// Why it accepts only stops, and what ends that; none if it accepts all commands.
+    /// Why the drive accepts only stops, and what ends that; `None` if it accepts all commands.
     pub fn why(&self) -> Option<Arc<String>> {
         self.0.load_full()
     }

@@ -118,7 +118,7 @@ pub enum Unavailable {
 }
 
 impl Snapshot {
-    /// Nothing is known of the plan's addresses yet.
+    /// A snapshot in which no address of the plan has a value yet.
     pub fn empty(plan: &Plan) -> Snapshot {
         let spans = plan.reads.iter().chain(&plan.monitors).map(|read| {
             Arc::new(Span {

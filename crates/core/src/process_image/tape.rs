@@ -10,7 +10,7 @@ use std::time::Instant;
 use crate::codec::Table;
 use crate::drive::DriveIndex;
 
-/// Bytes that wait for the recorder at most; what comes beyond is counted and dropped.
+/// Most bytes that wait for the recorder; further entries are counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;
 
 /// How a transaction looked on the line.
@@ -63,7 +63,8 @@ pub struct TapedRead {
 /// Bytes on the line: a request, or all that came until its transaction was over.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TapedFrame {
-    /// A request: when it was given to the port. Else when the last of it came, or the transaction was given up.
+    /// For a request, the time when it was given to the port; otherwise the time of the last byte, or when the
+    /// transaction was given up.
     pub at: Instant,
     /// Place of the drive of the transaction; none for bytes between two transactions.
     pub drive: Option<DriveIndex>,
@@ -150,8 +151,8 @@ impl Tape {
         self.taping.load(Ordering::Relaxed) >= taping as u8
     }
 
-    /// The drive at that place was read. `read` is only called while someone takes it. Only the bus itself may call
-    /// this.
+    /// Records a read of the drive with this index. `read` is only called while someone takes the entries. Only the bus
+    /// itself may call this.
     pub fn read(&self, drive: DriveIndex, read: impl FnOnce() -> TapedRead) {
         if self.takes(Taping::Reads) {
             self.append(Taped::Read(drive, read()));

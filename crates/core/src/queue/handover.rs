@@ -22,7 +22,7 @@ impl Heir {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (Arc::downgrade(queue), place);
     }
 
-    /// The queue; none where no bus serves the drive any more.
+    /// The queue that serves the drive now; `None` if no bus serves it any more.
     pub(super) fn served_by(&self) -> Option<(Arc<CommandQueue>, DriveIndex)> {
         let served_by = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         Some((served_by.0.upgrade()?, served_by.1))

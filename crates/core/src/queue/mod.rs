@@ -297,7 +297,8 @@ impl Pending {
                 continue;
             }
             let (client, of_client) = self.served(command);
-            // `None`, never served, comes before any place. What was overtaken often enough comes before all.
+            // `None`, which was never served, sorts before any place. A command that was overtaken often enough goes
+            // before all.
             let key = (command.overtaken < CAPACITY, client, of_client, index);
             if best.is_none_or(|(best, _)| key < best) {
                 best = Some((key, number));
@@ -306,7 +307,7 @@ impl Pending {
         best.map(|(_, number)| number)
     }
 
-    /// Judges a waiting command whose turn came. One that is refused is answered, and reported.
+    /// Judges a waiting command whose turn came. A refused command is answered and reported.
     fn judge_turn(&mut self, number: u64, facts: &dyn Facts, now: Instant) -> Verdict {
         let Some(index) = self.waiting.iter().position(|c| c.intent.number == number) else {
             return Verdict::Go;
@@ -393,7 +394,7 @@ impl Pending {
         self.waiting.iter().any(starts)
     }
 
-    /// The latest expiry of a client's waiting command or stop for that drive; none if none waits.
+    /// The latest expiry of a client's waiting command or stop for this drive; `None` if none waits.
     pub fn client_waits_until(&self, drive: DriveIndex) -> Option<Instant> {
         let commands = self
             .waiting

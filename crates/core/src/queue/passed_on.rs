@@ -9,7 +9,7 @@ use crate::permit::{Facts, Verdict};
 
 impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
-    /// that cannot be sent because its drive is offline does not hold up requests that also reach others.
+    /// that cannot be sent because its drive is offline does not hold up requests that also reach other drives.
     pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
         if self.waiting.iter().all(|c| c.as_passed_on().is_none()) {
             return Vec::new();

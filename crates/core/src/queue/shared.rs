@@ -59,7 +59,7 @@ impl CommandQueue {
         self.guards.as_ref()
     }
 
-    /// Takes a command in and wakes the bus. Returns the refusal where the gate refused it; it is answered then.
+    /// Adds a command and wakes the bus. Returns the refusal if the gate refused the command, which is then answered.
     pub fn submit(&self, command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
         let refusal = self.lock().push(command, facts, now);
         self.wake();
@@ -151,11 +151,11 @@ impl CommandQueue {
     /// Clears the wake-up.
     pub fn clear_wake(&self) {
         let mut count = [0u8; 8];
-        // Nothing to read: the bus was not woken.
+        // If there is nothing to read, the bus was not woken.
         let _ = rustix::io::read(&self.wake, &mut count);
     }
 
-    /// From now on these rules hold for the drives of the bus; none: `[authority]` is off.
+    /// Applies these rules to the drives of the bus from now on; with `None`, `[authority]` is off.
     pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
         let mut pending = self.lock();
         self.has_authority.store(rules.is_some(), Ordering::Release);

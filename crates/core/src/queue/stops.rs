@@ -115,8 +115,8 @@ impl Pending {
         }
     }
 
-    /// A stop joins one that was accepted when `last_starter` was that: it is noted as any stop, and nothing is written for it.
-    /// Whether it may: no command was accepted since that may start the drive.
+    /// Lets a stop join one that was accepted at this `last_starter`: the stop is noted like any other, but nothing is written
+    /// for it. Returns whether it may join, which needs that no command was accepted since that may start the drive.
     pub(crate) fn joins_stop(&mut self, drive: DriveIndex, last_starter: u64, by: &Origin, now: Instant) -> bool {
         let is_served = self.closed.is_none() && !self.heirs.contains_key(&drive);
         if !is_served || self.gate.last_starter(drive) != last_starter {

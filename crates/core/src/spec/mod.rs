@@ -106,7 +106,7 @@ pub struct DriveSpec {
     pub raw_writes: RawWrites,
     /// The permitted access to the drive's parameters.
     pub params: ParamsAccess,
-    /// How often what was ordered last is written again, for its own timeout; none where it is not.
+    /// How often the last order is written again because of the drive's own timeout; `None` if it is not repeated.
     pub refresh: Option<Duration>,
     /// Times of this drive on the line, where they are not those of its bus.
     pub timing: Timing,

@@ -66,8 +66,8 @@ impl Pauses {
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A stop was accepted. Each thread that reads orders shows that it runs: what it reads after a stall that begins now came
-    /// after the stop, so that no healthy client's order is purged by it.
+    /// Notes an accepted stop. Each thread that reads orders then shows that it runs: what it reads after a stall that begins
+    /// now came after the stop, so that no healthy client's order is purged by it.
     pub fn note_stop(&self) {
         self.0.stops.notify_waiters();
     }

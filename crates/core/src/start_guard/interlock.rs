@@ -25,7 +25,7 @@ impl fmt::Display for Unmet {
 }
 
 impl Interlock {
-    /// Returns it if a start is not to be made. Only a good sample satisfies it.
+    /// Returns the interlock if it forbids a start. Only a good sample satisfies it.
     pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| self.differs(watched, index, around, now))
     }

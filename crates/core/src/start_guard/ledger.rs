@@ -123,12 +123,12 @@ impl Guards {
         self.tell_change();
     }
 
-    /// The state to save, with its generation; none if already saved, or failed.
+    /// The state to save, with its generation; `None` if it is saved already, or failed.
     pub fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
         self.lock().to_write(now, time)
     }
 
-    /// Waits for a state to save; none after `time`.
+    /// Waits for a state to save, no longer than `most`; returns `None` if there is none.
     pub(super) fn wait_to_write(&self, most: Duration) -> Option<(u64, Saved)> {
         let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind();
         let waited = self.changed.wait_timeout_while(self.lock(), most, is_up_to_date);
@@ -223,7 +223,7 @@ impl Ledger {
         })
     }
 
-    /// A start is decided: it counts from now on, and belongs on disk before it is written.
+    /// Reserves a start that is decided: it counts from now on, and must be on disk before it is written to the drive.
     pub(super) fn reserve(&mut self, machine: &Machine, number: u64, until: Instant, now: Instant) {
         self.settle(machine, None);
         self.generation += 1;

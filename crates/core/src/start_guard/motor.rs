@@ -364,7 +364,7 @@ impl Motor {
             .is_some_and(|started| own(started) && first(started))
     }
 
-    /// Until when an ordinary stop waits; none where the motor does not run for certain.
+    /// Time until which an ordinary stop waits; `None` if the motor does not run for certain.
     pub(super) fn stop_waits(&self, guard: &Guard, now: Instant) -> Option<Instant> {
         let started = self.started.as_ref()?;
         let runs = match self.running {

@@ -23,7 +23,7 @@ pub enum Unable {
 /// Effect on the motor of a run command that is written now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ByRun {
-    /// Nothing new: the motor runs for certain.
+    /// The run command changes nothing: the motor runs for certain.
     Runs,
     /// The repetition of a start that is under way, and counts already.
     Repeats,
@@ -108,7 +108,7 @@ impl Passage {
         }
     }
 
-    /// The motor is seen to run; it `came` to run if it did not in the reading before.
+    /// Notes that the motor is seen to run; with `came`, it did not run in the previous reading.
     pub(super) fn is_seen_running(&mut self, came: bool, besides: Besides, at: Instant) -> Shown {
         if self.progress == Progress::Over {
             return if came { Shown::Another(None) } else { Shown::Nothing };

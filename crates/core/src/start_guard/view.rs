@@ -214,8 +214,8 @@ impl BusGuards {
         })
     }
 
-    /// An order has its turn and may go: its starts of these drives are counted once, and it goes when that is on disk. It is not
-    /// written later than `expires`.
+    /// Clears an order whose turn came: its starts of these drives are counted once, and it is sent when they are on disk. The
+    /// order is not written later than `expires`.
     pub fn clear(&self, started: &[DriveIndex], number: u64, expires: Instant, now: Instant) -> Clearance {
         let started: Vec<&Guarding> = started.iter().filter_map(|drive| self.of_drive(*drive)).collect();
         let mut ledger = self.shared.lock();
@@ -273,7 +273,7 @@ impl BusGuards {
         }
     }
 
-    /// A cleared command has ended: its unwritten starts count as made.
+    /// Ends a cleared command: its unwritten starts count as made.
     pub fn settle(&self, drive: DriveIndex, number: u64) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().settle(&of.machine, Some(number));
@@ -337,14 +337,14 @@ impl BusGuards {
         self.shared.lock().motor(&of.machine)?.stop_waits(&of.guard, now)
     }
 
-    /// Starts of that drive that were refused, by reason; none of one that is not guarded.
+    /// Starts of this drive that were refused, by reason; empty if the drive is not guarded.
     pub fn refused(&self, drive: DriveIndex) -> BTreeMap<Reason, u64> {
         let of = self.of_drive(drive);
         of.map_or_else(BTreeMap::new, |of| self.shared.lock().refused(&of.machine))
     }
 }
 
-/// The motor's state in a reading; none while that does not show whether it runs.
+/// The motor's state in a reading; `None` if the reading does not show whether it runs.
 fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let sample = reading.model(ModelPoint::Running);
     let running = sample.good()?.as_bool();

@@ -81,8 +81,8 @@ impl OneStop {
         };
     }
 
-    /// Whether a stop of that client joins it, and nothing is written for it: it waits for its acknowledgement, or has that, and
-    /// nothing has started the motor since as far as is known.
+    /// Whether a stop of this client joins this one, so that nothing is written for it: this one waits for its acknowledgement,
+    /// or has it, and nothing is known to have started the motor since.
     pub(crate) fn is_joined(&self, drive: &DriveHandle, by: &Origin, now: Instant) -> bool {
         let stands_good = match &self.step {
             Step::Placed(_) => true,

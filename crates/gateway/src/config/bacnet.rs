@@ -128,7 +128,7 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Result<Option<Secret>, Unu
     Ok(Some(Secret::new(text)))
 }
 
-/// The buses that are served; none: all.
+/// The buses that are served; `None` for all buses.
 fn read_buses(reader: &Reader<'_>, known: &[&str]) -> Option<Vec<String>> {
     let mut names = BACNET.buses.get(reader);
     let remedy = "write names of buses, or [] for all";
@@ -184,7 +184,8 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     }
 }
 
-/// The instance of a drive is that of the gateway and its unit: none twice, none too high.
+/// Checks the instances of drives, each the sum of the gateway's instance and the unit: none may occur twice or be too
+/// high.
 pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bacnet) {
     let (device, place) = &bacnet.device;
     let is_served = |bus: &&Found| match (&bacnet.buses, &bus.name) {

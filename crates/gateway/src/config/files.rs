@@ -74,7 +74,7 @@ pub(super) fn check_certificates(reader: &Reader<'_>, key: &str, path: &Path, ho
     }
 }
 
-/// Faults of files are `what; what to do`.
+/// Splits the fault of a file, which has the form `what; what to do`.
 fn parts(text: &str) -> (&str, &str) {
     text.rsplit_once("; ").unwrap_or((text, ""))
 }

@@ -229,7 +229,7 @@ impl Form<String> for Name {
     }
 }
 
-/// Any string that matches the pattern; the loader checks the rest. Then what to write.
+/// Any string that matches the pattern; the loader checks the rest. The second text tells what to write.
 pub(super) struct Text(pub(super) &'static str, pub(super) &'static str);
 
 impl<T: FromNode> Form<T> for Text {
@@ -325,7 +325,7 @@ impl Form<f64> for Figure {
     }
 }
 
-/// A whole number of the range; one outside it may have a message of its own.
+/// A whole number in the range; a certain number outside it may have a message of its own.
 pub(super) struct Number(pub(super) RangeInclusive<i64>, pub(super) Option<(i64, &'static str)>);
 
 impl<T: TryFrom<i64>> Form<T> for Number {

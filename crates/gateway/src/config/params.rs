@@ -22,7 +22,7 @@ pub struct ParamsSettings {
     pub every: Option<Duration>,
     /// Names of parameters that replace the names in the profiles, by profile.
     pub names: BTreeMap<String, Arc<Names>>,
-    /// Drives of the configuration that this process does not serve, with their names; none of a gateway.
+    /// Drives of the configuration that this process does not serve, with their names; empty in a gateway.
     pub others: Vec<(Machine, String)>,
 }
 

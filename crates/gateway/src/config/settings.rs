@@ -102,7 +102,7 @@ impl BusSettings {
         )
     }
 
-    /// Expected wire times, cycles and load; nothing where the gateway sends nothing.
+    /// Expected wire times, cycles and load; empty if the gateway only listens.
     pub fn predict(&self) -> Prediction {
         let asked: &[DriveSpec] = if self.listens() { &[] } else { &self.drives };
         predict::predict(&self.spec, self.options.silence, asked)

@@ -2,7 +2,7 @@
 
 use crate::config::Settings;
 
-/// Lines that say what `after` has that `before` had not; none where they are equal.
+/// Lines that describe what `after` has and `before` had not; empty if the two are equal.
 pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
     let mut changes = buses(before, after);
     let values = [

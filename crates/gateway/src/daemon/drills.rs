@@ -19,14 +19,14 @@ const LAST_STOP: Duration = Duration::from_secs(3);
 /// A file that is longer is none of these.
 const LONGEST: u64 = 16 << 20;
 
-/// The file of the drills; none while nothing is kept.
+/// The file of the drills; `None` while drills are not kept.
 pub(super) type DrillsFile = Arc<Mutex<Option<PathBuf>>>;
 
 fn path(file: &DrillsFile) -> Option<PathBuf> {
     file.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
-/// From now on they are kept in that state directory. What another one has is taken in.
+/// Keeps drills in this state directory from now on. Drills in another state directory are taken over.
 pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patience: &Patience, drills: &Drills) {
     let new = state_dir.map(|dir| dir.join(DRILLS));
     drills.keep(new.is_some());

@@ -14,7 +14,7 @@ const LOOK: Duration = Duration::from_millis(50);
 /// A file that is longer is none of these.
 const LONGEST: u64 = 1 << 20;
 
-/// The file of the reservations; none while nothing is kept.
+/// The file of the reservations; `None` while reservations are not kept.
 pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
 
 /// The kept reservations, as far as a change of them changes the file.

@@ -7,8 +7,9 @@ use crate::config::Settings;
 use crate::north::{bacnet, local};
 
 impl Daemon {
-    /// The new configuration is certain: what the broker's clients and those of the local socket may no longer do ends
-    /// before anything else changes. The servers that listen on the network end it themselves when they take their options.
+    /// Ends the rights that the broker's clients and those of the local socket no longer have, before anything else
+    /// changes; the new configuration is certain by then. The servers that listen on the network end rights themselves when
+    /// they take their options.
     pub(super) fn end_rights(&self, settings: &Settings) {
         self.mqtt.end_rights(settings.mqtt.as_ref());
         self.local.end_rights(self.local_options(settings).as_ref());

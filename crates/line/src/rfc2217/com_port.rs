@@ -103,7 +103,7 @@ impl Session {
         format!("{baud} {data_bits}{parity}{stop_bits}")
     }
 
-    /// Appends the data in `bytes` to `data`; what has to be sent to the server.
+    /// Appends the data in `bytes` to `data`; returns the bytes that must be sent to the server.
     pub(crate) fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
         let mut commands = Vec::new();
         self.decoder.take(bytes, data, &mut commands);

@@ -45,7 +45,7 @@ impl ServedPort {
         (port, first.collect())
     }
 
-    /// Appends the data in `bytes` to `data`; what has to be sent to the program.
+    /// Appends the data in `bytes` to `data`; returns the bytes that must be sent to the program.
     pub fn take(&mut self, bytes: &[u8], data: &mut Vec<u8>) -> Vec<u8> {
         let mut commands = Vec::new();
         self.decoder.take(bytes, data, &mut commands);

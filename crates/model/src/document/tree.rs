@@ -96,7 +96,7 @@ impl Raw {
     }
 }
 
-/// The keys of a table; none of any other value.
+/// The keys of a table; empty for any other value.
 pub(super) fn entries(node: &Node) -> &[Entry] {
     match &node.value {
         Raw::Table(entries) => entries,

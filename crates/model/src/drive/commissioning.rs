@@ -61,7 +61,7 @@ impl Step {
     }
 }
 
-/// The lines of each step; none without a manual.
+/// The lines of each step; empty without a manual.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Commissioning {
     pub(super) connect: Vec<String>,

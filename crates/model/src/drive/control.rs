@@ -29,7 +29,7 @@ pub struct Control {
     pub fault_reset: Option<Reset>,
     /// A reset while a run command is set starts the motor.
     pub restarts_on_reset: bool,
-    /// Time between two refreshes, where the family needs them: its timeout counts writes only.
+    /// Time between two refreshes, if the family needs them because its timeout counts only writes.
     pub refresh: Option<Duration>,
     /// A refresh of the reference alone feeds that timeout, too.
     pub refresh_with_reference: bool,
@@ -117,8 +117,7 @@ impl Setting {
         word & !self.mask | !self.value & self.mask
     }
 
-    /// The word without a pulse of these bits that stands in it: as they are between two pulses. Those of another place are not in
-    /// it.
+    /// The word without a pulse of these bits: they are as between two pulses. Bits of another place are not in the word.
     pub fn released(&self, word: u16) -> u16 {
         match self.place {
             None if self.value == 0 => word | self.mask,
@@ -298,7 +297,7 @@ impl Control {
         }
     }
 
-    /// The word without a reset that stands in it: its bits as they are between two resets.
+    /// The word without a reset: its bits are as between two resets.
     pub fn without_reset(&self, own: u16) -> u16 {
         let reset = self.fault_reset.map(|reset| reset.setting);
         reset.map_or(own, |reset| reset.released(own))

@@ -44,7 +44,7 @@ pub enum Numbering {
 }
 
 impl Numbering {
-    /// The name of the parameter at an address; none where none can be.
+    /// The name of the parameter at an address; `None` if no parameter can be there.
     pub fn id(self, address: u16) -> Option<String> {
         match self {
             Numbering::Id => Some((u32::from(address) + 1).to_string()),
@@ -83,7 +83,7 @@ pub struct Parameter {
     pub address: u16,
     /// Name and unit of the parameter.
     pub label: Label,
-    /// The accepted range, in its unit; in counts if the scale is unknown. None without a manual.
+    /// The accepted range, in the parameter's unit; in counts if the scale is unknown. `None` without a manual.
     pub range: Option<RangeInclusive<f64>>,
 }
 
@@ -117,7 +117,7 @@ pub struct Label {
 }
 
 impl Label {
-    /// The value in its unit; nothing where the value of a count is not known.
+    /// The value in the parameter's unit; empty if the value of a count is unknown.
     pub fn value(&self, raw: RawValue) -> String {
         let number = match raw {
             RawValue::Float(bits) => return with_unit(&f32::from_bits(bits).to_string(), &self.unit),
@@ -191,7 +191,7 @@ impl RawValue {
 }
 
 impl Profile {
-    /// Whether the parameter at that address can be written: one where the drive is commanded cannot.
+    /// Whether the parameter at this address can be written; a parameter where the drive is commanded cannot.
     pub fn parameter_is_writable(&self, address: u16) -> bool {
         let (range, words) = (self.range(Table::Holding, address), self.parameter_words());
         range.is_some_and(|range| range.write >= words) && !self.commands_in(address, words)

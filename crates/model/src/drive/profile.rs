@@ -29,7 +29,7 @@ pub struct Profile {
     pub title: String,
     /// Manual and tables the profile is based on.
     pub source: String,
-    /// Whether the profile is part of the program; else it came from a file.
+    /// Whether the profile is part of the program; otherwise it came from a file.
     pub built_in: bool,
     /// The profile that the file of this profile is based on.
     pub base: Option<String>,
@@ -88,10 +88,10 @@ pub struct Profile {
     pub(super) model: Vec<Option<PointIndex>>,
     /// The text of the profile's file, without the text of its base.
     pub text: Cow<'static, str>,
-    /// The file merged with its base, for profiles based on this one. None for built-in ones: their texts say it all, in a
-    /// fifth of the memory.
+    /// The file merged with its base, for profiles based on this one. `None` for built-in profiles: their texts contain
+    /// everything, in a fifth of the memory.
     pub(super) tree: Option<Node>,
-    /// Warnings about probable mistakes; none for built-in profiles.
+    /// Warnings about probable mistakes; empty for built-in profiles.
     pub warnings: Vec<Problem>,
 }
 
@@ -195,7 +195,7 @@ pub struct Probe {
 pub struct Expected {
     /// The read.
     pub probe: Probe,
-    /// Answered with values; else refused.
+    /// Whether the read is answered with values; otherwise it is refused.
     pub values: bool,
 }
 
@@ -265,7 +265,8 @@ pub struct Point {
     pub write_to: Option<PointIndex>,
     /// Written as a pulse 0, 1, 0.
     pub pulse: bool,
-    /// Written only if the drive is not known to have the value already: it is stored in EEPROM with limited write cycles.
+    /// Whether the point is written only if the drive is not known to have the value already, because the value is stored
+    /// in EEPROM with limited write cycles.
     pub on_change: bool,
     /// Range of commands in engineering units.
     pub range: Option<RangeInclusive<f64>>,
@@ -575,7 +576,7 @@ impl Profile {
 pub struct Profiles(BTreeMap<String, Arc<Profile>>);
 
 impl Profiles {
-    /// Adds a profile; one of the same name is replaced.
+    /// Adds a profile; it replaces a profile with the same name.
     pub(crate) fn insert(&mut self, profile: Profile) {
         self.0.insert(profile.name.clone(), Arc::new(profile));
     }

@@ -22,7 +22,8 @@ pub struct Repeats {
 }
 
 impl Control {
-    /// Bits of the control word that `[control]` gives a meaning, resets apart. A word with others is not repeated: they may jog.
+    /// Bits of the control word that `[control]` gives a meaning, except resets. A word with other bits is not repeated: these
+    /// may jog.
     pub fn known_bits(&self) -> u16 {
         let here = |setting: &&super::control::Setting| setting.place.is_none();
         let runs = self.runs();

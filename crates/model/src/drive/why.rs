@@ -57,7 +57,7 @@ impl Explanation {
         (!causes.is_empty()).then(|| causes.join(", "))
     }
 
-    /// Adds a cause that is not the drive's; it takes the place of none that is known.
+    /// Adds a cause outside the drive; it replaces the entry for an unknown cause.
     pub fn add(&mut self, cause: Cause) {
         self.causes.retain(|cause| cause.cause != NOT_KNOWN);
         self.causes.push(cause);
@@ -505,7 +505,7 @@ impl Look<'_> {
         })
     }
 
-    /// Nothing is in the way but that it shall turn in reverse, which a parameter can forbid.
+    /// The cause that nothing prevents the run except the reverse direction, which a parameter can forbid.
     fn direction(&self, found: &[Cause]) -> Option<Cause> {
         let (_, at) = self.bit(ModelPoint::Reverse).filter(|(reverse, _)| *reverse)?;
         let (reversed, _) = self.bit(ModelPoint::Reversed)?;

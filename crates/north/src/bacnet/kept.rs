@@ -54,7 +54,8 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
     all
 }
 
-/// Puts them into their slots again. Those whose client may no longer write, or whose drive is gone, are void.
+/// Puts the kept entries into their slots again. An entry is void if its client may no longer write, or its drive is
+/// gone.
 pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], now: Instant, time: SystemTime) {
     for slot in slots.iter().filter(|slot| (1..=PROTECTING).contains(&slot.priority)) {
         let Some(drive) = plant.drive_at(&slot.machine) else {

@@ -58,7 +58,7 @@ pub struct Options {
     pub listen: SocketAddrV4,
     /// Device instance of the gateway; the instance of a drive is this one plus its unit.
     pub device: u32,
-    /// Number of the virtual network of the drives; none where all objects belong to the gateway's device (`layout = "flat"`).
+    /// Number of the virtual network of the drives; `None` if all objects belong to the gateway's device (`layout = "flat"`).
     pub network: Option<u16>,
     /// Most foreign devices that the gateway serves as a BBMD.
     pub foreign_devices: usize,
@@ -78,7 +78,7 @@ pub struct Options {
     pub vendor: u16,
     /// The password of DeviceCommunicationControl.
     pub dcc_password: Option<Secret>,
-    /// The buses whose drives are served; none: all.
+    /// The buses whose drives are served; `None` for all buses.
     pub buses: Option<Vec<String>>,
     /// Directory for kept state.
     pub state_dir: PathBuf,
@@ -133,7 +133,7 @@ impl Options {
         4
     }
 
-    /// Whether a server with these options can continue with those: its sockets and its identity for clients stay.
+    /// Whether a server with these options can continue with `other`: its sockets and its identity for clients stay.
     fn continues(&self, other: &Options) -> bool {
         let identity = |options: &Options| {
             let Options {

@@ -143,7 +143,7 @@ pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item =
 /// Numbers of objects of one drive, where all belong to the gateway's device.
 const PER_DRIVE: u32 = 1000;
 
-/// The objects of one device for all drives, with the unit of the drive of each; none for those of the gateway.
+/// The objects of one device for all drives, with the unit of each object's drive; `None` for objects of the gateway.
 #[derive(Debug, Clone)]
 pub struct Flat {
     /// The device as BACnet clients see it.

@@ -33,7 +33,7 @@ impl Offline {
         }
     }
 
-    /// A datagram arrived. Its command is in the queue of its bus when this returns.
+    /// Processes a datagram that arrived. The command in it is in the queue of its bus when this returns.
     pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.desk.receive(from, datagram, now);
         self.take_up(now);

@@ -252,7 +252,8 @@ impl Task {
         }
     }
 
-    /// Where slots are kept; none where they are not, or a reload takes the server away and with it what they were for.
+    /// File in which slots are kept; `None` if they are not kept, or if a reload takes the server away and with it
+    /// their purpose.
     fn keep_file(&self) -> Option<std::path::PathBuf> {
         let keeps = self.options.keep_priorities && self.desk.view.rights.are_there();
         keeps.then(|| self.options.state_dir.join(kept::FILE))
@@ -396,7 +397,7 @@ async fn ending(token: u64, mut waiting: Waiting) -> Ended {
     Ended::of(token, waiting, outcome)
 }
 
-/// The reader of a socket that is new: what comes from now on is waited for.
+/// The reader of a new socket, which waits for bytes that come from now on.
 fn waiting_reader() -> Reader {
     let reader = Reader::here();
     reader.nothing(Instant::now(), || false);

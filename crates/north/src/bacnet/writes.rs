@@ -102,7 +102,8 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
     }
 }
 
-/// For how long from its request a write may be sent: one that waited for another of the same request has its own time.
+/// Time from its request for which a write may be sent: a write that waited for another one of the same request has its
+/// own time.
 fn expiry(job: &Job) -> Duration {
     DEFAULT_EXPIRY + job.since.saturating_duration_since(job.asked)
 }
@@ -196,7 +197,8 @@ fn slot(
     }
 }
 
-/// Nothing follows: it stands at once. The lease of the drive is that of the client whose slot governs.
+/// Handles a write from which no order follows: it is in force at once. The lease of the drive is that of the client
+/// whose slot governs.
 fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Option<Begun> {
     let governs = handle.priorities(|all| {
         if all.plan(write) != Follows::Nothing {
@@ -225,7 +227,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
     Some(Begun::Answered(Ok(())))
 }
 
-/// Whether the drive could be given that value at all; what is not known yet is judged when it becomes a command.
+/// Whether the drive could be given this value at all; anything unknown yet is judged when the write becomes a command.
 fn possible(handle: &DriveHandle, index: PointIndex, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
     match permit::admit(order, &handle.reading(now), Authority::Write) {

@@ -142,8 +142,8 @@ impl<R: Clone> Memory<R> {
         }
     }
 
-    /// The command that a message repeats: one that the broker marks as repeated, or the same topic, payload and `id`.
-    /// `stops` is the number of stops of the drive now.
+    /// The command that a message repeats: one that the broker marks as repeated, or one with the same topic, payload
+    /// and `id`. `stops` is the number of stops of the drive now.
     pub(crate) fn repeated(
         &mut self,
         taken: &Taken<'_>,
@@ -235,7 +235,7 @@ impl<R: Clone> Memory<R> {
         number
     }
 
-    /// Anyone who waited for the results of the commands so far has gone; they do not come any more.
+    /// Notes that nobody waits for the results of the commands so far any longer; these do not come any more.
     pub(crate) fn abandon(&mut self) {
         self.abandoned = self.taken;
     }

@@ -124,7 +124,8 @@ impl Asked {
         self.refused.is_none() && !(self.stops(profile) && whole())
     }
 
-    /// Gives it to the drive at `now`: as a whole, or its stop alone if the rest, `what`, is refused. It came so.
+    /// Gives the command to the drive at `now`: as a whole, or only its stop if the rest, `what`, is refused. `arrival`
+    /// tells how the command came.
     ///
     /// # Errors
     /// The answer if all of it is refused.

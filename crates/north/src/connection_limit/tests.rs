@@ -187,7 +187,7 @@ fn limits() -> impl Strategy<Value = Limits> {
 }
 
 fn newcomer() -> impl Strategy<Value = (u8, bool, u8)> {
-    // Few addresses often, many seldom; what becomes of it: silent, in use, or one closes.
+    // Few addresses come often, many seldom; the connection then stays silent, is used, or one closes.
     (prop_oneof![0..4_u8, 0..64_u8], prop::bool::weighted(0.3), 0..4_u8)
 }
 

@@ -48,7 +48,7 @@ pub(super) struct Drive<'d> {
     address: u8,
     unit: u8,
     profile: &'d str,
-    /// `false` if the profile is not tested on hardware; else absent.
+    /// `false` if the profile is not tested on hardware; otherwise absent.
     #[serde(skip_serializing_if = "Clone::clone")]
     profile_verified: bool,
     access: &'static str,

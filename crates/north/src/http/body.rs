@@ -26,7 +26,8 @@ impl<S: Sync> FromRequest<S> for Payload {
     }
 }
 
-/// The body of at most `most` bytes. Until it is complete the connection is not in use: it yields to others.
+/// Reads the body of at most `most` bytes. Until the body is complete, the connection is not in use: it yields to
+/// others.
 ///
 /// # Errors
 /// The reply to a body that is too long, incomplete or too slow.

@@ -388,8 +388,8 @@ pub struct PointValue {
     pub why: Option<String>,
 }
 
-/// The state in one word and the text of the fault. They are no points of a profile; they are read by these names all the
-/// same, as over MQTT and HTTP.
+/// The state in one word and the text of the fault. Both are no points of a profile, but are read by these names like
+/// points, as over MQTT and HTTP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Word {
     /// `offline`, `not_ready`, `ready`, `running` or `fault`.

@@ -371,7 +371,7 @@ fn set_socket_options(stream: &TcpStream) {
 /// The JSON of `/api/v1/drives/{name}` for a drive at `now`, which is `wall` on the calendar. Pure.
 ///
 /// # Errors
-/// None is known; a value that JSON cannot express would be one.
+/// No error is known; a value that JSON cannot express would be one.
 pub fn drive_json(
     drive: &DriveHandle,
     history: &History,

@@ -22,8 +22,8 @@ const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);
 
-/// The points of a drive that are polled, or those of `names`. One that is not polled is read from the drive for anyone
-/// who may command it.
+/// The points of a drive that are polled, or the points in `names`. A point that is not polled is read from the drive
+/// for anyone who may command it.
 pub(super) async fn points(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

@@ -52,7 +52,7 @@ impl Terms {
             replaced: CancellationToken::new(),
         })
     }
-    /// Takes the place of `current`. Its connections end if hosts or tokens are others.
+    /// Replaces `current` by these terms. The connections of `current` end if hosts or tokens have changed.
     pub(super) fn replace(mut self, current: &ArcSwap<Terms>) {
         let old = current.load_full();
         if old.access == self.access {

@@ -159,7 +159,7 @@ async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
     server.await.unwrap();
 }
 
-/// A server that starts: it has the listeners that there can be, and the others when their addresses come.
+/// A starting server opens the listeners whose addresses exist, and the others when their addresses appear.
 #[tokio::test]
 async fn an_address_that_is_not_there_yet_is_tried_again_and_an_error_in_a_reload() {
     let mut rig = OnePlaceServer::new();
@@ -272,7 +272,7 @@ async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
     assert_eq!(listeners.addresses(false), [wide]);
     reload(&mut listeners, &handler, &[narrow]).await.unwrap();
     assert_eq!(listeners.addresses(false), [narrow]);
-    // The second address is taken, so the first is as before.
+    // The second address is taken, so the first stays as before.
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let refused = [wide, taken.local_addr().unwrap()];
     reload(&mut listeners, &handler, &refused).await.unwrap_err();

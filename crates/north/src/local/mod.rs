@@ -174,7 +174,7 @@ async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel:
     }
 }
 
-/// Answers a client that is too many. What does not fit the socket's buffer at once is dropped.
+/// Answers a client beyond the limit. Bytes that do not fit into the socket's buffer at once are dropped.
 fn turn_away(stream: &UnixStream) {
     let body = format!("{{\"error\":\"{MAX_CLIENTS} local clients are already connected; try again\"}}");
     let head =

@@ -77,7 +77,7 @@ impl SocketPath {
         }
     }
 
-    /// Where a client looks for its gateway. That may be a service or run in a session of the same user.
+    /// Where a client looks for its gateway, which may be a service or run in a session of the same user.
     pub fn of_client(&self, directories: &RuntimeDirectories) -> Vec<PathBuf> {
         match self {
             SocketPath::Default => directories.all().flat_map(numbered).collect(),

@@ -147,7 +147,7 @@ impl Admission {
         }
     }
 
-    /// Applies a new policy to open connections too: they get its rights, or are closed.
+    /// Applies a new policy to open connections as well: they get its rights, or are closed.
     pub(super) fn update(&self, policy: Policy, view: View) {
         self.view.show(view, Instant::now());
         self.policy.store(Arc::new(policy.clone()));

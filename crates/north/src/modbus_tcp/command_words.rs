@@ -11,8 +11,8 @@ use crate::process_image::Machine;
 pub(super) struct CommandWords(Mutex<BTreeMap<u8, (Machine, Option<u16>)>>);
 
 impl CommandWords {
-    /// Calls `update` with the word last written to that machine at that unit while no other client can change it; none where
-    /// the unit meant another machine when it was written last.
+    /// Calls `update` with the word last written to this machine at this unit while no other client can change it; `None` if
+    /// the unit meant another machine at the last write.
     pub(super) fn update<T>(&self, unit: u8, machine: Machine, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
         let mut words = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let last = words.remove(&unit).filter(|(of, _)| *of == machine);

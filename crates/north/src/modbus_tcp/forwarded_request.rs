@@ -91,7 +91,8 @@ pub(super) enum Progress {
     Stopped(Header, RequestPdu, bool),
 }
 
-/// A request whose command is in the queue and only waits for its result. Its content is `None` once it is answered.
+/// A request whose command is in the queue and only waits for the result. The content is `None` once the request is
+/// answered.
 #[derive(Debug)]
 pub(super) enum PendingRequest {
     Forwarded(Option<Box<ForwardedRequest>>, Placed),

@@ -46,7 +46,8 @@ pub(crate) enum NotModbus {
     Serial(&'static str),
 }
 
-/// The first bytes of a connection that never sent a Modbus TCP frame, if they are a complete serial request.
+/// `NotModbus::Serial` if the first bytes of a connection that never sent a Modbus TCP frame are a complete serial
+/// request.
 pub(crate) fn of_serial_line(bytes: &[u8]) -> Option<NotModbus> {
     if bytes.first() == Some(&b':') {
         let whole = bytes.get(..ascii::request_len(bytes)?)?;

@@ -91,8 +91,8 @@ impl Registers {
         }
     }
 
-    /// A write from `start` on that reaches from one kind into another and covers the command word: its begin as if all of it
-    /// were of the common model. What stops is carried out, however far the write reaches.
+    /// Begin of a write from `start` on that reaches from one kind of registers into another and covers the command word, as
+    /// if all of it were of the common model. A stop in it is carried out, however far the write reaches.
     pub(super) fn around_the_command_word(self, start: u16, count: u16) -> Option<u16> {
         let word = match self {
             Registers::Model => FIRST + STOP_ALL,

@@ -103,8 +103,8 @@ impl ClientSession {
         }
     }
 
-    /// Answers a request that came so into `out`, or returns the pending request. Its command is in the queue when this
-    /// returns, so commands reach the bus in the order of their frames.
+    /// Answers a request that arrived in this way into `out`, or returns the pending request. The command is in the
+    /// queue when this returns, so commands reach the bus in the order of their frames.
     pub(super) fn take(
         &mut self,
         frame: &Frame<'_>,
@@ -417,8 +417,8 @@ impl ClientSession {
         Ok(Decision::Reply(request, reply))
     }
 
-    /// A write to unit 255: 1 at the register that stops all drives that the listener serves. They are stopped whatever else the
-    /// write covers.
+    /// Handles a write to unit 255: 1 at the register that stops all drives that the listener serves. The drives are stopped
+    /// whatever else the write covers.
     fn stop_all(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
         if self.client.rights.authority() != Authority::Write {
             return Err(Exception::FUNCTION);
@@ -435,7 +435,7 @@ impl ClientSession {
         let (plant, scope, origin) = (&self.routes.plant, self.routes.scope(), self.client.origin());
         match self.routes.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
             Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
-            // Nothing here may be written.
+            // The client may write nothing here.
             Err(why) => {
                 refuse_stop_all(plant, nothing_to_stop(&why), &origin, now);
                 Err(Exception::FUNCTION)
@@ -542,7 +542,7 @@ impl ClientSession {
                 },
                 _,
             )) => BusWork::Stop(Order::Points(points), refusal),
-            // A heartbeat alone is not a command: it is answered at once and not audited.
+            // A heartbeat alone is no command, so it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.heartbeat(&self.client.origin(), now);
                 return Decision::Reply(request, Reply::Written);

@@ -244,7 +244,8 @@ impl TlsAuthenticator {
         };
         let (name, role) = match chain.first().map(|der| certificate::read(der)) {
             Some(Ok(certificate)) => (certificate.name, certificate.role?),
-            // The verifier refuses clients without a certificate; one that only rustls can read grants no role.
+            // The verifier refuses clients without a certificate; a certificate that only rustls can read grants no
+            // role.
             Some(Err(_)) | None => ("unreadable certificate".to_string(), None),
         };
         let (certificate, role) = self

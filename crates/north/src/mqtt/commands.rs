@@ -22,7 +22,7 @@ use crate::permit::{Stage, Verb, access};
 use crate::plant::{Placed, Plant, Shown};
 use crate::stop_all::{StopAll, StopReport};
 
-/// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
+/// Limits of the commands that wait for the bus. Only stops can reach them: the queues of the buses accept fewer other
 /// commands.
 const WAITING: QueueLimit = QueueLimit {
     most: 4096,
@@ -95,8 +95,8 @@ pub(super) enum Finished {
 }
 
 impl Commands {
-    /// `memory` outlives this client, so that a command is recognised after a reload; it continues with the commands that the
-    /// client before has `left`.
+    /// `memory` outlives this client, so that a command is recognised after a reload; this client continues with the commands
+    /// that the previous one has `left`.
     pub(super) fn new(
         topics: Topics,
         rules: Rules,

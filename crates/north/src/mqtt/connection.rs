@@ -85,7 +85,7 @@ pub(super) enum Step {
     Pinged,
     /// Nothing that concerns the client, such as any other packet from the broker.
     Nothing,
-    /// The connection stands and cannot be used any more, for this reason: it is to be given up.
+    /// The connection is open but can no longer be used, for this reason, and must be given up.
     Stuck(&'static str),
     /// The broker refused the connection because of the last will. The last event.
     Refuses(Lack),
@@ -347,8 +347,8 @@ impl Connection {
         attempt.is_ok()
     }
 
-    /// Disconnects in order, so that the broker does not publish the last will. What a broker does not acknowledge is sent
-    /// before.
+    /// Disconnects in order, so that the broker does not publish the last will. Messages that the broker does not
+    /// acknowledge are sent before.
     pub(super) fn disconnect(&self, limits: BrokerLimits) -> bool {
         match limits.acknowledges {
             true => self.client.try_disconnect_now().is_ok(),

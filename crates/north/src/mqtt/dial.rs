@@ -64,7 +64,7 @@ impl Dial {
         addresses.rotate_left(start);
         for address in addresses {
             self.turn().await;
-            // A literal address: nothing is looked up.
+            // A literal address needs no lookup.
             let attempt = rumqttc::default_socket_connect(address.to_string(), options.clone());
             match tokio::time::timeout(each.max(WITHIN), attempt).await {
                 Ok(Ok(stream)) => return Ok(stream),

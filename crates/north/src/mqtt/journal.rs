@@ -67,7 +67,8 @@ pub(super) struct Journal {
     lost: u64,
     /// Messages already counted as lost in the gaps that are still to be passed.
     pub(super) counted: u64,
-    /// Up to here nothing is kept: the buffer was full. What of it was taken and is not acknowledged is lost.
+    /// Number up to which nothing is kept, because the buffer was full. Messages up to there that were taken and are
+    /// not acknowledged are lost.
     pub(super) gone: u64,
     /// The files were deleted since the last call of [`Journal::take_wiped`].
     wiped: bool,
@@ -164,7 +165,7 @@ impl Journal {
             }
         }
         if end < bytes.len() as u64 {
-            // Nothing valid follows: what was being written when the process ended, or when the disk was full.
+            // Nothing valid follows, only what was being written when the process ended or when the disk was full.
             if let Err(error) = self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default())
                 && end == 0
                 && !is_full(&error)
@@ -225,7 +226,8 @@ impl Journal {
         std::mem::take(&mut self.wiped)
     }
 
-    /// Appends a message; [`Journal::write`] writes it. One that is `taken` already is kept only until it is acknowledged.
+    /// Appends a message; [`Journal::write`] writes it. A message that is `taken` already is kept only until it is
+    /// acknowledged.
     pub(super) fn append(&mut self, message: Message, taken: bool) {
         self.last += 1;
         if taken {
@@ -351,7 +353,7 @@ impl Journal {
     /// Writes appended messages and acknowledgements; returns whether there was anything to write.
     ///
     /// # Errors
-    /// The disk does not take it; it stays in memory, and the next call tries again.
+    /// If the disk does not take the data; they stay in memory, and the next call tries again.
     pub(super) fn write(&mut self) -> io::Result<bool> {
         let mut written = false;
         if self.place.is_none() {
@@ -458,7 +460,7 @@ impl Journal {
         Ok(true)
     }
 
-    /// Writes the files again if someone deleted them: what they held is still there as long as they are open.
+    /// Writes the files again if someone deleted them; their content still exists as long as they are open.
     fn restore_wiped(&mut self) -> io::Result<()> {
         let Some(place) = &mut self.place else { return Ok(()) };
         let files = self.segments.iter().map(|s| &s.file).chain([&place.lock]);

@@ -75,7 +75,7 @@ pub(super) struct BrokerLink {
 }
 
 impl BrokerLink {
-    /// Begins with the broker `kept`, if it is still one of them: it worked before a reload.
+    /// A link that begins with the broker `kept`, which worked before a reload, if it is still configured.
     pub(super) fn new(options: Options, client_id: String, prefix: &'static str, kept: Option<&Broker>) -> BrokerLink {
         let brokers = &options.brokers;
         let first = kept.and_then(|kept| brokers.iter().position(|broker| broker == kept));
@@ -166,8 +166,8 @@ impl BrokerLink {
         }
     }
 
-    /// The broker answered the subscriptions; what it can do, if that was the first time on this connection: the client may
-    /// publish from now on.
+    /// Notes that the broker answered the subscriptions; returns the broker's limits if that was the first time on this
+    /// connection: the client may publish from now on.
     pub(super) fn become_ready(&mut self) -> Option<BrokerLimits> {
         let State::Up(_, phase) = &mut self.state else {
             return None;

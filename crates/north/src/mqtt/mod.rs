@@ -125,7 +125,7 @@ pub struct Options {
     pub telemetry_qos: Qos,
     /// Quality of service of events and history.
     pub event_qos: Qos,
-    /// Whether messages are retained; else none is, the last will included.
+    /// Whether messages are retained; otherwise none is, not even the last will.
     pub retain: bool,
     /// Time after which the broker drops telemetry; never if absent.
     pub expiry: Option<Duration>,
@@ -141,7 +141,7 @@ pub struct Options {
     pub require_id: bool,
     /// Filters of response topics that are allowed in addition to those outside of `base`.
     pub response_topics: Vec<String>,
-    /// The topic levels `as/WHO` of principals; none where `[authority]` is off.
+    /// The topic levels `as/WHO` of principals; `None` if `[authority]` is off.
     pub principals: Option<Vec<String>>,
     /// Disk buffer for events and history while the broker is not connected; in memory only if absent.
     pub buffer: Option<Buffer>,
@@ -214,7 +214,7 @@ pub struct Mqtt {
 
 impl server::Server for Mqtt {
     const NAME: &'static str = "MQTT";
-    // Commands that are in progress come first: its successor would be another client at the broker.
+    // The commands in progress come first: the successor would be another client for the broker.
     const STOP_TIMEOUT: Duration = Duration::from_secs(6);
     type Options = Options;
 
@@ -244,15 +244,15 @@ impl server::Server for Mqtt {
 }
 
 /// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
-/// raised from now on, or were left unread by the client before, are published, so start it before the buses.
+/// raised from now on, or that the previous client left unread, are published, so start it before the buses.
 pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, cancel: CancellationToken) -> Mqtt {
     options.buffer = options.buffer.or_else(Buffer::of_system);
-    // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
-    // unread comes first.
+    // Subscribed here and not in the task, so that no event after this call is missed. Events that the previous client left
+    // unread come first.
     let (topics, hosts) = stats.broker_rights.begin(&options);
     let kept = options.clone();
     let events = plant.load().events.subscribe();
-    // Taken here too: what no client has taken when this returns is discarded.
+    // Taken here as well: what no client has taken when this returns is discarded.
     let (unread, of_client, of_node) = {
         let mut left = stats.mqtt_left.lock();
         (

@@ -139,7 +139,7 @@ pub(super) struct Outbox {
     published: VecDeque<Key>,
     /// Published, by packet id.
     unacknowledged: HashMap<u16, Key>,
-    /// The first topic of `order` is published before everything else.
+    /// Whether the first topic of `order` is published before everything else.
     has_leader: bool,
     /// The kind that is sent next: results, events or telemetry.
     turn: usize,
@@ -230,8 +230,8 @@ impl Outbox {
         });
     }
 
-    /// Nothing up to this message is on disk any more, because the buffer was full: what waits of it is lost, as it would be
-    /// after a restart. What is in flight has probably been delivered.
+    /// Drops the waiting messages up to this one, which are no longer on disk because the buffer was full: they are lost, as
+    /// they would be after a restart. Messages in flight have probably been delivered.
     pub(super) fn drop_gone(&mut self, kind: MqttKind, through: Number) {
         let queue = self.queue_mut(kind);
         let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
@@ -280,7 +280,7 @@ impl Outbox {
         }
     }
 
-    /// The first message of that kind that is not acknowledged and on disk.
+    /// Number of the first message of this kind that is on disk and not acknowledged.
     pub(super) fn oldest(&self, kind: MqttKind) -> Option<Number> {
         self.queue(kind).entries.iter().find_map(|entry| entry.number)
     }
@@ -329,7 +329,7 @@ impl Outbox {
         self.published.len() + self.unacknowledged.len()
     }
 
-    /// The message to publish next; history only if it `may` come. It stays in the outbox; confirm with
+    /// The message to publish next; history only if `may_history`. The message stays in the outbox; confirm with
     /// [`Outbox::mark_published`] that it was published.
     pub(super) fn next(&self, window: usize, may_history: bool) -> Option<(Key, Message)> {
         let free = self.in_flight() < window;
@@ -498,8 +498,8 @@ impl Outbox {
         }
     }
 
-    /// The connection is lost. What was in flight waits again, in its order; telemetry is dropped, since the process
-    /// image has newer values.
+    /// Handles the loss of the connection. Messages in flight wait again, in their order; telemetry is dropped, since
+    /// the process image has newer values.
     pub(super) fn lost(&mut self) {
         self.latest.clear();
         self.order.clear();

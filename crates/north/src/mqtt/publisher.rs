@@ -265,7 +265,7 @@ impl Publisher {
         for drive in &mut self.drives {
             updates.extend(drive.recorder.ripe(now));
         }
-        // Nothing is recorded of the buses.
+        // No history is recorded of the buses.
         (updates, self.next(all, now, None))
     }
 

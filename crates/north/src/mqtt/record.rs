@@ -35,7 +35,7 @@ pub(super) fn length(message: &Message) -> u64 {
     (HEADER + 2 + message.topic.len() + message.payload.len()) as u64
 }
 
-/// Appends the record of a message; its topic has at most 65535 bytes, as MQTT requires.
+/// Appends the record of a message, whose topic has at most 65535 bytes, as MQTT requires.
 pub(super) fn message(number: u64, message: &Message, bytes: &mut Vec<u8>) {
     let topic = message.topic.as_bytes();
     let length = u16::try_from(topic.len()).unwrap_or(u16::MAX);

@@ -114,7 +114,7 @@ pub(super) trait Client {
     async fn say_goodbye(&mut self) -> bool;
 }
 
-/// Runs a client until `cancel`; then it ends: the commands that are in progress first.
+/// Runs a client until `cancel`, then ends it: the commands in progress come first.
 pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
     let mut checks = tokio::time::interval(CHECK);
     checks.set_missed_tick_behavior(MissedTickBehavior::Delay);

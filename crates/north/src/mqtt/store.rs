@@ -218,7 +218,8 @@ impl Store {
         }
     }
 
-    /// Up to this message nothing is kept any more, because the buffer was full; what of it is in the outbox is lost.
+    /// Number of the message up to which nothing is kept any more, because the buffer was full; messages up to there
+    /// that are in the outbox are lost.
     pub(super) fn gone(&self) -> Number {
         let gone = self.disk.as_ref().map(|disk| disk.shared.gone.load(Ordering::Relaxed));
         gone.unwrap_or(Number::MIN)

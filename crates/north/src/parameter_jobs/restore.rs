@@ -21,7 +21,7 @@ use crate::permit::{limits_passed, may_restore};
 use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
 use crate::process_image::Machine;
 
-/// A command of a restore waits no longer than that for its turn; then it is given again.
+/// Longest time for which a command of a restore waits for its turn; it is then given again.
 const EXPIRY: Duration = Duration::from_secs(30);
 /// The writes of a restore take at most one part in this number of a line's time.
 const SHARE: u32 = 5;
@@ -222,8 +222,8 @@ pub async fn take_up(
     Ok(())
 }
 
-/// Sets the journal of a restore that was cut off aside: the drive stays as it is, and takes all commands. One that
-/// goes on ends before its next parameter, and is to be released then.
+/// Sets the journal of an interrupted restore aside: the drive stays as it is and takes all commands. A restore in
+/// progress ends before its next parameter and must be released then.
 ///
 /// # Errors
 /// Why the drive is not released.

@@ -19,8 +19,8 @@ pub(crate) trait Source {
     /// Whether the source has bytes to read.
     fn is_readable(&self) -> bool;
 
-    /// Whether the other end has closed or reset it, whatever is left to read. One that has only ended writing, and still
-    /// reads, looks the same before it is sent something.
+    /// Whether the other end has closed or reset the connection, whatever is left to read. An end that has only finished
+    /// writing, and still reads, looks the same before bytes are sent to it.
     fn has_gone(&self) -> bool;
 }
 

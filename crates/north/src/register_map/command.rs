@@ -47,7 +47,7 @@ impl CommandContext {
 /// stops the drive, whatever is wrong with the rest.
 ///
 /// # Errors
-/// An address that is not writable or that the family lacks; else an invalid value.
+/// If an address is not writable or the family lacks it; otherwise, if a value is invalid.
 pub(crate) fn command(
     profile: &Profile,
     start: u16,

@@ -47,7 +47,8 @@ pub enum SlotAccess {
     Read,
     /// Tools may also write, like a Modbus TCP client that may write.
     Write,
-    /// Also what cannot be checked: broadcasts, functions that are not decoded, addresses of no configured drive.
+    /// Also send requests that cannot be checked: broadcasts, functions that are not decoded, addresses of no
+    /// configured drive.
     Raw,
 }
 

@@ -22,7 +22,7 @@ use crate::reading::{Dated, Reader};
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.
 const AGAIN: Duration = Duration::from_secs(5);
-/// After that time without a byte the program may have been killed: what the last close of a serial port does is done.
+/// Time without a byte after which the program may have been killed: the port then does what its last close does.
 const RESTS: Duration = Duration::from_secs(2);
 
 /// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot runs without it, logs
@@ -135,7 +135,7 @@ impl Port {
         self.write();
     }
 
-    /// A serial port does not wait for anyone who does not read: what finds no room is lost.
+    /// Writes as a serial port does, which does not wait for a program that does not read: bytes without room are lost.
     fn write(&mut self) {
         let answer = std::mem::take(&mut self.dialogue.output);
         if answer.is_empty() {

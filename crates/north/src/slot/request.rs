@@ -40,7 +40,7 @@ pub(super) enum Refused {
 }
 
 impl ToolRequest {
-    /// The request in a complete frame; `None` if the frame is invalid: it is not answered.
+    /// The request in a complete frame; `None` if the frame is invalid, which is not answered.
     pub(super) fn of(protocol: Protocol, frame: &[u8]) -> Option<ToolRequest> {
         let (address, pdu) = match protocol {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec()))?,

@@ -15,7 +15,7 @@ use crate::order::{Grants, Proof, Right};
 enum Way {
     Address(IpAddr),
     Pty(PathBuf),
-    /// None: a test without sockets.
+    /// No way at all: a test without sockets.
     Within,
 }
 

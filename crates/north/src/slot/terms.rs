@@ -29,7 +29,7 @@ const EXPIRY: Duration = super::dialogue::ANSWER_WITHIN;
 #[derive(Debug)]
 pub(super) enum Decision {
     Refuse(Refused),
-    /// Nothing is sent and nothing answered.
+    /// The request is neither sent nor answered.
     Silent,
     /// The bus answers.
     Wait(Work),

@@ -32,7 +32,7 @@ impl Exception {
         Exception(0x80 | code)
     }
 
-    /// The N2 error code; none of a code of Modbus.
+    /// The N2 error code; `None` for a code of Modbus.
     pub fn n2_code(self) -> Option<u8> {
         (self.0 & 0x80 != 0).then_some(self.0 & 0x7F)
     }

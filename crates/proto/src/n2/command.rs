@@ -231,7 +231,7 @@ fn bytes(digits: &[u8]) -> Result<Vec<u8>, u8> {
 /// The reply of a drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Answer {
-    /// Done; to a poll: nothing new.
+    /// The command is done; to a poll: nothing new.
     Ack,
     /// Hexadecimal digits.
     Data(Vec<u8>),

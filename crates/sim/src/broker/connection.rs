@@ -1,5 +1,5 @@
-//! One client's connection: bytes in, packets through, bytes out. One task does both directions, so that a client that
-//! only writes cannot block one that only reads.
+//! One client's connection: bytes in, packets through, bytes out. One task handles both directions, so that a client
+//! that only writes cannot block one that only reads.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;

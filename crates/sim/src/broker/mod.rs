@@ -36,7 +36,7 @@ const MAX_PACKET_BYTES: usize = 256 * 1024;
 const MAX_CLIENT_ID_BYTES: usize = 256;
 /// Most subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 64;
-/// Retained messages. One too many is passed on but not kept, nor is the one that it would replace.
+/// Most retained messages. A further message is passed on but not kept, nor is the message that it would replace.
 const MAX_RETAINED_MESSAGES: usize = 5_000;
 /// All retained messages together, bytes.
 const MAX_RETAINED_BYTES: usize = 8 * 1024 * 1024;

@@ -234,7 +234,8 @@ impl Client {
         });
     }
 
-    /// A client that does not take its messages loses its connection: nothing is dropped in silence.
+    /// Gives a message to a client; a client that does not take its messages loses its connection, so that nothing is
+    /// dropped silently.
     fn push(&mut self, delivery: Delivery) {
         let bytes = self.queue_bytes + delivery.message.weight();
         if self.queue.len() >= MAX_QUEUE_MESSAGES || bytes > MAX_QUEUE_BYTES {

@@ -246,7 +246,7 @@ impl ProfileDrive {
         self.family.map_or_else(said, |family| family.acts_once)
     }
 
-    /// Another state of the start sequence; one that it is in already does not take time.
+    /// Moves the drive to another state of the start sequence; a state that it is in already takes no time.
     fn come_to(&mut self, position: usize, now: SimTime) {
         if self.position < position {
             let step = position.saturating_sub(1);
@@ -276,7 +276,8 @@ impl ProfileDrive {
         self.body.latch.obeys(false);
     }
 
-    /// Somebody else than the bus lets it stand: it does not run by the word of before, though that is read back still.
+    /// Stops the motor from elsewhere than the bus: the drive does not run by the previous word, although the word
+    /// still reads back.
     fn stand(&mut self) {
         self.halt();
         self.word = 0;

@@ -412,7 +412,7 @@ fn a_profile_of_ones_own() {
     assert_ne!(status(&mut rig), 0x21, "that takes a while");
     rig.wait(30);
     assert_eq!(status(&mut rig), 0x21);
-    // The second step ends by time: what comes earlier is too early.
+    // The second step ends by time, so these writes come too early.
     rig.send(&[Single(0, 0x0407), Single(0, 0x040F)]);
     assert!(!rig.drive.state().running);
     rig.wait(200);

@@ -68,7 +68,7 @@ pub(super) struct Family {
 pub(super) struct Shows {
     pub(super) position: usize,
     pub(super) running: bool,
-    /// A run command holds; else a running motor comes down.
+    /// Whether a run command holds; otherwise a running motor slows down.
     pub(super) commanded: bool,
     pub(super) faulted: bool,
     pub(super) word: u16,

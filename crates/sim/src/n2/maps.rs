@@ -42,7 +42,7 @@ pub enum Beyond {
 pub struct Map {
     /// All objects of the board.
     pub entries: &'static [Entry],
-    /// An override of AI, BI or ADI changes what the bus sees, and a release ends it; else both do nothing.
+    /// Whether an override of AI, BI or ADI changes what the bus sees until a release; otherwise both do nothing.
     pub overrides_inputs: bool,
     /// AI have alarm and warning limits.
     pub has_limits: bool,

@@ -108,8 +108,8 @@ impl Board {
         }
     }
 
-    /// The answer to a command, appended to `out`; `Err` is the code that the frame itself deserves. Nothing is appended
-    /// where the drive stays silent.
+    /// Appends the answer to a command to `out`; `Err` is the code that the frame itself causes. Nothing is appended if
+    /// the drive stays silent.
     pub fn answer(&mut self, command: &Result<Command, u8>, now: SimTime, model: Model<'_>, out: &mut Vec<u8>) {
         if self.map.stands_alone && now.saturating_sub(self.polled) > ALONE {
             self.overridden.clear();

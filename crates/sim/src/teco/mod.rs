@@ -108,7 +108,7 @@ impl TecoDrive {
         }
     }
 
-    /// Switches the operator between PRGM and DRIVE. A running motor is brought down; it needs a new run command then.
+    /// Switches the operator between PRGM and DRIVE. A running motor is stopped and then needs a new run command.
     pub(crate) fn set_mode(&mut self, mode: Mode) {
         self.mode = mode;
         self.body.latch.disarm();

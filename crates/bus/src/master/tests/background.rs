@@ -170,7 +170,7 @@ fn a_stop_waits_for_the_exchange_on_the_line_only() {
         }
         longest
     };
-    // The rig is between two exchanges when the stop comes: what waits costs it nothing.
+    // The rig is between two exchanges when the stop comes, so waiting requests cost the stop nothing.
     assert_eq!(longest(6), longest(0));
 }
 

@@ -89,7 +89,7 @@ fn a_drive_that_goes_on_turning_fails() {
 /// Incident while the motor should come to a standstill.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meanwhile {
-    /// The first replies behind a silence are lost; the motor stands before any comes.
+    /// The first replies after a silence are lost; the motor stops before any reply arrives.
     Lost,
     /// The process is stalled.
     Pause,

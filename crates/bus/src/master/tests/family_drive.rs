@@ -50,7 +50,7 @@ impl FamilyDrive {
         }
     }
 
-    /// Shows that state; nothing where the profile has no such point.
+    /// Shows a state; does nothing if the profile has no such point.
     pub(super) fn show(&mut self, point: ModelPoint, on: bool) {
         let profile = self.profile.clone();
         match profile.model_point(point).map(|point| &point.source) {

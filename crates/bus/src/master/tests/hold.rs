@@ -267,7 +267,7 @@ fn nothing_starts_when_local_control_ends() {
         "free",
         "a stop of the gateway's own reserves nothing"
     );
-    // Found so at a start of the gateway: nothing is written.
+    // The local control is found at a start of the gateway, so nothing is written.
     let mut rig = Rig::new(1);
     rig.drives[0].holding.insert(2000, 1);
     let rules = plant.buses[0].queue.lock().gate.rules().cloned();

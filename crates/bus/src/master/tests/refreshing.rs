@@ -8,7 +8,7 @@ use crate::permit::DrillLock;
 
 const EVERY: Duration = Duration::from_secs(1);
 
-/// Whether the control word is repeated; else the reference alone is.
+/// Whether the control word is repeated; otherwise only the reference is.
 const FAMILIES: [(&str, bool); 13] = [
     ("abb-acs550", true),
     ("abb-acs580", false),

@@ -261,7 +261,7 @@ proptest! {
         if let (Some(least), Some(most)) = (counts.iter().min(), counts.iter().max()) {
             prop_assert!(most - least <= 2, "{counts:?}");
         }
-        // Slow polls: at 5 % of the line each has its turn; else each second.
+        // At 5 % of the line, each slow poll has its turn; otherwise, each is read every second.
         let slow_work = dearest * (of(PollClass::Slow) + of(PollClass::Once));
         let slow_bound = SLOW + (slow_work.mul_f64(1.0 / SLOW_SHARE) + bound) * 2;
         for (key, longest) in &seen.slow_longest {

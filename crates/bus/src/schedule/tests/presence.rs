@@ -5,7 +5,7 @@ use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 
 impl PolledLine {
-    /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. What changed.
+    /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. Returns the changes.
     fn answer(&mut self, time: Duration, mut answer: impl FnMut(&Poll, Instant) -> Polled) -> Vec<Change> {
         let (end, mut changes) = (self.now + time, Vec::new());
         while self.now < end {

@@ -4,7 +4,7 @@ use super::*;
 use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 
-/// A drive that never answers what covers `address`: its polls, and how often it went away and came.
+/// A drive that never answers reads that cover `address`: its polls, and how often it went away and came back.
 struct Silent {
     rig: PolledLine,
     of: (Table, u16),

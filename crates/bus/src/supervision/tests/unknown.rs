@@ -88,7 +88,7 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
             News::LeaseRanOut(DriveIndex::new(0))
         ]
     );
-    // The time in which it answers is what counts: it may come and go.
+    // Only the time in which the drive answers counts; it may go away and come back.
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();

@@ -267,7 +267,7 @@ fn many_drives_share_the_memory_and_what_they_keep_is_right() {
     rig.check();
     feed(&mut rig, 700);
     rig.check();
-    // Room for more: what was forgotten does not come back, what comes is kept.
+    // With more room, forgotten values do not come back, but new ones are kept.
     rig.trend.set_reach(Reach::FULL);
     let [fine, ..] = RANGES;
     let shown = rig.part(fine, rig.clock).steps.iter().flatten().count();

@@ -270,7 +270,7 @@ impl Verifier {
                 why: why.to_string(),
             });
         }
-        // The first line that is read may follow another file.
+        // The first line may continue the chain of another file.
         let before = before.or((head.seq <= 1).then(Chain::default));
         before.map_or(Ok(()), |before| follows(&head, before))
     }

@@ -43,7 +43,7 @@ pub(super) fn safe(
     ordered
 }
 
-/// Whether a limit holds; one of which a value is not known does.
+/// Whether a limit holds; a limit of which a value is unknown does.
 fn holds(limit: &Limit, values: &BTreeMap<u16, f64>) -> bool {
     match (values.get(&limit.upper), values.get(&limit.lower)) {
         (Some(upper), Some(lower)) => upper >= lower,

@@ -62,7 +62,7 @@ fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(
     }
 }
 
-/// A control word that is neither a stop nor clearly a run command is not passed on: its effect is unknown.
+/// A control word that is neither a stop nor clearly a run command is not passed on, because its effect is unknown.
 fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
     let Some(control) = &drive.spec.profile.control else {
         return Ok(());
@@ -138,8 +138,8 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
     Ok(ranges)
 }
 
-/// Whether a raw write takes the run command away and does nothing else. One of several items is judged as any other
-/// command: its stop was taken out of it before ([`crate::order::Parts`]).
+/// Whether a raw write takes the run command away and does nothing else. A write of several items is judged like any
+/// other command: its stop was taken out before ([`crate::order::Parts`]).
 pub(super) fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
     let profile = &drive.spec.profile;
     written(pdu).is_some_and(|(table, items)| match items.as_slice() {

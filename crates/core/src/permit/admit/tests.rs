@@ -106,7 +106,7 @@ fn frequency_becomes_percent_of_the_band() {
     assert!(twice.to_string().contains("twice"), "{twice}");
 }
 
-/// A Vacon NX between 10 and 50 Hz with these limits; what goes into its reference register.
+/// The value for the reference register of a Vacon NX between 10 and 50 Hz with these limits.
 fn ordered(limits: &[(&str, RangeInclusive<f64>)], name: &str, value: f64) -> Result<f64, Refusal> {
     let mut spec = drive(Access::Control).spec;
     spec.limits = limits

@@ -57,8 +57,8 @@ impl HoldNews {
 }
 
 impl Gate {
-    /// Calls `change` with the rules and the holding of a drive, and the list of its changes; none while `[authority]`
-    /// is off.
+    /// Calls `change` with the rules and the holding of a drive, and with the list of its changes; `None` while
+    /// `[authority]` is off.
     fn with_hold<T>(
         &mut self,
         drive: DriveIndex,
@@ -71,7 +71,7 @@ impl Gate {
         Some(changed)
     }
 
-    /// Applies new rules; none: `[authority]` is off, and all holds end.
+    /// Applies new rules; with `None`, `[authority]` is off and all holds end.
     pub(crate) fn set_rules(&mut self, rules: Option<Arc<Rules>>) {
         if self.rules == rules {
             return;
@@ -96,7 +96,7 @@ impl Gate {
         self.with_hold(drive, |holding, _, told| holding.end(why, told));
     }
 
-    /// A run command that is refused after a stop is remembered: its client does not start the motor by going on with it.
+    /// Remembers a run command that is refused after a stop, so that its client does not start the motor by repeating it.
     pub(super) fn note_refused_run(&mut self, ask: &Ask<'_>) {
         let Some(rules) = self.rules.clone().filter(|_| ask.origin.kind.is_client()) else {
             return;
@@ -143,7 +143,8 @@ impl Gate {
         Some(denial.refusal(rules))
     }
 
-    /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
+    /// Notes that the turn of an accepted command came and that it passes: the command takes the hold again if that has
+    /// ended since.
     pub(super) fn hold_turn_came(&mut self, command: &Command, now: Instant) {
         let origin = command.ticket.origin();
         let Some(who) = self.claim(origin).filter(|_| origin.kind.is_client()) else {
@@ -200,7 +201,7 @@ impl Gate {
         });
     }
 
-    /// A client was received from: its heartbeat came, or its order was carried out.
+    /// Notes a sign of life of a client: a heartbeat, or an order that was carried out.
     pub fn hold_renewed(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
         let Some(who) = self.claim(origin) else { return };
         self.with_hold(drive, |holding, rules, _| holding.renew(&who, rules, now));

@@ -14,7 +14,7 @@ pub enum Denial {
     Held(Claim, Duration),
     /// The stop of another client reserved the drive.
     Reserved(Claim, Duration),
-    /// The stop of another one refused its run: it does not start the motor by going on with that.
+    /// The stop of another client refused this client's run command, and repeating it does not start the motor.
     NeedsTake(Claim),
     /// The drive is under local control.
     Local,

@@ -136,7 +136,7 @@ struct Stood {
 pub struct Holding {
     state: State,
     local: bool,
-    /// The last holder: its silence is the one that counts.
+    /// The last holder, whose silence is the one that counts.
     last: Option<Claim>,
     /// Clients that must take the drive; at most as many as principals.
     waiting: Vec<Waiting>,
@@ -187,7 +187,7 @@ impl Holding {
         }
     }
 
-    /// Whether a command of that client passes. Being a principal grants nothing; it was admitted before.
+    /// Whether a command of this client passes. Being a principal grants nothing: the command was admitted before.
     ///
     /// # Errors
     /// Why it does not; in advisory mode, why it would not.
@@ -220,8 +220,8 @@ impl Holding {
         }
     }
 
-    /// Why the stop of a cyclic client is not sent: it repeats one that the drive acknowledged, and another client holds the drive,
-    /// or started the motor last.
+    /// Why the stop of a cyclic client is not sent: it repeats a stop that the drive acknowledged, and another client holds the
+    /// drive, or started the motor last.
     fn repeats_in_vain(&self, who: &Claim, now: Instant) -> Option<Denial> {
         let is_acknowledged = |stood: &Stood| stood.acknowledged && stood.name == who.name;
         if !who.cyclic || !self.stood.iter().any(is_acknowledged) {
@@ -306,7 +306,8 @@ impl Holding {
         }
     }
 
-    /// The client stopped, or gave its run back: it does not continue a run that was refused.
+    /// Notes that the client stopped or released the run command: its next run command then no longer continues a
+    /// refused one.
     pub fn said_stop(&mut self, who: &Claim) {
         self.waiting.retain(|waiting| !waiting.who.is(who));
     }
@@ -338,7 +339,8 @@ impl Holding {
         self.state = State::Held(who.clone(), now + rules.lease);
     }
 
-    /// An accepted command has its turn and passes: it takes the hold again if that has ended since.
+    /// Notes that the turn of an accepted command came and that it passes: the command takes the hold again if that has
+    /// ended since.
     pub(crate) fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
         self.settle(rules, now, told);
         if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
@@ -443,7 +445,7 @@ impl Holding {
         self.ends(why, told);
     }
 
-    /// Whether the silence of that client is the one that counts: it is the holder, or was the last one.
+    /// Whether the silence of this client counts, because it is the holder or was the last one.
     pub(crate) fn is_whose_silence_counts(&self, who: Option<&Claim>) -> bool {
         match &self.last {
             None => true,

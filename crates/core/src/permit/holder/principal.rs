@@ -124,7 +124,7 @@ pub struct Rules {
 }
 
 impl Rules {
-    /// The principal that sent a command; none if unknown.
+    /// The principal that sent a command; `None` if unknown.
     pub(crate) fn claim_of(&self, origin: &Origin) -> Option<Claim> {
         let claim = self.claim(origin.proof())?;
         Some(if origin.insists() {
@@ -134,7 +134,7 @@ impl Rules {
         })
     }
 
-    /// The principal of a client; none if unknown.
+    /// The principal of a client; `None` if unknown.
     pub fn claim(&self, proof: &Proof) -> Option<Claim> {
         let named = |is: &dyn Fn(&Principal) -> bool| self.principals.iter().find(|p| is(p)).map(claim_of);
         let matches = |field: &Option<String>, name: &str| field.as_deref() == Some(name);

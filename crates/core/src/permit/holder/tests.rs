@@ -312,7 +312,8 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
     assert_eq!(drive.order("plc", Asks::Run), "needs_take");
     drive.wait(300);
     assert_eq!(drive.order("plc", Asks::Run), "ok");
-    // Nothing else: not a reference that takes the drive, nor the hold renewed, a reset, or a stop of somebody else.
+    // Only a take helps: neither a reference that takes the drive, nor a renewed hold, a reset, or another client's
+    // stop.
     for asks in [Asks::Steer, Asks::Other] {
         let mut drive = stopped();
         drive.wait(31);

@@ -11,7 +11,7 @@ use super::{FORM, FULL, load, settings};
 pub(super) fn certificates() -> &'static Path {
     static DIR: LazyLock<(tempfile::TempDir, Child)> = LazyLock::new(|| {
         let dir = tempfile::tempdir().unwrap();
-        // Nothing drops what is static: it is removed when this process ends and with it the pipe.
+        // Static values are never dropped, so the folder is removed when this process ends and its pipe closes.
         let mut sweeper = Command::new("sh");
         sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
         let sweeper = sweeper

@@ -57,7 +57,7 @@ pub fn has(addresses: &[RangeInclusive<u16>], address: u16) -> bool {
 }
 
 impl WriteRules {
-    /// Why the parameter is written only if the user names it; nothing where it is written like the others.
+    /// Why the parameter is written only if the user names it; `None` if it is written like the others.
     pub fn held_back(&self, address: u16) -> Option<&str> {
         if has(&self.nameplate, address) {
             return Some("it describes the drive itself");

@@ -188,7 +188,7 @@ fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
 /// `point` of a form cannot be written to, which is reported.
 struct Unusable;
 
-/// `point` of a form; none is the control word.
+/// Reads `point` of a form; `None` means the control word.
 fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Result<Option<ControlItem>, Unusable> {
     let Some(name) = form.optional::<String>("point") else {
         return Ok(None);
@@ -285,7 +285,7 @@ fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Step>> {
     steps.into_iter().collect()
 }
 
-/// `also_stop`: none where a form is wrong, which is reported.
+/// Reads `also_stop`; `None` if a form is wrong, which is reported.
 fn read_stops(table: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Setting>> {
     let forms = table.tables("also_stop");
     if forms.len() > MOST_STOPS {

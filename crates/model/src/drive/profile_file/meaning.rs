@@ -129,7 +129,7 @@ fn read_scale_from(reader: &Reader<'_>, names: &[String], mut raw: Raw) -> Raw {
     raw
 }
 
-/// `factor_from`: one point or several by whose values the value is multiplied.
+/// Reads `factor_from`: one or several points by whose values the value is multiplied.
 fn read_factor_from(reader: &Reader<'_>, names: &[String], mut raw: Raw) -> Raw {
     let Some(node) = reader.raw("factor_from") else {
         return raw;

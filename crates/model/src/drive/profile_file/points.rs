@@ -241,7 +241,7 @@ fn read_blocks(reader: &Reader<'_>) -> Option<Blocks> {
     })
 }
 
-/// `[point.texts]`: what the values of an enumeration mean.
+/// Reads `[point.texts]`: what the values of an enumeration mean.
 fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
     let Some(table) = reader.table("texts") else {
         return BTreeMap::new();

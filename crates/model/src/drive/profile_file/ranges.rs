@@ -81,7 +81,7 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     })
 }
 
-/// `[ranges]`: what holds for all ranges of the drive.
+/// Reads the keys of `[ranges]` that hold for all ranges of the drive.
 pub(super) fn read_functions(reader: &Reader<'_>, ranges: &[AddressRange]) -> WriteFunctions {
     let mut functions = WriteFunctions::default();
     let Some(given) = reader.table("ranges") else {

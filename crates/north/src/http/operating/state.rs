@@ -43,7 +43,7 @@ pub(in crate::http) struct Operating {
     verifier: Verifier,
     /// Hashes names into keys of the throttle.
     pub(super) hasher: RandomState,
-    /// For passwords in memory; `None` if the system has no random numbers: nothing is kept then.
+    /// Key for the marks of passwords in memory; `None` if the system has no random numbers, and no mark is kept then.
     key: Option<hmac::Key>,
     pub(super) north: Arc<NorthState>,
     pub(super) in_progress: Arc<Semaphore>,
@@ -166,7 +166,7 @@ impl Operating {
     /// Sets the users who may command; `None`: commands are off. Sessions of users who were removed, or have a new
     /// password, end.
     pub(in crate::http) fn set_users(&self, users: Option<Users>) {
-        // A session is looked up under the same lock: it ends together with its user.
+        // A session is looked up under the same lock, so it ends together with its user.
         let mut state = self.state();
         let before = self.users.swap(users.map(Arc::new));
         let after = self.users.load_full();

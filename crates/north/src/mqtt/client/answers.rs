@@ -5,7 +5,8 @@ use rumqttc::PubAckReason;
 use super::*;
 
 impl PlainClient {
-    /// The broker refused a message. What must arrive, and what it refuses for now only, is published again.
+    /// Handles a message that the broker refused. A message that must arrive, or that the broker refuses only for now,
+    /// is published again.
     pub(super) fn refused(&mut self, packet: u16, why: PubAckReason) {
         let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
         let (now, root) = (Instant::now(), self.topics.root());

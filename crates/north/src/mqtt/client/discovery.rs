@@ -108,7 +108,7 @@ impl PlainClient {
         self.common.stats.mqtt_left.lock().retained = self.retained_topics();
     }
 
-    /// Whether a message is about discovery: it was one of Home Assistant, or one of an earlier run.
+    /// Whether a message is about discovery: a message of Home Assistant, or one of an earlier run.
     pub(super) fn on_discovery(&mut self, message: &Incoming) -> bool {
         let Some(announcer) = &mut self.announcer else {
             return false;

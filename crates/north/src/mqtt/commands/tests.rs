@@ -299,7 +299,7 @@ fn commands_are_queued_in_the_order_of_their_messages() {
         drive.image.spec.profile.point_index(name).unwrap()
     };
     let bool_of = |name, on| Order::Points(vec![(index(name), crate::drive::Value::Bool(on))]);
-    // The stop goes first and has removed what came before it; nothing was polled in between.
+    // The stop goes first and has removed the commands before it; nothing was polled in between.
     assert_eq!(taken(&bench), Some(bool_of("run", false)));
     assert_eq!(taken(&bench), Some(bool_of("run", true)));
     assert_eq!(taken(&bench), Some(bool_of("fault_reset", true)));

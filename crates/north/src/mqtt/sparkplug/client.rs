@@ -266,7 +266,8 @@ impl NodeClient {
         }
     }
 
-    /// The result of a command becomes metrics of the drive; what it was to change is published as it is.
+    /// Publishes the result of a command as metrics of the drive, and the metric that the command should change with
+    /// its present value.
     fn on_finished(&mut self, finished: Finished) {
         let drive_of = |drive: &Drive| drive.metrics.drive.image.spec.name == finished.drive;
         let Some(place) = self.drives.iter().position(drive_of) else {
@@ -468,7 +469,7 @@ impl session::Client for NodeClient {
                 sent = true;
             }
             match self.common.link.next().await {
-                // The broker does not take the death of the node: it publishes the last will instead.
+                // The broker does not take the death of the node, so it publishes the last will instead.
                 Step::Lost(_) | Step::Refused(..) => return false,
                 Step::Acked(_) => return true,
                 Step::Message(message) => self.on_message(*message),

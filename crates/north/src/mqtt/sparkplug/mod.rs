@@ -35,7 +35,7 @@ pub struct Options {
     pub group: String,
     /// Edge node id.
     pub node: String,
-    /// Id of the host that must be online before anything is published; empty: none.
+    /// Id of the host that must be online before anything is published; empty for no such host.
     pub primary_host: String,
     /// Metrics have aliases.
     pub alias: bool,

@@ -288,14 +288,14 @@ impl Session {
         std::mem::take(&mut self.lost)
     }
 
-    /// The death of the node, before the connection is closed; nothing else is sent on it.
+    /// The death of the node, which is the last message on the connection before it is closed.
     pub(super) fn end(&mut self, moment: Moment) -> Packet {
         self.closed();
         death(self.bd_seq, moment)
     }
 
-    /// The next message, if one is due; else when to ask again, unless something happens before. Once returned it counts
-    /// as sent.
+    /// The next message if one is due; otherwise when to ask again, unless something happens before. A returned message
+    /// counts as sent.
     pub(super) fn next(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         match self.phase {
             Phase::Away | Phase::Waiting => Err(None),

@@ -19,7 +19,7 @@ pub enum Form {
     },
     /// Signed 8 bit, two's complement: one byte of a register.
     I8 {
-        /// The high byte; else the low one.
+        /// Whether it is the high byte; otherwise the low one.
         high: bool,
     },
     /// Unsigned 16 bit.

@@ -57,7 +57,7 @@ impl Device {
         names.zip(self.namings.iter().copied()).collect()
     }
 
-    /// All metrics, those that nothing is known of too; they count as published at `now`.
+    /// All metrics, including those of which nothing is known; they count as published at `now`.
     pub(super) fn birth(&mut self, moment: Moment) -> Vec<Metric> {
         let unknown = moment.sample(None);
         let samples = self.now_is.iter().chain(std::iter::repeat(&unknown));
