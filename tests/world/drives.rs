@@ -57,7 +57,7 @@ pub struct Truth {
     pub stop_sent: Option<Instant>,
     /// The action of supervision that was last on the wire, while nothing else was written since.
     pub action: Option<Tried>,
-    /// A stop that the broker delivered once more may be under way until then.
+    /// Time until which a stop that the broker delivered once more may be in progress.
     pub repeated_until: Option<Instant>,
     /// When a request to the drive was last on the wire.
     pub asked: Option<Instant>,

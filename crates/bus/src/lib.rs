@@ -87,7 +87,7 @@ pub struct BusOptions {
     pub line: LineOptions,
     /// Role of the gateway on the line.
     pub mode: Mode,
-    /// From where the device of the bus may dial in.
+    /// Networks from which the device of the bus may connect.
     pub allow: Vec<IpNet>,
 }
 

@@ -43,7 +43,7 @@ pub struct BusHandle {
     pub image: Arc<BusImage>,
     /// The command queue.
     pub queue: Arc<CommandQueue>,
-    /// Earlier meanings of the names and units of its drives, before reloads.
+    /// Drives that the names and units of the bus meant before reloads.
     pub formerly: Arc<Formerly>,
 }
 
@@ -87,7 +87,7 @@ pub struct Plant {
     pub stale_after: Duration,
     /// The buses in the order of the file.
     pub buses: Vec<BusHandle>,
-    /// The events.
+    /// The events of the gateway.
     pub events: Events,
     /// Counters of commands.
     pub writes: Arc<WriteStats>,

@@ -33,7 +33,7 @@ pub struct Stall {
     /// When the thread ran last. If the machine was suspended, this is moved back by the time of the suspension, during
     /// which the clock did not advance.
     pub began: Instant,
-    /// When the thread ran again.
+    /// When the thread ran again after the stall.
     pub ended: Instant,
     /// Part of the stall during which the machine was suspended and its clock did not advance: dates before it are
     /// older by this time.

@@ -26,7 +26,7 @@ pub enum EndpointOptions {
     },
     /// A serial port on whose line the simulated drives sit.
     Port {
-        /// The device.
+        /// Path of the port's device.
         path: PathBuf,
     },
     /// Raw serial-over-TCP, as a serial device server gives it. One master at a time.

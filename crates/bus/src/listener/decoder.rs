@@ -102,7 +102,7 @@ struct Open {
     sent: Instant,
     /// Bytes after the request that are not a frame.
     garbage: Vec<u8>,
-    /// The request could be a reply: in which case the next request looks like its reply.
+    /// Whether the request could be a reply; the next request would then look like a reply to it.
     ambiguous: bool,
 }
 

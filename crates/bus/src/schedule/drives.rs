@@ -200,7 +200,7 @@ impl Item {
         }
     }
 
-    /// Whether the item is read in every round, and answered as far as is known.
+    /// Whether the item is read in every round and is not known to stay unanswered.
     pub(super) fn is_process_data(&self) -> bool {
         self.read.class == PollClass::Fast && !self.mute
     }

@@ -74,7 +74,7 @@ impl Entry {
     }
 }
 
-/// A number that was not given before: later writes have greater ones.
+/// A new number for a write; a later write has a greater number.
 fn number() -> u64 {
     static LAST: AtomicU64 = AtomicU64::new(1);
     LAST.fetch_add(1, Ordering::Relaxed)

@@ -58,7 +58,7 @@ impl Saved {
     pub(super) fn motors(&self) -> impl Iterator<Item = (Machine, impl Iterator<Item = SystemTime> + '_)> + '_ {
         self.motors.iter().map(|motor| {
             let at = |millis: &u64| {
-                // As late as the form can say, where the clock cannot.
+                // A time that the clock cannot represent becomes the latest time of the form.
                 let at = SystemTime::UNIX_EPOCH.checked_add(Duration::from_millis(*millis));
                 at.unwrap_or(SystemTime::UNIX_EPOCH + LATEST)
             };

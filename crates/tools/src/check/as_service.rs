@@ -88,7 +88,7 @@ impl Service {
         let homes = hides("ProtectHome", &["yes", "tmpfs"]).then_some(HOMES.as_slice());
         let temporary = hides("PrivateTmp", &["yes", "disconnected"]).then_some(TEMPORARY.as_slice());
         let hidden = homes.into_iter().chain(temporary).flatten().copied().collect();
-        // The group that a user has by itself.
+        // The user's own group, which the file of groups does not list for the user.
         let own = passwd.lines().map(|line| line.split(':').collect::<Vec<_>>());
         let own = own.filter(|fields| user.is_some() && fields.first() == Some(&name));
         let own = own.filter_map(|fields| fields.get(3)?.parse().ok());

@@ -99,7 +99,7 @@ impl Snippet<'_> {
         text
     }
 
-    /// The unit of a drive whose address cannot be one: 255 is the gateway itself.
+    /// The unit of a drive with address 255, which cannot be its unit: unit 255 is the gateway itself.
     fn unit_of(&self, drive: &Found) -> Option<u8> {
         let taken = |unit: &u8| self.found.iter().any(|other| other.address == *unit);
         (1..=254)

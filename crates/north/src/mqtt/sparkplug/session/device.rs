@@ -71,7 +71,7 @@ impl Device {
         metrics
     }
 
-    /// Metrics that changed and are due. The second is when to call again.
+    /// Metrics that changed and are due, and the time of the next call.
     pub(super) fn data(&mut self, least: Duration, now: Instant) -> (Vec<Metric>, Option<Instant>) {
         if !self.changed {
             return (Vec::new(), None);
