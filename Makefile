@@ -113,7 +113,7 @@ book: ## Build the pages of docs as a site with search, target/book; installs md
 	@tests/tools/mdbook.sh
 	tests/tools/book.py
 
-# What ships, in dist/; docs/development.md. ARCHITECTURES="amd64" for one of them.
+# What ships, in dist/; CONTRIBUTING.md. ARCHITECTURES="amd64" for one of them.
 ARCHITECTURES ?= amd64 arm64 armhf
 package-tools: ## Install what all packages need for ARCHITECTURES (apt, PyPI, cargo, rustup); quick when nothing is missing
 	@deploy/package/tools.sh all $(ARCHITECTURES)

@@ -12,7 +12,7 @@ target=$(rust_target "$architecture")
 
 [ -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] ||
     fail "no Rust standard library for $target" "$(rustc --version)" \
-        "run \`rustup target add $target\`; other ways are in docs/development.md#the-standard-library-of-other-targets"
+        "run \`rustup target add $target\`; other ways are in CONTRIBUTING.md#the-standard-library-of-other-targets"
 
 # Panic messages name source files: they are named alike whatever folder the tree, the registry and the target
 # directory are in. The last prefix that fits counts.

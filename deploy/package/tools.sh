@@ -147,7 +147,7 @@ install_targets() {
         [ -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] && continue
         say "adding the standard library for $target"
         { command -v rustup && rustup target add "$target"; } >&2 ||
-            say "no standard library for $target; its packages cannot be built here (docs/development.md#the-standard-library-of-other-targets)"
+            say "no standard library for $target; its packages cannot be built here (CONTRIBUTING.md#the-standard-library-of-other-targets)"
     done
 }
 
