@@ -1,7 +1,7 @@
 """Delta MS300: word 0x2000, reference 0x2001 (0.01 Hz), 0x2002 reset (bit 1; bit 0 external fault, bit 2 base block).
 
 Bits 1 and 0: 01 stop, 10 run; bits 5 and 4: 01 forward, 10 reverse. A code acts when it is written: 0 does nothing. Status 0x2100
-(low byte fault) and 0x2101.
+(low byte fault) and 0x2101. As on the MH300, 0x2001 and 0x2002 cannot be read.
 """
 
 import drive
@@ -14,6 +14,7 @@ class Drive(drive.Drive):
         super().__init__(unprepared)
         self.holding = dict.fromkeys([0x2000, 0x2001, 0x2002, *range(0x2100, 0x2110)], 0)
         self.read_only = set(range(0x2100, 0x2110))
+        self.write_only = {0x2001, 0x2002}
         self.facing = 1
 
     def wrote(self, table, address, value):

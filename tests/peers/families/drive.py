@@ -51,6 +51,7 @@ class Drive:
         self.holding = {}
         self.coils = {}
         self.read_only = set()
+        self.write_only = set()
         self.faulted = False
         self.direction = 0  # -1, 0, 1: as commanded
         self.speed = 0.0  # percent, signed
@@ -166,6 +167,8 @@ class Drive:
         if function == 3:
             if not 1 <= second <= self.MOST_READ:
                 raise Refused(3)
+            if self.write_only.intersection(range(first, first + second)):
+                raise Refused(2)
             words = [self.get("holding", first + place) for place in range(second)]
             return struct.pack(f">BB{second}H", 3, 2 * second, *words)
         if function == 1:

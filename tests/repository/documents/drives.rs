@@ -48,11 +48,11 @@ pub(crate) fn tables() -> String {
 fn unverified(profiles: &Profiles) -> (String, usize) {
     let mut text = String::from(
         "\n## Families not verified on hardware\n\nMade from manuals and reports, not confirmed ([how to](verifying.md)); \
-         `drivegate profiles show NAME` has points, settings and sources.\n\n|profile|drives|\n|---|---|\n",
+         `drivegate profiles show NAME` has points and settings.\n\n|profile|drives|sources|\n|---|---|---|\n",
     );
     let all: Vec<&std::sync::Arc<Profile>> = profiles.iter().filter(|profile| !profile.verified).collect();
     for profile in &all {
-        let _ = writeln!(text, "|`{}`|{}|", profile.name, profile.title);
+        let _ = writeln!(text, "|`{}`|{}|{}|", profile.name, profile.title, profile.source);
     }
     (text, all.len())
 }

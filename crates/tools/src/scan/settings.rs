@@ -12,10 +12,10 @@ use crate::document::Finding;
 use crate::report;
 
 /// Bauds of Modbus RTU tried by default: the factory settings of the drives of the built-in profiles, and those often chosen.
-const USUAL_BAUDS: [u32; 3] = [9600, 19_200, 38_400];
+const USUAL_BAUDS: [u32; 4] = [9600, 19_200, 38_400, 115_200];
 /// Bauds of Modbus ASCII tried by default: all that the switches of the TECO 7300PA can set, the factory setting first.
 const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
-/// Baud that is assumed behind a raw device server, which sets up its line itself: the highest of the usual ones,
+/// Baud that is assumed behind a raw device server, which sets up its line itself: the highest that such lines usually have,
 /// because a reply that comes later than the wire needs is accepted, one that comes earlier is not.
 const ASSUMED_BAUD: u32 = 38_400;
 /// All baud rates of the built-in profiles, and the rates of faster devices.
@@ -264,8 +264,8 @@ mod tests {
         let usual = settings_of("").unwrap();
         assert_eq!(usual.first().unwrap(), "modbus-rtu 9600 8N1");
         assert_eq!(usual.last().unwrap(), "n2 9600 8N1");
-        assert_eq!(usual.len(), 3 * 3 + 4 * 3 + 1);
-        // ASCII settings are those that the switches of a TECO card can set.
+        assert_eq!(usual.len(), 4 * 3 + 4 * 3 + 1);
+        // What the switches of a TECO card can set, and nothing else.
         let ascii: Vec<&String> = usual.iter().filter(|one| one.starts_with("modbus-ascii")).collect();
         assert_eq!(ascii[0], "modbus-ascii 19200 7N2");
         assert_eq!(ascii[11], "modbus-ascii 2400 7O1");

@@ -58,6 +58,7 @@ const BUILT_IN: &[(&str, &str)] = files![
     "abb-acs550.toml",
     "abb-acs580.toml",
     "danfoss-fc.toml",
+    "danfoss-fc51.toml",
     "delta-ms300.toml",
     "fuji-frenic.toml",
     "hitachi-wj200.toml",
