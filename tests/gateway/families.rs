@@ -5,7 +5,7 @@ mod behind_its_back;
 mod cases;
 mod confirmed;
 mod other_stops;
-mod own_timeout;
+mod status;
 mod words;
 
 use std::io::{Read, Write};

@@ -1,6 +1,6 @@
 """Schneider Altivar, CiA 402: CMD 8501, LFR 8502 (0.1 Hz), ETA 3201, RFR 3202, RFRD 8604, last fault 7121.
 
-6 shutdown, 7 switch on, 15 enable operation, each only from the state before it; bit 4 of ETA is the mains. Bit 3 off stops by
+6 shutdown, 7 switch on, 15 enable operation, each only from the state before it; bit 4 of ETA is the mains, bit 15 reverse. Bit 3 off stops by
 ramp, bit 2 off is the quick stop, bit 1 off takes the voltage away. Bit 11 turns the motor round, bit 7 resets on its edge.
 """
 
@@ -19,13 +19,22 @@ class Drive(drive.Drive):
         self.holding = {CMD: 0, LFR: 0, 8604: 0, 7121: 0, **dict.fromkeys(range(3201, 3212), 0)}
         self.read_only = {8604, 7121, *range(3201, 3212)}
         self.state = DISABLED
+        self.following = None  # the state at the end of the ramp
         self.word = 0
 
     def tripped(self):
-        self.state = FAULT
+        self.state, self.following = FAULT, None
 
     def stopped(self):
-        self.state = DISABLED
+        self.state, self.following = DISABLED, None
+
+    def ramp_to(self, state):
+        """Operation stays enabled while the motor comes down."""
+        self.stop()
+        if self.state == ENABLED and self.speed:
+            self.following = state
+        else:
+            self.state = state
 
     def wrote(self, table, address, value):
         if address == LFR:
@@ -51,23 +60,25 @@ class Drive(drive.Drive):
         code = value & 0x0F
         if not value & 0x0002:
             self.coast()
-            self.state = DISABLED
+            self.state, self.following = DISABLED, None
         elif not value & 0x0004:
             self.stop()
             self.state = QUICK if self.state == ENABLED else DISABLED
+            self.following = None
         elif code == 0x06 and self.state in (DISABLED, READY, ON, ENABLED):
-            self.stop()
-            self.state = READY
+            self.ramp_to(READY)
         elif code == 0x07 and self.state in (READY, ON, ENABLED):
-            self.stop()
-            self.state = ON
+            self.ramp_to(ON)
         elif code == 0x0F and self.state in (ON, ENABLED):
-            self.state = ENABLED
+            self.state, self.following = ENABLED, None
             self.start(self.wanted())
 
     def show(self):
+        if self.following and not self.running:
+            self.state, self.following = self.following, None
         status = self.state | 0x0210
-        status |= 0x0400 if self.speed == self.target * self.direction else 0
+        status |= 0x0400 if self.at_reference else 0
+        status |= 0x8000 if self.speed < 0 else 0
         self.holding[ETA] = status
         self.holding[3202] = drive.unsigned(self.speed * 5)
         self.holding[8604] = drive.unsigned(self.speed * 15)

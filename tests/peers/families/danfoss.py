@@ -41,7 +41,7 @@ class Drive(drive.Drive):
         status |= 0x0003 if not self.faulted and not self.unprepared else 0
         status |= 0x0004 if not coasting else 0
         status |= 0x0008 if self.faulted else 0
-        status |= 0x0100 if self.speed == self.target * self.direction else 0
+        status |= 0x0100 if self.at_reference else 0
         status |= 0x0800 if self.running else 0
         self.holding[STATUS] = status
         self.holding[16129] = drive.unsigned(abs(self.speed) * 5)

@@ -1,7 +1,8 @@
 """Delta MS300: word 0x2000, reference 0x2001 (0.01 Hz), 0x2002 reset (bit 1; bit 0 external fault, bit 2 base block).
 
 Bits 1 and 0: 01 stop, 10 run; bits 5 and 4: 01 forward, 10 reverse. A code acts when it is written: 0 does nothing. Status 0x2100
-(low byte fault) and 0x2101. As on the MH300, 0x2001 and 0x2002 cannot be read.
+(low byte fault) and 0x2101 (1..0 state, 4..3 00 forward, 11 reverse, 01 to forward, 10 to reverse, 10 bus). As on the MH300,
+0x2001 and 0x2002 cannot be read.
 """
 
 import drive
@@ -39,7 +40,8 @@ class Drive(drive.Drive):
     def show(self):
         state = 3 if self.direction else 1 if self.speed else 0
         self.holding[0x2100] = 4 if self.faulted else 0
-        self.holding[0x2101] = state | (3 << 3 if self.facing < 0 else 0) | 1 << 10
+        turns = self.speed or self.facing
+        self.holding[0x2101] = state | (turns < 0) << 3 | (self.facing < 0) << 4 | 1 << 10
         self.holding[0x2102] = self.holding[0x2001]
         self.holding[0x2103] = drive.unsigned(abs(self.speed) * 50)
         self.holding[0x2105] = 5400

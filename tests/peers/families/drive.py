@@ -124,6 +124,10 @@ class Drive:
     def running(self):
         return self.direction != 0 or self.speed != 0.0
 
+    @property
+    def at_reference(self):
+        return self.direction != 0 and self.speed == self.target * self.direction
+
     def moved(self):
         turning = (self.direction > 0) - (self.direction < 0) or (self.speed > 0) - (self.speed < 0)
         if turning != self.turning:

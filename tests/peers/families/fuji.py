@@ -34,7 +34,7 @@ class Drive(drive.Drive):
         off = not self.running
         link = not self.unprepared
         forward, reverse = self.running and self.speed >= 0, self.speed < 0
-        accelerating = self.direction != 0 and self.speed != self.target * self.direction
+        accelerating = self.direction != 0 and not self.at_reference
         decelerating = self.direction == 0 and self.speed != 0
         self.holding[0x080E] = (
             forward | reverse << 1 | off << 3 | link << 5 | accelerating << 9 | decelerating << 10 | self.faulted << 11 | 1 << 12

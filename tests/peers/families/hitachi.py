@@ -34,7 +34,7 @@ class Drive(drive.Drive):
         self.coils[14] = int(self.running)
         self.coils[15] = int(self.speed < 0)
         self.coils[16] = int(not self.faulted and not self.unprepared)
-        self.coils[19] = int(self.running and self.speed == self.target * self.direction)
+        self.coils[19] = int(self.at_reference)
         self.coils[23] = int(self.faulted)
         self.holding[0x1001] = drive.unsigned(abs(self.speed) * 50)
         self.holding[0x1025] = 5400

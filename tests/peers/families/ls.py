@@ -27,8 +27,17 @@ class Drive(drive.Drive):
             self.start(1 if value & 2 else -1)
 
     def show(self):
-        at = self.direction != 0 and self.speed == self.target * self.direction
+        accelerating = self.direction != 0 and not self.at_reference
+        decelerating = self.direction == 0 and self.speed != 0
         forward, reverse = self.running and self.speed >= 0, self.speed < 0
         stopped = not self.running
-        self.holding[13] = stopped | forward << 1 | reverse << 2 | self.faulted << 3 | at << 6
+        self.holding[13] = (
+            stopped
+            | forward << 1
+            | reverse << 2
+            | self.faulted << 3
+            | accelerating << 4
+            | decelerating << 5
+            | self.at_reference << 6
+        )
         self.holding[9] = drive.unsigned(abs(self.speed) * 50)

@@ -23,8 +23,7 @@ class Drive(drive.Drive):
                 self.stop()
 
     def show(self):
-        at = self.running and self.speed == self.target * self.direction
         forward, reverse = self.running and self.speed >= 0, self.speed < 0
-        self.holding[8] = self.running | forward << 1 | reverse << 2 | at << 3 | self.faulted << 7
+        self.holding[8] = self.running | forward << 1 | reverse << 2 | self.at_reference << 3 | self.faulted << 7
         self.holding[200] = drive.unsigned(abs(self.speed) * 50)
         self.holding[500] = 0x10 if self.faulted else 0

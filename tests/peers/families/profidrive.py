@@ -72,6 +72,6 @@ class Drive(drive.Drive):
         status |= 0x0004 if self.direction or self.speed else 0
         status |= 0x0008 if self.faulted else 0
         status |= 0x0040 if self.inhibited else 0
-        status |= 0x0100 if self.speed == self.target * self.direction else 0
+        status |= 0x0100 if self.at_reference else 0
         self.holding[self.STATUS] = status
         self.holding[self.ACTUAL] = drive.unsigned(self.speed * self.FULL / 100)

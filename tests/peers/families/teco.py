@@ -30,9 +30,8 @@ class Drive(drive.Drive):
 
     def show(self):
         ready = not self.faulted and not self.unprepared
-        at = self.running and self.speed == self.target * self.direction
         self.holding[0x2520] = (
-            self.running | (self.speed < 0) << 1 | ready << 2 | self.faulted << 3 | (self.speed == 0) << 5 | at << 7
+            self.running | (self.speed < 0) << 1 | ready << 2 | self.faulted << 3 | (self.speed == 0) << 5 | self.at_reference << 7
         )
         self.holding[0x2521] = 2 if self.faulted else 0
         self.holding[0x2524] = drive.unsigned(abs(self.speed) * 50)

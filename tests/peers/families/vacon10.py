@@ -28,9 +28,8 @@ class Drive(drive.Drive):
 
     def show(self):
         ready = not self.faulted and not self.unprepared
-        at = self.speed == self.target * self.direction
         self.holding[2100] = (
-            ready | self.running << 1 | (self.speed < 0) << 2 | self.faulted << 3 | at << 5 | (self.speed == 0) << 6
+            ready | self.running << 1 | (self.speed < 0) << 2 | self.faulted << 3 | self.at_reference << 5 | (self.speed == 0) << 6
         )
         self.holding[2103] = drive.unsigned(abs(self.speed) * 50)
         self.holding[2110] = 1 if self.faulted else 0

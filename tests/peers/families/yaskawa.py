@@ -35,9 +35,9 @@ class Drive(drive.Drive):
 
     def show(self):
         ready = not self.faulted and not self.unprepared
-        at = self.speed == self.target * self.direction
-        self.holding[0x2C] = self.running | (self.speed == 0) << 1 | at << 2 | ready << 6 | self.faulted << 14
-        self.holding[0x4B] = self.running | (self.speed < 0) << 2 | ready << 5 | self.faulted << 7
+        common = self.running | (self.speed == 0) << 1
+        self.holding[0x2C] = common | self.at_reference << 2 | ready << 6 | self.faulted << 14
+        self.holding[0x4B] = common | (self.speed < 0) << 2 | self.at_reference << 4 | ready << 5 | self.faulted << 7
         self.holding[0x41] = drive.unsigned(abs(self.speed) * 50)
         self.holding[0x46] = 540
         self.holding[0x80] = 7 if self.faulted else 0

@@ -1,15 +1,19 @@
 //! What the points of a drive of any profile show.
 
+use std::collections::BTreeMap;
+
 use super::super::SimTime;
 use super::super::model::{Model, unsigned};
+use super::status::Shows;
 use super::wishes::{Bits, Key, Wish, fulfilled};
-use super::words::Shows;
 use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
 use crate::codec::Table;
-use crate::drive::control::{Mask, OwnWord, Run, Until};
+use crate::drive::control::{Control, Mask, OwnWord, Run, Until};
 use crate::drive::profile::{Form, Part, PollClass, Raw};
 use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source, Value};
 
+/// Rank of a state that was given.
+const GIVEN: u8 = 0;
 /// kW of the simulated motor.
 const NOMINAL_POWER: f64 = 3.0;
 /// Nm of the simulated motor.
@@ -127,15 +131,27 @@ impl ProfileDrive {
     /// Brings all registers up to date.
     pub(super) fn show(&mut self, now: SimTime) {
         let profile = self.profile();
+        let mut figures: BTreeMap<Key, u16> = BTreeMap::new();
         for (index, point) in profile.points.enumerate() {
             if let (Some(raw), Some(number)) = (point.raw(), self.figure(index, point))
                 && raw.state_parts().is_none()
                 && !self.is_written(point, raw)
             {
                 self.put_number(&profile, raw, number);
+                for (key, part) in bits(raw, &raw.number_parts(0.0, 0)) {
+                    *figures.entry(key).or_default() |= part.mask;
+                }
             }
         }
-        let wishes = self.wishes(&profile, now);
+        let known = self.show_status(&profile, now);
+        let wishes = self.wishes(&profile, &known, now);
+        // Of earlier states nothing stays in a register.
+        for (key, part) in wishes.iter().flat_map(|wish| wish.any.iter().flatten()) {
+            if !known.contains(key) && !self.is_place(*key) {
+                let mask = part.mask & !figures.get(key).copied().unwrap_or(0);
+                self.registers.place(*key, Part { mask, value: 0 });
+            }
+        }
         let registers = &self.registers;
         let fixed = fulfilled(&wishes, |(table, address)| registers.get(table, address).unwrap_or(0));
         for (key, part) in fixed {
@@ -143,7 +159,67 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether only a master changes the register.
+    /// Whether that is a place of the commands that reads back what was written there.
+    fn is_place(&self, (table, address): Key) -> bool {
+        let holds = |control: &Control| {
+            let places = super::said::places(control);
+            let here = places
+                .iter()
+                .any(|place| (place.table, place.address) == (table, address));
+            here && control.own_word != OwnWord::Shadow
+        };
+        self.control.as_ref().is_some_and(holds)
+    }
+
+    /// The status words of a family that is known by hand, but for bits that were given: where they are.
+    fn show_status(&mut self, profile: &Profile, now: SimTime) -> Vec<Key> {
+        let Some(family) = self.family else {
+            return Vec::new();
+        };
+        let words = (family.status)(&self.shows(now));
+        let given: Vec<(Key, Part)> = self
+            .options
+            .values
+            .keys()
+            .filter_map(|index| raw_of(profile, *index))
+            .flat_map(|raw| match raw.state_parts() {
+                Some((parts, _)) => bits(raw, &parts),
+                None => bits(raw, &raw.number_parts(0.0, 0)),
+            })
+            .collect();
+        for (address, part) in &words {
+            let key = (Table::Holding, *address);
+            let of = given.iter().filter(|(given, _)| *given == key);
+            let mask = part.mask & !of.fold(0, |mask, (_, part)| mask | part.mask);
+            self.registers.place(key, Part { mask, ..*part });
+        }
+        words
+            .into_iter()
+            .map(|(address, _)| (Table::Holding, address))
+            .collect()
+    }
+
+    fn shows(&self, now: SimTime) -> Shows {
+        Shows {
+            position: self.shown_position(now),
+            running: self.body.shows_running(),
+            commanded: self.run.is_some(),
+            ordered_reverse: self.reverse,
+            turns_reverse: self.body.turns_reverse(self.target()),
+            at_reference: self.is_at_reference(),
+            standing: self.body.motor.output == 0.0,
+            fault: self.body.latch.fault(),
+            remote: self.remote,
+            word: self.word,
+        }
+    }
+
+    fn is_at_reference(&self) -> bool {
+        let near = (self.body.motor.output - self.target()).abs() < AT_REFERENCE_BAND;
+        self.body.shows_running() && self.run.is_some() && near
+    }
+
+    /// Whether only a master changes it.
     fn is_written(&self, point: &Point, raw: &Raw) -> bool {
         let own = self.control.as_ref().is_some_and(|control| {
             let at = raw.covers(control.at.table, control.at.address);
@@ -198,8 +274,8 @@ impl ProfileDrive {
         }
     }
 
-    /// The states that registers are to show, the ones that count most first.
-    fn wishes(&self, profile: &Profile, now: SimTime) -> Vec<Wish> {
+    /// The states that registers other than the `known` ones are to show, the ones that count most first.
+    fn wishes(&self, profile: &Profile, known: &[Key], now: SimTime) -> Vec<Wish> {
         let mut wishes: Vec<(u8, Wish)> = Vec::new();
         for (index, point) in profile.points.enumerate() {
             let Some((rank, is)) = self.state_of(index, point) else {
@@ -219,17 +295,8 @@ impl ProfileDrive {
             wishes.push((rank, Wish { any, want }));
         }
         wishes.extend(self.sequence(profile, now));
-        let shows = Shows {
-            position: self.shown_position(now),
-            running: self.body.shows_running(),
-            commanded: self.run.is_some(),
-            faulted: self.body.latch.fault() != 0,
-            word: self.word,
-        };
-        if let Some((address, part)) = self.family.and_then(|family| (family.status)(&shows)) {
-            let any = vec![vec![((Table::Holding, address), part)]];
-            wishes.push((0, Wish { any, want: true }));
-        }
+        let is_free = |bits: &Bits| bits.iter().any(|(key, _)| !known.contains(key));
+        wishes.retain(|(rank, wish)| *rank == GIVEN || wish.any.iter().any(is_free));
         wishes.sort_by_key(|(rank, _)| *rank);
         wishes.into_iter().map(|(_, wish)| wish).collect()
     }
@@ -239,14 +306,17 @@ impl ProfileDrive {
         let Some(Run::Steps(steps)) = self.control.as_ref().map(|control| &control.run) else {
             return Vec::new();
         };
-        let position = self.shown_position(now);
+        let position = match self.run {
+            Some(_) => steps.len(),
+            None => self.shown_position(now),
+        };
         let wish = |(step, step_of): (usize, &crate::drive::control::Step)| {
             let Until::State(mask) = step_of.until else {
                 return None;
             };
             let is = step + 1 == position;
-            // A motor that runs shows that and no step.
-            if step < position && (!is || self.run.is_some()) {
+            // A step that is behind it may still show.
+            if step < position && !is {
                 return None;
             }
             let any = masked(profile, &mask).into_iter().collect();
@@ -258,18 +328,19 @@ impl ProfileDrive {
     /// Whether the drive is in a state, and how much the state counts.
     fn state_of(&self, index: PointIndex, point: &Point) -> Option<(u8, bool)> {
         if let Some(Given::Number(number)) = self.options.values.get(&index) {
-            return Some((0, *number != 0.0));
+            return Some((GIVEN, *number != 0.0));
         }
         let (motor, target) = (&self.body.motor, self.target());
         let running = self.body.shows_running();
         let fault = self.body.latch.fault() != 0;
         Some(match point.model {
             Some(ModelPoint::Fault) => (1, fault),
+            // Before it runs, so that it runs in that direction.
+            Some(ModelPoint::Reversed) => (2, self.body.turns_reverse(target)),
             Some(ModelPoint::Running) => (3, running),
-            Some(ModelPoint::Reversed) => (4, self.body.turns_reverse(target)),
             Some(ModelPoint::Remote) => (4, self.remote),
             Some(ModelPoint::Warning) => (5, false),
-            Some(ModelPoint::AtReference) => (5, running && (motor.output - target).abs() < AT_REFERENCE_BAND),
+            Some(ModelPoint::AtReference) => (5, self.is_at_reference()),
             Some(ModelPoint::ZeroSpeed) => (5, motor.output == 0.0),
             Some(ModelPoint::Ready) => (6, self.ready()),
             Some(_) => return None,

@@ -4,6 +4,7 @@
 mod figures;
 mod registers;
 mod said;
+mod status;
 #[cfg(test)]
 mod tests;
 mod wishes;

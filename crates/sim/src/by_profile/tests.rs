@@ -466,3 +466,115 @@ fn a_meter_holds_what_it_was_given() {
     assert_eq!(write(Word(9, 3)), Reply::Exception(Exception::VALUE), "no text");
     assert_eq!(write(Word(9, 2)), Reply::Written);
 }
+
+/// The state of a point of the common model as the registers of a drive show it; none where the family lacks it.
+fn shown(rig: &mut ProfiledDrive, profile: &Profile, point: ModelPoint) -> Option<bool> {
+    let mut value = |index: PointIndex| {
+        let of = profile.points.get(index).unwrap();
+        let raw = of.raw().unwrap();
+        let words: Vec<u16> = raw
+            .addresses()
+            .map(|address| rig.register(raw.table, address))
+            .collect();
+        raw.decode(&words, of.kind()).unwrap()
+    };
+    let index = profile.model_index(point)?;
+    match &profile.points.get(index)?.source {
+        Source::Raw(_) => Some(value(index).as_bool()),
+        Source::Derived(derived) => {
+            let sources: Vec<Value> = derived.sources().map(value).collect();
+            derived.value(sources, None).map(|value| value.as_bool())
+        }
+    }
+}
+
+/// What a drive shows: ready, running, reversed, fault, warning, at reference, zero speed, remote.
+const SHOWN: [ModelPoint; 8] = [
+    ModelPoint::Ready,
+    ModelPoint::Running,
+    ModelPoint::Reversed,
+    ModelPoint::Fault,
+    ModelPoint::Warning,
+    ModelPoint::AtReference,
+    ModelPoint::ZeroSpeed,
+    ModelPoint::Remote,
+];
+
+/// Each state reads back by the profile as what it is, and as nothing else.
+#[test]
+fn every_family_shows_each_state_and_no_other() {
+    for case in &cases() {
+        let name = case.family.profile;
+        let profile = Profiles::built_in().get(name).unwrap().clone();
+        let mut rig = ProfiledDrive::named(name);
+        let check = |rig: &mut ProfiledDrive, when: &str, expected: [bool; 8]| {
+            for (point, expected) in SHOWN.into_iter().zip(expected) {
+                let found = shown(rig, &profile, point);
+                // Some are ready only while they stand.
+                let moving = point == ModelPoint::Ready && !["stopped", "tripped"].contains(&when);
+                // WEG belongs to the bus with the first word.
+                let early = point == ModelPoint::Remote && when == "switched on";
+                // Running is bits 0 to 2 of ABB, and OFF1 takes bit 1 away at once.
+                let off = name.starts_with("abb") && when == "coming down" && point == ModelPoint::Running;
+                let right = found.is_none_or(|found| found == expected) || moving || early || off;
+                assert!(right, "{name}, {when}: {} is {found:?}", point.name());
+            }
+        };
+        let (yes, no) = (true, false);
+        check(&mut rig, "switched on", [yes, no, no, no, no, no, yes, yes]);
+        rig.send(&case.family.reference);
+        rig.send(&case.family.start);
+        check(&mut rig, "starting", [yes, yes, no, no, no, no, no, yes]);
+        rig.wait(5000);
+        let forward = [yes, yes, no, no, no, yes, no, yes];
+        check(&mut rig, "running forward", forward);
+        rig.send(&case.family.stop);
+        check(&mut rig, "coming down", [yes, yes, no, no, no, no, no, yes]);
+        rig.wait(5000);
+        check(&mut rig, "stopped", [yes, no, no, no, no, no, yes, yes]);
+        if !case.family.reverse.is_empty() {
+            rig.send(&case.family.reverse);
+            rig.wait(5000);
+            check(&mut rig, "running in reverse", [yes, yes, yes, no, no, yes, no, yes]);
+            rig.send(&case.family.stop);
+            rig.wait(5000);
+        }
+        rig.send(&case.family.reference);
+        rig.send(&case.family.start);
+        rig.wait(8000);
+        check(&mut rig, "running again", forward);
+        rig.send(&[Word(rig.trip_address, 4)]);
+        check(&mut rig, "tripped", [no, no, no, yes, no, no, yes, yes]);
+    }
+}
+
+/// A last step that waits for a state comes to it, a state under a mask is shown shifted, and of two directions one.
+#[test]
+fn states_of_a_profile_of_ones_own() {
+    let text = format!(
+        "[control]\nat = \"holding 0\"\nown_word = \"shadow\"\nstop = {{ mask = 3, value = 0 }}\n\
+         run = {{ steps = [{{ write = 1, until = {{ point = \"status_word\", mask = 0x300, is = 0x100 }} }}, \
+         {{ write = 3, until = {{ point = \"status_word\", mask = 0x300, is = 0x200 }} }}] }}\nreverse = {{ bit = 2 }}\n\
+         [[state]]\nis = \"running\"\npoint = \"status_word\"\nmask = 0x09\nvalue = 0x01\n\
+         [[state]]\nis = \"running\"\npoint = \"status_word\"\nmask = 0x0A\nvalue = 0x02\n\
+         [[point]]\nname = \"status_word\"\nat = \"holding 3\"\nclass = \"fast\"\nhidden = true\n\
+         [[point]]\nname = \"reversed\"\nat = \"holding 3.1\"\nclass = \"fast\"\n\
+         [[point]]\nname = \"fault\"\nat = \"holding 3\"\nmask = 0x30\nequals = 3\nclass = \"fast\"\n\
+         [[point]]\nname = \"frequency_reference\"\nat = \"holding 1\"\nscale = 0.1\nwrite = true\nrange = [0, 50]\n{RANGE}"
+    );
+    let mut rig = ProfiledDrive::of(&profile(&text));
+    let status = |rig: &mut ProfiledDrive| rig.register(Table::Holding, 3);
+    rig.send(&[Word(1, 250), Word(0, 1)]);
+    assert_eq!(status(&mut rig) & 0x300, 0x100);
+    rig.send(&[Word(0, 3)]);
+    rig.wait(3000);
+    assert_eq!(status(&mut rig) & 0x33B, 0x201);
+    rig.send(&[Word(0, 0)]);
+    rig.wait(3000);
+    assert_eq!(status(&mut rig) & 3, 0);
+    rig.send(&[Word(0, 5), Word(0, 7)]);
+    rig.wait(3000);
+    assert_eq!(status(&mut rig) & 0x33B, 0x202, "in reverse, and not forward");
+    rig.send(&[Word(rig.trip_address, 1)]);
+    assert_eq!(status(&mut rig) & 0x30, 0x30, "the equal of a mask is shifted");
+}

@@ -56,11 +56,14 @@ fn search(fixed: &Fixed, wishes: &[&Wish], base: &impl Fn(Key) -> u16, tries: &m
     all.find_map(|way| search(&way, rest, base, tries))
 }
 
-/// Every way to fulfil a wish together with the bits already fixed: its alternatives in their order; ways to avoid it by how
-/// much they change `base`.
+/// Every way to fulfil a wish beside what is decided, those first that change least of `base`.
 fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
     match wish.want {
-        true => wish.any.iter().filter_map(|bits| with(fixed, bits)).collect(),
+        true => {
+            let mut ways: Vec<Fixed> = wish.any.iter().filter_map(|bits| with(fixed, bits)).collect();
+            ways.sort_by_key(|way| changes(way, base));
+            ways
+        }
         false => wish.any.iter().fold(vec![fixed.clone()], |ways, bits| {
             let mut next: Vec<Fixed> = ways.iter().flat_map(|way| without(way, bits)).collect();
             next.sort_by_key(|way| changes(way, base));

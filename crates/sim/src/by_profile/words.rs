@@ -1,7 +1,7 @@
 //! How the families react to the words written to them, by hand from their manuals: no profile is read here.
 
+use super::status::{self, Shows, Words};
 use crate::codec::Table;
-use crate::drive::profile::Part;
 
 /// Effect of a word on the motor and the start sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,79 +59,62 @@ pub(super) struct Family {
     pub(super) acts_once: bool,
     /// A reset while a run command stands starts the motor.
     pub(super) restarts_on_reset: bool,
-    /// Status word beyond what a profile makes of it: PDU address of the holding register and bits.
-    pub(super) status: fn(&Shows) -> Option<(u16, Part)>,
+    /// Its status words, all bits of them.
+    pub(super) status: fn(&Shows) -> Words,
 }
 
-/// The state that a status word shows.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Shows {
-    pub(super) position: usize,
-    pub(super) running: bool,
-    /// Whether a run command holds; otherwise a running motor slows down.
-    pub(super) commanded: bool,
-    pub(super) faulted: bool,
-    pub(super) word: u16,
-}
-
-const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> Told) -> Family {
+const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> Told, status: fn(&Shows) -> Words) -> Family {
     Family {
         name,
         word,
         other: |_, _, _| None,
         acts_once: false,
         restarts_on_reset: false,
-        status: |_| None,
+        status,
     }
 }
 
 pub(super) const FAMILIES: [Family; 16] = [
-    Family {
-        status: |shows| Some((3, off_status(shows))),
-        ..family("abb", abb)
-    },
-    Family {
-        status: |shows| Some((109, off_status(shows))),
-        ..family("profidrive", profidrive)
-    },
-    family("danfoss", danfoss),
-    family("cia402", cia402),
-    family("yaskawa", yaskawa),
+    family("abb", abb, status::abb),
+    family("profidrive", profidrive, status::profidrive),
+    family("danfoss", danfoss, status::danfoss),
+    family("cia402", cia402, status::cia402),
+    family("yaskawa", yaskawa, status::yaskawa),
     Family {
         other: delta_reset,
         acts_once: true,
-        status: |shows| Some((0x2101, delta_status(shows))),
-        ..family("delta", delta)
+        ..family("delta", delta, status::delta)
     },
     Family {
         acts_once: true,
-        ..family("invt", invt)
+        ..family("invt", invt, status::invt)
     },
-    family("mitsubishi", mitsubishi),
-    family("invertek", invertek),
-    family("weg", weg),
+    family("mitsubishi", mitsubishi, status::mitsubishi),
+    family("invertek", invertek, status::invertek),
+    family("weg", weg, status::weg),
     Family {
         other: fuji_reset,
         restarts_on_reset: true,
-        ..family("fuji", fuji)
+        ..family("fuji", fuji, status::fuji)
     },
-    family("toshiba", toshiba),
+    family("toshiba", toshiba, status::toshiba),
     Family {
         acts_once: true,
-        ..family("ls", ls)
+        ..family("ls", ls, status::ls)
     },
-    family("teco-f510", teco),
+    family("teco-f510", teco, status::teco),
     Family {
         restarts_on_reset: true,
-        ..family("vacon-10", vacon)
+        ..family("vacon-10", vacon, status::vacon)
     },
+    // Its states are coils, each a point of its own.
     Family {
         other: hitachi_coils,
-        ..family("hitachi", hitachi)
+        ..family("hitachi", hitachi, |_| Vec::new())
     },
 ];
 
-const fn is(word: u16, mask: u16) -> bool {
+pub(super) const fn is(word: u16, mask: u16) -> bool {
     word & mask == mask
 }
 
@@ -173,25 +156,6 @@ fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> Told {
         _ => Does::Nothing,
     };
     told(does, rises(known, word, 0x0080), word)
-}
-
-/// Bits 0 ready to switch on, 1 ready, 2 operation, 3 fault, 4 and 5 OFF2 and OFF3 inactive, 6 switching on inhibited.
-fn off_status(shows: &Shows) -> Part {
-    let ready = shows.position > 0 && !shows.faulted;
-    let bits = [
-        ready,
-        ready && is(shows.word, 0x0001),
-        shows.running,
-        shows.faulted,
-        is(shows.word, 0x0002),
-        is(shows.word, 0x0004),
-        shows.position == 0,
-    ];
-    let value = bits
-        .iter()
-        .zip(0u16..)
-        .fold(0, |word, (on, bit)| word | u16::from(*on) << bit);
-    Part { mask: 0x007F, value }
 }
 
 fn abb(known: &Known<'_>, word: u16) -> Told {
@@ -250,16 +214,6 @@ fn delta(known: &Known<'_>, word: u16) -> Told {
         _ => Does::Nothing,
     };
     told(does, false, word)
-}
-
-/// 00 stopped, 01 stopping, 11 running.
-fn delta_status(shows: &Shows) -> Part {
-    let value = match (shows.running, shows.commanded) {
-        (false, _) => 0,
-        (true, false) => 1,
-        (true, true) => 3,
-    };
-    Part { mask: 3, value }
 }
 
 /// 0x2002: bit 0 external fault, bit 1 reset, bit 2 base block.

@@ -16,8 +16,11 @@ impl Raw {
     pub fn state_parts(&self) -> Option<(Vec<Part>, bool)> {
         match (self.equals, self.form) {
             (Some(Equals { count, invert }), form) => {
-                let all = form.bits_of(-1);
-                let mask = self.mask.unwrap_or(all);
+                let mask = match (self.mask, form) {
+                    (Some(mask), _) => mask,
+                    (None, Form::Bits { first, count }) => u64::from(low_mask(count)) << first,
+                    (None, form) => form.bits_of(-1),
+                };
                 let is = (form.bits_of(i128::from(count)) << mask.trailing_zeros().min(63)) & mask;
                 Some((self.masked(mask, is), invert))
             }
@@ -158,6 +161,19 @@ mod tests {
             value: 0x0030,
         };
         assert_eq!(equals.state_parts(), Some((vec![wanted], true)));
+        // A mask of neighbouring bits of one register is read as these bits.
+        let neighbours = Raw {
+            equals: Some(Equals {
+                count: 3,
+                invert: false,
+            }),
+            ..Raw::plain(Table::Holding, 0, Form::Bits { first: 3, count: 2 })
+        };
+        let wanted = Part {
+            mask: 0x0018,
+            value: 0x0018,
+        };
+        assert_eq!(neighbours.state_parts(), Some((vec![wanted], false)));
         let bits = Raw::plain(Table::Input, 0, Form::Bits { first: 4, count: 3 });
         let wanted = Part {
             mask: 0x0070,
