@@ -40,6 +40,9 @@ vacon-10           | 2100";
 /// Longer than any of the drives takes to come to a state.
 const SETTLED: Duration = Duration::from_secs(20);
 
+/// As long as the independent drives take to half of their speed.
+const AT_SPEED: Duration = Duration::from_millis(1200);
+
 struct Status {
     table: Table,
     address: u16,
@@ -136,6 +139,26 @@ impl Both {
     }
 }
 
+/// Stops both at speed; whether they agree while the motor comes down. On a machine that stood still meanwhile the independent
+/// one may have stopped before it was looked at, and runs again then.
+fn passes_through_the_same(both: &mut Both, case: &Case, all: &[Status]) -> bool {
+    both.send(&case.start);
+    both.wait(10_000);
+    std::thread::sleep(AT_SPEED);
+    let before = both.peer.output().len();
+    both.send(&case.stop);
+    loop {
+        let same = all.iter().all(|status| {
+            let (simulated, independent) = both.words(status);
+            simulated == independent
+        });
+        let is_over = both.peer.output()[before..].contains("motor stopped");
+        if same || is_over {
+            return same && !is_over;
+        }
+    }
+}
+
 fn agrees(case: &Case, all: &[Status]) {
     let mut both = Both::new(case);
     let name = case.profile;
@@ -160,8 +183,8 @@ fn agrees(case: &Case, all: &[Status]) {
     both.send(&case.start);
     both.wait(10_000);
     shows_the_same(&mut both, "running forward");
-    both.send(&case.stop);
-    shows_the_same(&mut both, "coming down");
+    let passes = (0..5).any(|_| passes_through_the_same(&mut both, case, all));
+    assert!(passes, "{name}, coming down: other words than the independent drive's");
     both.wait(10_000);
     shows_the_same(&mut both, "stopped");
     if turns_back {

@@ -24,6 +24,16 @@ impl Control {
         self.reverse.iter().for_each(|reverse| refuse("reverse", reverse));
         let reset = self.fault_reset.map(|reset| reset.setting);
         reset.iter().for_each(|reset| refuse("fault_reset", reset));
+        found.extend(self.wrong_on_coil());
+        if let Some(reverse) = self.reverse.filter(|reverse| reverse.place == self.stop.place)
+            && !self.stop.holds(reverse.applied(self.stop.applied(0)))
+        {
+            found.push((
+                "reverse",
+                "a direction alone takes the word of a stop away: the drive may start by it".to_string(),
+                "write `run` as a pair; if the direction starts nothing, leave its bits out of `stop`",
+            ));
+        }
         if self.runs().iter().any(|run| run.agrees(&self.stop)) {
             found.push((
                 "stop",
@@ -59,7 +69,26 @@ impl Control {
         found
     }
 
-    /// The error of a word that is to stop in another way.
+    /// Forms on a coil, which has bit 0 only.
+    fn wrong_on_coil(&self) -> Vec<(&'static str, String, &'static str)> {
+        let reset = self.fault_reset.map(|reset| reset.setting);
+        let steps = match &self.run {
+            Run::Steps(steps) => steps.iter().map(|step| step.write).collect(),
+            Run::One(_) | Run::Pair { .. } => self.runs(),
+        };
+        let all = steps.into_iter().map(|run| ("run", run)).chain([("stop", self.stop)]);
+        let all = all.chain(self.reverse.map(|reverse| ("reverse", reverse)));
+        let all = all.chain(reset.map(|reset| ("fault_reset", reset)));
+        let is_coil = |setting: &Setting| setting.place.unwrap_or(self.at).table == Table::Coil;
+        all.filter(|(_, setting)| is_coil(setting) && (setting.mask & 1 == 0 || setting.value > 1))
+            .map(|(key, setting)| {
+                let what = format!("{:#06x} in {:#06x} is not in a coil", setting.value, setting.mask);
+                (key, what, "write `bit = 0`: a coil has no other")
+            })
+            .collect()
+    }
+
+    /// What is wrong with a word that is to stop by other means.
     fn wrong_stop(&self, stop: &Setting) -> Option<(&'static str, String, &'static str)> {
         let key = "also_stop";
         let is = format!("{:#06x} in {:#06x}", stop.value, stop.mask);

@@ -3,7 +3,7 @@
 use crate::drive::{PerPoint, PointIndex};
 use std::time::Duration;
 
-use super::super::control::{Always, Control, ControlItem, Mask, OwnWord, Reset, Run, Setting, Step, Until};
+use super::super::control::{Always, Control, ControlItem, Mask, OwnWord, Run, Setting, Step, Until};
 use super::super::derive::Derived;
 use super::super::model::ModelPoint;
 use super::super::profile::{AddressRange, Form, Point, PollClass, Raw, Source};
@@ -11,6 +11,7 @@ use super::super::refresh::REFRESH;
 use super::derived::point_of;
 use super::place::parse_place;
 use super::ranges::Offsets;
+use super::reset;
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
 
@@ -52,7 +53,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Around<'_>) -> Option<Control> 
     };
     let (stop, reverse) = (of("stop"), of("reverse"));
     let also_stop = read_stops(&table, around);
-    let fault_reset = read_reset(&table, around);
+    let fault_reset = reset::read(&table, around, stop);
     let restarts_on_reset = table.or("restarts_on_reset", false);
     let refresh = read_refresh(&table);
     let refresh_with = table.parsed("refresh_with", |text| match text {
@@ -140,7 +141,7 @@ fn read_always(table: &Reader<'_>) -> Always {
 }
 
 /// `{ bit = 0, is = 1 }` or `{ mask = 0x0F, value = 0x02 }`, with `point` and `once`.
-fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
+pub(super) fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Setting> {
     let place = read_place(form, around).ok()?;
     let once = form.or("once", false);
     let bits = match (form.optional::<u8>("bit"), form.optional::<u16>("mask")) {
@@ -271,7 +272,7 @@ fn pair_of_bits(form: &Reader<'_>, bits: (Option<u8>, Option<u8>), place: Option
     })
 }
 
-fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Step>> {
+pub(super) fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Step>> {
     let tables = form.tables("steps");
     if tables.is_empty() || tables.len() > MOST_STEPS {
         form.problem(
@@ -347,7 +348,7 @@ fn read_step(table: &Reader<'_>, around: &Around<'_>) -> Option<Step> {
     })
 }
 
-fn read_time(table: &Reader<'_>, key: &str) -> Option<Duration> {
+pub(super) fn read_time(table: &Reader<'_>, key: &str) -> Option<Duration> {
     let time: Duration = table.optional(key)?;
     if time.is_zero() || time > LONGEST {
         table.problem(key, "the time is out of range", "write up to 60s");
@@ -404,17 +405,6 @@ fn read_refresh(table: &Reader<'_>) -> Option<Duration> {
         table.problem(key, "the time is out of range", "write 100ms to 60s");
     }
     Some(every)
-}
-
-fn read_reset(table: &Reader<'_>, around: &Around<'_>) -> Option<Reset> {
-    let form = table.table("fault_reset")?;
-    let setting = read_setting(&form, around);
-    let hold = read_time(&form, "hold").unwrap_or(2 * around.update_period);
-    form.finish();
-    Some(Reset {
-        setting: setting?,
-        hold,
-    })
 }
 
 /// The points of the common model that `[control]` makes, to be put behind `before` others: what they read as rests on the

@@ -5,6 +5,7 @@ mod base;
 mod commissioning;
 mod control;
 mod derived;
+mod doubts;
 mod identify;
 mod meaning;
 mod n2;
@@ -14,6 +15,7 @@ mod place;
 mod points;
 mod ranges;
 mod reference;
+mod reset;
 mod states;
 
 use crate::drive::{PerPoint, PointIndex};
@@ -352,6 +354,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         profile.control = profile.control_of_bits();
     }
     check_sums(&tables, &profile);
+    doubts::check(reader, &profile);
     if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
         reader.problem(
             "broadcast_stop",

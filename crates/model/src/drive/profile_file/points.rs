@@ -167,6 +167,16 @@ pub(super) fn check_target(reader: &Reader<'_>, index: PointIndex, points: &PerP
     if !point.write {
         reader.problem("write_to", "the point is not writable", "add `write = true`");
     }
+    if is_reference(point) && target.raw().is_some_and(|raw| raw.scale < 0.0) {
+        reader.problem(
+            "write_to",
+            format!(
+                "a positive `{}` would be a negative count, with which drives turn in reverse",
+                point.name
+            ),
+            "write a positive scale there",
+        );
+    }
     if !target.write || target.write_to.is_some() {
         reader.problem(
             "write_to",
@@ -356,6 +366,13 @@ pub(super) fn check_object(reader: &Reader<'_>, index: PointIndex, points: &PerP
     }
 }
 
+fn is_reference(point: &Point) -> bool {
+    matches!(
+        point.model,
+        Some(ModelPoint::SpeedReference | ModelPoint::FrequencyReference)
+    )
+}
+
 fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if point.pulse && !point.write {
         reader.problem("pulse", "only a writable point can be a pulse", "add `write = true`");
@@ -382,6 +399,16 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
             "leave `write` out; bits are written with `at = \"holding 300.4-6\"`",
         );
         return;
+    }
+    if raw.scale < 0.0 && is_reference(point) {
+        reader.problem(
+            "scale",
+            format!(
+                "a positive `{}` would be a negative count, with which drives turn in reverse",
+                point.name
+            ),
+            "write a positive scale",
+        );
     }
     let range = ranges
         .iter()
