@@ -461,11 +461,15 @@ pub(super) fn place(profile: &Profile, point: &Point) -> (String, String, String
     }
 }
 
+/// The end of a band that only the configuration of a drive says.
+const CONFIGURED: &str = "frequency_range of the drive";
+
 /// How a derived point is computed, as text.
 fn derivation(profile: &Profile, derived: &Derived) -> String {
     let bound = |bound: &Bound| match bound {
         Bound::Point(point) => name_of(profile, *point).to_string(),
         Bound::Fixed(figure) => figure.to_string(),
+        Bound::Configured => CONFIGURED.to_string(),
     };
     match derived {
         Derived::Band { minimum, maximum, .. } => {

@@ -176,6 +176,7 @@ fn family(profile: &Profile) -> String {
     let mut text = format!(
         "\n## `{}`: {}\n\nSource: {}.",
         profile.name, profile.title, profile.source
+        Bound::Configured => "`frequency_range`".to_string(),
     );
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());

@@ -80,6 +80,6 @@ fn band(profile: &Profile, point: PointIndex) -> Option<(Bound, Bound)> {
 fn ends((minimum, maximum): (Bound, Bound)) -> impl Iterator<Item = PointIndex> {
     [minimum, maximum].into_iter().filter_map(|end| match end {
         Bound::Point(point) => Some(point),
-        Bound::Fixed(_) => None,
+        Bound::Fixed(_) | Bound::Configured => None,
     })
 }

@@ -171,6 +171,7 @@ impl<'a> Standing<'a> {
         let written = self.begun.unwrap_or_default();
         let end = |bound: Bound, configured: Option<f64>| match bound {
             Bound::Fixed(figure) => Some(figure),
+            Bound::Configured => configured,
             Bound::Point(point) => self.known(point, written.range).or(configured),
         };
         let band = (

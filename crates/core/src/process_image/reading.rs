@@ -283,9 +283,10 @@ impl Reading<'_> {
         let own = |bound: Bound| match bound {
             Bound::Point(point) => known(&self.sample(point)).map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),
+            Bound::Configured => None,
         };
         let configured = self.spec.frequency_range.as_ref();
-        if let (Bound::Fixed(_), Some(configured)) = (maximum, configured) {
+        if let (Bound::Fixed(_) | Bound::Configured, Some(configured)) = (maximum, configured) {
             let low = own(minimum).unwrap_or(*configured.start());
             return Some((low, *configured.end())).filter(|(low, high)| high > low);
         }
@@ -310,6 +311,7 @@ impl Reading<'_> {
                 Some((value.as_f64(), sample.quality))
             }
             Bound::Fixed(figure) => Some((figure, Quality::Good)),
+            Bound::Configured => None,
         };
         let ((low, of_low), (high, of_high)) = (end(minimum)?, end(maximum)?);
         (high > low).then_some(((low, high), of_low.worse(of_high)))

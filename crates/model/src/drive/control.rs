@@ -196,6 +196,8 @@ pub struct Reset {
     pub setting: Setting,
     /// Time for which the bits are held.
     pub hold: Duration,
+    /// Whether more than one source has it.
+    pub verified: bool,
 }
 
 impl Control {

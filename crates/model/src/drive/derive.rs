@@ -16,6 +16,8 @@ pub enum Bound {
     Point(PointIndex),
     /// A fixed bound, in the unit of the band.
     Fixed(f64),
+    /// `frequency_range` of the drive's configuration: nothing of the drive says it.
+    Configured,
 }
 
 /// How a value is derived from other points, given by their indices in the profile. All of them are raw points.
@@ -139,7 +141,7 @@ impl Derived {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
-            Bound::Fixed(_) => None,
+            Bound::Fixed(_) | Bound::Configured => None,
         })
     }
 

@@ -503,6 +503,7 @@ impl Profile {
             fault_reset: reset.map(|setting| Reset {
                 setting,
                 hold: 2 * self.update_period,
+                verified: true,
             }),
             restarts_on_reset: false,
             refresh: None,

@@ -144,7 +144,11 @@ impl ProfileDrive {
             }
         }
         let known = self.show_status(&profile, now);
-        let wishes = self.wishes(&profile, &known, now);
+        let is_decided = |(key, part): &(Key, Part)| {
+            let figure = figures.get(key).copied().unwrap_or(0);
+            known.contains(key) || part.mask & !figure == 0
+        };
+        let wishes = self.wishes(&profile, is_decided, now);
         // Of earlier states nothing stays in a register.
         for (key, part) in wishes.iter().flat_map(|wish| wish.any.iter().flatten()) {
             if !known.contains(key) && !self.is_place(*key) {
@@ -274,8 +278,8 @@ impl ProfileDrive {
         }
     }
 
-    /// The states that registers other than the `known` ones are to show, the ones that count most first.
-    fn wishes(&self, profile: &Profile, known: &[Key], now: SimTime) -> Vec<Wish> {
+    /// The states that registers are to show in bits that are not decided yet, the ones that count most first.
+    fn wishes(&self, profile: &Profile, is_decided: impl Fn(&(Key, Part)) -> bool, now: SimTime) -> Vec<Wish> {
         let mut wishes: Vec<(u8, Wish)> = Vec::new();
         for (index, point) in profile.points.enumerate() {
             let Some((rank, is)) = self.state_of(index, point) else {
@@ -295,7 +299,7 @@ impl ProfileDrive {
             wishes.push((rank, Wish { any, want }));
         }
         wishes.extend(self.sequence(profile, now));
-        let is_free = |bits: &Bits| bits.iter().any(|(key, _)| !known.contains(key));
+        let is_free = |bits: &Bits| !bits.iter().all(&is_decided);
         wishes.retain(|(rank, wish)| *rank == GIVEN || wish.any.iter().any(is_free));
         wishes.sort_by_key(|(rank, _)| *rank);
         wishes.into_iter().map(|(_, wish)| wish).collect()

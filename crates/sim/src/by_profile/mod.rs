@@ -440,7 +440,7 @@ fn maximum(profile: &Profile) -> f64 {
     });
     let mut fixed = ends.filter_map(|(_, _, maximum)| match maximum {
         Bound::Fixed(hertz) => Some(hertz),
-        Bound::Point(_) => None,
+        Bound::Point(_) | Bound::Configured => None,
     });
     fixed.find(|hertz| (1.0..=600.0).contains(hertz)).unwrap_or(MAXIMUM)
 }

@@ -449,6 +449,7 @@ pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: u
     let made = made.map(|(model, any)| Point {
         write: true,
         pulse: model == ModelPoint::FaultReset,
+        verified: model != ModelPoint::FaultReset || control.fault_reset.is_none_or(|reset| reset.verified),
         ..Point::of_model(model, Source::Derived(Derived::State { any }))
     });
     helpers.iter().cloned().chain(made).collect()

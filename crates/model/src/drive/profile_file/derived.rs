@@ -7,6 +7,9 @@ use crate::codec::Table;
 use crate::document::{self, Finding, Reader};
 use crate::drive::{PerPoint, Plan, PlannedRead, PointIndex, Profile};
 
+/// The `maximum` of a band that only the configuration of a drive says: its key there.
+const CONFIGURED: &str = "frequency_range";
+
 pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
     const KNOWN: [&str; 7] = ["band", "percent", "zero", "equal", "all", "sum", "lowest_bit"];
     let kind = reader.parsed("derive", |text| {
@@ -123,6 +126,9 @@ fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<
         Some(document::Raw::Float(_) | document::Raw::Integer(_)) => reader.optional(key).map(Bound::Fixed),
         _ => {
             let name: String = reader.required(key)?;
+            if key == "maximum" && name == CONFIGURED {
+                return Some(Bound::Configured);
+            }
             point_of(reader, key, &name, names).map(Bound::Point)
         }
     }

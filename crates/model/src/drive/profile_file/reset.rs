@@ -10,16 +10,19 @@ use crate::document::Reader;
 pub(super) fn read(table: &Reader<'_>, around: &Around<'_>, stop: Option<Setting>) -> Option<Reset> {
     let form = table.table("fault_reset")?;
     if form.has("steps") {
-        let steps = read_steps(&form, around);
+        let (steps, verified) = (read_steps(&form, around), form.or("verified", true));
         form.finish();
-        return reset_of_steps(&form, &steps?, stop, 2 * around.update_period);
+        let reset = reset_of_steps(&form, &steps?, stop, 2 * around.update_period)?;
+        return Some(Reset { verified, ..reset });
     }
     let setting = read_setting(&form, around);
     let hold = read_time(&form, "hold").unwrap_or(2 * around.update_period);
+    let verified = form.or("verified", true);
     form.finish();
     Some(Reset {
         setting: setting?,
         hold,
+        verified,
     })
 }
 
@@ -59,5 +62,9 @@ fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, hold
         value: set.write.value & mask,
         ..set.write
     };
-    Some(Reset { setting, hold })
+    Some(Reset {
+        setting,
+        hold,
+        verified: true,
+    })
 }
