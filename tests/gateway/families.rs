@@ -289,20 +289,18 @@ fn obeys_the_common_model(case: &Case) {
     rig.drive.signal("USR1");
     rig.printed("motor stopped", stopped);
     rig.site.until_state("drive", "fault");
-    if !case.reset.is_empty() {
-        done(command(false, false, true));
-        rig.printed("\nreset", 0);
-        until("the end of the fault", || (rig.state() != "fault").then_some(()));
-        std::thread::sleep(Duration::from_millis(300));
-        assert_eq!(
-            rig.drive.output().matches("motor forward").count(),
-            forward + 1,
-            "{name}"
-        );
-        assert_ne!(rig.state(), "running", "{name}: no reset starts the motor");
-        done(command(true, false, false));
-        rig.printed("motor forward", forward + 1);
-    }
+    done(command(false, false, true));
+    rig.printed("\nreset", 0);
+    until("the end of the fault", || (rig.state() != "fault").then_some(()));
+    std::thread::sleep(Duration::from_millis(300));
+    assert_eq!(
+        rig.drive.output().matches("motor forward").count(),
+        forward + 1,
+        "{name}"
+    );
+    assert_ne!(rig.state(), "running", "{name}: no reset starts the motor");
+    done(command(true, false, false));
+    rig.printed("motor forward", forward + 1);
     done(command(false, false, false));
 }
 

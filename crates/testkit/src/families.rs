@@ -77,7 +77,7 @@ pub struct Family {
     pub reverse: Vec<Order>,
 }
 
-/// Profile, half the maximum forward, start, stop, reverse. A negative reference of Invertek is outside what its profile commands.
+/// Profile, half the maximum forward, start, stop, reverse.
 const FAMILIES: &str = "\
 abb-acs550         | 1=10000      | 0=0x47E,0x47F  | 0=0x47E       | 1=0xD8F0 0=0x47F
 abb-acs580         | 1=10000      | 0=0x47E,0x47F  | 0=0x47E       | 1=0xD8F0 0=0x47F
@@ -89,7 +89,7 @@ yaskawa-v1000      | 2=[2500]     | 1=[1]          | 1=[0]         | 1=[2]
 delta-ms300        | 0x2001=2500  | 0x2000=0x12    | 0x2000=1      | 0x2000=0x22
 invt-goodrive      | 0x2001=2500  | 0x2000=1       | 0x2000=5      | 0x2000=2
 mitsubishi-d700    | 13=2500      | 8=2            | 8=0           | 8=4
-invertek-optidrive | 1=250        | 0=1            | 0=0           |
+invertek-optidrive | 1=250        | 0=1            | 0=0           | 1=0xFF06 0=1
 weg-cfw            | 683=4096     | 682=0x17       | 682=0x16      | 682=0x13
 fuji-frenic        | 0x0705=2500  | 0x0706=1       | 0x0706=0      | 0x0706=2
 hitachi-wj200      | 0=[0,2500]   | 1=off 0=on     | 0=off         | 1=on 0=on

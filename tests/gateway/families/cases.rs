@@ -48,7 +48,7 @@ pub(super) struct Case {
     pub(super) start: Vec<Order>,
     pub(super) stop: Vec<Order>,
     pub(super) reverse: Vec<Order>,
-    /// Empty where the family's reset is not known.
+    /// As a client may write it raw; empty where it is passed on only as the model's.
     pub(super) reset: Vec<Order>,
     /// Orders that are refused: neither a stop nor clearly a run command.
     pub(super) refused: Vec<Order>,
@@ -71,20 +71,20 @@ impl Case {
     }
 }
 
-/// Profile, peer, what it shows, reset, refused words. A raw 7 is neither a stop nor a run command of INVT.
+/// Profile, peer, what it shows, reset, refused words. A raw 7 of INVT and a raw 8 of LS are neither a stop nor a run command.
 const CASES: &str = "\
-abb-acs550         | abb        | frequency          | 0=0x47E,0x4FE,0x47E         | 0=0x7F,0x57E,0x67F
-abb-acs580         | abb        |                    | 0=0x47E,0x4FE,0x47E         | 0=0x7,0x77
-danfoss-fc         | danfoss    | frequency          | 49999=0x43C,0x4BC,0x43C     | 49999=0x7C,0x3C,0x41C,0x53C,0x74
-siemens-v20        | siemens    | frequency          | 99=0x47E,0x4FE,0x47E        | 99=0x7F,0x7E,0x57E,0x7D
-siemens-g120       | siemens    |                    | 99=0x47E,0x4FE,0x47E        | 99=0x77,0x67E
-schneider-altivar  | cia402     | frequency          | 8501=0,0x80,0               | 8501=0x1F,0x8F,0xE
+abb-acs550         | abb        | frequency reversed | 0=0x47E,0x4FE,0x47E         | 0=0x7F,0x57E,0x67F
+abb-acs580         | abb        | reversed           | 0=0x47E,0x4FE,0x47E         | 0=0x7,0x77
+danfoss-fc         | danfoss    | frequency reversed | 49999=0x43C,0x4BC,0x43C     | 49999=0x7C,0x3C,0x41C,0x53C,0x74
+siemens-v20        | siemens    | frequency reversed | 99=0x47E,0x4FE,0x47E        | 99=0x7F,0x7E,0x57E,0x7D
+siemens-g120       | siemens    | reversed           | 99=0x47E,0x4FE,0x47E        | 99=0x77,0x67E
+schneider-altivar  | cia402     | frequency reversed | 8501=0,0x80,0               | 8501=0x1F,0x8F,0xE
 yaskawa-v1000      | yaskawa    | frequency reversed | 1=0,8,0                     | 1=3,4,5,0x10
 delta-ms300        | delta      | frequency reversed | 0x2002=2                    | 0x2000=0,2,3 0x2002=1,4
 invt-goodrive      | invt       | frequency reversed |                             | 0x2000=0,3,4,7,8,14
-mitsubishi-d700    | mitsubishi | frequency reversed |                             | 8=6,1,8
-invertek-optidrive | invertek   | frequency          | 0=0,4,0                     | 0=0x11,0x21 1=0xFF06
-weg-cfw            | weg        | frequency          | 682=0x16,0x96,0x16          | 682=0x7,0x1E,0x5,0x6
+mitsubishi-d700    | mitsubishi | frequency reversed | 1=0x9696                    | 8=6,1,8
+invertek-optidrive | invertek   | frequency reversed | 0=0,4,0                     | 0=0x11,0x21
+weg-cfw            | weg        | frequency reversed | 682=0x16,0x96,0x16          | 682=0x7,0x1E,0x5,0x6
 fuji-frenic        | fuji       | frequency reversed | 0x0706=0,0x8000,0           | 0x0706=3,4,0x2000
 hitachi-wj200      | hitachi    | frequency reversed | 0=off 3=on 3=off            |
 toshiba-vf-s15     | toshiba    | frequency reversed | 0xFA00=0xC000,0xE000,0xC000 | 0xFA00=0,0x4400,0x5400,0x4C00

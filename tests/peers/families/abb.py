@@ -12,13 +12,14 @@ class Drive(profidrive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding.update({2: 0, 5: 0, 400: 0})
-        self.holding.update(dict.fromkeys(range(100, 110), 0))
-        self.read_only |= set(range(100, 110)) | {400, 5}
+        self.holding.update(dict.fromkeys(range(100, 115), 0))
+        self.read_only |= set(range(100, 115)) | {400, 5}
 
     def show(self):
         super().show()
-        self.holding[101] = drive.unsigned(self.speed * 15)
-        self.holding[102] = drive.unsigned(self.speed * 5)
+        self.holding[100] = drive.unsigned(self.speed * 15)
+        self.holding[101] = drive.unsigned(abs(self.speed) * 15)
+        self.holding[102] = drive.unsigned(abs(self.speed) * 5)
         self.holding[103] = 25 if self.speed else 0
         self.holding[106] = 540
         self.holding[400] = 1 if self.faulted else 0

@@ -16,8 +16,8 @@ class Drive(drive.Drive):
 
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
-        self.holding = {CMD: 0, LFR: 0, 8604: 0, 7121: 0, **dict.fromkeys(range(3201, 3212), 0)}
-        self.read_only = {8604, 7121, *range(3201, 3212)}
+        self.holding = {CMD: 0, LFR: 0, 8604: 0, 7121: 0, 9630: 0, **dict.fromkeys(range(7201, 7205), 0), **dict.fromkeys(range(3201, 3212), 0)}
+        self.read_only = {8604, 7121, 9630, *range(7201, 7205), *range(3201, 3212)}
         self.state = DISABLED
         self.following = None  # the state at the end of the ramp
         self.word = 0

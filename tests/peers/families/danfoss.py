@@ -7,7 +7,8 @@ runs, bit 15 turns the motor round, bit 7 resets on its edge.
 import drive
 
 WORD, REFERENCE, STATUS = 49999, 50009, 50199
-READINGS = [16119, 16129, 16299, 16339]
+ACTUAL = 50209
+READINGS = [ACTUAL, 15009, 15010, 15019, 15020, 16119, 16129, 16299, 16339]
 
 
 class Drive(drive.Drive):
@@ -44,5 +45,6 @@ class Drive(drive.Drive):
         status |= 0x0100 if self.at_reference else 0
         status |= 0x0800 if self.running else 0
         self.holding[STATUS] = status
+        self.holding[ACTUAL] = drive.unsigned(self.speed * 0x4000 / 100)
         self.holding[16129] = drive.unsigned(abs(self.speed) * 5)
         self.holding[16299] = 540

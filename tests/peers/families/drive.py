@@ -50,6 +50,7 @@ class Drive:
         self.unprepared = unprepared
         self.holding = {}
         self.coils = {}
+        self.inputs = {}
         self.read_only = set()
         self.write_only = set()
         self.faulted = False
@@ -175,6 +176,11 @@ class Drive:
                 raise Refused(2)
             words = [self.get("holding", first + place) for place in range(second)]
             return struct.pack(f">BB{second}H", 3, 2 * second, *words)
+        if function == 4:
+            words = [self.inputs.get(first + place) for place in range(second)]
+            if None in words:
+                raise Refused(2)
+            return struct.pack(f">BB{second}H", 4, 2 * second, *words)
         if function == 1:
             bits = [self.get("coil", first + place) for place in range(second)]
             packed = sum(bool(bit) << place for place, bit in enumerate(bits))

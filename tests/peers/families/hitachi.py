@@ -9,7 +9,7 @@ class Drive(drive.Drive):
 
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
-        self.holding = dict.fromkeys([0, 1, 0x1000, 0x1001, 0x1002, 0x1010, 0x1011, 0x1025], 0)
+        self.holding = dict.fromkeys([0, 1, 0x1000, 0x1001, 0x1002, *range(0x1010, 0x1019), 0x1025], 0)
         self.coils = dict.fromkeys(range(32), 0)
 
     def put(self, table, address, value):

@@ -1,6 +1,7 @@
 """Mitsubishi D700: word 8 (bit 1 forward, bit 2 reverse), which reads the status; reference 13 (0.01 Hz).
 
-Status: bit 0 run, 1 forward, 2 reverse, 3 at speed, 7 fault. A reset is a restart by register 1, which the gateway does not do.
+Status: bit 0 run, 1 forward, 2 reverse, 3 at speed, 7 fault. A write of register 1
+restarts it.
 """
 
 import drive
@@ -9,11 +10,14 @@ import drive
 class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
-        self.holding = dict.fromkeys([8, 13, 200, 201, 202, 207, 213, *range(500, 508)], 0)
+        self.holding = dict.fromkeys([1, 8, 13, 200, 201, 202, 207, 213, *range(500, 508)], 0)
         self.read_only = {200, 201, 202, 207, 213, *range(500, 508)}
 
     def wrote(self, table, address, value):
-        if address == 13:
+        if address == 1:
+            self.coast()
+            self.reset()
+        elif address == 13:
             self.target = value / 50
         elif address == 8:
             run = value >> 1 & 3

@@ -10,7 +10,9 @@ class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding = dict.fromkeys([*range(2000, 2011), *range(2100, 2111)], 0)
-        self.read_only = set(range(2100, 2111))
+        self.holding.update({100: 0, 101: 5000, 102: 30, 103: 30})
+        self.read_only = {*range(100, 104), *range(2100, 2111)}
+        self.inputs = {7: 35}
         self.word = 0
 
     def wrote(self, table, address, value):

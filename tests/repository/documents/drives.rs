@@ -54,7 +54,38 @@ fn unverified(profiles: &Profiles) -> (String, usize) {
     for profile in &all {
         let _ = writeln!(text, "|`{}`|{}|{}|", profile.name, profile.title, profile.source);
     }
+    text += &common_points(&all);
     (text, all.len())
+}
+
+/// Which points of the common model and which commands they have.
+fn common_points(profiles: &[&std::sync::Arc<Profile>]) -> String {
+    let names: Vec<&str> = profiles.iter().map(|profile| profile.name.as_str()).collect();
+    let mut text = format!(
+        "\n### Common points and commands of these families\n\n**?**: not confirmed; -: none; *sign*: by a negative \
+         reference.\n\n|point|`{}`|\n|---|{}\n",
+        names.join("`|`"),
+        "---|".repeat(names.len())
+    );
+    for point in ModelPoint::ALL {
+        let cells: Vec<&str> = profiles.iter().map(|profile| has(profile, *point)).collect();
+        let _ = writeln!(text, "|`{}`|{}|", point.name(), cells.join("|"));
+    }
+    text
+}
+
+fn has(profile: &Profile, point: ModelPoint) -> &'static str {
+    let signed = || {
+        let reference = profile.model_point(ModelPoint::SpeedReference);
+        let range = reference.and_then(|reference| reference.range.as_ref());
+        range.is_some_and(|range| *range.start() < 0.0)
+    };
+    match profile.model_point(point) {
+        Some(found) if found.verified => "yes",
+        Some(_) => "**?**",
+        None if point == ModelPoint::Reverse && signed() => "*sign*",
+        None => "-",
+    }
 }
 
 fn model(profiles: &Profiles, names: &[&str]) -> String {
@@ -145,6 +176,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     let end = |bound: &Bound| match bound {
         Bound::Point(i) => name(i),
         Bound::Fixed(figure) => figure.to_string(),
+        Bound::Configured => "`frequency_range`".to_string(),
     };
     match derived {
         Derived::Band { of, minimum, maximum } => {
@@ -176,7 +208,6 @@ fn family(profile: &Profile) -> String {
     let mut text = format!(
         "\n## `{}`: {}\n\nSource: {}.",
         profile.name, profile.title, profile.source
-        Bound::Configured => "`frequency_range`".to_string(),
     );
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());

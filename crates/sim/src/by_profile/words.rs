@@ -89,7 +89,10 @@ pub(super) const FAMILIES: [Family; 16] = [
         acts_once: true,
         ..family("invt", invt, status::invt)
     },
-    family("mitsubishi", mitsubishi, status::mitsubishi),
+    Family {
+        other: mitsubishi_restart,
+        ..family("mitsubishi", mitsubishi, status::mitsubishi)
+    },
     family("invertek", invertek, status::invertek),
     family("weg", weg, status::weg),
     Family {
@@ -239,6 +242,11 @@ fn invt(_: &Known<'_>, word: u16) -> Told {
 
 fn mitsubishi(_: &Known<'_>, word: u16) -> Told {
     told(pair(word >> 1 & 3), false, word)
+}
+
+/// Register 1 restarts the drive: the motor coasts, and the fault is gone.
+fn mitsubishi_restart(table: Table, address: u16, word: u16) -> Option<Told> {
+    ((table, address) == (Table::Holding, 1)).then(|| told(Does::Coasts, true, word))
 }
 
 /// Bit 3 coasts, bit 1 stops by the second ramp; both go before bit 0.

@@ -65,6 +65,7 @@ const BUILT_IN: &[(&str, &str)] = files![
     "fuji-frenic.toml",
     "hitachi-wj200.toml",
     "invertek-optidrive.toml",
+    "invertek-eco.toml",
     "invt-goodrive.toml",
     "lenze-i550.toml",
     "ls-g100.toml",
