@@ -28,7 +28,7 @@ impl Shows {
         self.fault != 0
     }
 
-    /// It would run if it were commanded to.
+    /// Whether the drive would run if it were commanded to.
     fn ready(&self) -> bool {
         !self.faulted()
     }
