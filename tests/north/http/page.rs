@@ -84,6 +84,12 @@ async fn questions_are_answered_about_what_they_asked() {
     browse("questions.js", Vec::new()).await;
 }
 
+/// What is pressed keeps its place and the focus, and is large enough for a finger.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_page_fits_the_hand() {
+    browse("hand.js", Vec::new()).await;
+}
+
 /// The time that an update takes grows with the number of drives and no faster.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_thousand_drives_stay_smooth() {

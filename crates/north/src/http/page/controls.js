@@ -67,7 +67,7 @@ function buildReference(panel, name, { command, tell, known }) {
   panel.label = make("span", "", t("Speed reference"));
   panel.set = Object.assign(make("button", "operate-button", t("Set")), { type: "submit" });
   panel.set.setAttribute("aria-label", t("Set the reference of {drive}", { drive: name }));
-  panel.reference = make("form", "operate-reference", make("label", "", panel.label, " ", panel.input), panel.unit, panel.understood, panel.set, panel.range);
+  panel.reference = make("form", "operate-reference", make("label", "", panel.label, " ", panel.input), panel.unit, panel.set, panel.range, panel.understood);
   panel.reference.noValidate = true;
   const typed = () => reading(panel.input.value, referenceOf(known(name).about));
   panel.input.addEventListener("input", () => {
@@ -137,7 +137,7 @@ function buildQuestion(panel, name, { command, tell, known }) {
     panel.directions[orderedReverse(json) ? 1 : 0].checked = true;
     panel.target = !orderedReverse(json);
     ask(panel, name, known(name));
-    for (const each of [panel.start, panel.turn]) hide(each, true);
+    panel.show(known(name));
     hide(panel.question, false);
     asked(panel.asks);
     panel.really.focus();
@@ -195,9 +195,23 @@ export function build(panel, name, actions) {
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
   panel.place.classList.add("operate");
-  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), panel.start, panel.turn, panel.question, panel.reference, panel.reset, panel.holder, panel.result, panel.lease);
-  panel.show = (drive) => show(panel, name, drive);
+  // What comes and goes stands behind what is pressed, which so keeps its place.
+  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), make("span", "operate-go", panel.start, panel.turn), panel.reference, panel.reset, panel.question, panel.holder,
+    panel.result, panel.lease);
+  panel.show = (drive) => {
+    const focused = panel.place.contains(document.activeElement) ? document.activeElement : null;
+    show(panel, name, drive);
+    keepFocus(panel, focused);
+  };
   panel.built = true;
+}
+
+/// The focus goes from a control that is no longer there to the one that took its place.
+function keepFocus(panel, focused) {
+  const isLost = focused && !focused.checkVisibility() && [focused, document.body].includes(document.activeElement);
+  if (!isLost || panel.asking) return;
+  const next = [panel.turn, panel.start, panel.set, panel.place].find((each) => each.checkVisibility());
+  next?.focus({ preventScroll: true });
 }
 
 function show(panel, name, drive) {
@@ -212,6 +226,7 @@ function show(panel, name, drive) {
   hide(panel.reset, json.state !== "fault");
   text(panel.holder, holdWords(drive));
   if (panel.asking && panel.restsOn !== restsOn(drive)) return panel.close(t("{drive} has changed", { drive: name }));
+  for (const each of [panel.start, panel.turn]) each.disabled = Boolean(panel.asking);
   if (panel.asking) return ask(panel, name, drive);
   const runs = json.state === "running";
   hide(panel.start, runs);

@@ -117,7 +117,7 @@ function figures() {
 function top(name) {
   const parts = { badge: make("span", "badge"), warning: make("span", "tag amber", `! ${t("warning")}`), quality: make("span", "tag"), fault: told("p", "why"),
     where: make("p", "where") };
-  parts.element = make("div", "top", make("p", "crumbs", anchor("#/", "", t("Drives")), " › "), make("h1", "", name), parts.where, make("p", "state", parts.badge, " ", parts.warning, " ", parts.quality), parts.fault);
+  parts.element = make("div", "top", make("p", "crumbs", anchor("#/", "", t("Drives")), " › "), make("h1", "", name), parts.where, make("p", "state", parts.badge, " ", parts.warning, " ", parts.quality));
   return parts;
 }
 
@@ -228,7 +228,8 @@ export function open(root, { name }) {
   const counters = section("counters", t("Counted by the gateway"), parts.counters.element, parts.stops);
   const line = section("line", t("Line"), parts.line.element, make("p", "note", t("Errors by minute, the last hour")), parts.strip, minuteAxis());
   const events = section("drive-events", t("Events"), parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", t("All events of this drive"))));
-  root.append(parts.top.element, parts.why.element, parts.operate, parts.figures.element, parts.trends.element,
+  // What comes and goes stands below the controls, so that a stop keeps its place.
+  root.append(parts.top.element, parts.operate, parts.top.fault, parts.why.element, parts.figures.element, parts.trends.element,
     make("div", "pair", counters, line), parts.points.element, parts.commands.element, make("div", "pair", events, parts.recordings.element));
   window.Operate?.mount(parts.operate, name);
   let slow = 0;

@@ -96,6 +96,11 @@ function build(place) {
     event.preventDefault();
     logIn();
   });
+  corner.form.addEventListener("keydown", ({ key }) => {
+    if (key !== "Escape") return;
+    unfold(false);
+    corner.open.focus();
+  });
   corner.open = button("login-open", t("Log in"), () => unfold(corner.form.hidden));
   corner.open.setAttribute("aria-controls", corner.form.id);
   corner.name = make("b");

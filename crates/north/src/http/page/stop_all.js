@@ -80,6 +80,7 @@ async function send() {
   stopPressed();
   for (const listener of listeners) listener();
   say(t("{what}: sent …", { what: t("Stop all") }));
+  bar.element.focus({ preventScroll: true });
   const begun = performance.now();
   let ended = null;
   for (;;) {
@@ -96,6 +97,7 @@ async function send() {
 open.type = bar.yes.type = bar.no.type = "button";
 open.id = "stop-all";
 bar.words.setAttribute("role", "alert");
+bar.element.tabIndex = -1;
 open.addEventListener("click", ask);
 bar.yes.addEventListener("click", send);
 bar.no.addEventListener("click", close);

@@ -1,4 +1,5 @@
-// Stops that were not carried out: a banner over everything, until somebody dismisses it. A stop that fails must not be missed.
+// Stops that were not carried out: a banner over everything, until somebody dismisses it. A stop that fails must not be missed. Banners
+// lie over the lower end of the window: one that comes or goes moves nothing that somebody is about to press.
 
 import { $, className, clock, make, text } from "./common.js";
 import { t } from "./texts.js";
@@ -53,5 +54,5 @@ export function stopped(drive, words) {
   text(alert.tries, t("The stop sent at {time} was carried out: {words}", { time: clock(new Date()), words }));
 }
 
-// What else sticks to the top stays below the banners.
+// The end of the page can be scrolled to above the banners.
 new ResizeObserver(([{ contentRect }]) => document.documentElement.style.setProperty("--alerts", `${contentRect.height}px`)).observe($("alerts"));
