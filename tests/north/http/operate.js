@@ -146,6 +146,8 @@ async function operate(browser) {
   await browser.until("the login is shown", "document.querySelector('.login-known').innerText.includes('alice')");
   await browser.until("the stop button", seen(stopButton));
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate .operate-stop').length"), 1, "fan-2 is only monitored");
+  // The row has the stop, the page of the drive the rest.
+  await browser.press(".rows a[href='#/drive/pump-1']");
   await browser.until("the limits", "document.querySelector('.operate-reference').innerText.includes('from 0 to 80 %')");
   await accessible(browser, "after the login");
   // A reference outside the limits is not sent, one inside is.
@@ -171,21 +173,21 @@ async function operate(browser) {
   assert.ok(await browser.run(`${result("Reference 50 %")} || ${result("nothing was sent")}`), "something was sent");
   await browser.answer("button[aria-label='Start pump-1']", "button[aria-label='Start now: pump-1']");
   await browser.until("the start", result("Start forward: confirmed"));
-  await browser.until("it runs", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it runs", "document.querySelector('.top .badge').textContent.includes('running')");
   // The lease of 8 s is renewed while the person is active.
   for (let turn = 0; turn < 24; turn += 1) {
     await browser.key("Tab");
     await new Promise((done) => setTimeout(done, 500));
   }
   // A drive that was stopped does not start by itself; a late value shows no state for a moment.
-  await browser.until("it runs still: its lease was renewed", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it runs still: its lease was renewed", "document.querySelector('.top .badge').textContent.includes('running')");
   await browser.until("who supervises", "document.querySelector('.operate-lease').textContent.includes('Supervised by this page')");
   await browser.press(stopButton);
   await browser.until("the stop", result("Stop: "));
-  await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it stands", "!document.querySelector('.top .badge').textContent.includes('running')");
   // All drives at once: asked back once, and told when they stand.
   await browser.answer("button[aria-label='Start pump-1']", "button[aria-label='Start now: pump-1']");
-  await browser.until("it runs again", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it runs again", "document.querySelector('.top .badge').textContent.includes('running')");
   await browser.press("#stop-all");
   await browser.until("the question", seen("#stops .operate-stop"));
   await accessible(browser, "while stop all asks");
@@ -195,10 +197,10 @@ async function operate(browser) {
   } catch {
     await browser.answer("#stop-all", "#stops .operate-button");
   }
-  await browser.until("it runs still: nothing was stopped", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it runs still: nothing was stopped", "document.querySelector('.top .badge').textContent.includes('running')");
   await browser.answer("#stop-all", "#stops .operate-stop");
   await browser.until("all stand", "document.getElementById('stops').innerText.includes('All drives have stopped: 1 of 1')");
-  await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.until("it stands", "!document.querySelector('.top .badge').textContent.includes('running')");
   await browser.press("#stops .operate-button");
   assert.strictEqual(await browser.run("document.getElementById('stops').innerText"), "");
   await browser.press("#login .login-known button");

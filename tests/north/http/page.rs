@@ -84,6 +84,12 @@ async fn questions_are_answered_about_what_they_asked() {
     browse("questions.js", Vec::new()).await;
 }
 
+/// The overview of 60 drives after login: compact rows, colour only where a person is wanted.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn sixty_drives_are_seen_at_a_glance() {
+    browse("rows.js", Vec::new()).await;
+}
+
 /// What is pressed keeps its place and the focus, and is large enough for a finger.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_page_fits_the_hand() {

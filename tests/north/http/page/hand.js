@@ -2,7 +2,7 @@
 // The page in the hand of an operator: what is pressed keeps its place and the focus, and is large enough for a finger. Drives a real
 // browser against a gateway that says what the test wants.
 const assert = require("node:assert");
-const { STOP, click, opened, run, shown } = require("./operated.js");
+const { STOP, click, opened, run, shown, told } = require("./operated.js");
 const { point } = require("./fake_gateway.js");
 
 const START = "button[aria-label='Start pump-1']";
@@ -14,7 +14,6 @@ const boxes = (selectors) => selectors.map((selector) => {
   const { x, y, width, height } = document.querySelector(selector).getBoundingClientRect();
   return [selector, x, y, width, height].join(" ");
 });
-const told = (wanted) => document.querySelector(".operate .operate-result").textContent.includes(wanted);
 
 async function sized(page, width, height) {
   await page.send("Emulation.setDeviceMetricsOverride", { width, height, deviceScaleFactor: 1, mobile: width < 600 });

@@ -9,6 +9,9 @@ const STOP = "button[aria-label='Stop pump-1']";
 const click = (selector) => document.querySelector(selector).click();
 const shown = (selector) => document.querySelector(selector)?.checkVisibility() && document.querySelector(selector).innerText;
 
+/// What came of a command: beside the controls, or in the row of the drive.
+const told = (wanted) => [...document.querySelectorAll(".operate-result, .notice")].some((each) => each.textContent.includes(wanted));
+
 const REFERENCE = { name: "speed_reference", kind: "number", unit: "%", minimum: 0, maximum: 80 };
 
 function plant(gateway, more = {}) {
@@ -68,4 +71,4 @@ function run(steps) {
   });
 }
 
-module.exports = { STOP, click, logIn, opened, plant, run, shown };
+module.exports = { STOP, click, logIn, opened, plant, run, shown, told };

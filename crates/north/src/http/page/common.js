@@ -86,7 +86,7 @@ export const places = {
   recording: (id) => `#/recording/${encodeURIComponent(id)}`,
 };
 
-const TITLES = { actual_speed: t("Speed"), output_frequency: t("Frequency"), motor_speed: t("Motor"), motor_current: t("Current"), motor_torque: t("Torque"),
+const TITLES = { actual_speed: t("Speed"), output_frequency: t("Frequency"), motor_speed: t("Motor speed"), motor_current: t("Current"), motor_torque: t("Torque"),
   motor_power: t("Power"), motor_voltage: t("Voltage"), dc_link_voltage: t("DC link"), heatsink_temperature: t("Heatsink") };
 
 /// The heading of a point: short for those that are on every page.
@@ -142,7 +142,8 @@ export const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : 
 // ---- States and qualities
 
 /// Colour and sign of each state; faults are told first.
-export const STATES = { fault: ["red", "▲"], unknown: ["amber", "?"], offline: ["", "✕"], not_ready: ["amber", "◌"], ready: ["blue", "●"], running: ["green", "▶"] };
+// Colour means that a person is wanted; what is as usual is grey.
+export const STATES = { fault: ["red", "▲"], unknown: ["amber", "?"], offline: ["amber", "✕"], not_ready: ["", "◌"], ready: ["", "●"], running: ["runs", "▶"] };
 
 export const stateWords = (state) => `${STATES[state]?.[1] ?? ""} ${words(state)}`.trim();
 
@@ -213,10 +214,13 @@ export function speedBar() {
   return bar;
 }
 
-export function showSpeed(bar, point, points) {
+export function fillSpeed(bar, point) {
   hide(bar.element, !point);
-  const good = isGood(point) && !point.contradicted;
-  fill(bar.fill, good ? point.value / 100 : 0);
+  fill(bar.fill, isGood(point) && !point.contradicted ? point.value / 100 : 0);
+}
+
+export function showSpeed(bar, point, points) {
+  fillSpeed(bar, point);
   text(bar.direction, directionOf(points));
   const reference = points.speed_reference;
   text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(reference.value, reference.unit)} %` }) : "");
@@ -229,6 +233,15 @@ export const directionWord = (isReverse) => (isReverse ? t("reverse") : t("forwa
 export function directionOf({ reversed }) {
   if (!isGood(reversed) || reversed.contradicted) return "";
   return `${reversed.value ? "←" : "→"} ${directionWord(reversed.value)}`;
+}
+
+/// The direction as an arrow; its word is for readers of the screen.
+export const directionMark = () => make("span", "direction", make("span", "arrow"), make("span", "unseen"));
+
+export function showDirection({ children: [arrow, word] }, points) {
+  const [sign, ...rest] = directionOf(points).split(" ");
+  text(arrow, sign && ` ${sign}`);
+  text(word, rest.length ? ` ${rest.join(" ")}` : "");
 }
 
 // ---- Lists

@@ -181,9 +181,22 @@ function ask(panel, name, { json, about }) {
 
 // ---- All of them
 
+function stopButton(name, actions) {
+  const made = button("operate-stop", "", t("Stop {drive}", { drive: name }), () => actions.stop(name));
+  made.append(make("span", "sign", "■"), ` ${t("STOP")}`);
+  return made;
+}
+
+/// Only the stop of a drive, for a row of many.
+export function buildStop(panel, name, actions) {
+  panel.place.classList.add("operate");
+  panel.place.replaceChildren(stopButton(name, actions));
+  panel.built = true;
+}
+
 /// Builds the controls of a drive into the place of the panel.
 export function build(panel, name, actions) {
-  panel.stop = button("operate-stop", `■ ${t("STOP")}`, t("Stop {drive}", { drive: name }), () => actions.stop(name));
+  panel.stop = stopButton(name, actions);
   panel.reset = button("operate-button", t("Reset fault"), t("Reset the fault of {drive}", { drive: name }), () => actions.command(name, { fault_reset: true }, t("Reset")));
   buildQuestion(panel, name, actions);
   buildReference(panel, name, actions);

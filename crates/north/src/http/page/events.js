@@ -5,8 +5,7 @@ import { t } from "./texts.js";
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
   refused_command: "amber", restarted: "amber", unlike_profile: "amber", selection_differs: "amber", not_confirmed: "amber", reload_refused: "amber",
-  foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", guarded: "amber", interlock: "amber", slot_void: "amber", paused: "amber", fault_end: "green", warning_end: "green", online: "green", bus_up: "green",
-  started: "blue", stopped: "blue", recording: "blue" };
+  foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", guarded: "amber", interlock: "amber", slot_void: "amber", paused: "amber" };
 
 // All that the gateway knows; it refuses to search for others.
 const KINDS = [

@@ -67,7 +67,7 @@ function show(isLost) {
   if (lost === isLost) return;
   lost = isLost;
   document.body.classList.toggle("lost", lost);
-  className($("link"), `pill ${lost ? "red" : "green"}`);
+  className($("link"), `pill ${lost ? "red" : ""}`);
   hide($("link"), false);
   text($("link-text"), lost ? t("Connection lost") : t("Live"));
   const since = lastGoodTime ? t("No connection to the gateway since {time}.", { time: clock(lastGoodTime) }) : t("No connection to the gateway yet.");

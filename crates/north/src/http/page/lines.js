@@ -49,7 +49,7 @@ function busFacts(shown = FACTS) {
 function showFacts(facts, bus) {
   const up = bus.state === "up";
   text(facts.badge, up ? `● ${t("up")}` : bus.tried ? `✕ ${t("down")}` : `◌ ${t("opening")}`);
-  className(facts.badge, `badge ${up ? "green" : bus.tried ? "red" : "amber"}`);
+  className(facts.badge, `badge ${up ? "" : bus.tried ? "red" : "amber"}`);
   text(facts.where, `${bus.port} · ${bus.protocol} · ${bus.baud} ${bus.format}`);
   text(facts.why, bus.reason || "");
   hide(facts.why, !bus.reason);

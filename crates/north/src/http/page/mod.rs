@@ -171,6 +171,9 @@ mod tests {
     use crate::event::EventKind;
     use crate::history::TriggerKind;
 
+    /// The document with all its files.
+    const MOST_BYTES: usize = 224 * 1024;
+
     #[test]
     fn text_cannot_become_markup() {
         assert_eq!(
@@ -200,6 +203,13 @@ mod tests {
         for inline in ["<style", " style=", " onclick=", "<script>", "javascript:"] {
             assert!(!DOCUMENT.contains(inline), "{inline}");
         }
+    }
+
+    /// A phone loads the page over a slow line, too.
+    #[test]
+    fn the_page_keeps_within_its_bytes() {
+        let served: usize = ASSETS.iter().map(|asset| asset.body.len()).sum();
+        assert!(served + DOCUMENT.len() <= MOST_BYTES, "{served} bytes");
     }
 
     /// Searching for another kind would be refused.

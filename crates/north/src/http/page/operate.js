@@ -2,6 +2,7 @@
 //
 //   Operate.mount(element, drive)  puts the controls of a drive into an element; `drive` is its name, or its object of
 //                                  the JSON interface. Mounting an element again changes nothing.
+//   Operate.mount(element, drive, notice)  puts only its stop there; `notice` is an element for what came of it.
 //   Operate.update(drive)          shows a newer object of /api/v1/drives. To be called for each drive at each update.
 //
 // Without a login, and for drives with access "monitor", a mounted element stays empty. A lease is renewed only for drives that this
@@ -9,7 +10,7 @@
 // keyboard within the last ACTIVE_MS.
 
 import { clock, text } from "./common.js";
-import { build } from "./controls.js";
+import { build, buildStop } from "./controls.js";
 import { stopPressed } from "./questions.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
 import { onStopAll } from "./stop_all.js";
@@ -23,6 +24,8 @@ const STOP_ANSWER_MS = 8000;
 // A stop without an answer is sent again for that long, with a pause between two tries.
 const STOP_MS = 30000;
 const PAUSE_MS = 1000;
+// A row of the overview says for that long what came of a command.
+const NOTICE_MS = 20000;
 
 const panels = new Map();
 const drives = new Map();
@@ -167,7 +170,7 @@ function tries(count, from, again) {
 }
 
 function tell(name, words, good) {
-  known(name).result = { words, good };
+  known(name).result = { words, good, at: performance.now() };
   show(name);
 }
 
@@ -181,18 +184,31 @@ function show(name) {
     const usable = isLoggedIn() && drive.json !== null && drive.json.access === "control";
     if (!usable && panel.built) {
       panel.place.replaceChildren();
+      if (panel.notice) text(panel.notice, "");
       panel.built = false;
     }
     // An element that never was on the screen has no controls yet: a plant may have a thousand drives.
     if (!usable || !panel.seen) continue;
-    if (!panel.built) build(panel, name, actions);
+    if (!panel.built && panel.notice) buildStop(panel, name, actions);
+    else if (!panel.built) build(panel, name, actions);
     ask(name);
+    if (panel.notice) {
+      showNotice(panel.notice, drive);
+      continue;
+    }
     panel.show(drive);
     const { words, good } = drive.result || { words: "", good: null };
     text(panel.result, words);
     panel.result.className = `operate-result ${words === "" || good === null ? "" : good ? "good" : "bad"}`;
     text(panel.lease, leaseWords(drive));
   }
+}
+
+function showNotice(element, drive) {
+  const { words, good, at } = drive.result ?? {};
+  const isNew = Boolean(words) && performance.now() - at < NOTICE_MS;
+  text(element, isNew ? words : leaseWarning(drive));
+  element.className = `notice ${isNew && good !== false ? "" : "bad"}`;
 }
 
 onSession(() => {
@@ -216,12 +232,13 @@ function renews(drive) {
   return isLoggedIn() && drive.ours && runs && drive.about && drive.about.lease_ms !== null;
 }
 
-function leaseWords(drive) {
+function leaseWarning(drive) {
   if (!renews(drive)) return drive.lost || "";
   if (idle() >= ACTIVE_MS) return t("No activity here: its lease is no longer renewed.");
-  if (idle() >= WARN_MS) return t("Move the mouse or press a key, or its lease is no longer renewed.");
-  return t("Supervised by this page while you are active.");
+  return idle() >= WARN_MS ? t("Move the mouse or press a key, or its lease is no longer renewed.") : "";
 }
+
+const leaseWords = (drive) => leaseWarning(drive) || (renews(drive) ? t("Supervised by this page while you are active.") : "");
 
 async function renew(name, drive, now) {
   drive.renewed = now;
@@ -261,10 +278,10 @@ const screen = new IntersectionObserver((entries) => {
   }
 }, { rootMargin: "200px" });
 
-function mount(place, drive) {
+function mount(place, drive, notice = null) {
   const name = typeof drive === "string" ? drive : drive.name;
   if (place.operatePanel) return;
-  const panel = { place, name, seen: false, built: false };
+  const panel = { place, name, notice, seen: false, built: false };
   place.operatePanel = panel;
   panels.set(name, [...(panels.get(name) || []), panel].filter((other) => other === panel || other.place.isConnected));
   screen.observe(place);

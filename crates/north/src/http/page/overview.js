@@ -1,19 +1,24 @@
 // All drives: faults first, then warnings, then by name; or in the order of a column, and in groups of their lines.
 
 import {
-  anchor, arrange, badge, blockedOf, className, directionOf, faultOf, hide, isOn, keyed, make, old, places, showSpeed, showValue, speedBar,
+  anchor, arrange, badge, blockedOf, className, directionMark, faultOf, fillSpeed, hide, isOn, keyed, make, old, places, showDirection, showValue, speedBar,
   STATES, stateOf, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { eventList } from "./events.js";
 import { busCards, FEW_FACTS } from "./lines.js";
 import { t } from "./texts.js";
 
-// Point, and the widths that have its column: all, not the phone, the desktop only.
-const COLUMNS = [["actual_speed", "mid"], ["output_frequency", "all"], ["motor_speed", "far"], ["motor_current", "all"],
+// Point, and the widths that have its column: all, not the phone, the desktop only. A column that no drive fills is left out.
+const COLUMNS = [["actual_speed", "speed"], ["output_frequency", "mid frequency"], ["reference", "reference"], ["motor_speed", "far"], ["motor_current", "current"],
   ["motor_torque", "mid"], ["motor_power", "far"], ["dc_link_voltage", "far"], ["heatsink_temperature", "far"]];
 
 // With 1,000 drives the rest of their points would be most of what the gateway sends.
-const POINTS = [...COLUMNS.map(([point]) => point), "speed_reference", "frequency_reference", "reverse", "reversed", "warning", "fault_code"];
+const POINTS = [...COLUMNS.map(([point]) => point).filter((point) => point !== "reference"), "speed_reference", "frequency_reference", "reverse", "reversed", "warning", "fault_code"];
+// The column of names is as wide as the longest one, in characters, within these; each takes about so many px.
+const NAME_WIDTHS = [10, 26];
+const CHARACTER_PX = 9;
+// On a phone the letters of a longer name are smaller.
+const LONG_NAME = 14;
 const EVENTS_SHOWN = 12;
 
 // Tiles: the words beside the count, which drives it counts, and its colour where there are any.
@@ -27,6 +32,9 @@ const TILES = {
 
 // pump-2 stands before pump-10.
 const byName = new Intl.Collator("en", { numeric: true }).compare;
+
+/// The point in a column. A drive has its reference in percent or in Hz.
+const pointIn = ({ points }, column) => (column === "reference" ? (points.speed_reference ?? points.frequency_reference) : points[column]);
 
 /// Faults first, then warnings, then all others; the order of each is that of the names.
 export function rank(drive) {
@@ -44,7 +52,7 @@ const FALLING = new Set(COLUMNS.map(([point]) => point));
 export function sorted(drives, column, places) {
   const [, turned, key] = /^(-?)(.*)$/.exec(column);
   const states = Object.keys(STATES);
-  const valueOf = { "": rank, name: ({ name }) => places.get(name), state: (drive) => states.indexOf(stateOf(drive)) }[key] ?? ((drive) => drive.points[key]?.value ?? null);
+  const valueOf = { "": rank, name: ({ name }) => places.get(name), state: (drive) => states.indexOf(stateOf(drive)) }[key] ?? ((drive) => pointIn(drive, key)?.value ?? null);
   const keys = drives.map((drive) => ({ drive, value: valueOf(drive), place: places.get(drive.name) }));
   const sign = turned ? -1 : 1;
   keys.sort((a, b) => (a.value === null) - (b.value === null) || sign * (a.value - b.value) || a.place - b.place);
@@ -59,37 +67,35 @@ function cell(tag, name, ...children) {
   return element;
 }
 
-/// The controls of the drive, where the gateway serves them.
-function mountOperate(element, name) {
-  if (!window.Operate) return;
+/// The stop of the drive, where the gateway serves controls; the others are on its page. What came of it is said in `notice`.
+function mountStop(element, name, notice) {
   const place = make("div");
+  element.append(cell("div", "stop", place));
+  if (!window.Operate) return;
   place.dataset.operate = name;
-  element.append(cell("div", "operate-row", place));
-  window.Operate.mount(place, name);
+  window.Operate.mount(place, name, notice);
 }
 
 export function driveRow({ name }) {
-  const row = { bus: make("span"), address: make("span", "address"), badge: make("span", "badge"), warning: make("span", "tag amber", `! ${t("warning")}`), quality: make("span", "tag grey"),
-    fault: told("span", "why"), blocked: make("span", "sub blocked"), cells: [] };
+  const row = { bus: make("span"), address: make("span", "address"), badge: make("span", "badge"), warning: make("span", "tag amber", "! ", make("span", "word", t("warning"))), quality: make("span", "tag"),
+    notice: make("span", "notice"), fault: told("span", "why"), blocked: make("span", "blocked"), cells: [] };
+  row.notice.setAttribute("role", "status");
+  row.second = make("span", "second", row.notice, row.fault, row.blocked);
   row.element = make("div", "row");
   row.element.setAttribute("role", "row");
   row.element.append(
-    cell("div", "name", anchor(places.drive(name), "", name), make("span", "where", row.bus, row.address)),
-    cell("div", "state", row.badge, " ", row.warning, " ", row.quality, row.fault, row.blocked),
+    cell("div", name.length > LONG_NAME ? "name long" : "name", anchor(places.drive(name), "", name), make("span", "where", row.bus, row.address)),
+    cell("div", "state", make("span", "first", row.badge, " ", row.warning, " ", row.quality), row.second),
   );
   for (const [point, width] of COLUMNS) {
     const entry = { point, ...valueCell("div", `n ${width}`) };
     entry.element.setAttribute("role", "cell");
-    if (point === "actual_speed") {
-      entry.bar = speedBar();
-      entry.element.append(entry.bar.element, entry.bar.direction, entry.bar.reference);
-    }
-    // On a phone the frequency stands for the speed.
-    if (point === "output_frequency") entry.element.append((row.direction = make("span", "sub direction narrow")));
+    if (["actual_speed", "output_frequency"].includes(point)) entry.unit.after((entry.direction = directionMark()));
+    if (point === "actual_speed") entry.element.append((entry.bar = speedBar()).element);
     row.cells.push(entry);
     row.element.append(entry.element);
   }
-  mountOperate(row.element, name);
+  mountStop(row.element, name, row.notice);
   return row;
 }
 
@@ -103,7 +109,8 @@ function groupRow({ name }) {
 export function showDrive(row, drive) {
   window.Operate?.update(drive);
   const state = stateOf(drive);
-  className(row.element, `row ${state}`);
+  // A family without a speed in percent shows its frequency in that place, where there is only one.
+  className(row.element, `row ${state} ${isOn(drive.points.warning) ? "warned" : ""} ${drive.points.actual_speed ? "" : "by-frequency"}`);
   badge(row.badge, state);
   hide(row.warning, !isOn(drive.points.warning));
   const fault = faultOf(drive);
@@ -112,15 +119,16 @@ export function showDrive(row, drive) {
   const blocked = blockedOf(drive);
   text(row.blocked, blocked);
   hide(row.blocked, !blocked);
+  row.second.title = [fault, blocked].filter(Boolean).join(" · ");
   text(row.bus, drive.bus);
   const doubt = drive.profile_verified === false ? ` · ${t("not verified on hardware")}` : "";
   text(row.address, ` · ${t("address {address}", drive)}${doubt}`);
   for (const entry of row.cells) {
-    const point = drive.points[entry.point];
+    const point = pointIn(drive, entry.point);
     showValue(entry, point, drive.quality);
-    if (entry.bar) showSpeed(entry.bar, point, drive.points);
+    if (entry.direction) showDirection(entry.direction, drive.points);
+    if (entry.bar) fillSpeed(entry.bar, point);
   }
-  text(row.direction, directionOf(drive.points));
   text(row.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
   hide(row.quality, drive.quality === "good");
 }
@@ -181,7 +189,7 @@ function tiles(changed) {
 function headings(filter, changed) {
   const row = make("div", "row head");
   row.setAttribute("role", "row");
-  const columns = [["name", t("Drive"), "name"], ["state", t("State"), "state"], ...COLUMNS.map(([point, width]) => [point, titleOf(point), `n ${width}`])];
+  const columns = [["name", t("Drive"), "name"], ["state", t("State"), "state"], ...COLUMNS.map(([point, width]) => [point, point === "reference" ? t("Reference") : titleOf(point), `n ${width}`])];
   const cells = columns.map(([key, title, name]) => {
     const [first, second] = FALLING.has(key) ? [`-${key}`, key] : [key, `-${key}`];
     const button = make("button", "sort", title);
@@ -192,8 +200,12 @@ function headings(filter, changed) {
     row.append(element);
     return { key, element };
   });
+  const stop = make("div", "stop", make("span", "unseen", t("Stop")));
+  stop.setAttribute("role", "columnheader");
+  row.append(stop);
   return {
     element: row,
+    cells,
     show: () => cells.forEach(({ key, element }) => element.setAttribute("aria-sort", { [key]: "ascending", [`-${key}`]: "descending" }[filter.sort] ?? "none")),
   };
 }
@@ -204,6 +216,24 @@ const LEGEND = [["stale", "12.3", t("stale: too old or the drive is offline")], 
 function legend() {
   const parts = LEGEND.flatMap(([quality, sample, said], place) => [place ? " · " : "", make("span", `value ${quality}`, sample), ` ${said}`]);
   return make("p", "note legend", ...parts);
+}
+
+/// Leaves out the columns that no drive fills, and makes room for the names.
+function fitColumns(table, heads, { drives, rows }) {
+  const filled = new Set(COLUMNS.map(([column]) => column).filter((column) => drives.some((drive) => pointIn(drive, column))));
+  const shown = [...filled].join();
+  for (const { key, element } of heads) if (COLUMNS.some(([column]) => column === key)) hide(element, !filled.has(key));
+  for (const row of rows.values()) {
+    if (row.columns === shown) continue;
+    row.columns = shown;
+    for (const { point, element } of row.cells) hide(element, !filled.has(point));
+  }
+  const [least, most] = NAME_WIDTHS;
+  const longest = drives.reduce((most, { name }) => Math.max(most, name.length), least);
+  const width = `${Math.round(CHARACTER_PX * Math.min(most, longest))}px`;
+  if (table.nameWidth === width) return;
+  table.nameWidth = width;
+  table.style.setProperty("--name", width);
 }
 
 function frame(root, headingRow) {
@@ -220,6 +250,7 @@ function frame(root, headingRow) {
   parts.latest = eventList();
   parts.events = make("section", "", make("h2", "", t("Latest events")), parts.latest.element, make("p", "note", anchor("#/events", "", t("All events"))));
   parts.events.setAttribute("aria-label", t("Latest events"));
+  parts.table = table;
   root.append(parts.news, table, parts.none, legend(), parts.lines, parts.events);
   return parts;
 }
@@ -264,6 +295,11 @@ export function open(root, { query }) {
     hide(parts.none, shown > 0 || drives.length === 0);
   }
 
+  // Whether somebody may be about to press something in the list, which then keeps its order.
+  function isAimedAt() {
+    return document.body.classList.contains("operating") && parts.rows.matches(":hover") && state.drives.every(({ name }) => state.rows.get(name).element.isConnected);
+  }
+
   // The elements of these drives, each group below the name of its line.
   function grouped(order) {
     const { rows, groups } = state;
@@ -303,7 +339,8 @@ export function open(root, { query }) {
       ]);
       state.drives = drives;
       keyed(state.rows, drives, driveRow, showDrive);
-      arrangeRows();
+      fitColumns(parts.table, heads.cells, state);
+      if (!isAimedAt()) arrangeRows();
       showTiles();
       announce();
       cards.show(buses, drives);

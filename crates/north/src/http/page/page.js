@@ -50,7 +50,13 @@ function unknownView(root, { word }) {
   return { title: t("Nothing here"), refresh: async () => {} };
 }
 
+function unfold(isOpen) {
+  document.querySelector("header").classList.toggle("open", isOpen);
+  $("menu").setAttribute("aria-expanded", String(isOpen));
+}
+
 function open(isFirst) {
+  unfold(false);
   const place = placeOf(location.hash);
   const [opener, entry] = VIEWS[place.word] ?? [unknownView, ""];
   view?.close?.();
@@ -143,6 +149,9 @@ addEventListener("hashchange", () => open(false));
 addEventListener("scroll", () => view && !view.fresh && scrolled.set(location.hash, window.scrollY), { passive: true });
 setInterval(() => document.hidden || watch(), 500);
 for (const kind of ["click", "input"]) $("view").addEventListener(kind, soon);
+// On a phone the pages are in a menu.
+$("menu").addEventListener("click", () => unfold($("menu").getAttribute("aria-expanded") !== "true"));
+addEventListener("keydown", ({ key }) => key === "Escape" && unfold(false));
 $("skip").addEventListener("click", (event) => {
   event.preventDefault();
   $("view").focus();

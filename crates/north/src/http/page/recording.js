@@ -54,7 +54,7 @@ export function spans(samples, end) {
 export function happenings(recording) {
   const { name } = recording.drive;
   const events = recording.events.map((event) => ({ t: event.t, kind: words(event.event), colour: EVENT_COLOURS[event.event] || "", text: textOf({ text: event.text, drive: name }) }));
-  const commands = recording.commands.map((command) => ({ t: command.t, kind: t("command"), colour: "blue",
+  const commands = recording.commands.map((command) => ({ t: command.t, kind: t("command"), colour: "",
     text: t("{command} from {client}: {result} after {time}", { command: command.command, client: `${words(command.source)} ${command.client}`, result: words(command.result), time: `${decimal(command.latency_ms, 0)} ms` }) }));
   const more = recording.more.map(({ t, trigger, text: what }) => ({ t, kind: words(trigger), colour: "amber", text: what }));
   return [...events, ...commands, ...more].sort((a, b) => a.t - b.t);
