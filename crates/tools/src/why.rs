@@ -92,6 +92,7 @@ mod tests {
             evidence: "interlocked is on".to_string(),
             age_ms: Some(140),
             remedy: "close it".to_string(),
+            ..Cause::default()
         };
         let explanation = Explanation {
             runs: Some(false),

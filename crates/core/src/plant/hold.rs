@@ -193,8 +193,8 @@ impl DriveHandle {
         why.causes.push(Cause {
             cause: HoldState::Reserved.name().to_string(),
             evidence,
-            age_ms: None,
             remedy,
+            ..Cause::default()
         });
         why
     }

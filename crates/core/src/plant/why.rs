@@ -33,8 +33,9 @@ pub(super) fn guarded(hindrance: &Guarded) -> Cause {
     Cause {
         cause: cause.to_string(),
         evidence: hindrance.why.clone(),
-        age_ms: None,
         remedy: remedy.to_string(),
+        retry_after_ms: Some(hindrance.retry_after_ms()),
+        ..Cause::default()
     }
 }
 
@@ -69,6 +70,7 @@ fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
         by,
         who: format!("{} {}", record.source, record.client),
         text: record.text.clone(),
+        result: record.result.to_string(),
         age,
     })
 }

@@ -22,8 +22,8 @@ const LOCAL_CONTROL: &str = "local_control";
 /// Word for an interlock, as `blocks` of a point names it.
 const INTERLOCKED: &str = "interlocked";
 
-/// A reason why a motor does not run.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+/// One reason why a motor does not run.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Cause {
     /// The reason in one word, for programs.
     pub cause: String,
@@ -33,6 +33,15 @@ pub struct Cause {
     pub age_ms: Option<u64>,
     /// The remedy.
     pub remedy: String,
+    /// Of a cause in the last order: who gave it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+    /// Of a refused order: its result code.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub result: Option<String>,
+    /// Of a start that must wait: after which it may be tried again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub retry_after_ms: Option<u64>,
 }
 
 /// Whether a motor runs, and why not.
@@ -103,7 +112,9 @@ pub struct RunOrder {
     pub who: String,
     /// The outcome as text.
     pub text: String,
-    /// Time since the order ended.
+    /// The outcome as a result code.
+    pub result: String,
+    /// How long ago it ended.
     pub age: Duration,
 }
 
@@ -222,6 +233,7 @@ impl Look<'_> {
             evidence,
             age_ms: self.age(at),
             remedy: remedy.to_string(),
+            ..Cause::default()
         }
     }
 
@@ -482,7 +494,11 @@ impl Look<'_> {
             ),
             (RunWish::Stop | RunWish::Reset, Fate::Refused | Fate::NotSent, _) => return None,
         };
-        Some(self.cause(cause, evidence, ended, remedy))
+        Some(Cause {
+            by: Some(order.who.clone()),
+            result: (order.fate == Fate::Refused).then(|| order.result.clone()),
+            ..self.cause(cause, evidence, ended, remedy)
+        })
     }
 
     fn no_order(&self, at: Option<Instant>) -> Cause {

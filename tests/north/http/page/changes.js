@@ -115,7 +115,7 @@ async function driveHasALinkOfItsOwn(gateway, page) {
   // The plot is drawn empty before its samples come.
   await page.until(() => document.querySelector('.points div') && document.querySelector(".curve")?.getAttribute("d"));
   const text = await page.eval("document.querySelector('.view').textContent");
-  for (const wanted of [/hand autohand(?!\d)/, /old point7/, /Interlocked|interlocked/, /interlocked is on \(140 ms ago\)close it/, /2 h 1 min/, /Starts3/, /unknown/,
+  for (const wanted of [/hand autohand(?!\d)/, /old point7/, /Interlocked|interlocked/, /interlockedAn interlock does not hold\.Make the interlock hold, then press Start\.interlocked is on/, /2 h 1 min/, /Starts3/, /unknown/,
     /a stop command: stopped in time, 1 min ago · a silent client: did not stop in time, 2 h 1 min ago, due · a silent gateway: never tested/]) assert.match(text, wanted);
   assert.deepEqual(await page.eval(() => [...document.querySelectorAll(".curve")].map((path) => path.getAttribute("d").split("M").length - 1)), [2], "a gap is a gap");
   assert.ok(await page.eval(() => document.querySelector('[data-operate]').dataset.operate === "pump 1/ä"));
@@ -243,6 +243,39 @@ async function rowsKeepTheFocus(gateway, page) {
   gateway.recordings = {};
 }
 
+/// Causes, faults and events in the words of an operator, in both languages: nothing that only a program can send.
+async function causesAreToldToAnOperator(gateway, first, browser) {
+  const causes = ["bus_down", "offline", "stale", "fault", "no_dc_link", "not_ready", "held", "order_refused", "order_expired", "order_unanswered", "other_master", "supervision", "stopped_by_gateway",
+    "stopped_by_interlock", "stopped_by_order", "fault_was_reset", "no_run_order", "direction_blocked", "warning", "not_known", "guarded", "interlocked", "reserved", "local_control"];
+  const why = causes.map((cause) => ({ cause, evidence: "it is on", age_ms: 10, remedy: cause === "fault" ? "check the cable; then write fault_reset" : "send run again", by: "http alice", result: "not_allowed",
+    retry_after_ms: 23400 }));
+  const fault = { state: "fault", fault_text: "1", points: { fault_code: point(1) } };
+  gateway.events = [{ id: 2, boot: 1, time: "2026-03-02T07:40:12.118Z", event: "fault", bus: "line1", drive: "pump-1", text: "drive pump-1 has fault 1: 1" }];
+  const words = {
+    "en-US": [/fault 1 \(no text known for this drive\)/, /press Reset fault/, /It may start again in 24 s\./, /It was stopped by http alice\./, /was refused: not allowed\./, /Nobody has started it\.\s+Press Start\./, /check the cable/],
+    de: [/Störung 1 \(kein Text für diesen Umrichter bekannt\)/, /dann Störung quittieren drücken/, /Er darf in 24 s wieder starten\./, /Gestoppt von http alice\./, /abgelehnt: nicht erlaubt\./, /Niemand hat ihn gestartet\.\s+Start drücken\./],
+  };
+  await first.open("about:blank");
+  for (const [language, wanted] of Object.entries(words)) {
+    gateway.drives = [drive("pump-1", { access: "control", why, blocked_by: causes, holder: "plc", hold_left_s: 9, ...fault })];
+    const page = await browser.page({ language });
+    await page.open(`${gateway.url}#/drive/pump-1`);
+    await page.until((count) => document.querySelectorAll(".causes li").length === count, causes.length);
+    await page.until(() => document.querySelector("#live:not([hidden])") && document.querySelector(".events .text"));
+    const text = await page.eval("document.querySelector('.view').innerText");
+    for (const each of wanted) assert.match(text, each);
+    assert.doesNotMatch(text, /send run|fault_reset|\[authority\]|no run order|\{\w+\}|undefined|has fault 1: 1/);
+    // A motor that is on at reference 0 does what it is asked to do.
+    gateway.drives = [drive("pump-1", { state: "running", why: [{ cause: "reference_zero", evidence: "run is on, and frequency_reference is 0 Hz", age_ms: 10, remedy: "send a reference above zero" }], blocked_by: ["reference_zero"] })];
+    const heading = language === "de" ? "Läuft mit 0 %: der Sollwert ist 0" : "Runs at 0 %: the reference is 0";
+    await page.until((heading) => document.getElementById("why-title").textContent === heading, heading);
+    await page.open(`${gateway.url}#/`);
+    await page.until((said) => document.querySelector(".rows .blocked")?.textContent === said, heading[0].toLowerCase() + heading.slice(1));
+    await page.close();
+  }
+  await first.open(`${gateway.url}#/`);
+}
+
 /// The language of the browser, its decimals and its units; texts of the gateway stay as they are.
 async function pageSpeaksTheLanguageOfTheBrowser(gateway, first, browser) {
   await first.open("about:blank");
@@ -293,7 +326,7 @@ async function main() {
   const browser = new Browser();
   const page = await browser.page();
   for (const step of [rowsFollowTheirDrives, listIsFiltered, listIsSortedAndGrouped, agesAreTheException, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis,
-    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, pageSpeaksTheLanguageOfTheBrowser]) {
+    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
     try {
       await step(gateway, page, browser);
     } catch (error) {

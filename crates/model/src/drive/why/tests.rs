@@ -81,6 +81,7 @@ impl Says {
             by,
             who: "mqtt plc".to_string(),
             text: "the text".to_string(),
+            result: "not_allowed".to_string(),
             age: Duration::from_secs(12),
         });
         self
@@ -237,6 +238,8 @@ fn what_became_of_the_last_order() {
         .ordered(RunWish::Run, Fate::Refused, Giver::Client)
         .explain();
     assert_eq!(refused.causes[0].evidence, "run from mqtt plc was refused: the text");
+    assert_eq!(refused.causes[0].by.as_deref(), Some("mqtt plc"));
+    assert_eq!(refused.causes[0].result.as_deref(), Some("not_allowed"));
     let mut read_before = stands("vacon-nx")
         .off("run")
         .ordered(RunWish::Run, Fate::Taken, Giver::Client);

@@ -158,16 +158,13 @@ export function badge(element, state) {
   text(element, stateWords(state));
 }
 
+export const faultWithoutText = (code) => t("fault {code} (no text known for this drive)", { code });
+
 /// Code and text of the fault that is known for now; empty without one.
 export function faultOf(drive) {
   const code = drive.points.fault_code;
   if (!isOn(code)) return "";
-  return drive.fault_text === String(code.value) ? t("fault {code}", { code: code.value }) : `F${code.value} ${drive.fault_text}`;
-}
-
-/// What holds the drive, apart from the fault and being offline, which are told elsewhere.
-export function blockedOf(drive) {
-  return drive.blocked_by.filter((word) => word !== "fault" && word !== "offline").map(words).join(", ");
+  return drive.fault_text === String(code.value) ? faultWithoutText(code.value) : `F${code.value} ${drive.fault_text}`;
 }
 
 const QUALITY_TITLES = {

@@ -2,9 +2,10 @@
 // well the line carries it.
 
 import {
-  age, anchor, badge, clock, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, old, places, section, showSpeed, showValue, size,
+  anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, old, places, section, showSpeed, showValue, size,
   speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
 } from "./common.js";
+import { causesTitle, causeText } from "./causes.js";
 import { EVENT_COLOURS, eventList, textOf } from "./events.js";
 import { failures } from "./lines.js";
 import { minuteAxis, minutes } from "./strips.js";
@@ -69,22 +70,22 @@ function pointList() {
 
 // ---- What it does and why
 
-function causeText(cause) {
-  const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${t("{age} ago", { age: age(cause.age_ms) })})`;
-  return [words(cause.cause), `${cause.evidence}${since}`, cause.remedy];
-}
-
 function whyPanel() {
   const list = make("ul", "causes");
-  const element = section("why", t("Why it does not run"), list);
-  element.classList.add("panel", "why-panel");
+  const element = section("why", "", list);
   return {
     element,
-    show(causes) {
+    show(drive) {
+      const { why: causes } = drive;
       hide(element, causes.length === 0);
+      text(element.firstChild, causesTitle(drive));
+      className(element, `panel why-panel ${drive.state === "running" ? "quiet" : ""}`);
       while (list.children.length > causes.length) list.lastChild.remove();
-      while (list.children.length < causes.length) list.append(make("li", "", make("b"), told("span", "evidence"), told("span", "remedy")));
-      causes.forEach((cause, place) => causeText(cause).forEach((part, at) => text(list.children[place].children[at], part)));
+      while (list.children.length < causes.length) list.append(make("li", "", make("b"), make("span", "said"), make("span", "remedy"), told("span", "evidence")));
+      causes.forEach((cause, place) => {
+        const { name, said, todo, evidence } = causeText(cause, drive, faultOf(drive));
+        [name, said, todo, evidence].forEach((part, at) => text(list.children[place].children[at], part));
+      });
     },
   };
 }
@@ -255,7 +256,7 @@ export function open(root, { name }) {
       const drive = await load(`drives/${encodeURIComponent(name)}`);
       showTop(parts.top, drive);
       parts.figures.show(drive);
-      parts.why.show(drive.why);
+      parts.why.show(drive);
       parts.points.show(drive.points);
       showCounters(parts.counters, drive);
       showStops(parts.stops, drive.stops);

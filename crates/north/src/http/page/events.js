@@ -1,6 +1,6 @@
 // Events: lists of them, and the view that searches them.
 
-import { anchor, arrange, hide, keyed, make, places, stamp, told, words } from "./common.js";
+import { anchor, arrange, faultWithoutText, hide, keyed, make, places, stamp, told, words } from "./common.js";
 import { t } from "./texts.js";
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
@@ -33,6 +33,8 @@ export function textOf({ text, drive, bus, recording }) {
   if (!name) return text;
   const known = [`${kind} ${name} `, recording?.id && `recording ${recording.id}`].find((words) => words && text.startsWith(words)) ?? "";
   const rest = text.slice(known.length).replace(/^: /, "");
+  const [, code] = /^has fault (\d+): \1$/.exec(rest) ?? [];
+  if (code) return faultWithoutText(code);
   return rest.replaceAll(` of ${kind} ${name}`, "").replaceAll(` of ${name} `, " ").replaceAll(`${kind} ${name}`, `the ${kind}`);
 }
 

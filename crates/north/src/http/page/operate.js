@@ -9,6 +9,7 @@
 // login commanded last (the gateway decides that), while the motor runs, the page is visible, and somebody used mouse, touch or
 // keyboard within the last ACTIVE_MS.
 
+import { refusalText } from "./causes.js";
 import { clock, text } from "./common.js";
 import { build, buildStop } from "./controls.js";
 import { stopPressed } from "./questions.js";
@@ -65,10 +66,12 @@ async function ask(name) {
 // ---- Commands
 
 // The words of a result: what the gateway knows, and nothing more.
-function words(status, json) {
+function words(status, json, about) {
   const ms = (value) => `${Math.round(value)} ms`;
   if (json.result === "confirmed") return t("confirmed: the drive shows the effect, after {time}", { time: ms(json.confirmed_ms) });
   if (json.result === "acknowledged") return t("acknowledged by the drive after {time}", { time: ms(json.latency_ms) }) + `; ${json.note || t("no read has shown the effect yet")}`;
+  const refusal = json.error?.code && refusalText(json, about);
+  if (refusal) return refusal;
   if (json.error && json.error.message) return `${wordsOf(json.error.code)}: ${json.error.message}`;
   return json.error || t("The gateway replied {status}.", { status });
 }
@@ -92,13 +95,13 @@ async function command(name, points, what, takesOver = false) {
   try {
     const refused = points.run === true ? await take(name, takesOver, abort) : null;
     if (refused !== null || abort.signal.aborted) {
-      if (refused !== null && !drive.stopping) tell(name, `${what}: ${words(refused.status, refused.json)}`, false);
+      if (refused !== null && !drive.stopping) tell(name, `${what}: ${words(refused.status, refused.json, drive.about)}`, false);
       drive.pending.delete(abort);
       return;
     }
     const { status, json } = await send(name, points, ANSWER_MS, abort);
     if (status === 200) drive.ours = true;
-    if (!drive.stopping) tell(name, `${what}: ${words(status, json)}`, status === 200);
+    if (!drive.stopping) tell(name, `${what}: ${words(status, json, drive.about)}`, status === 200);
   } catch {
     if (!drive.stopping) tell(name, t("{what}: no reply from the gateway; it is unknown whether the drive executed it", { what }), false);
   }

@@ -24,6 +24,7 @@ export const onStopAll = (listener) => listeners.push(listener);
 
 function say(words, name = "not-stopped") {
   className(bar.element, name);
+  bar.words.setAttribute("role", name.includes("information") ? "status" : "alert");
   text(bar.words, words);
   hide(bar.yes, true);
   hide(bar.no, sending);
@@ -57,7 +58,7 @@ function told({ drives }) {
   for (const { drive } of drives) {
     if (!open.some((other) => other.drive === drive)) stopped(drive, t("it has stopped"));
   }
-  if (!open.length) return [t("All drives have stopped: {count} of {count}, at {time}.", { count: drives.length, time: clock(new Date()) }), "not-stopped ended"];
+  if (!open.length) return [t("All drives have stopped: {count} of {count}, at {time}.", { count: drives.length, time: clock(new Date()) }), "not-stopped information"];
   return [t("{shown} of {count} drives are not known to have stopped.", { shown: open.length, count: drives.length })];
 }
 
