@@ -193,11 +193,18 @@ export function valueCell(tag, name) {
   return cell;
 }
 
-/// `told`: the quality that is told of all its values together, which is not repeated.
+// Values with a direction. Some families give them a sign, others only a bit: the page shows all of them as a magnitude and an arrow.
+const DIRECTED = new Set(["actual_speed", "output_frequency", "motor_speed", "speed_reference", "frequency_reference", "reference"]);
+
+export const isDirected = (name) => DIRECTED.has(name);
+
+const magnitudeOf = (name, point) => (isDirected(name) && typeof point.value === "number" ? Math.abs(point.value) : point.value);
+
+/// `cell.point` is the name of the point. `told`: the quality that is told of all its values together, which is not repeated.
 export function showValue(cell, point, told) {
   const shown = Boolean(point) && point.value !== null;
   const quality = qualityOf(point);
-  text(cell.value, shown ? (point.text ?? figure(point.value, point.unit)) : point ? "—" : "");
+  text(cell.value, shown ? (point.text ?? figure(magnitudeOf(cell.point, point), point.unit)) : point ? "—" : "");
   text(cell.unit, shown && point.unit && !point.text ? ` ${unitOf(point.unit)}` : "");
   className(cell.value, `value ${quality === "good" ? "main" : quality}`);
   hint(cell.value, point && QUALITY_TITLES[quality] ? QUALITY_TITLES[quality](point) : "");
@@ -218,25 +225,33 @@ export function fillSpeed(bar, point) {
 
 export function showSpeed(bar, point, points) {
   fillSpeed(bar, point);
-  text(bar.direction, directionOf(points));
+  text(bar.direction, directionOf(points, point));
   const reference = points.speed_reference;
-  text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(reference.value, reference.unit)} %` }) : "");
+  const sign = reference?.value < 0 ? " ←" : "";
+  text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(Math.abs(reference.value), reference.unit)} %${sign}` }) : "");
 }
 
 /// The direction in words.
 export const directionWord = (isReverse) => (isReverse ? t("reverse") : t("forward"));
 
-/// The way that a drive turns, or would, with a sign; empty where it is not known.
-export function directionOf({ reversed }) {
-  if (!isGood(reversed) || reversed.contradicted) return "";
-  return `${reversed.value ? "←" : "→"} ${directionWord(reversed.value)}`;
+/// The way that a drive turns, or would, with an arrow; empty where it is not known. A value below zero says it, whatever the bit says.
+export function directionOf({ reversed }, point) {
+  const isNegative = point?.value < 0;
+  if (!isNegative && (!isGood(reversed) || reversed.contradicted)) return "";
+  const isReverse = isNegative || Boolean(reversed.value);
+  return `${isReverse ? "←" : "→"} ${directionWord(isReverse)}`;
 }
 
-/// The direction as an arrow; its word is for readers of the screen.
-export const directionMark = () => make("span", "direction", make("span", "arrow"), make("span", "unseen"));
+/// The direction as an arrow behind the unit; its word is for readers of the screen.
+export function markDirection(cell) {
+  cell.direction = make("span", "direction", make("span", "arrow"), make("span", "unseen"));
+  cell.unit.after(cell.direction);
+}
 
-export function showDirection({ children: [arrow, word] }, points) {
-  const [sign, ...rest] = directionOf(points).split(" ");
+/// The bit says how the motor turns; a reference has only its own sign.
+export function showDirection({ point: name, direction: { children: [arrow, word] } }, point, points) {
+  const known = name.endsWith("reference") && !(point?.value < 0) ? "" : directionOf(points, point);
+  const [sign, ...rest] = (point ? known : "").split(" ");
   text(arrow, sign && ` ${sign}`);
   text(word, rest.length ? ` ${rest.join(" ")}` : "");
 }

@@ -2,8 +2,8 @@
 // well the line carries it.
 
 import {
-  anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, old, places, section, showSpeed, showValue, size,
-  speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
+  anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isDirected, isOn, keyed, make, markDirection, old, places, section,
+  showDirection, showSpeed, showValue, size, speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { causesTitle, causeText } from "./causes.js";
 import { EVENT_COLOURS, eventList, textOf } from "./events.js";
@@ -48,6 +48,8 @@ function pointList() {
   const create = ({ name, point }) => {
     const entry = valueCell("dd", "");
     entry.dd = entry.element;
+    entry.point = name;
+    if (isDirected(name)) markDirection(entry);
     entry.group = groupOf(name, point);
     entry.element = make("div", "", make("dt", "", words(name)), entry.dd);
     groups.get(entry.group).list.append(entry.element);
@@ -62,6 +64,7 @@ function pointList() {
         // A point that was never read has no kind yet.
         if (group !== entry.group) groups.get((entry.group = group)).list.append(entry.element);
         showValue(entry, point);
+        if (entry.direction) showDirection(entry, point, points);
       });
       for (const { group, list } of groups.values()) hide(group, list.childElementCount === 0);
     },
@@ -97,6 +100,8 @@ function figures() {
     if (point === "actual_speed") {
       cell.bar = speedBar();
       cell.element.append(cell.bar.element, cell.bar.direction, cell.bar.reference);
+    } else if (isDirected(point)) {
+      markDirection(cell);
     }
     cell.box = make("div", "", make("dt", "", titleOf(point)), cell.element);
     element.append(cell.box);
@@ -110,6 +115,7 @@ function figures() {
         hide(cell.box, !point);
         showValue(cell, point, drive.quality);
         if (cell.bar) showSpeed(cell.bar, point, drive.points);
+        if (cell.direction) showDirection(cell, point, drive.points);
       }
     },
   };

@@ -92,10 +92,10 @@ function ticks(low, high, step) {
 
 const place = (n) => n.toFixed(1);
 
-/// One plot. `digits`: of its figures; `time`: writes a time at the axis.
+/// One plot. `digits`: of its figures; `directed`: a value below zero is read as a magnitude and an arrow.
 class Plot {
-  constructor(group, { title, unit, digits }) {
-    Object.assign(this, { group, title, unit: unitOf(unit), digits, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
+  constructor(group, { title, unit, digits, directed = false }) {
+    Object.assign(this, { group, title, unit: unitOf(unit), digits, directed, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
     this.svg = draw("svg", { role: "img", "aria-label": title, height: group.height });
     this.reading = make("span", "reading");
     this.spread = make("span", "sub");
@@ -256,7 +256,8 @@ class Plot {
       this.dot.setAttribute("cy", place(this.y(sample.value)));
     }
     const resting = !shown && this.resting !== undefined;
-    const value = sample ? `${this.figure(sample.value)} ${this.unit}` : t("no value");
+    const isReverse = this.directed && sample?.value < 0;
+    const value = sample ? `${this.figure(isReverse ? -sample.value : sample.value)} ${this.unit}${isReverse ? " ←" : ""}` : t("no value");
     const spread = sample && sample.high > sample.low ? `${this.figure(sample.low)} … ${this.figure(sample.high)}` : "";
     text(this.reading, resting ? this.resting : value);
     text(this.spread, resting ? "" : spread);

@@ -1,6 +1,6 @@
 // Trends of a drive: what the gateway keeps in memory of its points, over 10 minutes, an hour or a day.
 
-import { anchor, clock, digitsOf, figure, hide, make, section, text, titleOf } from "./common.js";
+import { anchor, clock, digitsOf, directionOf, figure, hide, isDirected, make, section, text, titleOf } from "./common.js";
 import { PlotGroup } from "./plot.js";
 import { t, unitOf } from "./texts.js";
 
@@ -15,10 +15,14 @@ export function samplesOf({ samples, step_s: step }) {
   return samples.map((sample) => sample && { t: sample[0] + step * 500, low: sample[1], high: sample[2], value: sample[3] });
 }
 
-const nowOf = (point) => {
+function nowOf(name, points) {
+  const point = points[name];
   if (!point || point.value === null) return "—";
-  return point.quality === "good" && !point.contradicted ? `${figure(point.value, point.unit)} ${unitOf(point.unit)}` : t("not good");
-};
+  if (point.quality !== "good" || point.contradicted) return t("not good");
+  if (!isDirected(name)) return `${figure(point.value, point.unit)} ${unitOf(point.unit)}`;
+  const [arrow] = directionOf(points, point).split(" ");
+  return `${figure(Math.abs(point.value), point.unit)} ${unitOf(point.unit)} ${arrow}`.trim();
+}
 
 /// The trends of one drive; `marks` are its events.
 export function trends(drive) {
@@ -55,7 +59,7 @@ export function trends(drive) {
   function create(points) {
     const first = (names) => names.map((name) => points.find(({ point }) => point === name)).find(Boolean);
     chosen.points = SHOWN.map(first).filter(Boolean);
-    for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit) }));
+    for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit), directed: isDirected(point) }));
     // The same links for every time: new ones would take the focus from those that somebody is on.
     const titles = chosen.points.map(({ point }) => [`point=${point}&`, titleOf(point)]);
     links.push(...[["", t("all")], ...titles].map(([query, title]) => ({ query, element: anchor("", "", title) })));
@@ -68,7 +72,7 @@ export function trends(drive) {
     element,
     /// What the plots say while their cursor rests.
     showNow(points) {
-      for (const [name, plot] of plots) plot.now(nowOf(points[name]));
+      for (const [name, plot] of plots) plot.now(nowOf(name, points));
     },
     async refresh(load, marks) {
       if (performance.now() < chosen.next) return;
