@@ -49,8 +49,19 @@ const isHeldByOther = ({ json, about }) => json.hold === "held" && json.holder !
 /// Whether this login ranks above the client that holds it.
 const mayTakeOver = (drive) => isHeldByOther(drive) && (drive.about?.outranks ?? []).includes(drive.json.holder_rank);
 
+/// Whether this login holds it.
+const isHeldHere = ({ json, about }) => json.hold === "held" && json.holder === about?.principal;
+
+/// Whether this login may take the drive without a start.
+function mayTake(drive) {
+  const { hold, holder, holder_rank: rank } = drive.json;
+  if (!drive.about?.principal) return false;
+  return hold === "free" || (hold === "reserved" && (holder === drive.about.principal || drive.about.outranks.includes(rank))) || mayTakeOver(drive);
+}
+
 function holdWords(drive) {
   const { hold, holder, holder_rank: rank, hold_left_s: left } = drive.json;
+  if (isHeldHere(drive)) return t("held by you, {left} s left", { left });
   if (isHeldByOther(drive)) return t("held by {holder} ({rank}), {left} s left", { holder, rank, left });
   if (hold === "reserved") return t("stopped by {holder} ({rank}), reserved for {left} s", { holder, rank, left });
   if (hold === "local") return t("under local control");
@@ -107,7 +118,8 @@ function restsOn({ json, about }) {
 }
 
 // One question for both: what is about to happen is read before it is done.
-function buildQuestion(panel, name, { command, tell, known }) {
+function buildQuestion(panel, name, actions) {
+  const { tell, known } = actions;
   panel.asked = make("span");
   panel.choice = make("span", "operate-directions");
   panel.choice.setAttribute("role", "radiogroup");
@@ -119,16 +131,18 @@ function buildQuestion(panel, name, { command, tell, known }) {
     return radio;
   });
   panel.really = button("operate-button operate-start", "", "", () => {
-    const [points, what] = panel.order;
-    const takesOver = panel.takesOver;
+    const { send } = panel.order;
     panel.close();
-    command(name, points, what, takesOver);
+    send();
   });
   panel.cancel = button("operate-button", t("Cancel"), t("Cancel: do not start {drive}", { drive: name }), () => panel.close());
   panel.question = make("span", "operate-confirm", panel.asked, panel.choice, panel.really, panel.cancel);
   panel.question.hidden = true;
   panel.start = button("operate-button", t("Start …"), t("Start {drive}", { drive: name }), () => panel.open("start"));
   panel.turn = button("operate-button", "", "", () => panel.open("turn"));
+  panel.take = button("operate-button", "", "", () => (isHeldByOther(known(name)) ? panel.open("take") : actions.hold(name, "take", t("Take"))));
+  panel.release = button("operate-button", t("Release"), t("Release {drive}", { drive: name }), () => actions.hold(name, "release", t("Release")));
+  panel.actions = actions;
   panel.open = (kind) => {
     const { json } = known(name);
     panel.asking = kind;
@@ -144,13 +158,13 @@ function buildQuestion(panel, name, { command, tell, known }) {
   };
   panel.close = (why = "") => {
     if (!panel.asking) return;
-    const from = panel.asking === "turn" ? panel.turn : panel.start;
+    const from = panel[panel.asking];
     const hadFocus = panel.question.contains(document.activeElement);
     panel.asking = null;
     closed(panel.asks);
     hide(panel.question, true);
     panel.show(known(name));
-    if (why) tell(name, t("{what}: nothing was sent, {why}", { what: panel.order[1], why }), false);
+    if (why) tell(name, t("{what}: nothing was sent, {why}", { what: panel.order.what, why }), false);
     // What somebody presses next, meant for the question, meets no control.
     if (hadFocus) (why || from.hidden ? panel.place : from).focus();
   };
@@ -159,22 +173,30 @@ function buildQuestion(panel, name, { command, tell, known }) {
 
 /// Writes the question; the reference may change while it is asked.
 function ask(panel, name, { json, about }) {
+  const { command, hold } = panel.actions;
   const starts = panel.asking === "start";
+  const { takesOver } = panel;
+  const order = (points, what) => ({ what, send: () => command(name, points, what, takesOver) });
   const isReverse = starts ? panel.directions[1].checked : panel.target;
   const told = { drive: name, direction: directionWord(isReverse), reference: standingReference(json) };
   hide(panel.choice, !starts || !hasReverse(about));
-  if (!starts) {
+  if (panel.asking === "take") {
+    const what = t("Take over");
+    text(panel.asked, t("Take {drive} over from {holder} ({rank})? The motor goes on as it is.", { drive: name, holder: json.holder, rank: json.holder_rank }));
+    text(panel.really, t("Take over now"));
+    panel.order = { what, send: () => hold(name, "break", what) };
+  } else if (!starts) {
     text(panel.asked, t("{drive} {direction}, {reference}? The motor will change direction.", told));
     text(panel.really, t("Change direction now"));
-    panel.order = [{ reverse: isReverse }, t("Direction {direction}", told)];
+    panel.order = order({ reverse: isReverse }, t("Direction {direction}", told));
   } else if (hasReverse(about)) {
     text(panel.asked, t("Start {drive} {direction}, {reference}? The motor will turn.", told));
     text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
-    panel.order = [{ run: true, reverse: isReverse }, t("Start {direction}", told)];
+    panel.order = order({ run: true, reverse: isReverse }, t("Start {direction}", told));
   } else {
     text(panel.asked, t("Start {drive}, {reference}? The motor will turn.", told));
     text(panel.really, panel.takesOver ? t("Take over and start") : t("Start now"));
-    panel.order = [{ run: true }, t("Start")];
+    panel.order = order({ run: true }, t("Start"));
   }
   panel.really.setAttribute("aria-label", `${panel.really.textContent}: ${name}`);
 }
@@ -202,14 +224,15 @@ export function build(panel, name, actions) {
   buildReference(panel, name, actions);
   panel.result = make("span", "operate-result");
   panel.result.setAttribute("role", "status");
-  panel.holder = make("span", "operate-holder");
+  panel.holder = make("span");
+  panel.hold = make("span", "operate-holder", panel.holder, panel.take, panel.release);
   panel.lease = make("span", "operate-lease");
   panel.place.tabIndex = -1;
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
   panel.place.classList.add("operate");
   // What comes and goes stands behind what is pressed, which so keeps its place.
-  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), make("span", "operate-go", panel.start, panel.turn), panel.reference, panel.reset, panel.question, panel.holder,
+  panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), make("span", "operate-go", panel.start, panel.turn), panel.reference, panel.reset, panel.question, panel.hold,
     panel.result, panel.lease);
   panel.show = (drive) => {
     const focused = panel.place.contains(document.activeElement) ? document.activeElement : null;
@@ -223,8 +246,19 @@ export function build(panel, name, actions) {
 function keepFocus(panel, focused) {
   const isLost = focused && !focused.checkVisibility() && [focused, document.body].includes(document.activeElement);
   if (!isLost || panel.asking) return;
-  const next = [panel.turn, panel.start, panel.set, panel.place].find((each) => each.checkVisibility());
+  const holds = [panel.release, panel.take];
+  const next = [...(holds.includes(focused) ? holds : []), panel.turn, panel.start, panel.set, panel.place].find((each) => each.checkVisibility());
   next?.focus({ preventScroll: true });
+}
+
+/// Who holds the drive, and the ways to take and release it; nothing where drives are not held.
+function showHold(panel, drive) {
+  text(panel.holder, holdWords(drive));
+  hide(panel.take, !mayTake(drive));
+  text(panel.take, isHeldByOther(drive) ? t("Take over …") : t("Take"));
+  panel.take.setAttribute("aria-label", `${drive.json.name}: ${panel.take.textContent}`);
+  hide(panel.release, !isHeldHere(drive));
+  hide(panel.hold, !panel.holder.textContent && panel.take.hidden && panel.release.hidden);
 }
 
 function show(panel, name, drive) {
@@ -237,13 +271,14 @@ function show(panel, name, drive) {
     text(panel.range, limits(point));
   }
   hide(panel.reset, json.state !== "fault");
-  text(panel.holder, holdWords(drive));
+  showHold(panel, drive);
   if (panel.asking && panel.restsOn !== restsOn(drive)) return panel.close(t("{drive} has changed", { drive: name }));
-  for (const each of [panel.start, panel.turn]) each.disabled = Boolean(panel.asking);
+  for (const each of [panel.start, panel.turn, panel.take]) each.disabled = Boolean(panel.asking);
   if (panel.asking) return ask(panel, name, drive);
   const runs = json.state === "running";
   hide(panel.start, runs);
   text(panel.start, mayTakeOver(drive) ? t("Take over and start …") : t("Start …"));
+  panel.start.setAttribute("aria-label", mayTakeOver(drive) ? `${panel.start.textContent}: ${name}` : t("Start {drive}", { drive: name }));
   hide(panel.turn, !runs || !hasReverse(about));
   text(panel.turn, orderedReverse(json) ? t("Forward …") : t("Reverse …"));
   panel.turn.setAttribute("aria-label", `${name}: ${panel.turn.textContent}`);

@@ -19,6 +19,8 @@ import { notStopped, stopped } from "./stops.js";
 import { t, wordsOf } from "./texts.js";
 
 const ACTIVE_MS = 120000;
+// A hold is renewed as a lease of that time.
+const KEPT_MS = 15000;
 const WARN_MS = 90000;
 const ANSWER_MS = 15000;
 const STOP_ANSWER_MS = 8000;
@@ -36,7 +38,7 @@ const page = Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byt
 
 // What is known of a drive besides its values.
 function known(name) {
-  if (!drives.has(name)) drives.set(name, { json: null, about: null, asked: false, ours: false, commanded: -Infinity, renewed: 0, pending: new Set(), stopping: false });
+  if (!drives.has(name)) drives.set(name, { json: null, about: null, asked: false, ours: false, kept: false, commanded: -Infinity, renewed: 0, pending: new Set(), stopping: false });
   return drives.get(name);
 }
 
@@ -106,6 +108,19 @@ async function command(name, points, what, takesOver = false) {
     if (!drive.stopping) tell(name, t("{what}: no reply from the gateway; it is unknown whether the drive executed it", { what }), false);
   }
   drive.pending.delete(abort);
+}
+
+/// Takes, takes over (`break`) or releases the drive; the motor goes on as it is.
+async function hold(name, action, what) {
+  const drive = known(name);
+  tell(name, t("{what}: sent …", { what }), null);
+  try {
+    const { status, json } = await post(pathOf(name, "hold"), { action }, ANSWER_MS);
+    if (status === 200) drive.kept = action !== "release";
+    if (!drive.stopping) tell(name, `${what}: ${status === 200 ? t("done") : words(status, json, drive.about)}`, status === 200);
+  } catch {
+    if (!drive.stopping) tell(name, `${what}: ${t("The gateway does not respond.")}`, false);
+  }
 }
 
 // Of these nobody knows whether the drive took it; of the others it is known that it did not.
@@ -179,7 +194,7 @@ function tell(name, words, good) {
 
 // ---- What is shown
 
-const actions = { command, stop, tell, known };
+const actions = { command, hold, stop, tell, known };
 
 function show(name) {
   for (const panel of panels.get(name) || []) {
@@ -216,7 +231,7 @@ function showNotice(element, drive) {
 
 onSession(() => {
   if (!isLoggedIn()) {
-    for (const drive of drives.values()) Object.assign(drive, { about: null, asked: false, ours: false, result: null });
+    for (const drive of drives.values()) Object.assign(drive, { about: null, asked: false, ours: false, kept: false, result: null });
   }
   for (const name of panels.keys()) show(name);
 });
@@ -230,10 +245,15 @@ function active({ repeat }) {
 
 const idle = () => performance.now() - lastActive;
 
-function renews(drive) {
+function supervises(drive) {
   const runs = drive.json && (drive.json.state === "running" || performance.now() - drive.commanded < 10000);
   return isLoggedIn() && drive.ours && runs && drive.about && drive.about.lease_ms !== null;
 }
+
+/// What somebody took here is kept while somebody is here.
+const keeps = ({ kept, json, about }) => isLoggedIn() && kept && json?.hold === "held" && about && json.holder === about.principal;
+
+const renews = (drive) => supervises(drive) || keeps(drive);
 
 function leaseWarning(drive) {
   if (!renews(drive)) return drive.lost || "";
@@ -241,7 +261,10 @@ function leaseWarning(drive) {
   return idle() >= WARN_MS ? t("Move the mouse or press a key, or its lease is no longer renewed.") : "";
 }
 
-const leaseWords = (drive) => leaseWarning(drive) || (renews(drive) ? t("Supervised by this page while you are active.") : "");
+function leaseWords(drive) {
+  if (supervises(drive)) return leaseWarning(drive) || t("Supervised by this page while you are active.");
+  return leaseWarning(drive) || (keeps(drive) ? t("Kept by this page while you are active.") : "");
+}
 
 async function renew(name, drive, now) {
   drive.renewed = now;
@@ -261,7 +284,7 @@ setInterval(() => {
   const now = performance.now();
   for (const [name, drive] of drives) {
     if (!renews(drive)) continue;
-    const due = now - drive.renewed >= Math.max(250, Math.min(5000, drive.about.lease_ms / 3));
+    const due = now - drive.renewed >= Math.max(250, Math.min(5000, (drive.about.lease_ms ?? KEPT_MS) / 3));
     if (due && !document.hidden && idle() < ACTIVE_MS) renew(name, drive, now);
     show(name);
   }
