@@ -220,10 +220,14 @@ mod tests {
         let documented = include_str!("../../../../../docs/troubleshooting.md");
         let (_, table) = documented.split_once("| cause | evidence |").expect("the causes");
         let rows = table.lines().skip(2).take_while(|line| line.starts_with('|'));
-        let named = rows.filter_map(|row| row.split('|').nth(1)).flat_map(|cell| cell.split('`').skip(1).step_by(2));
+        let named = rows
+            .filter_map(|row| row.split('|').nth(1))
+            .flat_map(|cell| cell.split('`').skip(1).step_by(2));
         let profiles = Profiles::built_in();
         let points = profiles.iter().flat_map(|profile| profile.points.iter());
-        let blocks = points.filter_map(|point| point.blocks.as_ref()).map(|blocks| blocks.cause.as_str());
+        let blocks = points
+            .filter_map(|point| point.blocks.as_ref())
+            .map(|blocks| blocks.cause.as_str());
         let causes: BTreeSet<&str> = named.chain(blocks).collect();
         assert!(causes.len() > 25, "{causes:?}");
         for cause in causes.into_iter().filter(|cause| *cause != "fault") {
