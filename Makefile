@@ -15,7 +15,7 @@ IN_OWN_TMP := tests/tools/in_own_tmp.sh
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster fleet-thousand fleet-metrics interop book clean
+.PHONY: help build test tools install uninstall lint fmt deny advisories bench fuzz check world mutants soak fleet fleet-rollout fleet-cluster fleet-thousand fleet-metrics interop book clean
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
@@ -23,6 +23,33 @@ help: ## Show this list
 
 build: ## Build the optimised binary, target/release/drivegate
 	cargo build --release --locked
+
+PROGRAM ?= target/release/drivegate
+DESTDIR ?=
+SHARE := $(DESTDIR)/usr/share
+install: ## Install program, service, manual pages, completions and documents, as root after make build; an existing configuration stays
+	@[ -x $(PROGRAM) ] || { echo "error: $(PROGRAM) is missing; run make build first" >&2; exit 1; }
+	install -D -m 755 $(PROGRAM) $(DESTDIR)/usr/bin/drivegate
+	install -D -m 644 -t $(DESTDIR)/etc/systemd/system systemd/drivegate.service
+	install -D -m 644 -t $(DESTDIR)/etc/udev/rules.d systemd/99-drivegate.rules
+	[ -e $(DESTDIR)/etc/drivegate/drivegate.toml ] || install -D -m 644 -t $(DESTDIR)/etc/drivegate deploy/drivegate.toml
+	install -d $(SHARE)/man/man1 $(SHARE)/bash-completion/completions $(SHARE)/zsh/vendor-completions $(SHARE)/fish/vendor_completions.d
+	$(PROGRAM) man $(SHARE)/man/man1
+	$(PROGRAM) completions bash >$(SHARE)/bash-completion/completions/drivegate
+	$(PROGRAM) completions zsh >$(SHARE)/zsh/vendor-completions/_drivegate
+	$(PROGRAM) completions fish >$(SHARE)/fish/vendor_completions.d/drivegate.fish
+	for folder in . decisions pictures; do install -D -m 644 -t $(SHARE)/doc/drivegate/$$folder docs/$$folder/*.*; done
+	@[ -n "$(DESTDIR)" ] || ! [ -d /run/systemd/system ] || systemctl daemon-reload
+	@echo "edit /etc/drivegate/drivegate.toml; then: drivegate check && systemctl enable --now drivegate"
+
+uninstall: ## Remove what make install installed; configuration and state stay
+	@[ -n "$(DESTDIR)" ] || ! [ -d /run/systemd/system ] || systemctl disable --now drivegate || true
+	rm -f $(DESTDIR)/usr/bin/drivegate $(DESTDIR)/etc/systemd/system/drivegate.service $(DESTDIR)/etc/udev/rules.d/99-drivegate.rules
+	rm -f $(SHARE)/man/man1/drivegate.1 $(SHARE)/man/man1/drivegate-*.1 $(SHARE)/bash-completion/completions/drivegate
+	rm -f $(SHARE)/zsh/vendor-completions/_drivegate $(SHARE)/fish/vendor_completions.d/drivegate.fish
+	rm -rf $(SHARE)/doc/drivegate
+	@[ -n "$(DESTDIR)" ] || ! [ -d /run/systemd/system ] || systemctl daemon-reload
+	@echo "/etc/drivegate and /var/lib/drivegate stay"
 
 # Most tests wait for other programs and for real time, so three times as many as there are cores run at once.
 TEST_THREADS ?= $(shell expr 3 \* "$$(getconf _NPROCESSORS_ONLN)")

@@ -380,6 +380,49 @@ fn grafana_finds_its_datasource_and_dashboards() {
     assert_eq!(home, Some(format!("{path}/gateway.json").as_str()));
 }
 
+/// Installs into a folder, again over an edited configuration, and removes all but that.
+#[test]
+fn make_install_keeps_the_configuration_and_uninstall_removes_the_rest() {
+    let folder = TempDir::new().unwrap();
+    let make = |target: &str| {
+        let destination = format!("DESTDIR={}", folder.path().display());
+        let program = format!("PROGRAM={}", env!("CARGO_BIN_EXE_drivegate"));
+        let directory = root().display().to_string();
+        run_well(tool("make").as_ref(), &["-C", &directory, target, &destination, &program])
+    };
+    make("install");
+    let configuration = folder.path().join("etc/drivegate/drivegate.toml");
+    let read = |file: &str| fs::read_to_string(folder.path().join(file)).unwrap_or_default();
+    let unit = fs::read_to_string(root().join("systemd/drivegate.service")).unwrap();
+    assert_eq!(read("etc/systemd/system/drivegate.service"), unit);
+    assert!(read("usr/share/man/man1/drivegate.1").contains("drivegate"));
+    for completions in [
+        "bash-completion/completions/drivegate",
+        "zsh/vendor-completions/_drivegate",
+        "fish/vendor_completions.d/drivegate.fish",
+    ] {
+        assert!(read(&format!("usr/share/{completions}")).contains("stop-all"), "{completions}");
+    }
+    let program = folder.path().join("usr/bin/drivegate");
+    run_well(&program, &["check", "--config", &configuration.display().to_string()]);
+    fs::write(&configuration, "# edited\n").unwrap();
+    make("install");
+    assert_eq!(fs::read_to_string(&configuration).unwrap(), "# edited\n");
+    make("uninstall");
+    let mut left = Vec::new();
+    let mut open = vec![folder.path().to_path_buf()];
+    while let Some(directory) = open.pop() {
+        for entry in fs::read_dir(directory).unwrap() {
+            let path = entry.unwrap().path();
+            match path.is_dir() {
+                true => open.push(path),
+                false => left.push(path),
+            }
+        }
+    }
+    assert_eq!(left, [configuration]);
+}
+
 #[test]
 fn the_image_is_small_and_not_root() {
     let text = read("deploy/Dockerfile");
