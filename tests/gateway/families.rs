@@ -123,9 +123,13 @@ impl Rig {
 
     /// Gives a command with named values over the local socket; returns status and result.
     fn command(&self, values: &str) -> (u16, serde_json::Value) {
+        self.post("drives/drive/commands", values)
+    }
+
+    fn post(&self, path: &str, body: &str) -> (u16, serde_json::Value) {
         let socket = self.site.path("own.sock");
-        let url = "http://gateway/api/v1/drives/drive/commands";
-        curl(&["--unix-socket", &socket, "-d", values, url])
+        let url = format!("http://gateway/api/v1/{path}");
+        curl(&["--unix-socket", &socket, "-d", body, &url])
     }
 
     /// Number of times that the motor has started to turn.

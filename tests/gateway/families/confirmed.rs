@@ -1,4 +1,5 @@
-//! Orders of every family end as confirmed once the drive shows them, and as not confirmed where it does not.
+//! Orders of every family end as confirmed once the drive shows them, and as not confirmed where it does not; a stop of all
+//! drives is proven.
 
 use super::Rig;
 use super::cases::{Case, cases};
@@ -22,6 +23,13 @@ fn confirms(case: &Case) {
     rig.drive.signal("USR1");
     rig.site.until_state("drive", "fault");
     confirmed("{\"fault_reset\": true}");
+    confirmed("{\"run\": true}");
+    let (status, stopped) = rig.post("stop", "{}");
+    assert_eq!(
+        (status, &stopped["drives"][0]["outcome"]),
+        (200, &serde_json::json!("standing")),
+        "{name}: {stopped}"
+    );
 }
 
 /// Tests every third family from `first` on, so that three tests can run side by side.

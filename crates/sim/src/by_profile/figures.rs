@@ -149,7 +149,7 @@ impl ProfileDrive {
             known.contains(key) || part.mask & !figure == 0
         };
         let wishes = self.wishes(&profile, is_decided, now);
-        // Bits of earlier states do not stay in a register.
+        // Nothing of earlier states stays in a register.
         for (key, part) in wishes.iter().flat_map(|wish| wish.any.iter().flatten()) {
             if !known.contains(key) && !self.is_place(*key) {
                 let mask = part.mask & !figures.get(key).copied().unwrap_or(0);

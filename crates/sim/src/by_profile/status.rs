@@ -28,7 +28,7 @@ impl Shows {
         self.fault != 0
     }
 
-    /// Whether the drive would run if it were commanded to.
+    /// A run command would start the motor.
     fn ready(&self) -> bool {
         !self.faulted()
     }

@@ -59,7 +59,7 @@ pub(super) struct Family {
     pub(super) acts_once: bool,
     /// A reset while a run command stands starts the motor.
     pub(super) restarts_on_reset: bool,
-    /// All bits of the status words.
+    /// The status words, all bits of them.
     pub(super) status: fn(&Shows) -> Words,
 }
 
@@ -110,7 +110,7 @@ pub(super) const FAMILIES: [Family; 16] = [
         restarts_on_reset: true,
         ..family("vacon-10", vacon, status::vacon)
     },
-    // The states of this family are coils, each a point of its own.
+    // States of a Hitachi are coils, each a point of its own.
     Family {
         other: hitachi_coils,
         ..family("hitachi", hitachi, |_| Vec::new())
