@@ -84,7 +84,7 @@ async function keyboardIsEnough(page, base) {
 /// Longer words fit, too.
 async function otherLanguagesFit(browser, views, base) {
   const page = await browser.page({ width: 390, height: 800, language: "de" });
-  for (const [hash, sign] of views) await looks(page, [hash, sign, hash === "#/" ? ["Umrichter", "Aufzeichnungen"] : []], base, true);
+  for (const [hash, sign] of views) await looks(page, [hash, sign, hash === "#/" ? ["Umrichter", "Leitungen"] : []], base, true);
   await page.close();
 }
 
