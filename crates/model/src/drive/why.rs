@@ -33,13 +33,13 @@ pub struct Cause {
     pub age_ms: Option<u64>,
     /// The remedy.
     pub remedy: String,
-    /// Who gave the last order, where the cause lies in that order.
+    /// Of a cause in the last order: who gave it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
-    /// Result code of the refused order, where the cause is a refusal.
+    /// Of a refused order: its result code.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub result: Option<String>,
-    /// Time after which a start that must wait may be tried again, ms.
+    /// Of a start that must wait: after which it may be tried again.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retry_after_ms: Option<u64>,
 }

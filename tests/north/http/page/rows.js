@@ -143,4 +143,22 @@ async function rowsKeepTheirPlaceUnderThePointer(gateway, page) {
   await page.until(() => document.querySelector(".rows .name a").textContent === "feed-pump-house-1");
 }
 
-run([rowsAreCompact, theHeaderOfAPhoneIsOneLine, namesBreakBetweenWords, columnsThatNoDriveFillsAreLeftOut, colourMeansThatSomebodyIsWanted, rowsKeepTheirPlaceUnderThePointer]);
+/// That all drives have stopped is no warning.
+async function stoppedIsInformation(gateway, page) {
+  await overview(gateway, page, [1440, 900]);
+  gateway.obey = () => [200, { ok: true, drives: gateway.drives.map(({ name }) => ({ drive: name, outcome: "standing", reason: "" })) }];
+  await page.eval(click, "#stop-all");
+  await page.eval(click, "#stops .operate-stop");
+  await page.until(() => document.getElementById("stops").innerText.includes("All drives have stopped: 60 of 60"));
+  const [role, red, blue] = await page.eval(() => {
+    const bar = document.querySelector("#stops .not-stopped");
+    const [red, , blue] = getComputedStyle(bar).backgroundColor.match(/\d+/g).map(Number);
+    return [bar.querySelector("p").getAttribute("role"), red, blue];
+  });
+  assert.equal(role, "status");
+  assert.ok(Math.abs(red - blue) < 25, "grey");
+  await page.press("Escape");
+  assert.equal(await page.eval(() => document.getElementById("stops").innerText), "");
+}
+
+run([stoppedIsInformation, rowsAreCompact, theHeaderOfAPhoneIsOneLine, namesBreakBetweenWords, columnsThatNoDriveFillsAreLeftOut, colourMeansThatSomebodyIsWanted, rowsKeepTheirPlaceUnderThePointer]);

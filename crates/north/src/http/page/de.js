@@ -361,7 +361,6 @@ const texts = {
   "Its panel or its terminals control it.": "Sein Bedienfeld oder seine Klemmen steuern ihn.",
   "Select the fieldbus as control place at the drive.": "Am Umrichter den Feldbus als Steuerplatz wählen.",
   "undervoltage": "Unterspannung",
-  "start inhibited": "Start gesperrt",
   "Its supply voltage is too low.": "Seine Versorgungsspannung ist zu niedrig.",
   "Check the mains and its fuses.": "Netz und Sicherungen prüfen.",
   "bypass": "Bypass",
@@ -375,8 +374,6 @@ const texts = {
   "Turn the switch to automatic.": "Den Schalter auf Automatik stellen.",
   "output blocked": "Impulssperre",
   "Its output is blocked by an input.": "Ein Eingang sperrt seinen Ausgang.",
-  "An input of the drive inhibits the start.": "Ein Eingang des Umrichters sperrt den Start.",
-  "Close the enable input of the drive.": "Den Freigabeeingang des Umrichters schließen.",
   "Open the input that blocks the output.": "Den Eingang öffnen, der den Ausgang sperrt.",
   "reference missing": "Sollwert fehlt",
   "The drive misses its reference.": "Dem Umrichter fehlt sein Sollwert.",
@@ -412,16 +409,6 @@ const texts = {
   "the drive does not answer": "der Umrichter antwortet nicht",
   "not sent: the line was busy": "nicht gesendet: die Leitung war belegt",
   "fault {code} (no text known for this drive)": "Störung {code} (kein Text für diesen Umrichter bekannt)",
-  "held by you, {left} s left": "von Ihnen belegt, noch {left} s",
-  "Take": "Übernehmen",
-  "Release": "Freigeben",
-  "Release {drive}": "{drive} freigeben",
-  "Take over": "Übernahme",
-  "Take over …": "Übernehmen …",
-  "Take over now": "Jetzt übernehmen",
-  "Take {drive} over from {holder} ({rank})? The motor goes on as it is.": "{drive} von {holder} ({rank}) übernehmen? Der Motor läuft unverändert weiter.",
-  "done": "erledigt",
-  "Kept by this page while you are active.": "Von dieser Seite belegt, solange Sie aktiv sind.",
 };
 
 const words = {

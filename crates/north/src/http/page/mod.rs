@@ -213,6 +213,28 @@ mod tests {
         assert!(served + DOCUMENT.len() <= MOST_BYTES, "{served} bytes");
     }
 
+    /// A cause without words of its own would be told to an operator in those of the interface.
+    #[test]
+    fn every_cause_has_words_for_an_operator() {
+        let script = include_str!("causes.js");
+        let documented = include_str!("../../../../../docs/troubleshooting.md");
+        let (_, table) = documented.split_once("| cause | evidence |").expect("the causes");
+        let rows = table.lines().skip(2).take_while(|line| line.starts_with('|'));
+        let named = rows
+            .filter_map(|row| row.split('|').nth(1))
+            .flat_map(|cell| cell.split('`').skip(1).step_by(2));
+        let profiles = Profiles::built_in();
+        let points = profiles.iter().flat_map(|profile| profile.points.iter());
+        let blocks = points
+            .filter_map(|point| point.blocks.as_ref())
+            .map(|blocks| blocks.cause.as_str());
+        let causes: BTreeSet<&str> = named.chain(blocks).collect();
+        assert!(causes.len() > 25, "{causes:?}");
+        for cause in causes.into_iter().filter(|cause| *cause != "fault") {
+            assert!(script.contains(&format!("\n  {cause}: [")), "causes.js lacks {cause}");
+        }
+    }
+
     /// Searching for another kind would be refused.
     #[test]
     fn the_kinds_of_events_are_those_that_there_are() {

@@ -1,7 +1,7 @@
 // All drives: faults first, then warnings, then by name; or in the order of a column, and in groups of their lines.
 
 import {
-  anchor, arrange, badge, blockedOf, className, directionMark, faultOf, fillSpeed, hide, isOn, keyed, make, old, places, showDirection, showValue, speedBar,
+  anchor, arrange, badge, className, directionMark, faultOf, fillSpeed, hide, isOn, keyed, make, old, places, showDirection, showValue, speedBar,
   STATES, stateOf, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { blockedOf } from "./causes.js";
