@@ -243,6 +243,32 @@ async function rowsKeepTheFocus(gateway, page) {
   gateway.recordings = {};
 }
 
+/// A magnitude and an arrow, whether a family gives its values a sign or says the direction by a bit alone.
+async function everyFamilyHasOneConventionOfSigns(gateway, page) {
+  const values = (sign, more) => ({ output_frequency: point(sign * 27.5, { unit: "Hz" }), actual_speed: point(sign * 55, { unit: "%" }), motor_speed: point(sign * 803, { unit: "rpm" }),
+    speed_reference: point(55, { unit: "%" }), motor_torque: point(-12.5, { unit: "%" }), ...more });
+  const families = { "a-signed": values(-1, { reversed: point(true) }), "b-bit": values(1, { reversed: point(true) }), "c-sign-only": values(-1, {}), "d-forward": values(1, { reversed: point(false) }),
+    "e-unknown": values(1, {}), "f-slows": values(-1, { reversed: point(false) }) };
+  gateway.drives = Object.entries(families).map(([name, points]) => drive(name, { state: "running", points }));
+  await page.open(`${gateway.url}#/lines`);
+  await page.open(`${gateway.url}#/`);
+  await page.until(() => document.querySelectorAll(".rows .row").length === 6);
+  const shownIn = () => [...document.querySelectorAll(".rows .row")].map((row) => [...row.querySelectorAll(".n")].filter((cell) => !cell.hidden).map((cell) => cell.textContent));
+  const reverse = ["55.0 % ← reverse", "27.50 Hz ← reverse", "55.0 %", "803 rpm ← reverse", "-12.5 %"];
+  const forward = ["55.0 % → forward", "27.50 Hz → forward", "55.0 %", "803 rpm → forward", "-12.5 %"];
+  assert.deepEqual(await page.eval(shownIn), [reverse, reverse, reverse, forward, ["55.0 %", "27.50 Hz", "55.0 %", "803 rpm", "-12.5 %"], reverse]);
+  gateway.trends = { output_frequency: { unit: "Hz", samples: [[-27.5, -27.5, -27.5], [-27.5, -27.5, -27.5], [-27.5, -27.5, -27.5]] } };
+  await page.open(`${gateway.url}#/drive/a-signed`);
+  await page.until(() => document.querySelector(".plot .reading")?.textContent === "27.50 Hz ←");
+  const text = await page.eval(() => [...document.querySelectorAll(".figures dd, .points dd")].map((each) => each.textContent).join("|"));
+  assert.match(text, /27\.50 Hz ← reverse/);
+  assert.doesNotMatch(text, /-27|-55|-803/);
+  await page.eval(() => document.querySelector(".cursor").focus());
+  await page.press("ArrowLeft");
+  assert.match(await page.eval(() => document.querySelector(".cursor").getAttribute("aria-valuetext")), /Frequency 27\.50 Hz ←/);
+  gateway.trends = {};
+}
+
 /// Causes, faults and events in the words of an operator, in both languages: nothing that only a program can send.
 async function causesAreToldToAnOperator(gateway, first, browser) {
   const causes = ["bus_down", "offline", "stale", "fault", "no_dc_link", "not_ready", "held", "order_refused", "order_expired", "order_unanswered", "other_master", "supervision", "stopped_by_gateway",
@@ -326,7 +352,7 @@ async function main() {
   const browser = new Browser();
   const page = await browser.page();
   for (const step of [rowsFollowTheirDrives, listIsFiltered, listIsSortedAndGrouped, agesAreTheException, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis,
-    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
+    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, everyFamilyHasOneConventionOfSigns, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
     try {
       await step(gateway, page, browser);
     } catch (error) {

@@ -225,7 +225,7 @@ export function fillSpeed(bar, point) {
 
 export function showSpeed(bar, point, points) {
   fillSpeed(bar, point);
-  text(bar.direction, directionOf(points));
+  text(bar.direction, directionOf(points, point));
   const reference = points.speed_reference;
   const sign = reference?.value < 0 ? " ←" : "";
   text(bar.reference, isGood(reference) ? t("set {value}", { value: `${figure(Math.abs(reference.value), reference.unit)} %${sign}` }) : "");
@@ -252,15 +252,6 @@ export function markDirection(cell) {
 export function showDirection({ point: name, direction: { children: [arrow, word] } }, point, points) {
   const known = name.endsWith("reference") && !(point?.value < 0) ? "" : directionOf(points, point);
   const [sign, ...rest] = (point ? known : "").split(" ");
-  text(arrow, sign && ` ${sign}`);
-  text(word, rest.length ? ` ${rest.join(" ")}` : "");
-}
-
-/// The direction as an arrow; its word is for readers of the screen.
-export const directionMark = () => make("span", "direction", make("span", "arrow"), make("span", "unseen"));
-
-export function showDirection({ children: [arrow, word] }, points) {
-  const [sign, ...rest] = directionOf(points).split(" ");
   text(arrow, sign && ` ${sign}`);
   text(word, rest.length ? ` ${rest.join(" ")}` : "");
 }

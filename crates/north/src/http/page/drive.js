@@ -2,8 +2,8 @@
 // well the line carries it.
 
 import {
-  anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, old, places, section, showSpeed, showValue, size,
-  speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
+  anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isDirected, isOn, keyed, make, markDirection, old, places, section,
+  showDirection, showSpeed, showValue, size, speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { causesTitle, causeText } from "./causes.js";
 import { EVENT_COLOURS, eventList, textOf } from "./events.js";

@@ -1,8 +1,8 @@
 // All drives: faults first, then warnings, then by name; or in the order of a column, and in groups of their lines.
 
 import {
-  anchor, arrange, badge, className, directionMark, faultOf, fillSpeed, hide, isOn, keyed, make, old, places, showDirection, showValue, speedBar,
-  STATES, stateOf, text, titleOf, told, valueCell, words,
+  anchor, arrange, badge, className, faultOf, fillSpeed, hide, isDirected, isOn, keyed, make, markDirection, old, places, showDirection, showValue,
+  speedBar, STATES, stateOf, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { blockedOf } from "./causes.js";
 import { eventList } from "./events.js";
@@ -91,7 +91,7 @@ export function driveRow({ name }) {
   for (const [point, width] of COLUMNS) {
     const entry = { point, ...valueCell("div", `n ${width}`) };
     entry.element.setAttribute("role", "cell");
-    if (["actual_speed", "output_frequency"].includes(point)) entry.unit.after((entry.direction = directionMark()));
+    if (isDirected(point)) markDirection(entry);
     if (point === "actual_speed") entry.element.append((entry.bar = speedBar()).element);
     row.cells.push(entry);
     row.element.append(entry.element);
@@ -127,7 +127,7 @@ export function showDrive(row, drive) {
   for (const entry of row.cells) {
     const point = pointIn(drive, entry.point);
     showValue(entry, point, drive.quality);
-    if (entry.direction) showDirection(entry.direction, drive.points);
+    if (entry.direction) showDirection(entry, point, drive.points);
     if (entry.bar) fillSpeed(entry.bar, point);
   }
   text(row.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
