@@ -84,6 +84,12 @@ async fn questions_are_answered_about_what_they_asked() {
     browse("questions.js", Vec::new()).await;
 }
 
+/// A drive is taken, taken over and released while its motor goes on.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_running_drive_is_taken_over() {
+    browse("hold.js", Vec::new()).await;
+}
+
 /// The overview of 60 drives after login: compact rows, colour only where a person is wanted.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn sixty_drives_are_seen_at_a_glance() {

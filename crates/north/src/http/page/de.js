@@ -409,6 +409,16 @@ const texts = {
   "the drive does not answer": "der Umrichter antwortet nicht",
   "not sent: the line was busy": "nicht gesendet: die Leitung war belegt",
   "fault {code} (no text known for this drive)": "Störung {code} (kein Text für diesen Umrichter bekannt)",
+  "held by you, {left} s left": "von Ihnen belegt, noch {left} s",
+  "Take": "Übernehmen",
+  "Release": "Freigeben",
+  "Release {drive}": "{drive} freigeben",
+  "Take over": "Übernahme",
+  "Take over …": "Übernehmen …",
+  "Take over now": "Jetzt übernehmen",
+  "Take {drive} over from {holder} ({rank})? The motor goes on as it is.": "{drive} von {holder} ({rank}) übernehmen? Der Motor läuft unverändert weiter.",
+  "done": "erledigt",
+  "Kept by this page while you are active.": "Von dieser Seite belegt, solange Sie aktiv sind.",
 };
 
 const words = {

@@ -250,13 +250,21 @@ function supervises(drive) {
   return isLoggedIn() && drive.ours && runs && drive.about && drive.about.lease_ms !== null;
 }
 
+/// What somebody took here is kept while somebody is here.
+const keeps = ({ kept, json, about }) => isLoggedIn() && kept && json?.hold === "held" && about && json.holder === about.principal;
+
+const renews = (drive) => supervises(drive) || keeps(drive);
+
 function leaseWarning(drive) {
   if (!renews(drive)) return drive.lost || "";
   if (idle() >= ACTIVE_MS) return t("No activity here: its lease is no longer renewed.");
   return idle() >= WARN_MS ? t("Move the mouse or press a key, or its lease is no longer renewed.") : "";
 }
 
-const leaseWords = (drive) => leaseWarning(drive) || (renews(drive) ? t("Supervised by this page while you are active.") : "");
+function leaseWords(drive) {
+  if (supervises(drive)) return leaseWarning(drive) || t("Supervised by this page while you are active.");
+  return leaseWarning(drive) || (keeps(drive) ? t("Kept by this page while you are active.") : "");
+}
 
 async function renew(name, drive, now) {
   drive.renewed = now;
