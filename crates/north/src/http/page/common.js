@@ -304,6 +304,15 @@ export function fillRows(entries, body, records, row) {
   arrange(body, named.map(({ name }) => entries.get(name).element));
 }
 
+/// A row that opens that place from anywhere in it; its link is for keys and for readers of the screen.
+export function opening(row, href) {
+  row.classList.add("opening");
+  row.addEventListener("click", ({ target }) => {
+    if (!target.closest("a") && !getSelection().toString()) location.hash = href;
+  });
+  return row;
+}
+
 /// A table with headings, that can be scrolled by itself where it is wider than the page.
 export function table(caption, ...headings) {
   const body = make("tbody");

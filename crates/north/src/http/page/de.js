@@ -419,6 +419,8 @@ const texts = {
   "Take {drive} over from {holder} ({rank})? The motor goes on as it is.": "{drive} von {holder} ({rank}) übernehmen? Der Motor läuft unverändert weiter.",
   "done": "erledigt",
   "Kept by this page while you are active.": "Von dieser Seite belegt, solange Sie aktiv sind.",
+  "reference now {time}": "Sollwert jetzt {time}",
+
 };
 
 const words = {

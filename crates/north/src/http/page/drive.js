@@ -3,7 +3,7 @@
 
 import {
   anchor, badge, className, clock, faultOf, figure, fillRows, hide, hours, isDirected, isOn, keyed, make, markDirection, old, places, section,
-  showDirection, showSpeed, showValue, size, speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
+  opening, showDirection, showSpeed, showValue, size, speedBar, stamp, stateOf, table, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { causesTitle, causeText } from "./causes.js";
 import { EVENT_COLOURS, eventList, textOf } from "./events.js";
@@ -202,8 +202,9 @@ function commandRow(record) {
 }
 
 function recordingRow(record) {
-  return make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.recording(record.id), "", words(record.trigger))),
-    told("td", "", record.summary), make("td", "n", size(record.bytes)));
+  const place = places.recording(record.id);
+  return opening(make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(place, "", words(record.trigger))),
+    told("td", "", record.summary), make("td", "n", size(record.bytes))), place);
 }
 
 function log(id, title, none, columns, row) {
@@ -269,7 +270,7 @@ export function open(root, { name }) {
       showLine(parts.line, drive);
       window.Operate?.update(drive);
       if (performance.now() >= slow) await refreshSlow(load, drive);
-      await parts.trends.refresh(load, parts.marks ?? []);
+      await parts.trends.refresh(load, parts.marks ?? [], drive.points);
       parts.trends.showNow(drive.points);
     },
   };

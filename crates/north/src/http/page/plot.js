@@ -114,10 +114,10 @@ class Plot {
     return from + ((event.clientX - left - LEFT) / this.width) * (to - from);
   }
 
-  /// `reach`: how long a sample is in force, ms; `aim`: what the values are meant to be;
+  /// `reach`: how long a sample is in force, ms; `aim`: what the values are meant to be, said as `aimed`;
   /// `includes`: values that the axis has in any case.
-  show(samples, { reach = Infinity, marks = [], aim = null, includes = [] } = {}) {
-    Object.assign(this, { samples, reach, marks, aim, includes, loading: false });
+  show(samples, { reach = Infinity, marks = [], aim = null, aimed = t("target {time}"), includes = [] } = {}) {
+    Object.assign(this, { samples, reach, marks, aim, aimed, includes, loading: false });
     this.render();
   }
 
@@ -223,7 +223,7 @@ class Plot {
     if (this.aim !== null) {
       const y = place(this.y(this.aim));
       const aim = draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y });
-      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, t("target {time}", { time: `${this.figure(this.aim)} ${this.unit}` }));
+      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, this.aimed.replace("{time}", `${this.figure(this.directed ? Math.abs(this.aim) : this.aim)} ${this.unit}`));
       drawn.push(aim, label);
     }
     return drawn;

@@ -1,7 +1,7 @@
 // A recording: what was read before and after a fault as plots with one cursor, states as lanes, events, commands and frames under
 // them. And the list of all recordings.
 
-import { anchor, digitsOf, draw, fillRows, hide, make, places, section, size, stamp, table, text, titleOf, told, words } from "./common.js";
+import { anchor, digitsOf, draw, fillRows, hide, make, opening, places, section, size, stamp, table, text, titleOf, told, words } from "./common.js";
 import { EVENT_COLOURS, textOf } from "./events.js";
 import { PlotGroup, reachOf, sampleAt, withGaps } from "./plot.js";
 import { decimal, t } from "./texts.js";
@@ -259,8 +259,8 @@ export function openList(root) {
   const note = make("p", "note", t("There are no recordings. The gateway makes one when a drive trips, is lost, or refuses a stop."));
   root.append(make("h1", "", t("Recordings")), list.element, note);
   const entries = new Map();
-  const row = (record) => make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.drive(record.drive), "", record.drive)),
-    make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), told("td", "", record.summary), make("td", "n", size(record.bytes)));
+  const row = (record) => opening(make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.drive(record.drive), "", record.drive)),
+    make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), told("td", "", record.summary), make("td", "n", size(record.bytes))), places.recording(record.id));
   return {
     title: t("Recordings"),
     async refresh(load) {

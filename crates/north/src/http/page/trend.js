@@ -24,6 +24,13 @@ function nowOf(name, points) {
   return `${figure(Math.abs(point.value), point.unit)} ${unitOf(point.unit)} ${arrow}`.trim();
 }
 
+/// The reference of now, in the direction of the speed: a dashed line in its plot. It has no past.
+function referenceOf(name, { speed_reference: reference, actual_speed: speed }) {
+  if (name !== "actual_speed" || reference?.quality !== "good" || typeof reference.value !== "number") return {};
+  const aim = speed?.value < 0 ? -Math.abs(reference.value) : reference.value;
+  return { aim, aimed: t("reference now {time}"), includes: [aim] };
+}
+
 /// The trends of one drive; `marks` are its events.
 export function trends(drive) {
   const chosen = { span: SPANS[0], points: null, next: 0 };
@@ -74,7 +81,7 @@ export function trends(drive) {
     showNow(points) {
       for (const [name, plot] of plots) plot.now(nowOf(name, points));
     },
-    async refresh(load, marks) {
+    async refresh(load, marks, values) {
       if (performance.now() < chosen.next) return;
       const span = chosen.span;
       if (!chosen.points) create((await load(all)).points);
@@ -87,7 +94,7 @@ export function trends(drive) {
       if (!replies.length) return;
       const step = replies[0].step_s * 1000;
       group.setRange(Date.parse(replies[0].from), Date.parse(replies[0].to), step);
-      for (const reply of replies) plots.get(reply.point).show(samplesOf(reply), { reach: 1.5 * step, marks });
+      for (const reply of replies) plots.get(reply.point).show(samplesOf(reply), { reach: 1.5 * step, marks, ...referenceOf(reply.point, values) });
       group.moved();
     },
   };
