@@ -33,13 +33,13 @@ pub struct Cause {
     pub age_ms: Option<u64>,
     /// The remedy.
     pub remedy: String,
-    /// Of a cause in the last order: who gave it.
+    /// Who gave the order, where the cause is the last order.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
-    /// Of a refused order: its result code.
+    /// Result code of the order, where it was refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub result: Option<String>,
-    /// Of a start that must wait: after which it may be tried again.
+    /// Time after which a start that must wait may be tried again.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retry_after_ms: Option<u64>,
 }

@@ -39,7 +39,7 @@ async function aRunningDriveIsTakenOver(gateway, page) {
   assert.match(await page.eval(shown, ".operate-holder"), /held by you, 30 s left/);
   assert.deepEqual(gateway.commands, [{ action: "break" }], "and nothing else: the motor goes on");
   assert.equal(await page.eval(box), before, "STOP keeps its place");
-  // What was taken here is kept while somebody is here.
+  // The hold is renewed while somebody is active.
   await page.until(() => document.querySelector(".operate-lease").textContent.includes("Kept by this page"));
   const since = gateway.asked.length;
   await page.press("Tab");
@@ -60,7 +60,7 @@ async function whoRanksTooLowIsNotOfferedIt(gateway, page) {
     await held(gateway, page, hold, outranks);
     assert.equal(await page.eval(shown, TAKE), false, JSON.stringify(hold));
     assert.equal(await page.eval(shown, RELEASE), false);
-    assert.equal(await page.eval(shown, STOP), "■ STOP", "whoever holds it, a stop is offered");
+    assert.equal(await page.eval(shown, STOP), "■ STOP", "a stop is always offered");
   }
   // A gateway without holders has neither.
   await opened(gateway, page, DRIVE);
@@ -76,7 +76,7 @@ async function aRefusalIsSaid(gateway, page) {
   assert.deepEqual(gateway.commands, [{ action: "take" }]);
 }
 
-/// A change of the holder ends the question; what was asked about is no more.
+/// A change of the holder ends the question.
 async function aChangeEndsTheQuestion(gateway, page) {
   await held(gateway, page, BY_PLC);
   await page.eval(click, TAKE);

@@ -9,7 +9,7 @@ const STOP = "button[aria-label='Stop pump-1']";
 const click = (selector) => document.querySelector(selector).click();
 const shown = (selector) => document.querySelector(selector)?.checkVisibility() && document.querySelector(selector).innerText;
 
-/// What came of a command: beside the controls, or in the row of the drive.
+/// The result of a command, at the controls or in the row of the drive.
 const told = (wanted) => [...document.querySelectorAll(".operate-result, .notice")].some((each) => each.textContent.includes(wanted));
 
 const REFERENCE = { name: "speed_reference", kind: "number", unit: "%", minimum: 0, maximum: 80 };

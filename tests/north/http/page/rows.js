@@ -143,7 +143,7 @@ async function rowsKeepTheirPlaceUnderThePointer(gateway, page) {
   await page.until(() => document.querySelector(".rows .name a").textContent === "feed-pump-house-1");
 }
 
-/// That all drives have stopped is no warning.
+/// "All drives have stopped" informs and does not warn.
 async function stoppedIsInformation(gateway, page) {
   await overview(gateway, page, [1440, 900]);
   gateway.obey = () => [200, { ok: true, drives: gateway.drives.map(({ name }) => ({ drive: name, outcome: "standing", reason: "" })) }];

@@ -1,5 +1,5 @@
 // Why a drive does not run, and why a command was refused, in the words of an operator: what is the matter, and what to press or to look at.
-// The gateway's own texts are for programs; where they carry what a manual or a configuration says, they are shown besides, in English.
+// The gateway's own texts are for programs; where they carry what a manual or a configuration says, they are shown as well, in English.
 
 import { words } from "./common.js";
 import { t } from "./texts.js";
@@ -7,7 +7,7 @@ import { t } from "./texts.js";
 const START = t("Press Start.");
 const AGAIN = t("Press Start again.");
 
-// Of each cause: in a few words, in a sentence, and what to do.
+// Each cause in a few words, in a sentence, and what to do.
 const CAUSES = {
   bus_down: [t("line down"), t("The line has no connection."), t("Check the adapter and its cable.")],
   offline: [t("offline"), t("The drive does not answer."), t("Check its power supply, wiring and address.")],
@@ -46,7 +46,7 @@ const CAUSES = {
   trip_lock: [t("trip lock"), t("It tripped and is locked."), t("Switch its supply off and on again.")],
 };
 
-// Their evidence says what no text of the page can: a manual's words, a name of the configuration, an error of the machine.
+// Causes whose evidence says what no text of the page can: a manual's words, a name of the configuration, an error of the machine.
 const EVIDENT = ["bus_down", "held", "interlocked", "fault"];
 
 const seconds = (ms) => `${Math.ceil(ms / 1000)} s`;
@@ -66,11 +66,11 @@ function faultText(cause, fault) {
   return { name: t("fault"), said: fault || t("A fault is active; its code is not known."), todo: press, evidence: [cause.evidence, manual].filter(Boolean).join("; ") };
 }
 
-/// A cause for an operator: its name, what is the matter, what to do, and what the gateway says besides in English. `fault`: that of the drive in words.
+/// A cause for an operator: its name, what is the matter, what to do, and what the gateway adds in English. `fault`: that of the drive in words.
 export function causeText(cause, drive, fault) {
   if (cause.cause === "fault") return faultText(cause, fault);
   const known = CAUSES[cause.cause];
-  // What a profile of one's own names has the texts of that profile.
+  // A cause that only a custom profile names has the texts of that profile.
   if (!known) return { name: words(cause.cause), said: "", todo: "", evidence: [cause.evidence, cause.remedy].filter(Boolean).join("; ") };
   const values = { who: giver(cause.by), holder: drive.holder, left: drive.hold_left_s, time: seconds(cause.retry_after_ms ?? 0) };
   const fill = (text) => text.replace(/\{(\w+)\}/g, (hole, name) => values[name] ?? hole);

@@ -62,7 +62,7 @@ export function hide(element, hidden) {
   element.hidden = hidden;
 }
 
-function hint(element, value) {
+export function hint(element, value) {
   if ((element.lastTitle ?? "") === value) return;
   element.lastTitle = value;
   element.title = value;

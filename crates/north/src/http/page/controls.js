@@ -231,7 +231,7 @@ export function build(panel, name, actions) {
   panel.place.setAttribute("role", "group");
   panel.place.setAttribute("aria-label", t("Commands of {drive}", { drive: name }));
   panel.place.classList.add("operate");
-  // What comes and goes stands behind what is pressed, which so keeps its place.
+  // Whatever comes and goes stands below the buttons, which so keep their place.
   panel.place.replaceChildren(panel.stop, make("b", "operate-name", name), make("span", "operate-go", panel.start, panel.turn), panel.reference, panel.reset, panel.question, panel.hold,
     panel.result, panel.lease);
   panel.show = (drive) => {
@@ -242,7 +242,7 @@ export function build(panel, name, actions) {
   panel.built = true;
 }
 
-/// The focus goes from a control that is no longer there to the one that took its place.
+/// The focus moves from a control that is gone to its successor.
 function keepFocus(panel, focused) {
   const isLost = focused && !focused.checkVisibility() && [focused, document.body].includes(document.activeElement);
   if (!isLost || panel.asking) return;

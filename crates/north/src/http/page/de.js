@@ -440,12 +440,8 @@ const words = {
   parameters_changed: "Parameter geändert", restore_unfinished: "Rückspielen unvollendet", recording: "Aufzeichnung", bus_up: "Leitung verbunden",
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", guarded: "Start zu früh", interlock: "Verriegelung", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
   released: "freigegeben", hold_broken: "übernommen", slot_void: "BACnet-Platz ungültig", drill: "Übung", paused: "Gateway stand still", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
-  // Why a drive does not run.
-  no_dc_link: "kein Zwischenkreis", held: "belegt", reserved: "nach Stopp reserviert", order_refused: "Startbefehl abgelehnt", order_expired: "Startbefehl abgelaufen",
-  order_unanswered: "Startbefehl unbeantwortet", stopped_by_order: "durch Befehl gestoppt", fault_was_reset: "Störung wurde quittiert",
-  stopped_by_gateway: "vom Gateway gestoppt", stopped_by_interlock: "durch Verriegelung gestoppt", other_master: "anderer Master", no_run_order: "kein Startbefehl", reference_zero: "Sollwert null",
-  direction_blocked: "Drehrichtung gesperrt", not_known: "nicht bekannt", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", inhibited: "Start gesperrt", bypass: "Bypass",
-  fire_mode: "Brandfallbetrieb", interlocked: "verriegelt", hand_off_auto: "Hand-Aus-Automatik", baseblock: "Impulssperre",
+  // Holds, and points that say why a drive does not run.
+  held: "belegt", reserved: "nach Stopp reserviert", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", bypass: "Bypass", fire_mode: "Brandfallbetrieb", interlocked: "verriegelt",
   // Results and sources of commands.
   confirmed: "bestätigt", acknowledged: "quittiert", refused_by_drive: "vom Umrichter abgelehnt", timeout: "keine Antwort", garbled: "gestörte Antwort",
   expired: "abgelaufen", replaced: "ersetzt", purged: "durch Stopp verworfen", withdrawn: "zurückgezogen", not_taken: "nicht übernommen", interrupted: "unterbrochen",

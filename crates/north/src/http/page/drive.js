@@ -236,7 +236,7 @@ export function open(root, { name }) {
   const counters = section("counters", t("Counted by the gateway"), parts.counters.element, parts.stops);
   const line = section("line", t("Line"), parts.line.element, make("p", "note", t("Errors by minute, the last hour")), parts.strip, minuteAxis());
   const events = section("drive-events", t("Events"), parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", t("All events of this drive"))));
-  // What comes and goes stands below the controls, so that a stop keeps its place.
+  // Reasons come and go: they stand below the controls, so that a stop keeps its place.
   root.append(parts.top.element, parts.operate, parts.top.fault, parts.why.element, parts.figures.element, parts.trends.element,
     make("div", "pair", counters, line), parts.points.element, parts.commands.element, make("div", "pair", events, parts.recordings.element));
   window.Operate?.mount(parts.operate, name);

@@ -213,7 +213,7 @@ mod tests {
         assert!(served + DOCUMENT.len() <= MOST_BYTES, "{served} bytes");
     }
 
-    /// A cause without words of its own would be told to an operator in those of the interface.
+    /// A cause without a text here would reach an operator in words for programs.
     #[test]
     fn every_cause_has_words_for_an_operator() {
         let script = include_str!("causes.js");

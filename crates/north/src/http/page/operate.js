@@ -10,7 +10,7 @@
 // keyboard within the last ACTIVE_MS.
 
 import { refusalText } from "./causes.js";
-import { clock, text } from "./common.js";
+import { clock, hint, text } from "./common.js";
 import { build, buildStop } from "./controls.js";
 import { stopPressed } from "./questions.js";
 import { check, isLoggedIn, onSession, post } from "./session.js";
@@ -226,6 +226,7 @@ function showNotice(element, drive) {
   const { words, good, at } = drive.result ?? {};
   const isNew = Boolean(words) && performance.now() - at < NOTICE_MS;
   text(element, isNew ? words : leaseWarning(drive));
+  hint(element, element.textContent);
   element.className = `notice ${isNew && good !== false ? "" : "bad"}`;
 }
 
@@ -250,7 +251,7 @@ function supervises(drive) {
   return isLoggedIn() && drive.ours && runs && drive.about && drive.about.lease_ms !== null;
 }
 
-/// What somebody took here is kept while somebody is here.
+/// A drive that was taken here is kept while somebody is active.
 const keeps = ({ kept, json, about }) => isLoggedIn() && kept && json?.hold === "held" && about && json.holder === about.principal;
 
 const renews = (drive) => supervises(drive) || keeps(drive);

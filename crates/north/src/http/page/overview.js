@@ -1,7 +1,7 @@
 // All drives: faults first, then warnings, then by name; or in the order of a column, and in groups of their lines.
 
 import {
-  anchor, arrange, badge, className, faultOf, fillSpeed, hide, isDirected, isOn, keyed, make, markDirection, old, places, showDirection, showValue,
+  anchor, arrange, badge, className, faultOf, fillSpeed, hide, hint, isDirected, isOn, keyed, make, markDirection, old, places, showDirection, showValue,
   speedBar, STATES, stateOf, text, titleOf, told, valueCell, words,
 } from "./common.js";
 import { blockedOf } from "./causes.js";
@@ -120,7 +120,7 @@ export function showDrive(row, drive) {
   const blocked = blockedOf(drive);
   text(row.blocked, blocked);
   hide(row.blocked, !blocked);
-  row.second.title = [fault, blocked].filter(Boolean).join(" · ");
+  hint(row.second, [fault, blocked].filter(Boolean).join(" · "));
   text(row.bus, drive.bus);
   const doubt = drive.profile_verified === false ? ` · ${t("not verified on hardware")}` : "";
   text(row.address, ` · ${t("address {address}", drive)}${doubt}`);
