@@ -143,6 +143,25 @@ async function rowsKeepTheirPlaceUnderThePointer(gateway, page) {
   await page.until(() => document.querySelector(".rows .name a").textContent === "feed-pump-house-1");
 }
 
+/// The result of a stop can be read in the row of a phone, next to the state of the drive.
+async function resultsAreReadOnAPhone(gateway, page) {
+  await overview(gateway, page, [390, 844]);
+  const running = () => [...document.querySelectorAll(".rows .row")].find((row) => row.className.includes("running"));
+  await page.eval(`(${running})().querySelector(".operate-stop").click()`);
+  await page.until(told, "Stop: confirmed");
+  const { height, state, seen } = await page.eval(`(() => {
+    const row = (${running})();
+    const range = document.createRange();
+    const text = row.querySelector(".notice").firstChild;
+    range.setStart(text, 0);
+    range.setEnd(text, "Stop: confirmed".length);
+    return { height: row.getBoundingClientRect().height, state: row.querySelector(".badge").innerText, seen: range.getBoundingClientRect().right < row.querySelector(".second").getBoundingClientRect().right };
+  })()`);
+  assert.equal(state, "▶ running");
+  assert.ok(seen, "the result is cut off");
+  assert.ok(height <= MOST_PX, `${height} px`);
+}
+
 /// "All drives have stopped" informs and does not warn.
 async function stoppedIsInformation(gateway, page) {
   await overview(gateway, page, [1440, 900]);
@@ -161,4 +180,4 @@ async function stoppedIsInformation(gateway, page) {
   assert.equal(await page.eval(() => document.getElementById("stops").innerText), "");
 }
 
-run([stoppedIsInformation, rowsAreCompact, theHeaderOfAPhoneIsOneLine, namesBreakBetweenWords, columnsThatNoDriveFillsAreLeftOut, colourMeansThatSomebodyIsWanted, rowsKeepTheirPlaceUnderThePointer]);
+run([stoppedIsInformation, resultsAreReadOnAPhone, rowsAreCompact, theHeaderOfAPhoneIsOneLine, namesBreakBetweenWords, columnsThatNoDriveFillsAreLeftOut, colourMeansThatSomebodyIsWanted, rowsKeepTheirPlaceUnderThePointer]);
