@@ -207,6 +207,37 @@ async function eventsAreSearched(gateway, page) {
   assert.equal(await page.eval("location.hash"), "#/events?kind=fault");
 }
 
+async function eventsOfATimeAreSaved(gateway, page) {
+  const hour = (n) => new Date(2026, 2, 2, n, 30).toISOString();
+  gateway.events = Array.from({ length: 20 }, (_, at) => ({ id: 20 - at, boot: 1, time: hour(20 - at), event: "started", bus: "line1", drive: "pump-2", text: `event "${20 - at}", ${NASTY}` }));
+  await page.open(`${gateway.url}#/lines`);
+  await page.open(`${gateway.url}#/events`);
+  await page.until(() => document.querySelectorAll(".events li").length === 20);
+  const choose = (id, value) => {
+    const control = document.getElementById(id);
+    control.value = value;
+    control.dispatchEvent(new Event("input", { bubbles: true }));
+  };
+  await page.eval(choose, "event-from", "2026-03-02T05:00");
+  await page.until(() => document.querySelectorAll(".events li").length === 16);
+  await page.eval(choose, "event-to", "2026-03-02T08:00");
+  await page.until(() => document.querySelectorAll(".events li").length === 3);
+  assert.deepEqual(await page.eval(() => [...document.querySelectorAll(".events .text")].map((each) => each.textContent.slice(0, 9))), ['event "7"', 'event "6"', 'event "5"']);
+  assert.equal(await page.eval(() => [...document.querySelectorAll(".pages button")].find((button) => button.textContent === "Older").disabled), true);
+  await page.eval(() => {
+    const make = URL.createObjectURL;
+    URL.createObjectURL = (blob) => {
+      window.saved = blob;
+      return make.call(URL, blob);
+    };
+    [...document.querySelectorAll(".pages button")].find((button) => button.textContent === "Save as CSV").click();
+  });
+  await page.until(() => window.saved);
+  const lines = (await page.eval(() => window.saved.text())).split("\r\n");
+  assert.deepEqual(lines, ["time,event,bus,drive,text", ...[5, 6, 7].map((n) => `"${hour(n)}","started","line1","pump-2","event ""${n}"", ${NASTY}"`), ""]);
+  gateway.events = [];
+}
+
 async function linesTellTheirDiagnosis(gateway, page) {
   const seen = () => document.querySelector("#diagnosis-title")?.checkVisibility() && document.querySelector("#diagnosis-title").parentElement.textContent;
   await page.open(`${gateway.url}#/line/line1`);
@@ -364,7 +395,7 @@ async function main() {
   gateway.url = await gateway.start();
   const browser = new Browser();
   const page = await browser.page();
-  for (const step of [rowsFollowTheirDrives, listIsFiltered, listIsSortedAndGrouped, agesAreTheException, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis,
+  for (const step of [rowsFollowTheirDrives, listIsFiltered, listIsSortedAndGrouped, agesAreTheException, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, eventsOfATimeAreSaved, linesTellTheirDiagnosis,
     rowsKeepTheFocus, whatIsChosenIsShownAtOnce, everyFamilyHasOneConventionOfSigns, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
     try {
       await step(gateway, page, browser);

@@ -25,6 +25,9 @@ function bus(name, more = {}) {
 
 const ended = (count) => new Date(Date.now() - count * 1000).toISOString();
 
+/// `before` is a time in seconds, or the number of an event.
+const isBefore = ({ id, time }, before) => (before.includes("-") ? id < Number(before.split("-")[1]) : Date.parse(time) < 1000 * Number(before));
+
 class FakeGateway {
   constructor() {
     Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, asked: [] });
@@ -103,7 +106,7 @@ class FakeGateway {
   search(wanted) {
     const matches = (event) => ["drive", "bus"].every((name) => !wanted.get(name) || event[name] === wanted.get(name)) &&
       (!wanted.get("kind") || event.event === wanted.get("kind")) && (!wanted.get("text") || event.text.includes(wanted.get("text"))) &&
-      (!wanted.get("before") || event.id < Number(wanted.get("before").split("-")[1]));
+      (!wanted.get("before") || isBefore(event, wanted.get("before")));
     return this.events.filter(matches).slice(0, Number(wanted.get("limit")));
   }
 

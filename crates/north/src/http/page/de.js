@@ -421,6 +421,10 @@ const texts = {
   "Kept by this page while you are active.": "Von dieser Seite belegt, solange Sie aktiv sind.",
   "reference now {time}": "Sollwert jetzt {time}",
 
+  "From": "Von",
+  "To": "Bis",
+  "Save as CSV": "Als CSV sichern",
+
 };
 
 const words = {

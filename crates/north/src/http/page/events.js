@@ -1,6 +1,7 @@
 // Events: lists of them, and the view that searches them.
 
 import { anchor, arrange, faultWithoutText, hide, keyed, make, places, stamp, told, words } from "./common.js";
+import { load } from "./gateway.js";
 import { t } from "./texts.js";
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
@@ -15,6 +16,9 @@ const KINDS = [
   "bus_down", "diagnosis", "reload_refused",
 ];
 const PAGE = 100;
+// A file has at most so many events; the gateway gives that many at once.
+const MOST_SAVED = 20000;
+const SAVED_AT_ONCE = 1000;
 
 /// The query of these conditions; those that are empty are left out.
 export function query(conditions) {
@@ -89,17 +93,66 @@ function kinds(chosen) {
   return select;
 }
 
+function moment(value) {
+  const element = make("input");
+  element.type = "datetime-local";
+  element.value = value;
+  return element;
+}
+
+const quoted = (value) => `"${String(value ?? "").replaceAll('"', '""')}"`;
+
+/// Events as a table for other programs, oldest first.
+function csvOf(events) {
+  const lines = events.map(({ time, event, bus, drive, text }) => [time, event, bus, drive, text].map(quoted).join(","));
+  return ["time,event,bus,drive,text", ...lines.reverse(), ""].join("\r\n");
+}
+
+function save(name, content) {
+  const link = anchor(URL.createObjectURL(new Blob([content], { type: "text/csv" })), "");
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
+
 /// All events that the gateway has, searched.
 export function open(root, place) {
   const given = (name) => place.query.get(name) ?? "";
-  const controls = { text: input(given("text")), kind: kinds(given("kind")), drive: input(given("drive")), bus: input(given("bus")) };
+  const controls = { text: input(given("text")), kind: kinds(given("kind")), drive: input(given("drive")), bus: input(given("bus")), from: moment(given("from")), to: moment(given("to")) };
   const list = eventList();
   const older = make("button", "chip", t("Older"));
   const newest = make("button", "chip", t("Newest"));
   const pages = [""];
   let next = null;
-  for (const button of [older, newest]) button.type = "button";
+  const csv = make("button", "chip", t("Save as CSV"));
+  for (const button of [older, newest, csv]) button.type = "button";
   const conditions = () => Object.fromEntries(Object.entries(controls).map(([name, control]) => [name, control.value.trim()]));
+  const timeOf = (control) => (control.value ? new Date(control.value).getTime() : null);
+  // Up to `limit` events before the one named, or before the end of the chosen time; `next` names the last where there may be more.
+  async function read(load, from, limit) {
+    const { from: begin, to: end, ...wanted } = conditions();
+    const until = timeOf(controls.to);
+    const reply = await list.load(load, { ...wanted, before: from || (end && until / 1000), limit });
+    const events = reply.filter(({ time }) => !begin || Date.parse(time) >= timeOf(controls.from));
+    const last = events.length === limit ? events[limit - 1] : null;
+    return { events, next: last && `${last.boot}-${last.id}` };
+  }
+  async function saveAll() {
+    csv.disabled = true;
+    const all = [];
+    try {
+      for (let from = ""; from !== null && all.length < MOST_SAVED;) {
+        const { events, next } = await read(load, from, SAVED_AT_ONCE);
+        all.push(...events);
+        from = next;
+      }
+      save("events.csv", csvOf(all));
+    } catch (error) {
+      console.warn("cannot read the events:", error);
+    }
+    csv.disabled = false;
+  }
+  csv.addEventListener("click", saveAll);
   const changed = () => {
     pages.length = 1;
     const found = query(conditions());
@@ -110,19 +163,18 @@ export function open(root, place) {
   older.addEventListener("click", () => next !== null && pages.push(next) && (view.stale = true));
   newest.addEventListener("click", () => (pages.length = 1) && (view.stale = true));
   root.append(make("h1", "", t("Events")), make("div", "filter",
-    field(t("Text"), controls.text, "event-text"), field(t("Kind"), controls.kind, "event-kind"), field(t("Drive"), controls.drive, "event-drive"), field(t("Line"), controls.bus, "event-bus")),
-  list.element, make("p", "pages", newest, " ", older));
+    field(t("Text"), controls.text, "event-text"), field(t("Kind"), controls.kind, "event-kind"), field(t("Drive"), controls.drive, "event-drive"), field(t("Line"), controls.bus, "event-bus"),
+    field(t("From"), controls.from, "event-from"), field(t("To"), controls.to, "event-to")),
+  list.element, make("p", "pages", newest, " ", older, " ", csv));
   const view = {
     title: t("Events"),
     stale: true,
     async refresh(load) {
       view.stale = false;
-      const before = pages[pages.length - 1];
-      const reply = await list.load(load, { ...conditions(), before, limit: PAGE });
+      const found = await read(load, pages[pages.length - 1], PAGE);
       if (view.stale) return;
-      list.show(reply);
-      const last = reply[PAGE - 1];
-      next = last ? `${last.boot}-${last.id}` : null;
+      list.show(found.events);
+      next = found.next;
       older.disabled = next === null;
       newest.disabled = pages.length === 1;
     },
