@@ -6,11 +6,9 @@ import subprocess
 import time
 from pathlib import Path
 
-from bench import ROOT, Bench, end, expect, python_of, say, until, venv
+from bench import ROOT, Bench, end, expect, say, until
+from hass import HomeAssistant, python_of_home_assistant
 
-VERSION = "2025.4.4"
-# Of the MQTT integration; Home Assistant would install it by itself.
-REQUIREMENTS = [f"homeassistant=={VERSION}", "paho-mqtt==2.1.0"]
 DISCOVERY = "[mqtt.home_assistant]\n"
 # A profile of each family, the example of a meter, and their protocols.
 FAMILIES = {
@@ -20,42 +18,13 @@ FAMILIES = {
 # Entities of the gateway for each bus.
 OF_BUS = 5
 # Keys of a state that are no entities.
-BESIDES = {"quality", "time", "age_ms", "point_quality"}
+BESIDES = {"quality", "time", "age_ms", "point_quality", "blocked_by"}
 
 
-class HomeAssistant:
-    def __init__(self, bench, python):
-        directory = bench.dir / "home-assistant"
-        directory.mkdir()
-        (directory / "configuration.yaml").write_text("homeassistant:\n  name: interop\n")
-        inside = Path(__file__).parent / "lib" / "inside_home_assistant.py"
-        log = (bench.dir / "home-assistant.log").open("w")
-        self.process = subprocess.Popen(
-            [python, inside, directory, str(bench.mqtt)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
-        )
-        bench.stack.callback(end, self.process)
-        self.log = Path(log.name)
-        if self.read() != "ready":
-            raise SystemExit(f"error: Home Assistant did not start:\n{self.log.read_text()[-4000:]}")
-
-    def read(self):
-        line = self.process.stdout.readline()
-        return json.loads(line) if line else None
-
-    def ask(self, **command):
-        self.process.stdin.write(json.dumps(command) + "\n")
-        self.process.stdin.flush()
-        return self.read()
-
-    def entities(self):
-        return self.ask(do="entities")
-
-    def state(self, name):
-        return self.entities().get(name, {}).get("state")
-
-    def call(self, domain, service, **data):
-        self.ask(do="call", domain=domain, service=service, data=data)
+def entered(port):
+    """What a user enters to set up the integration."""
+    other = {"set_client_cert": False, "set_ca_cert": "off"}
+    return {"broker": "127.0.0.1", "port": port, "other_settings": other}
 
 
 def expected_entities(bench, drives):
@@ -96,7 +65,7 @@ def check_schemas(python):
 
 
 def main():
-    python = venv("home-assistant", REQUIREMENTS, python_of("3.13"))
+    python = python_of_home_assistant()
     check_schemas(python)
     with Bench() as bench:
         bench.broker()
@@ -104,7 +73,7 @@ def main():
         drives = ["p1", "p2", "p3"]
         gateway = bench.gateway(bench.configuration(drives, DISCOVERY, ["p3"]))
         until("the first state", lambda: bench.retained("drivegate/hall/drive/p3/state"))
-        hass = HomeAssistant(bench, python)
+        hass = HomeAssistant(bench, "mqtt", entered(bench.mqtt))
         wanted = expected_entities(bench, drives)
         until("the entities", lambda: len(hass.entities()) >= wanted)
         time.sleep(1)

@@ -13,7 +13,8 @@ import sys
 import tempfile
 import time
 
-from bench import DRIVEGATE, venv
+from bench import DRIVEGATE
+from programs import venv
 
 PYSPARKPLUG = "pysparkplug==0.6.1"
 try:

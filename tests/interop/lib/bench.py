@@ -1,19 +1,15 @@
-"""A broker, a simulated line and a gateway on free ports of 127.0.0.1, and the programs under test in .tools/interop."""
+"""A broker, a simulated line and a gateway on free ports of 127.0.0.1."""
 
 import contextlib
-import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
-TOOLS = ROOT / ".tools" / "interop"
 DRIVEGATE = Path(os.environ.get("DRIVEGATE", ROOT / "target" / "debug" / "drivegate"))
 # Longest wait for something that has to happen, s.
 PATIENCE = 60
@@ -47,47 +43,6 @@ def expect(what, truth):
     if not truth:
         fail(f"not so: {what}")
     say(f"   ok: {what}")
-
-
-def venv(name, requirements, python=sys.executable):
-    """The Python of a virtual environment with these packages; made when it is not there yet."""
-    place = TOOLS / name
-    wanted = json.dumps([str(python), requirements])
-    stamp = place / "installed"
-    if not stamp.exists() or stamp.read_text() != wanted:
-        say(f"   installing {', '.join(requirements)}; the first time takes minutes")
-        shutil.rmtree(place, ignore_errors=True)
-        subprocess.run([python, "-m", "venv", place], check=True)
-        pip = [place / "bin" / "pip", "install", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, *requirements], check=True, stdin=subprocess.DEVNULL)
-        stamp.write_text(wanted)
-    return place / "bin" / "python"
-
-
-def npm(name, packages):
-    """A directory with these Node packages; made when it is not there yet."""
-    place = TOOLS / name
-    stamp = place / "installed"
-    if not stamp.exists() or stamp.read_text() != json.dumps(packages):
-        say(f"   installing {', '.join(packages)}")
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir(parents=True)
-        (place / "package.json").write_text('{"private": true}')
-        install = ["npm", "install", "--silent", "--no-audit", "--no-fund", "--no-package-lock", "--omit=optional"]
-        subprocess.run([*install, *packages], cwd=place, check=True, stdin=subprocess.DEVNULL)
-        stamp.write_text(json.dumps(packages))
-    return place
-
-
-def python_of(version):
-    """A Python of that version, such as "3.13": on the PATH, or of pyenv."""
-    for candidate in [shutil.which(f"python{version}"), *sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python3"))]:
-        if candidate:
-            asked = [candidate, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
-            answer = subprocess.run(asked, capture_output=True, text=True)
-            if answer.stdout.strip() == version:
-                return str(candidate)
-    fail(f"there is no Python {version}; install it (pyenv install {version}), then run again")
 
 
 class Bench:

@@ -7,7 +7,7 @@ import json
 import sys
 import tempfile
 
-import voluptuous
+import probatio
 from homeassistant.components.mqtt import discovery
 from homeassistant.components.sensor.const import DEVICE_CLASS_STATE_CLASSES
 from homeassistant.core import HomeAssistant
@@ -18,7 +18,7 @@ def faults(payload):
     discovery._replace_all_abbreviations(payload)
     try:
         discovery.DEVICE_DISCOVERY_SCHEMA(payload)
-    except voluptuous.Invalid as fault:
+    except probatio.Invalid as fault:
         yield "the device", fault
         return
     for key, config in payload["components"].items():
@@ -31,7 +31,7 @@ def faults(payload):
         config["origin"] = payload["origin"]
         try:
             valid = importlib.import_module(f"homeassistant.components.mqtt.{platform}").DISCOVERY_SCHEMA(config)
-        except voluptuous.Invalid as fault:
+        except probatio.Invalid as fault:
             yield key, fault
             continue
         possible = DEVICE_CLASS_STATE_CLASSES.get(valid.get("device_class"))
