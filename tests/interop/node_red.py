@@ -1,12 +1,9 @@
-"""Node-RED from npm with the flow of docs/integrations.md: it keeps states and starts a motor."""
+"""Node-RED from npm with the flow of docs/integrations.md: it keeps states, starts a motor, and finds the gateway again."""
 
 import json
-import subprocess
-import urllib.request
 
-from bench import ROOT, Bench, expect, free_port, npm, until
-
-PACKAGES = ["node-red@4.1"]
+from bench import ROOT, Bench, expect, say, until
+from red import NodeRed
 
 
 def flow(port):
@@ -16,41 +13,32 @@ def flow(port):
     for node in nodes:
         if node["type"] == "mqtt-broker":
             node["port"] = str(port)
-    return json.dumps(nodes)
+    return nodes
 
 
 def main():
-    place = npm("node-red", PACKAGES)
     with Bench() as bench:
         bench.broker()
         bench.line(1)
-        bench.gateway(bench.configuration(["p1"]))
-        user = bench.dir / "node-red"
-        user.mkdir()
-        (user / "flows.json").write_text(flow(bench.mqtt))
-        (user / "settings.js").write_text("module.exports = { flowFile: 'flows.json', uiHost: '127.0.0.1' };")
-        port = free_port()
-        log = (bench.dir / "node-red.log").open("w")
-        red = place / "node_modules" / "node-red" / "red.js"
-        bench.start(["node", red, "--userDir", user, "--port", str(port)], stdout=log, stderr=subprocess.STDOUT)
-
-        def context(key):
-            """What the flow has kept under `key`."""
-            try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/context/flow/drives/{key}", timeout=5) as answer:
-                    kept = json.load(answer).get("msg")
-            except OSError:
-                return None
-            return json.loads(kept) if kept and kept != "(undefined)" else None
-
-        state, _ = until("the state", lambda: context("p1"))
+        configuration = bench.configuration(["p1"])
+        gateway = bench.gateway(configuration)
+        red = NodeRed(bench, flow(bench.mqtt))
+        state, _ = until("the state", lambda: red.kept("drives", "p1"))
         expect("Node-RED has the state of p1", state["quality"] == "good" and state["running"] is False)
-        press = urllib.request.Request(f"http://127.0.0.1:{port}/inject/start", method="POST")
-        urllib.request.urlopen(press, timeout=5).close()
-        result, _ = until("the result", lambda: context("result"))
+
+        gateway.kill()
+        gateway.wait()
+        before = red.kept("drives", "p1")["time"]
+        bench.gateway(configuration)
+        until("a newer state", lambda: red.kept("drives", "p1")["time"] > before and red.kept("drives", "p1")["quality"] == "good")
+        say("   ok: gateway killed and restarted, the state is new and good")
+
+        red.press("start")
+        result, _ = until("the result", lambda: red.kept("drives", "result"))
         expect(f"the command was {result['result']}", result["ok"])
-        _, took = until("the motor", lambda: context("p1")["running"])
-        expect(f"the motor runs, {took:.2f} s after the result", True)
+        _, took = until("the motor", lambda: red.kept("drives", "p1")["running"])
+        expect(f"the motor runs, {took:.2f} s after the result", bench.point("p1", "running"))
+        expect("the drive has the reference 30 %", bench.point("p1", "speed_reference") == 30.0)
 
 
 main()

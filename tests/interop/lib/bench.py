@@ -1,12 +1,14 @@
 """A broker, a simulated line and a gateway on free ports of 127.0.0.1."""
 
 import contextlib
+import json
 import os
 import signal
 import socket
 import subprocess
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -52,6 +54,7 @@ class Bench:
         self.stack = contextlib.ExitStack()
         self.dir = Path(self.stack.enter_context(tempfile.TemporaryDirectory(prefix="interop-")))
         self.mqtt, self.http = free_port(), free_port()
+        self.has_broker = False
         return self
 
     def __exit__(self, error, *_):
@@ -71,6 +74,7 @@ class Bench:
         log = (self.dir / "mosquitto.log").open("w")
         self.start(["mosquitto", "-c", configuration], stdout=log, stderr=log)
         until("mosquitto", lambda: reachable(self.mqtt))
+        self.has_broker = True
 
     def line(self, drives):
         """Simulated drives of the NX family at the addresses from 1 on."""
@@ -81,8 +85,8 @@ class Bench:
         until("the simulated line", link.exists)
         return process
 
-    def configuration(self, drives, mqtt="", monitored=()):
-        """A configuration of these drives; they may be commanded, except those `monitored`."""
+    def configuration(self, drives, north="", monitored=()):
+        """A configuration of these drives, for the broker if there is one; they may be commanded, except those `monitored`."""
         text = f'[gateway]\nname = "hall"\nsocket = ""\nstate_dir = "{self.dir}/state"\n'
         text += f'[[bus]]\nname = "line1"\nport = "{self.dir}/line"\nbaud = 115200\n'
         for address, name in enumerate(drives, 1):
@@ -90,7 +94,9 @@ class Bench:
             text += f'[[bus.drive]]\nname = "{name}"\naddress = {address}\nprofile = "vacon-nx"\naccess = "{access}"\n'
             text += "limits = { speed_reference = [0.0, 80.0] }\n"
         text += f'[http]\nlisten = "127.0.0.1:{self.http}"\n'
-        text += f'[mqtt]\nurl = "mqtt://127.0.0.1:{self.mqtt}"\ncommands = true\n{mqtt}'
+        if self.has_broker:
+            text += f'[mqtt]\nurl = "mqtt://127.0.0.1:{self.mqtt}"\ncommands = true\n'
+        text += north
         path = self.dir / "drivegate.toml"
         path.write_text(text)
         return path
@@ -98,8 +104,19 @@ class Bench:
     def gateway(self, configuration):
         log = (self.dir / "drivegate.log").open("a")
         process = self.start([DRIVEGATE, "run", "--config", configuration], stdout=log, stderr=log)
-        until("the gateway", lambda: self.retained("drivegate/hall/status") == "online")
+        online = lambda: self.retained("drivegate/hall/status") == "online"
+        until("the gateway", online if self.has_broker else lambda: self.get("/readyz"))
         return process
+
+    def get(self, path):
+        """What the gateway's HTTP server answers with 200, or None."""
+        with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{self.http}{path}", timeout=5) as answer:
+            return answer.read()
+        return None
+
+    def point(self, drive, name):
+        """The value of a point as the gateway has read it from the drive last."""
+        return json.loads(self.get(f"/api/v1/drives/{drive}"))["points"][name]["value"]
 
     def retained(self, topic):
         """The retained message of a topic, or None."""

@@ -44,8 +44,8 @@ async def answer(hass, command):
 async def main():
     bootstrap.DEFAULT_INTEGRATIONS = set()
     bootstrap.CRITICAL_INTEGRATIONS = set()
-    hass = await bootstrap.async_setup_hass(runner.RuntimeConfig(config_dir=directory))
     logging.getLogger().addHandler(handler := Complaints(logging.WARNING))
+    hass = await bootstrap.async_setup_hass(runner.RuntimeConfig(config_dir=directory))
     await hass.async_start()
     if entered:
         flow = await hass.config_entries.flow.async_init(integration, context={"source": "user"})
