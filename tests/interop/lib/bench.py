@@ -51,6 +51,7 @@ class Bench:
     """What runs, in a directory of its own; everything ends with the `with` block."""
 
     def __enter__(self):
+        signal.signal(signal.SIGTERM, lambda *_: fail("terminated"))
         self.stack = contextlib.ExitStack()
         self.dir = Path(self.stack.enter_context(tempfile.TemporaryDirectory(prefix="interop-")))
         self.mqtt, self.http = free_port(), free_port()

