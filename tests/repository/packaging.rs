@@ -388,7 +388,10 @@ fn make_install_keeps_the_configuration_and_uninstall_removes_the_rest() {
         let destination = format!("DESTDIR={}", folder.path().display());
         let program = format!("PROGRAM={}", env!("CARGO_BIN_EXE_drivegate"));
         let directory = root().display().to_string();
-        run_well(tool("make").as_ref(), &["-C", &directory, target, &destination, &program])
+        run_well(
+            tool("make").as_ref(),
+            &["-C", &directory, target, &destination, &program],
+        )
     };
     make("install");
     let configuration = folder.path().join("etc/drivegate/drivegate.toml");
@@ -401,7 +404,10 @@ fn make_install_keeps_the_configuration_and_uninstall_removes_the_rest() {
         "zsh/vendor-completions/_drivegate",
         "fish/vendor_completions.d/drivegate.fish",
     ] {
-        assert!(read(&format!("usr/share/{completions}")).contains("stop-all"), "{completions}");
+        assert!(
+            read(&format!("usr/share/{completions}")).contains("stop-all"),
+            "{completions}"
+        );
     }
     let program = folder.path().join("usr/bin/drivegate");
     run_well(&program, &["check", "--config", &configuration.display().to_string()]);

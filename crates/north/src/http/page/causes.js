@@ -33,6 +33,7 @@ const CAUSES = {
   interlocked: [t("interlocked"), t("An interlock does not hold."), t("Make the interlock hold, then press Start.")],
   reserved: [t("reserved after a stop"), t("It was stopped by {holder}, who keeps it for another {left} s."), t("Wait, or let {holder} release it.")],
   local_control: [t("local control"), t("Its panel or its terminals control it."), t("Select the fieldbus as control place at the drive.")],
+  inhibited: [t("start inhibited"), t("An input of the drive inhibits the start."), t("Close the enable input of the drive.")],
   undervoltage: [t("undervoltage"), t("Its supply voltage is too low."), t("Check the mains and its fuses.")],
   bypass: [t("bypass"), t("The motor runs past the drive, at the mains."), t("End the bypass at its switch.")],
   fire_mode: [t("fire mode"), t("Fire mode is active; it obeys no other command."), t("End fire mode at the input of the drive.")],

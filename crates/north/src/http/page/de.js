@@ -361,6 +361,7 @@ const texts = {
   "Its panel or its terminals control it.": "Sein Bedienfeld oder seine Klemmen steuern ihn.",
   "Select the fieldbus as control place at the drive.": "Am Umrichter den Feldbus als Steuerplatz wählen.",
   "undervoltage": "Unterspannung",
+  "start inhibited": "Start gesperrt",
   "Its supply voltage is too low.": "Seine Versorgungsspannung ist zu niedrig.",
   "Check the mains and its fuses.": "Netz und Sicherungen prüfen.",
   "bypass": "Bypass",
@@ -374,6 +375,8 @@ const texts = {
   "Turn the switch to automatic.": "Den Schalter auf Automatik stellen.",
   "output blocked": "Impulssperre",
   "Its output is blocked by an input.": "Ein Eingang sperrt seinen Ausgang.",
+  "An input of the drive inhibits the start.": "Ein Eingang des Umrichters sperrt den Start.",
+  "Close the enable input of the drive.": "Den Freigabeeingang des Umrichters schließen.",
   "Open the input that blocks the output.": "Den Eingang öffnen, der den Ausgang sperrt.",
   "reference missing": "Sollwert fehlt",
   "The drive misses its reference.": "Dem Umrichter fehlt sein Sollwert.",
@@ -445,7 +448,7 @@ const words = {
   bus_down: "Leitung unterbrochen", diagnosis: "Diagnose", guarded: "Start zu früh", interlock: "Verriegelung", reload_refused: "Neuladen abgelehnt", lost: "verloren", refused_stop: "Stopp abgelehnt",
   released: "freigegeben", hold_broken: "übernommen", slot_void: "BACnet-Platz ungültig", drill: "Übung", paused: "Gateway stand still", line_errors: "Leitungsfehler", point: "Grenzwert", command: "Befehl",
   // Holds, and points that say why a drive does not run.
-  held: "belegt", reserved: "nach Stopp reserviert", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", bypass: "Bypass", fire_mode: "Brandfallbetrieb", interlocked: "verriegelt",
+  held: "belegt", reserved: "nach Stopp reserviert", local_control: "Vor-Ort-Steuerung", undervoltage: "Unterspannung", inhibited: "Start gesperrt", bypass: "Bypass", fire_mode: "Brandfallbetrieb", interlocked: "verriegelt",
   // Results and sources of commands.
   confirmed: "bestätigt", acknowledged: "quittiert", refused_by_drive: "vom Umrichter abgelehnt", timeout: "keine Antwort", garbled: "gestörte Antwort",
   expired: "abgelaufen", replaced: "ersetzt", purged: "durch Stopp verworfen", withdrawn: "zurückgezogen", not_taken: "nicht übernommen", interrupted: "unterbrochen",
