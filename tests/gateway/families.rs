@@ -132,6 +132,12 @@ impl Rig {
         curl(&["--unix-socket", &socket, "-d", body, &url])
     }
 
+    fn post(&self, path: &str, body: &str) -> (u16, serde_json::Value) {
+        let socket = self.site.path("own.sock");
+        let url = format!("http://gateway/api/v1/{path}");
+        curl(&["--unix-socket", &socket, "-d", body, &url])
+    }
+
     /// Number of times that the motor has started to turn.
     fn starts(&self) -> usize {
         let output = self.drive.output();

@@ -166,10 +166,13 @@ fn every_family_confirms_what_it_shows() {
         };
         assert_eq!(order(ModelPoint::Run, true), expected(Effect::Runs), "{name}");
         assert_eq!(order(ModelPoint::Run, false), expected(Effect::Stops), "{name}");
-        // Nor is a stop of all drives proven otherwise.
+        // A stop of all drives is proven by one of these.
         let stands = [ModelPoint::ZeroSpeed, ModelPoint::OutputFrequency];
         let read = stands.into_iter().any(|point| profile.model_index(point).is_some());
-        assert!(read || shows_nothing.contains(&name), "{name} does not show that it stands");
+        assert!(
+            read || shows_nothing.contains(&name),
+            "{name} does not show that it stands"
+        );
         if let Some(effects) = order(ModelPoint::FaultReset, true) {
             assert_eq!(effects, [Effect::NoFault], "{name}");
         }
