@@ -133,7 +133,7 @@ fleet-metrics: tools build ## Let one Prometheus read 1,000 gateways for ten min
 	.tools/venv/bin/python tests/fleet/metrics.py
 
 CHECKS ?=
-interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one
+interop: ## Run the gateway with Home Assistant, Node-RED (MQTT, Modbus, BACnet) and pysparkplug, which it installs. CHECKS=name runs one
 	tests/interop/run.sh $(CHECKS)
 
 book: ## Build the pages of docs as a site with search, target/book; installs mdbook, which takes a minute
