@@ -5,6 +5,7 @@ mod behind_its_back;
 mod cases;
 mod confirmed;
 mod other_stops;
+mod own_timeout;
 mod status;
 mod words;
 
@@ -124,12 +125,6 @@ impl Rig {
     /// Gives a command with named values over the local socket; returns status and result.
     fn command(&self, values: &str) -> (u16, serde_json::Value) {
         self.post("drives/drive/commands", values)
-    }
-
-    fn post(&self, path: &str, body: &str) -> (u16, serde_json::Value) {
-        let socket = self.site.path("own.sock");
-        let url = format!("http://gateway/api/v1/{path}");
-        curl(&["--unix-socket", &socket, "-d", body, &url])
     }
 
     fn post(&self, path: &str, body: &str) -> (u16, serde_json::Value) {
