@@ -178,5 +178,5 @@ fn stops_stand_and_all_heals_for_every_family_of_the_language() {
         }
         count += 1;
     }
-    assert_eq!(count, 18);
+    assert_eq!(count, 20);
 }
