@@ -2,12 +2,11 @@
 
 import time
 
-from bench import Bench, expect, free_port, say, until
+from bench import Bench, end, expect, free_port, say, until
 from hass import HomeAssistant
 
 RUNNING, READY = 3, 2
 MODBUS_TCP = '[modbus_tcp]\nlisten = ["127.0.0.1:{port}"]\nwrite = ["127.0.0.1/32"]\n'
-# docs/home-assistant.md has the switch.
 HUB = """
 modbus:
   - name: hall
@@ -29,9 +28,10 @@ SENSORS = [
     "name: p1 energy, unique_id: p1_energy, slave: 1, address: 0x800D, data_type: uint32, nan_value: 0xFFFFFFFF",
     "name: online, unique_id: online, slave: 255, address: 2, input_type: input, data_type: uint16",
 ]
+# The switch of docs/home-assistant.md. State 0, offline, is neither on nor off: such a motor may run.
 SWITCH = (
     "name: p{n} run, unique_id: p{n}_run, slave: {n}, address: 0x8100, "
-    "verify: {{address: 0x8001, input_type: input, state_on: [3], state_off: [0, 1, 2, 4]}}"
+    "verify: {{address: 0x8001, input_type: input, state_on: [3], state_off: [1, 2, 4]}}"
 )
 
 
@@ -42,7 +42,7 @@ def hub(port):
 
 def main():
     with Bench() as bench:
-        bench.line(2)
+        line = bench.line(2)
         port = free_port()
         configuration = bench.configuration(["p1", "p2"], MODBUS_TCP.format(port=port), ["p2"])
         gateway = bench.gateway(configuration)
@@ -69,7 +69,7 @@ def main():
         write(0x8101, 9000)
         time.sleep(0.5)
         expect("90 % is outside the limits: refused", bench.point("p1", "speed_reference") == 40.0)
-        expect("Home Assistant logs it", any("hall" in line for line in hass.ask(do="complaints")))
+        expect("Home Assistant logs it", any("hall" in text for text in hass.ask(do="complaints")))
         hass.call("switch", "turn_on", entity_id="switch.p2_run")
         time.sleep(0.5)
         expect("p2 is monitored: refused", not running("p2") and hass.state("switch.p2_run") in ("off", "unavailable"))
@@ -89,8 +89,11 @@ def main():
         write(0x8100, [1, 2500])
         until("the motor", lambda: running("p1") and bench.point("p1", "speed_reference") == 25.0)
         say("   ok: one write of two registers: the motor runs at 25 %")
-        write(0x8100, 0)
-        until("the stop", lambda: not running("p1"))
+        until("the switch", lambda: hass.state("switch.p1_run") == "on")
+        end(line)
+        until("the drive offline", lambda: hass.state("sensor.p1_state") == "0" and hass.state("sensor.p1_speed") == "unknown")
+        until("the switch's reading", lambda: any("Unexpected response" in text for text in hass.ask(do="complaints")))
+        expect("a drive that is offline has no speed, and its switch does not say off", hass.state("switch.p1_run") != "off")
 
 
 main()
