@@ -1,6 +1,6 @@
 //! From the text of a file to settings: every section is read, then what they say together is judged.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use super::gateway::{self, Gateway};
@@ -8,7 +8,9 @@ use super::keys::{MODBUS_TCP, ROOT};
 use super::params::ParamsSettings;
 use super::settings::{BusSettings, ENVIRONMENT, Settings, Unusable};
 use super::together::{Clients, judge};
-use super::{authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings};
+use super::{
+    authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings, unused_profiles,
+};
 use crate::bus::proof;
 use crate::document::{self, Document, Finding, Problem, Reader};
 use crate::drive::Profile;
@@ -101,9 +103,12 @@ pub(super) fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String
         .filter(|(name, _)| name.starts_with(ENVIRONMENT))
         .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
     document.overlay(ENVIRONMENT, variables);
-    let mut profile_errors = Vec::new();
     let base = path.parent().unwrap_or(Path::new(""));
-    let settings = read(&document.reader(), base, &mut profile_errors);
+    let mut of_profiles = OfProfiles {
+        named: unused_profiles::named_by_drives(document.root()),
+        ..OfProfiles::default()
+    };
+    let settings = read(&document.reader(), base, &mut of_profiles);
     let known = document.known_keys().into_iter().collect();
     let is_toml = document.is_toml();
     let (mut errors, mut warnings) = document.into_findings();
@@ -113,8 +118,9 @@ pub(super) fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String
             .flat_map(|settings| settings.profiles.warnings())
             .cloned(),
     );
+    warnings.extend(of_profiles.warnings);
     if is_toml {
-        errors.extend(profile_errors);
+        errors.extend(of_profiles.errors);
         errors.extend(broken.iter().map(|(name, _)| not_text(name)));
     }
     let loaded = Loaded {
@@ -125,10 +131,20 @@ pub(super) fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String
     (loaded, known)
 }
 
-fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
+/// The profiles that drives name, and what is wrong in the files of profiles.
+#[derive(Default)]
+struct OfProfiles {
+    named: BTreeSet<String>,
+    errors: Vec<Problem>,
+    warnings: Vec<Problem>,
+}
+
+fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Option<Settings> {
     let gateway = ROOT.gateway.table(reader).map(|table| gateway::read(&table, base));
     let mut gateway = gateway.unwrap_or_default();
-    profile_errors.append(&mut gateway.errors);
+    let problems = std::mem::take(&mut gateway.errors);
+    (of_profiles.errors, of_profiles.warnings) =
+        unused_profiles::divide(problems, &of_profiles.named, &gateway.profiles);
     let Gateway {
         name,
         socket,
@@ -137,7 +153,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         profiles,
         ..
     } = gateway;
-    let broken = !profile_errors.is_empty();
+    let broken = !(of_profiles.errors.is_empty() && of_profiles.warnings.is_empty());
     let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
         .iter()

@@ -32,6 +32,7 @@ mod slot;
 mod start_guard;
 mod together;
 mod unique;
+mod unused_profiles;
 mod values;
 
 pub use drive::{addresses, unknown_profile};

@@ -181,7 +181,7 @@ impl Document {
     }
 
     /// The whole tree.
-    pub(crate) fn root(&self) -> &Node {
+    pub fn root(&self) -> &Node {
         &self.root
     }
 

@@ -16,7 +16,7 @@ pub struct Node {
 
 impl Node {
     /// The value of `key`; `None` if this is no table or lacks the key.
-    pub(crate) fn entry(&self, key: &str) -> Option<&Node> {
+    pub fn entry(&self, key: &str) -> Option<&Node> {
         entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
     }
 

@@ -101,6 +101,12 @@ impl Profiles {
         READ.clone()
     }
 
+    /// The name that a profile file gives, and its base; none for what is missing or cannot be read.
+    pub fn names_in(file: &Path) -> (Option<String>, Option<String>) {
+        let source = document::read_file(file).unwrap_or_default();
+        base::peek(&Document::parse(file.display().to_string(), &source))
+    }
+
     /// Adds the profiles of the files `*.toml` in `directory`; they replace built-in ones of the same name. A file may
     /// have any other of them as its `base`, in any order.
     pub fn load(&mut self, directory: &Path) -> Vec<Problem> {
@@ -117,6 +123,11 @@ impl Profiles {
         for path in files {
             let file = path.display().to_string();
             match document::read_file(&path) {
+                Ok(source) if is_configuration(&Document::parse(&file, &source)) => {
+                    let what = "this is a configuration, not a profile";
+                    let finding = Finding::new(what, "move it out of the directory of the profiles");
+                    problems.push(Problem::of_file(file, "", finding));
+                }
                 Ok(source) => waiting.push(Waiting::new(file, source)),
                 Err(problem) => problems.push(problem),
             }
@@ -146,6 +157,12 @@ impl Profiles {
         }
         problems
     }
+}
+
+/// Whether a file in a profile directory is a configuration of the gateway.
+fn is_configuration(document: &Document) -> bool {
+    let has = |key: &str| document.root().entry(key).is_some();
+    !has("name") && (has("gateway") || has("bus"))
 }
 
 /// A file whose base may not be read yet.
