@@ -112,7 +112,7 @@ fn misused(key: &str, why: Finding) -> Failure {
 }
 
 fn unknown(name: &str, key: &str, profiles: &Profiles) -> Failure {
-    misused(key, unknown_profile(name, profiles, false))
+    misused(key, unknown_profile(name, profiles))
 }
 
 fn begin(name: &str, base: Option<&str>, profiles: &Profiles) -> Result<String, Failure> {

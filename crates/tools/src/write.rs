@@ -166,8 +166,17 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
         (Kind::Text, _) => Err(bad("another point: this one is a read-only text")),
         (Kind::Number, _) => {
             let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
-            number.map(Value::Number).ok_or_else(|| bad("a number"))
+            number.map(Value::Number).ok_or_else(|| bad(&wanted_number(text)))
         }
+    }
+}
+
+/// The number that was probably meant by a text with a decimal comma or a unit.
+fn wanted_number(text: &str) -> String {
+    let digits = text.trim_end_matches(|c: char| !c.is_ascii_digit()).replace(',', ".");
+    match digits.parse::<f64>() {
+        Ok(_) => format!("the number alone, with a decimal point: {digits}"),
+        Err(_) => "a number".to_string(),
     }
 }
 
@@ -213,4 +222,22 @@ fn acknowledged(what: &str, write: &Written, way: Way) -> String {
         printable::line(what),
         write.latency_ms
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_decimal_comma_or_a_unit_is_named() {
+        for (text, wanted) in [
+            ("20,5", "the number alone, with a decimal point: 20.5"),
+            ("20%", "the number alone, with a decimal point: 20"),
+            ("-7,25 Hz", "the number alone, with a decimal point: -7.25"),
+            ("fast", "a number"),
+            ("", "a number"),
+        ] {
+            assert_eq!(wanted_number(text), wanted, "{text}");
+        }
+    }
 }

@@ -1,5 +1,6 @@
 //! `[[bus]]`: the line and its drives.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
@@ -29,7 +30,7 @@ pub(super) struct Found {
     pub(super) cadence: (Place, Place),
 }
 
-pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profiles_broken: bool) -> Found {
+pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, faulty: &BTreeSet<String>) -> Found {
     let name = BUS.name.placed(reader);
     let port = BUS.port.read(reader);
     let port = port.and_then(|text| reader.accept(BUS.port.name, port::check(&text, base)));
@@ -50,7 +51,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
         protocol,
         is_modbus_tcp,
         profiles,
-        profiles_broken,
+        faulty,
     };
     let tables = BUS.drive.tables(reader);
     if !reader.has(BUS.drive.name) {

@@ -1,6 +1,6 @@
 //! `[[bus.drive]]`: one drive, checked against its profile.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
@@ -50,7 +50,8 @@ pub(super) struct Surroundings<'a> {
     pub(super) protocol: Protocol,
     pub(super) is_modbus_tcp: bool,
     pub(super) profiles: &'a Profiles,
-    pub(super) profiles_broken: bool,
+    /// Names of the profiles in files with faults.
+    pub(super) faulty: &'a BTreeSet<String>,
 }
 
 pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
@@ -242,7 +243,13 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
     let key = DRIVE.profile.name;
     let name = DRIVE.profile.read(reader)?;
     let known = around.profiles.get(&name);
-    let profile = known.ok_or_else(|| unknown_profile(&name, around.profiles, around.profiles_broken));
+    let profile = known.ok_or_else(|| match around.faulty.contains(&name) {
+        true => Finding::new(
+            format!("the file of profile `{name}` has errors"),
+            "correct it: its errors are listed here, too",
+        ),
+        false => unknown_profile(&name, around.profiles),
+    });
     let profile = reader.accept(key, profile)?;
     if !profile.protocols.contains(&around.protocol) {
         let spoken: Vec<&str> = profile.protocols.iter().map(|p| p.name()).collect();
@@ -282,20 +289,15 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
 }
 
 /// ``unknown profile `x` ``, with the nearest one and all known ones.
-pub fn unknown_profile(name: &str, profiles: &Profiles, some_broken: bool) -> Finding {
+pub fn unknown_profile(name: &str, profiles: &Profiles) -> Finding {
     let near = match nearest(name, profiles.names()) {
         Some(near) => format!("did you mean `{near}`? "),
         None => String::new(),
     };
     let known: Vec<&str> = profiles.names().collect();
-    let broken = if some_broken {
-        ", besides those of profile_dirs that have errors"
-    } else {
-        ""
-    };
     Finding::new(
         format!("unknown profile `{name}`"),
-        format!("{near}known profiles: {}{broken}", known.join(", ")),
+        format!("{near}known profiles: {}", known.join(", ")),
     )
 }
 

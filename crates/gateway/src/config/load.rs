@@ -143,8 +143,10 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
     let gateway = ROOT.gateway.table(reader).map(|table| gateway::read(&table, base));
     let mut gateway = gateway.unwrap_or_default();
     let problems = std::mem::take(&mut gateway.errors);
+    let faulty = unused_profiles::faulty(&problems);
     (of_profiles.errors, of_profiles.warnings) =
-        unused_profiles::divide(problems, &of_profiles.named, &gateway.profiles);
+        unused_profiles::divide(problems, &faulty, &of_profiles.named, &gateway.profiles);
+    let faulty: BTreeSet<String> = faulty.into_values().filter_map(|(name, _)| name).collect();
     let Gateway {
         name,
         socket,
@@ -153,11 +155,10 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
         profiles,
         ..
     } = gateway;
-    let broken = !(of_profiles.errors.is_empty() && of_profiles.warnings.is_empty());
     let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
         .iter()
-        .map(|table| bus::read(table, base, &profiles, broken))
+        .map(|table| bus::read(table, base, &profiles, &faulty))
         .collect();
     let names: Vec<&str> = buses
         .iter()

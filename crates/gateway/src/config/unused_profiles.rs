@@ -22,18 +22,26 @@ pub(super) fn named_by_drives(root: &Node) -> BTreeSet<String> {
     drives.filter_map(name).collect()
 }
 
+/// The files with faults: the name that each gives, and its base.
+pub(super) type Faulty = BTreeMap<String, (Option<String>, Option<String>)>;
+
+/// The files in which these faults are.
+pub(super) fn faulty(problems: &[Problem]) -> Faulty {
+    let files: BTreeSet<&str> = problems.iter().map(|problem| problem.file.as_str()).collect();
+    files
+        .into_iter()
+        .map(|file| (file.to_string(), Profiles::names_in(Path::new(file))))
+        .collect()
+}
+
 /// Divides the faults of profile files into errors and warnings: warnings are faults of files that give a name which neither a
 /// drive nor, by its base, a profile of a drive uses.
 pub(super) fn divide(
     problems: Vec<Problem>,
+    names: &Faulty,
     named: &BTreeSet<String>,
     profiles: &Profiles,
 ) -> (Vec<Problem>, Vec<Problem>) {
-    let files: BTreeSet<&str> = problems.iter().map(|problem| problem.file.as_str()).collect();
-    let names: BTreeMap<String, (Option<String>, Option<String>)> = files
-        .into_iter()
-        .map(|file| (file.to_string(), Profiles::names_in(Path::new(file))))
-        .collect();
     let mut used = named.clone();
     let mut open: Vec<String> = used.iter().cloned().collect();
     while let Some(name) = open.pop() {
@@ -76,7 +84,7 @@ mod tests {
         let problems = profiles.load(folder.path());
         let errors = |named: &[&str]| {
             let named = named.iter().map(|name| name.to_string()).collect();
-            let (errors, warnings) = divide(problems.clone(), &named, &profiles);
+            let (errors, warnings) = divide(problems.clone(), &faulty(&problems), &named, &profiles);
             assert_eq!(errors.len() + warnings.len(), problems.len());
             let file = |problem: &Problem| {
                 Path::new(&problem.file)

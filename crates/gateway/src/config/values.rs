@@ -50,6 +50,12 @@ pub(super) fn check_name(text: &str, joints: &str) -> Result<(), Finding> {
 pub(super) fn socket(text: &str) -> Result<SocketAddr, Finding> {
     text.parse().map_err(|_| {
         let port = text.rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
+        if text.parse::<IpAddr>().is_ok() {
+            return Finding::new(
+                format!("`{text}` has no port"),
+                format!("write it with the port of this server, such as \"{text}:1502\" for Modbus TCP, \"{text}:9488\" for HTTP"),
+            );
+        }
         let port = port.unwrap_or(1502);
         Finding::new(
             format!("`{text}` is not an IP address with a port"),

@@ -20,7 +20,7 @@ impl FromStr for Url {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Url, String> {
-        let form = "write it as http://127.0.0.1:9488";
+        let form = format!("write it as {}", meant(text));
         let uri: Uri = text.parse().map_err(|why| format!("{why}; {form}"))?;
         let tls = match uri.scheme_str() {
             Some("http") => false,
@@ -39,6 +39,19 @@ impl FromStr for Url {
             authority,
             path: uri.path().trim_end_matches('/').to_string(),
         })
+    }
+}
+
+/// The address that was probably meant: with a scheme, and with the usual port where none was given.
+fn meant(text: &str) -> String {
+    let host = text.rsplit("//").next().unwrap_or_default();
+    let plain = host
+        .chars()
+        .all(|c| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | ':'));
+    match (plain && !host.is_empty(), host.contains(':')) {
+        (false, _) => "http://127.0.0.1:9488".to_string(),
+        (true, true) => format!("http://{host}"),
+        (true, false) => format!("http://{host}:9488"),
     }
 }
 
@@ -68,7 +81,8 @@ mod tests {
         assert_eq!(url.to_string(), "https://gateway.example");
         for (bad, why) in [
             ("127.0.0.1:9488", "http:// is missing"),
-            ("gateway", "http:// is missing"),
+            ("gateway", "http:// is missing; write it as http://gateway:9488"),
+            ("10.0.0.5:80", "http:// is missing; write it as http://10.0.0.5:80"),
             ("http://me:secret@gateway", "not supported"),
             ("http://gateway/?a=b", "not supported"),
             ("http://", "write it as"),

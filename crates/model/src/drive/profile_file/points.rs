@@ -88,7 +88,8 @@ pub(super) fn read_point(
         }
         None => reader.or("unit", String::new()),
     };
-    let derived = !matches!(source, Some(Source::Raw(_)));
+    // Of a point whose source has a fault, the other keys are known nevertheless.
+    let derived = reader.has("derive");
     let class = if derived { PollClass::Never } else { read_class(reader) };
     let point = Point {
         name,
