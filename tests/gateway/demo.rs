@@ -5,6 +5,7 @@ use std::process::{Command, Output};
 use crate::support::process::{
     Running, api, drivegate, free_port, get, mbpoll_read, point, read_registers, until, until_ready, write_registers,
 };
+use crate::support::site::curl;
 use crate::support::tools::{root, tool};
 
 /// The number behind `mark` in what the demo printed.
@@ -70,6 +71,29 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     until("pump-1 stopped", || {
         (api(http, "pump-1")["state"] == "ready").then_some(())
     });
+
+    // The login that it prints starts a motor as the page does, and no other one does.
+    let (_, rest) = printed.split_once("user operator, password ").unwrap();
+    let password = rest.split_whitespace().next().unwrap();
+    let order = |password: &str, order: &str| {
+        let (login, url) = (
+            format!("operator:{password}"),
+            format!("http://127.0.0.1:{http}/api/v1/drives/pump-1/commands"),
+        );
+        curl(&["-u", &login, "-d", order, &url])
+    };
+    assert_eq!(order("another-password", "{\"run\": true}").0, 401);
+    let (status, result) = order(password, "{\"run\": true, \"speed_reference\": 30}");
+    assert_eq!(status, 200, "{result}");
+    until("pump-1 at its reference", || {
+        (point(http, "pump-1", "output_frequency") == 15.0).then_some(())
+    });
+    assert_eq!(order(password, "{\"run\": false}").0, 200);
+    let metrics = get(http, "/metrics").unwrap().1;
+    assert!(
+        metrics.contains("drivegate_listener_up{server=\"bacnet\"} 1"),
+        "{metrics}"
+    );
 
     demo.signal("INT");
     let status = demo.ended();

@@ -33,6 +33,14 @@ pub(super) struct CredentialsFile<C: Filed> {
 }
 
 impl<C: Filed> CredentialsFile<C> {
+    /// The file at that path.
+    pub(super) fn at(path: &Path) -> CredentialsFile<C> {
+        CredentialsFile {
+            path: path.to_path_buf(),
+            of: PhantomData,
+        }
+    }
+
     /// Reads the text of the file.
     ///
     /// # Errors The fault, as a message.

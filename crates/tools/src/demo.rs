@@ -1,15 +1,17 @@
 //! `drivegate demo`: the whole product with no hardware and nothing to install.
 
+mod login;
 mod welcome;
 mod written;
 
 use std::io::ErrorKind;
-use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use tokio_util::sync::CancellationToken;
 
+use self::login::Login;
 use self::written::Written;
 use super::failure::Outcome;
 use super::report;
@@ -106,10 +108,14 @@ const LINES: [DemoLine; 5] = [
     },
 ];
 
+/// The drive with a start guard.
+const GUARDED: &str = "pump-2";
+
 /// Preferred ports.
 const MQTT: u16 = 1883;
 const MODBUS_TCP: u16 = 1502;
 const HTTP: u16 = 9488;
+const BACNET: u16 = 47_808;
 
 /// Runs the demo until Ctrl-C.
 pub(super) fn run(args: &Args) -> Outcome {
@@ -127,8 +133,12 @@ async fn demo(args: &Args) -> Result<(), String> {
     let written = args.write_config.as_deref().map(Written::prepare).transpose()?;
     let lines =
         start_lines(args.speed, written.as_ref()).map_err(|e| format!("cannot create a simulated line: {e}"))?;
+    let directory = written
+        .as_ref()
+        .map_or_else(temporary, |written| written.dir().to_path_buf());
     let place = DemoPlace {
         ports: lines.iter().map(|line| line.address()).collect(),
+        login: Login::new(&directory)?,
         written,
     };
     let cancel = CancellationToken::new();
@@ -157,16 +167,22 @@ async fn demo(args: &Args) -> Result<(), String> {
     broker.stop().await;
     lines.into_iter().for_each(SimulatedBus::stop);
     if place.written.is_none() {
-        // While nothing was recorded, the directory does not exist.
         let _ = std::fs::remove_dir_all(place.state_dir());
     }
     Ok(())
+}
+
+/// The directory of a demo that leaves nothing.
+fn temporary() -> PathBuf {
+    std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id()))
 }
 
 /// Places of the demo on this machine.
 struct DemoPlace {
     /// Ports of the lines.
     ports: Vec<String>,
+    /// The login of the page.
+    login: Login,
     /// The directory of `--write-config`.
     written: Option<Written>,
 }
@@ -176,7 +192,7 @@ impl DemoPlace {
     fn state_dir(&self) -> PathBuf {
         match &self.written {
             Some(written) => written.state_dir(),
-            None => std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id())),
+            None => temporary(),
         }
     }
 
@@ -187,32 +203,35 @@ impl DemoPlace {
     }
 }
 
-/// Addresses of the three north sides.
+/// Addresses of the north sides.
 struct Sides {
     mqtt: SocketAddr,
     modbus: SocketAddr,
     http: SocketAddr,
+    bacnet: SocketAddr,
 }
 
 impl Sides {
     /// Name, address and preferred port.
-    fn each(&self) -> [(&'static str, SocketAddr, u16); 3] {
+    fn each(&self) -> [(&'static str, SocketAddr, u16); 4] {
         [
             ("MQTT broker", self.mqtt, MQTT),
             ("Modbus TCP", self.modbus, MODBUS_TCP),
             ("HTTP", self.http, HTTP),
+            ("BACnet/IP", self.bacnet, BACNET),
         ]
     }
 }
 
 async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
     let (mqtt, broker) = start_broker(cancel).await?;
-    let [mut modbus, mut http] = [MODBUS_TCP, HTTP];
+    let [mut modbus, mut http, mut bacnet] = [MODBUS_TCP, HTTP, BACNET];
     loop {
         let sides = Sides {
             mqtt,
             modbus: free_port("Modbus TCP", modbus)?,
             http: free_port("HTTP", http)?,
+            bacnet: free_of("BACnet/IP", bacnet, |address| UdpSocket::bind(address).is_ok())?,
         };
         let loaded = Settings::parse("demo.toml", &configuration(place, &sides), std::iter::empty());
         report::errors(&loaded.errors);
@@ -225,6 +244,7 @@ async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon,
         match failed.address_in_use() {
             Some(taken) if taken == sides.modbus => modbus = taken.port().saturating_add(1),
             Some(taken) if taken == sides.http => http = taken.port().saturating_add(1),
+            Some(taken) if taken == sides.bacnet => bacnet = taken.port().saturating_add(1),
             _ => return Err(failed.to_string()),
         }
     }
@@ -280,9 +300,14 @@ fn start_lines(speed: Speed, written: Option<&Written>) -> std::io::Result<Vec<S
 
 /// The preferred port on loopback, or the next free one.
 pub(super) fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
+    free_of(what, wanted, |address| TcpListener::bind(address).is_ok())
+}
+
+/// The first port from `wanted` on, on loopback, that is free.
+fn free_of(what: &str, wanted: u16, is_free: impl Fn(SocketAddr) -> bool) -> Result<SocketAddr, String> {
     for port in wanted..wanted.saturating_add(100) {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
-        if TcpListener::bind(address).is_ok() {
+        if is_free(address) {
             return Ok(address);
         }
     }
@@ -293,7 +318,12 @@ pub(super) fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
 }
 
 fn configuration(place: &DemoPlace, sides: &Sides) -> String {
-    let Sides { mqtt, modbus, http } = sides;
+    let Sides {
+        mqtt,
+        modbus,
+        http,
+        bacnet,
+    } = sides;
     let mut text = format!(
         "[gateway]\nname = \"demo\"\nsocket = {:?}\nstate_dir = {:?}\n",
         place.socket(),
@@ -315,6 +345,9 @@ fn configuration(place: &DemoPlace, sides: &Sides) -> String {
             text += &format!("\n[[bus.drive]]\nname = \"{drive}\"\naddress = {address}\nprofile = \"{profile}\"\n");
             text += &format!("unit = {unit}\naccess = \"control\"\n");
             text += "supervision = { timeout = \"10min\", action = \"stop\" }\n";
+            if *drive == GUARDED {
+                text += "guard = { min_off = \"10s\" }\n";
+            }
             if *profile == "vacon-nx" {
                 text += "turnaround = \"0.5ms\"\n";
             }
@@ -322,12 +355,13 @@ fn configuration(place: &DemoPlace, sides: &Sides) -> String {
     }
     text += &format!("\n[modbus_tcp]\nlisten = [\"{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n");
     text += &format!("\n[mqtt]\nurl = \"mqtt://{mqtt}\"\nclient_id = \"drivegate-demo\"\ncommands = true\n");
-    text += &format!("\n[http]\nlisten = \"{http}\"\n");
-    text + &match place.written.as_ref().and_then(Written::users) {
-        Some(users) => format!("commands = true\nusers_file = {:?}\n", users.display().to_string()),
-        None => "# Operating from the page: `drivegate user add --file users alice` here, then start the demo again.\n"
-            .to_string(),
-    }
+    text += &format!("\n[bacnet]\nlisten = \"{bacnet}\"\ncommands = true\nwrite = [\"127.0.0.0/8\"]\n");
+    let users = place.login.file.display().to_string();
+    text += &format!("\n[http]\nlisten = \"{http}\"\ncommands = true\nusers_file = {users:?}\n");
+    let user = Login::USER;
+    // Advisory: holders are shown, and nobody is refused.
+    text += "\n[authority]\nmode = \"advisory\"\n";
+    text + &format!("\n[[authority.principal]]\nname = \"{user}\"\nrank = \"operator\"\nhttp_user = \"{user}\"\n")
 }
 
 #[cfg(test)]
@@ -337,12 +371,21 @@ mod tests {
     /// The demo's configuration, which newcomers read first, gives no warning, and its timeouts suit a busy machine.
     #[test]
     fn the_configuration_of_the_demo_has_no_warnings() {
+        let folder = tempfile::tempdir().expect("a directory");
         let place = DemoPlace {
             ports: LINES.iter().map(|line| format!("/dev/{}", line.name)).collect(),
+            login: Login::new(folder.path()).expect("a login"),
             written: None,
         };
-        let [mqtt, modbus, http] = [MQTT, MODBUS_TCP, HTTP].map(|port| SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
-        let text = configuration(&place, &Sides { mqtt, modbus, http });
+        let [mqtt, modbus, http, bacnet] =
+            [MQTT, MODBUS_TCP, HTTP, BACNET].map(|port| SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
+        let sides = Sides {
+            mqtt,
+            modbus,
+            http,
+            bacnet,
+        };
+        let text = configuration(&place, &sides);
         let loaded = Settings::parse("demo.toml", &text, std::iter::empty());
         assert!(loaded.errors.is_empty(), "{:?}", loaded.errors);
         assert!(loaded.warnings.is_empty(), "{:?}", loaded.warnings);

@@ -1,6 +1,7 @@
 //! `drivegate user`: the users who may command over HTTP.
 
 use std::io::{self, BufRead, IsTerminal, Read, Write};
+use std::path::Path;
 
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
@@ -78,8 +79,18 @@ fn add(file: &UsersFile, name: &str) -> Result<String, String> {
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
     Ok(match file.put(&user, true)? {
         true => format!("{name} has a new password; reload the gateway\n"),
-        false => format!("{name} was added; reload the gateway\n"),
+        false => format!("{name} was added; reload the gateway\n{}", lines(&file.path)),
     })
+}
+
+/// The lines of the configuration that let users of that file command.
+fn lines(file: &Path) -> String {
+    let file = std::path::absolute(file).unwrap_or_else(|_| file.to_path_buf());
+    format!(
+        "its configuration needs, with TLS (`drivegate certificate new`) or `listen` on the loopback:\n\
+         [http]\ncommands = true\nusers_file = {:?}\n",
+        file.display().to_string()
+    )
 }
 
 fn list(file: &UsersFile) -> Result<String, String> {

@@ -1,7 +1,8 @@
 //! The text that the demo prints: its lines, and commands that can be copied whole. Pure, but for the path of the
 //! program.
 
-use super::{DemoLine, DemoPlace, LINES, Sides};
+use super::login::Login;
+use super::{DemoLine, DemoPlace, GUARDED, LINES, Sides};
 
 /// The text. Every line that begins with exactly two blanks is a command, or a comment of the shell.
 pub(super) fn text(place: &DemoPlace, sides: &Sides) -> String {
@@ -19,12 +20,28 @@ drivegate {} demo: simulated drives of every family and protocol, true wire timi
 The drives start, stop, ramp and occasionally fault on their own until you command them.
 mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosquitto-clients
 
-{}{}{configured}
+{}{}{}{configured}
 Ctrl-C ends the demo.",
         crate::version::VERSION,
         lines(&place.ports),
         look(&quoted(&program), sides),
+        page(place, sides),
         command(sides),
+    )
+}
+
+/// Three steps to a start from the page.
+fn page(place: &DemoPlace, sides: &Sides) -> String {
+    let (http, bacnet, password) = (sides.http, sides.bacnet, &place.login.password);
+    format!(
+        "
+Start a motor from the page
+  # 1. Open http://{http}/#/drive/pump-1 and log in: user {}, password {password} (another at each start).
+  # 2. Press Start, and confirm.
+  # 3. Press STOP. {GUARDED} may start again 10 s after a stop only; who takes a drive is shown to the others.
+  # BACnet/IP: device 100 and a device for each drive behind it, at {bacnet}.
+",
+        Login::USER
     )
 }
 

@@ -52,9 +52,9 @@ impl Written {
         self.dir.join("drivegate.sock")
     }
 
-    /// The users who may operate the demo from the page, if someone made that file.
-    pub(super) fn users(&self) -> Option<PathBuf> {
-        Some(self.dir.join("users")).filter(|users| users.exists())
+    /// The directory itself.
+    pub(super) fn dir(&self) -> &Path {
+        &self.dir
     }
 
     pub(super) fn state_dir(&self) -> PathBuf {

@@ -88,7 +88,7 @@ pub(super) fn read_point(
         }
         None => reader.or("unit", String::new()),
     };
-    // Of a point whose source has a fault, the other keys are known nevertheless.
+    // The other keys of a point are known even where its source has a fault.
     let derived = reader.has("derive");
     let class = if derived { PollClass::Never } else { read_class(reader) };
     let point = Point {
