@@ -134,7 +134,12 @@ impl Network {
                 }
                 let count = super::receive_from(client, buffer);
                 self.received.extend(buffer.iter().take(count));
-                let Some((asked, frame)) = take_adu(&mut self.received) else {
+                // Requests that queued up while the process stood still were given up by the master: the last one is answered.
+                let mut last = None;
+                while let Some(next) = take_adu(&mut self.received) {
+                    last = Some(next);
+                }
+                let Some((asked, frame)) = last else {
                     return 0;
                 };
                 (*id, self.answered) = (asked, Vec::new());
