@@ -36,7 +36,7 @@ impl Schedule {
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online && !d.is_quiet(now))
         {
-            // Reads that may get no reply: one of them a round.
+            // A round has at most one read of each drive that may get no reply.
             let mut mute = 0;
             let due = drive
                 .items

@@ -27,8 +27,8 @@ const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::f
 
 /// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
 pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-/// Pause before the next request of a drive that may get no reply, in times of the last one that got none: while the register
-/// is sought, and once it is known.
+/// Pause before the next request that a drive may leave unanswered, as a multiple of the time that the last such request took
+/// on the line: while the silent register is sought, and once the register is known.
 const SOUGHT_PAUSE: u32 = 4;
 const KNOWN_PAUSE: u32 = 50;
 /// How often a register is tried again before it counts as one that the drive never answers.
@@ -357,8 +357,8 @@ impl DriveSchedule {
         turn.and_then(|turn| others.get(turn).copied()).or(Some(first))
     }
 
-    /// The drive, which answers others, did not answer this read as often as it is tried. A block is read in halves from now on,
-    /// until the register that silences the drive is found, which is tried again after a pause that grows.
+    /// The drive answers other reads, and left this one unanswered in every try. A block is read in halves from now on, until the
+    /// register that silences the drive is found; that register is tried again after a pause that grows.
     /// `took` is the time of that request on the line.
     pub(super) fn in_vain(&mut self, read: PlannedRead, took: Duration, now: Instant) {
         self.divide(read, now);
