@@ -1,5 +1,5 @@
 //! Drives whose own timeout counts only writes: `refresh` keeps them running while the gateway lives, and they trip once it is
-//! gone. The drives are those in Python, which trip two seconds after the last write.
+//! gone. The drives are those in Python, which trip three seconds after the last write.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use super::cases::{Case, cases};
 use crate::support::process::{get, until};
 
 /// The drive's own timeout, s.
-const TIMEOUT: &str = "timeout=2";
+const TIMEOUT: &str = "timeout=3";
 
 const REFRESH: &str = "refresh = \"500ms\"\nsupervision = { timeout = \"60s\", action = \"stop\" }\n";
 

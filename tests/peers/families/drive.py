@@ -3,6 +3,9 @@
 Address 1. Every write is printed as `wrote TABLE ADDRESS VALUE` (hexadecimal), every change of the motor as `motor forward`,
 `motor reverse` or `motor stopped`. SIGUSR1 trips the drive, SIGUSR2 stops it at its panel, SIGHUP switches it off and on. An
 unprepared drive never becomes ready.
+
+Where a drive has a timeout of its own, a signal acts at the next read: nobody who writes can know what happened at the panel since
+the read that the write rests on.
 """
 
 import signal
@@ -59,6 +62,7 @@ class Drive:
         self.target = 0.0  # percent, without the direction's sign
         self.turning = 0
         self.fed = time.monotonic()
+        self.happening = []
         self.lock = threading.RLock()
 
     # What a family defines.
@@ -106,9 +110,9 @@ class Drive:
 
     def restart(self):
         with self.lock:
-            lock, turning = self.lock, self.turning
+            lock, turning, happening = self.lock, self.turning, self.happening
             self.__init__(self.unprepared)
-            self.lock, self.turning = lock, turning
+            self.lock, self.turning, self.happening = lock, turning, happening
             self.log("restarted")
             self.moved()
             self.show()
@@ -208,6 +212,8 @@ class Drive:
         if frame[0] not in (0, 1):
             return b""
         with self.lock:
+            while self.happening and frame[1] in (1, 3, 4):
+                self.happening.pop(0)()
             self.show()
             try:
                 pdu = self.answer(frame[1:-2])
@@ -232,13 +238,20 @@ def frames(data):
     return found, data
 
 
+def happen(drive, happens):
+    if TIMEOUT:
+        drive.happening.append(happens)
+    else:
+        threading.Thread(target=happens).start()
+
+
 def serve(drive, port):
     for number, happens in (
         (signal.SIGUSR1, drive.trip),
         (signal.SIGUSR2, drive.panel),
         (signal.SIGHUP, drive.restart),
     ):
-        signal.signal(number, lambda *_, happens=happens: threading.Thread(target=happens).start())
+        signal.signal(number, lambda *_, happens=happens: happen(drive, happens))
 
     def turn():
         last = time.monotonic()
