@@ -89,12 +89,17 @@ impl Site {
         std::fs::write(self.file(name), text).unwrap();
     }
 
-    /// Writes the configuration, with the ports of the site where `{modbus}`, `{mqtt}` and `{http}` stand.
+    /// Writes the configuration, with the ports of the site where `{modbus}`, `{mqtt}` and `{http}` stand. The local socket is in
+    /// the folder unless the configuration says otherwise: the default one is shared by all gateways of a user, and thus of all tests.
     pub(crate) fn configure(&self, parts: &[&str]) {
         let ports = [("{modbus}", self.modbus), ("{mqtt}", self.mqtt), ("{http}", self.http)];
         let text = ports.iter().fold(parts.concat(), |text, (place, port)| {
             text.replace(place, &port.to_string())
         });
+        let text = match text.contains("\nsocket = ") {
+            true => text,
+            false => text.replacen("[gateway]\n", "[gateway]\nsocket = \"own.sock\"\n", 1),
+        };
         self.write("drivegate.conf", &text);
     }
 
