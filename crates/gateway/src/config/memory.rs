@@ -6,7 +6,7 @@ use crate::history::line;
 use crate::history::trend::Reach;
 
 /// The program, its libraries, its threads and what its servers keep for the clients they allow, bytes; measured.
-const PROGRAM: usize = 20 << 20;
+const PROGRAM: usize = 25 << 20;
 /// A bus: queue, trace, tape and thread, bytes; measured.
 const BUS: usize = 256 << 10;
 /// A drive: plan, image, health, what the servers remember of it and its part of the longest answers, bytes; measured with 992 drives.
