@@ -5,10 +5,10 @@
 use std::sync::{Arc, LazyLock};
 
 use arc_swap::ArcSwap;
-use drivegate::north::http::Offline;
+use drivegate::north::http::Loopback;
 use drivegate::plant::Plant;
 
-static SERVER: LazyLock<Offline> = LazyLock::new(|| {
+static SERVER: LazyLock<Loopback> = LazyLock::new(|| {
     let plant = Plant {
         gateway: "fuzz".to_string(),
         stale_after: std::time::Duration::from_secs(1),
@@ -16,7 +16,7 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         events: Default::default(),
         writes: Default::default(),
     };
-    Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
+    Loopback::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
 });
 
 pub(crate) fn run(data: &[u8]) {

@@ -14,7 +14,7 @@ use drivegate::codec::{Exception, Reply, RequestPdu, Table};
 use drivegate::order::{Authority, Command, Order, Outcome, Urgency};
 use drivegate::queue::{Ready, CommandQueue};
 use drivegate::config::Settings;
-use drivegate::north::modbus_tcp::{Offline, Options, Uncached};
+use drivegate::north::modbus_tcp::{Loopback, Options, Uncached};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 
 /// Unit 1 may be commanded, 2 not, 3 is offline, the bus of 4 is down.
@@ -124,7 +124,7 @@ pub(crate) fn run(data: &[u8]) {
     }
     let plant = PLANT.clone();
     let authority = if flags & 1 == 0 { Authority::Write } else { Authority::ReadOnly };
-    let mut client = Offline::new(options, plant.clone(), Arc::default(), ([127, 0, 0, 1], 502).into(), authority);
+    let mut client = Loopback::new(options, plant.clone(), Arc::default(), ([127, 0, 0, 1], 502).into(), authority);
     let (mut sent, mut answers) = (Vec::new(), Vec::new());
     let mut transaction = 0u16;
     while let [kind, length, rest @ ..] = data {

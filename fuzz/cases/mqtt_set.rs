@@ -10,7 +10,7 @@ use drivegate::codec::{Reply, Table};
 use drivegate::order::{Order, Outcome, Urgency};
 use drivegate::queue::{Ready, CommandQueue};
 use drivegate::config::Settings;
-use drivegate::north::mqtt::{Incoming, Offline};
+use drivegate::north::mqtt::{Incoming, Loopback};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{BusImage, DriveImage, Link};
 
@@ -67,7 +67,7 @@ pub(crate) fn run(data: &[u8]) {
     };
     let plant = PLANT.clone();
     let now = Instant::now();
-    let mut client = Offline::new("drivegate", plant.clone(), now, SystemTime::UNIX_EPOCH);
+    let mut client = Loopback::new("drivegate", plant.clone(), now, SystemTime::UNIX_EPOCH);
     let retain = flags & 4 != 0;
     client.receive(
         Incoming {

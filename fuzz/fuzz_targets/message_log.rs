@@ -1,6 +1,6 @@
 #![no_main]
 
-#[path = "../cases/journal.rs"]
+#[path = "../cases/message_log.rs"]
 mod case;
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| case::run(data));

@@ -19,7 +19,7 @@ targets! {
     certificate "../../fuzz/cases/certificate.rs",
     configuration "../../fuzz/cases/configuration.rs",
     http_request "../../fuzz/cases/http_request.rs",
-    journal "../../fuzz/cases/journal.rs",
+    message_log "../../fuzz/cases/message_log.rs",
     modbus_tcp_stream "../../fuzz/cases/modbus_tcp_stream.rs",
     mqtt_set "../../fuzz/cases/mqtt_set.rs",
     n2 "../../fuzz/cases/n2.rs",

@@ -11,7 +11,7 @@ use drivegate_world::bacnet::encoding::{Reader, Writer};
 use drivegate_world::bacnet::npdu::{self, Payload};
 use drivegate_world::bacnet::{Data, Mac, ObjectId, ObjectType, To, bvlc};
 use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate_world::north::bacnet::{Offline, Options, WhenOffline};
+use drivegate_world::north::bacnet::{Loopback, Options, WhenOffline};
 use drivegate_world::order::{Outcome, Refusal};
 use drivegate_world::plant::Placed;
 use drivegate_world::process_image::{LeaseAction, Supervision};
@@ -51,7 +51,7 @@ struct Client {
 
 struct BacnetWorld {
     rig: Rig,
-    server: Offline,
+    server: Loopback,
     dice: Random,
     clients: [Client; 3],
     next_poll: Instant,
@@ -115,7 +115,7 @@ impl BacnetWorld {
             buses: None,
             state_dir: "/nonexistent".into(),
         };
-        let server = Offline::new(options, rig.shared_plant(), rig.now);
+        let server = Loopback::new(options, rig.shared_plant(), rig.now);
         let next_poll = rig.now;
         BacnetWorld {
             rig,

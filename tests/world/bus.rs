@@ -409,7 +409,7 @@ impl WorldBus {
         }
         if self.open && (stood || !bytes.is_empty()) {
             seen.push(Seen::Heard(bytes.clone()));
-            self.core.heard(&bytes, now);
+            self.core.received(&bytes, now);
             self.note_over(seen);
         }
     }

@@ -31,9 +31,9 @@ pub enum Way {
     /// Orders given by the function that all north sides use.
     Plain(Vec<Waiting>),
     /// Over MQTT; the id in the result identifies the order.
-    Mqtt(Box<mqtt::Offline>, Broker),
+    Mqtt(Box<mqtt::Loopback>, Broker),
     /// Over Modbus TCP; the id of the transaction identifies the order.
-    ModbusTcp(Box<modbus_tcp::Offline>, BTreeMap<u16, usize>, u16),
+    ModbusTcp(Box<modbus_tcp::Loopback>, BTreeMap<u16, usize>, u16),
 }
 
 /// An order that a client waits for.
@@ -82,7 +82,7 @@ impl Broker {
 /// Everything that all clients share.
 pub struct Servers {
     plant: SharedPlant,
-    modbus_tcp: modbus_tcp::Offline,
+    modbus_tcp: modbus_tcp::Loopback,
 }
 
 impl Servers {
@@ -96,7 +96,7 @@ impl Servers {
             uncached: Uncached::Forward,
         };
         let stats = Arc::<NorthState>::default();
-        let modbus_tcp = modbus_tcp::Offline::new(options, plant.clone(), stats, address(250, 0), Authority::Write);
+        let modbus_tcp = modbus_tcp::Loopback::new(options, plant.clone(), stats, address(250, 0), Authority::Write);
         Servers { plant, modbus_tcp }
     }
 
@@ -107,7 +107,7 @@ impl Servers {
 
     /// A connection of a Modbus TCP client. Connections of [`Habit::Shares`] belong to two clients, one of them with a
     /// certificate.
-    pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Offline {
+    pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Loopback {
         let (host, name) = match habit {
             Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),
             Habit::Shares => (252, None),
@@ -120,7 +120,7 @@ impl Servers {
     pub fn client(&self, index: usize, habit: Habit, now: Instant) -> Client {
         let way = match habit {
             Habit::Mqtt => {
-                let gateway = mqtt::Offline::new("b", self.plant.clone(), now, SystemTime::UNIX_EPOCH);
+                let gateway = mqtt::Loopback::new("b", self.plant.clone(), now, SystemTime::UNIX_EPOCH);
                 Way::Mqtt(Box::new(gateway), Broker::default())
             }
             Habit::ModbusTcp | Habit::StopsInALoop | Habit::Shares => {

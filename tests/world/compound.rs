@@ -116,7 +116,7 @@ fn a_held_drive_takes_the_stop_and_nothing_else() {
     let mut rig = nx();
     rig.drive(1)
         .image
-        .hold
+        .restore_lock
         .set(Some("its parameters are being restored".to_string()));
     let orders = [
         rig.points(1, &[("run", 0.0), ("speed_reference", 77.0)]),
@@ -137,7 +137,7 @@ fn a_held_drive_takes_the_stop_and_nothing_else() {
     assert!(rig.set(1, &[("run", 0.0), ("reverse", 0.0)]).is_ok());
     assert!(rig.ordered(1, write(CONTROL_WORD, 0)).is_ok());
     rig.until_state(1, State::Ready);
-    rig.drive(1).image.hold.set(None);
+    rig.drive(1).image.restore_lock.set(None);
     assert!(rig.ordered(1, block(0, 3_000)).is_ok());
     assert_eq!(rig.word(1, REFERENCE), 3_000);
 }

@@ -100,7 +100,7 @@ impl Play {
             self.rig.run(LOOK);
             let report = drills.report(&id).unwrap();
             meanwhile(&mut self.rig, &report);
-            let goes_on = drills.look(&self.rig.plant, self.rig.now, self.time());
+            let goes_on = drills.advance(&self.rig.plant, self.rig.now, self.time());
             self.rig.bus.command_came(self.rig.now);
             if !goes_on {
                 return drills.report(&id).unwrap();
@@ -115,7 +115,7 @@ impl Play {
             !self.rig.with_drive(1, |drive, _| drive.state().running),
             "it was left running"
         );
-        assert_eq!(self.rig.drive(1).image.hold.why(), None);
+        assert_eq!(self.rig.drive(1).image.restore_lock.reason(), None);
         assert_eq!(self.rig.bus.handle.queue.quiet(self.rig.now), None);
     }
 }
@@ -557,7 +557,7 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         for look in 0..=kill * 10 {
             play.rig.run(LOOK);
             disk.look(&play.drills, play.rig.now);
-            play.drills.look(&play.rig.plant, play.rig.now, play.time());
+            play.drills.advance(&play.rig.plant, play.rig.now, play.time());
             play.rig.bus.command_came(play.rig.now);
             assert!(
                 !turns(&mut play.rig) || disk.knows(&id),
@@ -575,7 +575,7 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         }
         for _ in 0..500 {
             play.rig.run(LOOK);
-            play.drills.look(&play.rig.plant, play.rig.now, play.time());
+            play.drills.advance(&play.rig.plant, play.rig.now, play.time());
             play.rig.bus.command_came(play.rig.now);
         }
         play.healed();

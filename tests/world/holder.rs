@@ -440,7 +440,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
         for drive in 0..usize::from(DRIVES) {
             assert_eq!(play.holder(drive).0, HoldState::Free, "its lease has ended");
         }
-        play.rig.plant.tell_holds(play.rig.now, play.time());
+        play.rig.plant.publish_holds(play.rig.now, play.time());
         frames += play.frames;
         for (code, count) in play.results {
             *all.entry(code).or_insert(0) += count;

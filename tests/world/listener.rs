@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use drivegate_world::bus::listener::{Decoder, Heard};
+use drivegate_world::bus::listener::{Decoder, Traffic};
 use drivegate_world::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Table, ascii, n2, rtu};
 
 /// Replies that a decoder accepts from successive frames, each with a pause in ms before it: address, first register, words.
@@ -23,8 +23,10 @@ fn believed(protocol: Protocol, frames: &[(&[u8], u64)]) -> Vec<(u8, u16, Vec<u1
 }
 
 /// A read that is believed.
-fn read(heard: &Heard) -> Option<(u8, u16, Vec<u16>)> {
-    let Heard::Exchange(exchange) = heard else { return None };
+fn read(heard: &Traffic) -> Option<(u8, u16, Vec<u16>)> {
+    let Traffic::Exchange(exchange) = heard else {
+        return None;
+    };
     let (request, reply) = exchange.believed()?;
     let RequestPdu::Read { start, .. } = request.pdu else {
         return None;
@@ -150,7 +152,7 @@ struct Talk {
     /// Frames of drives that are still to come.
     coming: Vec<(Duration, Vec<u8>)>,
     said: BTreeMap<(u8, u16), VecDeque<Vec<u16>>>,
-    heard: Vec<Heard>,
+    heard: Vec<Traffic>,
     counter: u32,
     believed: u64,
 }

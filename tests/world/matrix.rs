@@ -289,7 +289,7 @@ impl Watched {
         let mut longest = Duration::ZERO;
         for _ in 0..10 {
             let before = self.rig.counts().faults;
-            self.rig.set_faults(FaultPlan::default().at(1, fault));
+            self.rig.set_faults(FaultPlan::default().on_request(1, fault));
             let met = |rig: &Rig| rig.counts().faults > before;
             self.rig.until("the fault is met", BACK, met);
             let ok = self.rig.counts().ok;

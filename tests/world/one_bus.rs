@@ -78,7 +78,7 @@ fn the_frames_on_the_line_are_those_of_the_reference() {
 fn a_fault_is_told_and_reset() {
     // A lease is configured, because a missing one would be reported.
     let mut rig = ready(&Line {
-        supervision: supervised(LeaseAction::Hold, PATIENCE),
+        supervision: supervised(LeaseAction::LeaveRunning, PATIENCE),
         ..nx(115_200, 1)
     });
     let mut events = rig.plant.events.subscribe();
@@ -144,7 +144,7 @@ fn after_a_replug_everything_is_read_and_nothing_written() {
         assert_eq!(rig.set(1, &[("run", 1.0)]), Outcome::BusDown);
         rig.bus.wire.record(10_000);
         if lost {
-            rig.set_faults(FaultPlan::default().at(1, Fault::Drop));
+            rig.set_faults(FaultPlan::default().on_request(1, Fault::Drop));
         }
         rig.bus.set_open(true, rig.now);
         rig.until("all is good again", PATIENCE, all_read);

@@ -165,7 +165,7 @@ impl RestoreWorld {
     /// The drive takes no commands but stops from now on, or all again.
     fn hold(&self, held: bool) {
         let why = held.then(|| "a restore".to_string());
-        self.rig.drive(DRIVE).image.hold.set(why);
+        self.rig.drive(DRIVE).image.restore_lock.set(why);
     }
 
     /// Checks the line: a parameter is written only directly after the answer that the motor stands, and with the journal on disk.
@@ -336,7 +336,7 @@ impl RestoreWorld {
 
     /// Whatever a client orders is refused while the drive is held.
     fn order_of_a_client(&mut self) {
-        let held = self.rig.drive(DRIVE).image.hold.why().is_some();
+        let held = self.rig.drive(DRIVE).image.restore_lock.reason().is_some();
         if !held {
             return;
         }

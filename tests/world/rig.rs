@@ -72,7 +72,7 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
         faults: String::new(),
         flips: 0.0,
         supervision: None,
-        on_shutdown: OnShutdown::Hold,
+        on_shutdown: OnShutdown::LeaveRunning,
         dead: Vec::new(),
         swapped: false,
         refuses: None,

@@ -177,7 +177,7 @@ impl Line {
         let timeout = ms(dice.within(300..=3_000));
         let action = match dice.within(0..=9) {
             0..=6 => LeaseAction::Stop,
-            7 => LeaseAction::Hold,
+            7 => LeaseAction::LeaveRunning,
             _ => LeaseAction::SpeedReference(20.0),
         };
         let supervised = dice.chance(0.6);
@@ -212,7 +212,7 @@ impl Line {
             on_shutdown: if dice.chance(0.6) {
                 OnShutdown::Stop
             } else {
-                OnShutdown::Hold
+                OnShutdown::LeaveRunning
             },
             dead: if dice.chance(0.2) && drives > 1 {
                 vec![drives]

@@ -138,7 +138,7 @@ fn replies_that_are_lost_make_no_selection_differ() {
     let mut events = rig.plant.events.subscribe();
     for round in 0..6 {
         let lossy = (0..40).fold(FaultPlan::default(), |plan, at| {
-            plan.at(3 * at + 1 + round, Fault::Drop)
+            plan.on_request(3 * at + 1 + round, Fault::Drop)
         });
         rig.set_faults(lossy);
         let reference = f64::from(20 + 10 * (round as u32 % 5));

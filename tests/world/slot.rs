@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use drivegate_world::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate_world::drive::{DriveIndex, ModelPoint};
-use drivegate_world::north::slot::{Offline, Slot, SlotAccess};
+use drivegate_world::north::slot::{Loopback, Slot, SlotAccess};
 use drivegate_world::north::{NorthState, SlotOutcome};
 use drivegate_world::order::Urgency;
 use drivegate_world::process_image::Access;
@@ -54,7 +54,7 @@ struct Figures {
 /// A tool that behaves like a program: it sends a request, waits, thinks, and sends the next.
 struct ToolRig {
     rig: Rig,
-    slot: Offline,
+    slot: Loopback,
     stats: Arc<NorthState>,
     dice: Random,
     question: Option<Question>,
@@ -93,7 +93,7 @@ impl ToolRig {
         let mut rig = Rig::new(&line, parts);
         rig.until("all drives are read", Duration::from_secs(600), Rig::is_whole);
         let stats: Arc<NorthState> = Arc::default();
-        let slot = Offline::new(slot(&line, access), rig.shared_plant(), stats.clone(), "tool");
+        let slot = Loopback::new(slot(&line, access), rig.shared_plant(), stats.clone(), "tool");
         ToolRig {
             next: rig.now,
             rig,
@@ -461,7 +461,7 @@ fn a_tool_that_says_nothing_changes_no_frame() {
         let line = line("vacon-nx", Protocol::ModbusRtu, 38_400, 3);
         let mut rig = Rig::recorded(&line, Parts::of(0, &line, 3));
         let slot =
-            with_tool.then(|| Offline::new(slot(&line, SlotAccess::Raw), rig.shared_plant(), Arc::default(), "tool"));
+            with_tool.then(|| Loopback::new(slot(&line, SlotAccess::Raw), rig.shared_plant(), Arc::default(), "tool"));
         rig.run(Duration::from_secs(10));
         drop(slot);
         let frames = rig.requests();

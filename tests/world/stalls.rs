@@ -20,7 +20,7 @@ use drivegate_world::codec::Protocol;
 use drivegate_world::drive::profile::Profiles;
 use drivegate_world::drive::{ModelPoint, Value};
 use drivegate_world::event::Events;
-use drivegate_world::north::modbus_tcp::Offline;
+use drivegate_world::north::modbus_tcp::Loopback;
 use drivegate_world::order::{Authority, Order, Origin, SourceKind, WriteStats};
 use drivegate_world::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
 use drivegate_world::sim::random::Random;
@@ -49,7 +49,7 @@ const HEALED: Duration = Duration::from_secs(20);
 struct Connection {
     /// Number of the connection.
     number: usize,
-    offline: Offline,
+    offline: Loopback,
     /// Whether the gateway has accepted the connection.
     open: bool,
     /// Unread bytes, each with the order whose first or last byte is among them.
@@ -317,7 +317,7 @@ impl World {
         }
         self.bus_ran = now;
         let (mut seen, mut stands) = (Vec::new(), false);
-        let stood = self.bus.core.ran(now, Duration::ZERO);
+        let stood = self.bus.core.note_run(now, Duration::ZERO);
         self.bus.deliver(now, stood, &mut seen);
         while self.bus.open {
             match self.bus.core.poll(now) {
@@ -434,7 +434,7 @@ impl World {
     fn tick(&mut self) {
         if self.next_tick <= self.now {
             self.next_tick = self.now + TICK;
-            self.beat.ran(self.now);
+            self.beat.note_run(self.now);
             self.servers.watch().runs(self.now);
         }
     }

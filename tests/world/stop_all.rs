@@ -51,7 +51,7 @@ fn stop_all(rig: &mut Rig, meanwhile: Meanwhile) -> StopReport {
     loop {
         assert!(rig.now < until, "no answer");
         rig.run(LOOK);
-        orders.look(&rig.plant, rig.now);
+        orders.advance(&rig.plant, rig.now);
         rig.bus.command_came(rig.now);
         let Ok(report) = order.report.try_recv() else { continue };
         for address in 1..=DRIVES {
@@ -156,7 +156,7 @@ fn a_second_order_joins_and_one_behind_a_start_does_not() {
         let until = rig.now + time;
         while rig.now < until {
             rig.run(LOOK);
-            orders.look(&rig.plant, rig.now);
+            orders.advance(&rig.plant, rig.now);
             rig.bus.command_came(rig.now);
         }
     };
@@ -218,7 +218,7 @@ fn forty_four_drives_are_stopped_as_fast_as_the_line_can() {
         let mut standing = std::collections::BTreeMap::new();
         let report = loop {
             rig.run(LOOK);
-            orders.look(&rig.plant, rig.now);
+            orders.advance(&rig.plant, rig.now);
             rig.bus.command_came(rig.now);
             for address in 1..=controlled {
                 if !rig.with_drive(address, |drive, _| drive.state().running) {

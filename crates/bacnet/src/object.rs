@@ -242,7 +242,7 @@ fn revision(name: &str, objects: &[Object]) -> u32 {
 
 impl Kind {
     /// Whether a value is of this kind.
-    pub(crate) fn takes(&self, datum: &Datum) -> bool {
+    pub(crate) fn accepts(&self, datum: &Datum) -> bool {
         matches!(
             (self, datum),
             (Kind::Analog { .. }, Datum::Number(_))

@@ -4,11 +4,11 @@ mod control;
 mod ending;
 mod functions;
 mod known_words;
-mod look;
 mod next;
 mod parameter;
 mod replies;
 mod standing;
+mod state_read;
 mod steps;
 
 use std::collections::VecDeque;
@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 
 pub use self::control::read_place;
 pub use self::known_words::KnownWords;
-pub(crate) use self::look::Look;
 pub(crate) use self::standing::Motor;
+pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
 
 use self::parameter::ParameterRun;
@@ -125,7 +125,7 @@ pub struct CommandRun {
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
     /// The drive is being read to see whether its motor runs.
-    look: Option<Look>,
+    look: Option<StateRead>,
     /// The ordered direction, where it waits for the next start.
     next_start: Option<bool>,
     /// Whether the command sets the direction, or starts the motor.

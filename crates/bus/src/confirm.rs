@@ -323,7 +323,7 @@ impl Confirmations {
     }
 
     /// The drive was read: confirms the commands whose effect it shows in time.
-    pub fn look(&mut self, reading: &Reading<'_>, now: Instant) {
+    pub fn take_reading(&mut self, reading: &Reading<'_>, now: Instant) {
         let mut index = 0;
         while let Some(watch) = self.0.get_mut(index) {
             let since = watch.since;

@@ -137,9 +137,9 @@ impl BusCore {
     /// Records that the thread runs at `now`; `boot` is the time since the machine was started, suspensions included.
     /// Returns whether the thread was stalled since it ran last: then bytes that came meanwhile must be read before
     /// anything else.
-    pub fn ran(&mut self, now: Instant, boot: Duration) -> bool {
+    pub fn note_run(&mut self, now: Instant, boot: Duration) -> bool {
         let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
-        let before = stalls.ran();
+        let before = stalls.last_run();
         let Some(stall) = stalls.observe(now, boot) else {
             if self.report.is_deaf(now) {
                 self.master.prolong(now.saturating_duration_since(before));
@@ -147,8 +147,8 @@ impl BusCore {
             return false;
         };
         self.stood = true;
-        self.master.stood(stall, now);
-        self.report.stood(stall);
+        self.master.after_stall(stall, now);
+        self.report.after_stall(stall);
         true
     }
 
@@ -272,7 +272,7 @@ impl BusCore {
         self.report_all(news, now);
         self.report.tick(|| self.master.unanswered(), now);
         self.counters
-            .look(&self.bus, &mut self.report.diagnosis, &self.writes, now);
+            .poll(&self.bus, &mut self.report.diagnosis, &self.writes, now);
         let turn = match next {
             Ok(turn) => turn,
             Err(until) => return Some(until),
@@ -368,19 +368,19 @@ impl BusCore {
     }
 
     /// Bytes were received.
-    pub fn heard(&mut self, bytes: &[u8], now: Instant) {
+    pub fn received(&mut self, bytes: &[u8], now: Instant) {
         if !self.line.is_underway() {
             if !bytes.is_empty() {
                 self.report.noise(bytes, self.line.quiet_since(), now);
                 self.report.diagnosis.figures().stray(bytes);
-                self.line.heard(bytes, now);
+                self.line.received(bytes, now);
             }
             return;
         }
         if let Some(tap) = &mut self.tap {
-            tap.heard(bytes, now);
+            tap.received(bytes, now);
         }
-        if let Some(exchanged) = self.line.heard(bytes, now) {
+        if let Some(exchanged) = self.line.received(bytes, now) {
             self.over(exchanged, now);
         }
     }
@@ -439,7 +439,7 @@ impl BusCore {
         for one in news.drain(..) {
             let wanted = self.report.apply(&one, now);
             if let Some(drive) = wanted.fault
-                && self.bus.image.tape.takes(Taping::Everything)
+                && self.bus.image.tape.records(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
             }

@@ -51,7 +51,7 @@ impl DriveCounters {
     }
 
     /// Requests what is due, and takes what was read.
-    pub(super) fn look(
+    pub(super) fn poll(
         &mut self,
         bus: &BusHandle,
         diagnosis: &mut LineDiagnosis,

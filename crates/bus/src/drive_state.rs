@@ -144,7 +144,7 @@ impl DriveState {
     }
 
     /// The next need of the started commands at `now`, highest rank first. Commands that have ended get their result.
-    pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
+    pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
@@ -300,7 +300,7 @@ impl DriveState {
     }
 
     /// The drive received a command that is not a started one: a broadcast, or one that is not decoded.
-    pub(super) fn heard_order(&mut self, renews: bool, now: Instant) {
+    pub(super) fn foreign_order(&mut self, renews: bool, now: Instant) {
         self.end_refresh(End::Passed);
         self.stopped = None;
         if renews {

@@ -11,7 +11,7 @@
 //! before. A reply that cannot be any of these settles it: a drive answers in order, so a reply to a request of another form
 //! shows that no earlier reply is still to come. A plan has such requests: its slow reads.
 //!
-//! Look-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
+//! ReplyShape-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
 //! held back too after a while, and the drive gets the time to catch up.
 //!
 //! A write acknowledged late proves nothing once the drive may have taken another write in between: the same
@@ -86,7 +86,7 @@ impl LateReply {
         if self.pdu == *pdu {
             self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
         } else {
-            look_alike(&self.pdu, pdu)
+            are_alike(&self.pdu, pdu)
         }
     }
 }
@@ -137,7 +137,7 @@ impl LateReplies {
     /// reply shows nothing where it may itself be the late reply to an earlier request. To be called before
     /// [`LateReplies::answered`].
     pub(crate) fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
-        let owed = |late: &&LateReply| late.ends() > now && look_alike(&late.pdu, pdu);
+        let owed = |late: &&LateReply| late.ends() > now && are_alike(&late.pdu, pdu);
         if self.expected.iter().any(|late| owed(&late)) {
             return;
         }
@@ -164,7 +164,7 @@ impl LateReplies {
             late.overtaken -= 1;
             return true;
         }
-        let alike = |late: &LateReply| owed(late) && late.pdu != *pdu && look_alike(&late.pdu, pdu);
+        let alike = |late: &LateReply| owed(late) && late.pdu != *pdu && are_alike(&late.pdu, pdu);
         let Some(index) = self.expected.iter().position(alike) else {
             return false;
         };
@@ -216,13 +216,13 @@ impl LateReplies {
 }
 
 /// Whether the reply to one of these requests could pass for the reply to the other.
-pub fn look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
-    Look::of(a) == Look::of(b)
+pub fn are_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
+    ReplyShape::of(a) == ReplyShape::of(b)
 }
 
 /// The part of a request that its reply shows.
 #[derive(Debug, PartialEq, Eq)]
-enum Look<'r> {
+enum ReplyShape<'r> {
     /// Function and length of a read.
     Read(u8, usize),
     /// Function, first address and count of a write of several items.
@@ -233,14 +233,14 @@ enum Look<'r> {
     Whole(&'r RequestPdu),
 }
 
-impl Look<'_> {
-    fn of(pdu: &RequestPdu) -> Look<'_> {
+impl ReplyShape<'_> {
+    fn of(pdu: &RequestPdu) -> ReplyShape<'_> {
         match pdu {
-            RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => Look::Read(pdu.function(), pdu.reply_len()),
-            RequestPdu::WriteRegisters { start, values } => Look::Several(16, *start, values.len()),
-            RequestPdu::WriteCoils { start, bits } => Look::Several(15, *start, bits.len()),
-            RequestPdu::Other(_) => Look::Function(pdu.function()),
-            other => Look::Whole(other),
+            RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => ReplyShape::Read(pdu.function(), pdu.reply_len()),
+            RequestPdu::WriteRegisters { start, values } => ReplyShape::Several(16, *start, values.len()),
+            RequestPdu::WriteCoils { start, bits } => ReplyShape::Several(15, *start, bits.len()),
+            RequestPdu::Other(_) => ReplyShape::Function(pdu.function()),
+            other => ReplyShape::Whole(other),
         }
     }
 }

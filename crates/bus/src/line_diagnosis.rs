@@ -8,8 +8,8 @@ use super::line_state::Exchanged;
 use super::listener::Exchange as Overheard;
 use super::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::{Reply, RequestPdu};
+use crate::diagnosis::debounce::{Change, Debounce};
 use crate::diagnosis::figures::Sign;
-use crate::diagnosis::hold::{Change, Hold};
 use crate::diagnosis::{
     Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, own_timeout, rules,
     unanswered,
@@ -27,7 +27,7 @@ pub(super) struct LineDiagnosis {
     image: Arc<BusImage>,
     names: PerDrive<String>,
     figures: Figures,
-    hold: Hold,
+    debounce: Debounce,
     /// Silence before the request that is on the line.
     gap: Duration,
     /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
@@ -61,7 +61,7 @@ impl LineDiagnosis {
         LineDiagnosis {
             names: image.drives.iter().map(|drive| drive.spec.name.clone()).collect(),
             figures,
-            hold: Hold::default(),
+            debounce: Debounce::default(),
             by_drive: vec![None; image.drives.len()].into(),
             gap: Duration::ZERO,
             trips: vec![None; image.drives.len()].into(),
@@ -151,7 +151,7 @@ impl LineDiagnosis {
     }
 
     /// A transaction of another master has ended.
-    pub(super) fn overheard(&mut self, drive: DriveIndex, exchange: &Overheard) {
+    pub(super) fn foreign_exchange(&mut self, drive: DriveIndex, exchange: &Overheard) {
         let (Some(request), Some(ended)) = (&exchange.request, &exchange.ended) else {
             return;
         };
@@ -231,12 +231,12 @@ impl LineDiagnosis {
         let recent = |(at, _): &&(Instant, Finding)| now.saturating_duration_since(*at) < TRIP_SHOWN;
         let trips = self.trips.iter().filter_map(|trip| trip.as_ref().filter(recent));
         found.extend(trips.map(|(_, finding)| finding.clone()));
-        let changes = self.hold.take(found);
+        let changes = self.debounce.take(found);
         self.show();
         self.figures.next_step(now);
         let tell = |change: &Change| match change {
-            Change::Came(finding) => (finding.drive, told(finding)),
-            Change::Firmer(finding) => (finding.drive, format!("now {}", told(finding))),
+            Change::Came(finding) => (finding.drive, text_of(finding)),
+            Change::Firmer(finding) => (finding.drive, format!("now {}", text_of(finding))),
             Change::Went(finding) => (finding.drive, format!("cleared: {}", finding.cause.meaning())),
         };
         changes.iter().map(tell).collect()
@@ -244,7 +244,7 @@ impl LineDiagnosis {
 
     fn show(&mut self) {
         let now = SystemTime::now();
-        let shown: Vec<Finding> = self.hold.shown().cloned().collect();
+        let shown: Vec<Finding> = self.debounce.shown().cloned().collect();
         let is = |finding: &Finding, (cause, drive, _): &(Cause, Option<DriveIndex>, SystemTime)| {
             finding.cause == *cause && finding.drive == *drive
         };
@@ -322,7 +322,7 @@ fn end(ended: &Ended) -> End {
     }
 }
 
-fn told(finding: &Finding) -> String {
+fn text_of(finding: &Finding) -> String {
     let Finding {
         cause,
         certainty,

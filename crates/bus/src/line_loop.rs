@@ -339,10 +339,10 @@ impl Worker {
         // The transaction on the line is ended first: anyone who comes after would talk into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
-            if core.ran(now, line::since_boot()) {
+            if core.note_run(now, line::since_boot()) {
                 // Bytes that came during the stall are a reply, although its time is over.
                 let count = line.receive(&mut buffer)?;
-                core.heard(buffer.get(..count).unwrap_or_default(), now);
+                core.received(buffer.get(..count).unwrap_or_default(), now);
             }
             if self.stop.load(Ordering::Relaxed) && now >= *break_off.get_or_insert(now + LAST_EXCHANGE) {
                 return Ok(());
@@ -354,8 +354,8 @@ impl Worker {
                     let count = line.receive(&mut buffer)?;
                     let now = Instant::now();
                     if count > 0 {
-                        core.heard(buffer.get(..count).unwrap_or_default(), now);
-                    } else if !core.ran(now, line::since_boot()) {
+                        core.received(buffer.get(..count).unwrap_or_default(), now);
+                    } else if !core.note_run(now, line::since_boot()) {
                         line.send(core.sending(now))?;
                     }
                     continue;
@@ -372,7 +372,7 @@ impl Worker {
             match woken {
                 Woken::Readable => {
                     let count = line.receive(&mut buffer)?;
-                    core.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
+                    core.received(buffer.get(..count).unwrap_or_default(), Instant::now());
                 }
                 Woken::Command => {
                     self.handle.queue.clear_wake();
@@ -389,7 +389,7 @@ impl Worker {
         core.runs_on(Instant::now(), line::since_boot());
         while !self.stopping() {
             let now = Instant::now();
-            core.ran(now, line::since_boot());
+            core.note_run(now, line::since_boot());
             match core.poll(now) {
                 Action::Send => return,
                 Action::Wait { until, commands, .. } => {

@@ -257,7 +257,7 @@ impl LineState {
     }
 
     /// Adds bytes received at `now`. Returns the transaction if they complete it.
-    pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
+    pub fn received(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
             self.begin_silence(now);
         }

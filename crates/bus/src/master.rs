@@ -7,7 +7,7 @@
 
 mod background;
 mod choose;
-mod hold;
+mod holder;
 mod passed_on;
 mod pauses;
 mod permission;
@@ -26,12 +26,12 @@ pub use self::remains::Remains;
 
 use self::background::Begun;
 use self::choose::Turns;
-use self::hold::look_at_hold;
+use self::holder::report_control;
 use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
-use super::late_replies::{FORGOTTEN_AFTER, LateReplies, look_alike};
+use super::late_replies::{FORGOTTEN_AFTER, LateReplies, are_alike};
 use super::line_state::{Learned, Sending};
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
@@ -367,13 +367,13 @@ impl Master {
     /// The time until which nothing does, always after `now`.
     pub fn next(&mut self, now: Instant, news: &mut Vec<News>) -> Result<Turn, Instant> {
         self.put_back_background(now);
-        self.look(now, news);
+        self.check(now, news);
         let next = self.choose(now);
         if let Some(round) = self.schedule.take_round() {
             news.push(News::FastRound(round.cycle));
         }
         if let Some(starts) = &mut self.waits.starts {
-            news.append(&mut starts.take_told());
+            news.append(&mut starts.take_news());
         }
         let mut queue = self.bus.queue.lock();
         queue.settle_stops(|drive| self.drives.get(drive).is_some_and(DriveState::is_stopping));
@@ -384,7 +384,7 @@ impl Master {
     }
 
     /// Checks what time and samples have changed: leases, confirmations, N2 drives that are due for a poll.
-    fn look(&mut self, now: Instant, news: &mut Vec<News>) {
+    fn check(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master {
             bus, drives, writes, ..
         } = self;
@@ -392,13 +392,13 @@ impl Master {
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.confirmations.is_empty() {
                 if std::mem::take(&mut drive.was_read) {
-                    drive.confirmations.look(&image.reading(now, drive.fresh), now);
+                    drive.confirmations.take_reading(&image.reading(now, drive.fresh), now);
                 }
                 let late = drive.confirmations.expire(&image.spec.profile, now);
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if drive.has_authority || has_authority {
-                look_at_hold(bus, index, image, drive, (has_authority, writes), now);
+                report_control(bus, index, image, drive, (has_authority, writes), now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
@@ -418,16 +418,16 @@ impl Master {
                 tracing::debug!(target: "drivegate::bus::master", drive = %image.spec.name, ?ordered, "a stop again");
             }
         }
-        self.look_at_refreshes(now, news);
-        self.look_at_starts(now);
+        self.check_refreshes(now, news);
+        self.check_starts(now);
         for drive in self.waits.sessions.neglected(now).collect::<Vec<_>>() {
             self.schedule.ask(drive, now);
         }
-        self.look_at_shutdown(now);
+        self.check_shutdown(now);
     }
 
     /// Updates the start guards with the state of their drives.
-    fn look_at_starts(&mut self, now: Instant) {
+    fn check_starts(&mut self, now: Instant) {
         let Master {
             bus,
             drives,
@@ -440,8 +440,8 @@ impl Master {
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if starts.guards(index) {
                 let reading = image.reading(now, drive.fresh);
-                starts.look(index, drive, &reading);
-                starts.look_at_interlocks(bus, (index, image), &drive.words, &reading, writes);
+                starts.update(index, drive, &reading);
+                starts.check_interlocks(bus, (index, image), &drive.words, &reading, writes);
             }
         }
         let mut pending = bus.queue.lock();
@@ -515,7 +515,7 @@ impl Master {
             // when it is opened again.
             could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
-                false => *of == turn.drive && look_alike(last, &turn.pdu),
+                false => *of == turn.drive && are_alike(last, &turn.pdu),
             }),
         }
     }
@@ -605,8 +605,8 @@ pub(super) fn supervise(
     };
     let reading = image.reading(now, drive.fresh);
     let DriveState { supervision, words, .. } = drive;
-    let demand = supervision.look(&reading, words, orders, now, news, index);
-    image.set_unsupervised(supervision.runs_unheard());
+    let demand = supervision.due_action(&reading, words, orders, now, news, index);
+    image.set_unsupervised(supervision.runs_unclaimed());
     match demand {
         Demand::None => {}
         Demand::Withdraw => {

@@ -185,7 +185,7 @@ impl N2LateReplies {
     }
 
     /// Notes that the frame was a late reply, which is no longer expected.
-    pub fn came(&mut self, frame: &[u8]) {
+    pub fn has_arrived(&mut self, frame: &[u8]) {
         let answer = self::frame(frame).map(|(_, answer)| answer);
         let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
         if let Some(index) = index {

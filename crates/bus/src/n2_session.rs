@@ -101,7 +101,7 @@ impl N2Sessions {
 
     /// A step returned by [`N2Sessions::before`] has ended.
     pub fn done(&mut self, drive: DriveIndex, step: Session, ended: &Ended, now: Instant) -> Progress {
-        let heard = self.heard(drive, ended);
+        let heard = self.transaction_ended(drive, ended);
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
             return if step == Session::Identify {
                 Progress::Failed
@@ -121,7 +121,7 @@ impl N2Sessions {
     }
 
     /// Any transaction with the drive has ended; [`Progress::Failed`] if it was refused although just identified.
-    pub fn heard(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
+    pub fn transaction_ended(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
             return match self.drives.is_empty() {
                 true => Progress::Going,

@@ -161,6 +161,6 @@ impl Prober<'_> {
         }
         Ok(self
             .state
-            .heard(buffer.get(..count).unwrap_or_default(), Instant::now()))
+            .received(buffer.get(..count).unwrap_or_default(), Instant::now()))
     }
 }

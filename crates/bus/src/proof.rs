@@ -248,12 +248,12 @@ impl<'p> Case<'p> {
         matches!(self.order, Order::Write(_))
     }
 
-    fn says(&self, point: ModelPoint) -> Option<bool> {
+    fn shows(&self, point: ModelPoint) -> Option<bool> {
         self.sets.iter().find(|(of, _)| *of == point).map(|(_, on)| *on)
     }
 
     fn is_stop(&self) -> bool {
-        self.says(ModelPoint::Run) == Some(false)
+        self.shows(ModelPoint::Run) == Some(false)
     }
 
     fn begin(&self, order: Order, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
@@ -366,7 +366,7 @@ impl<'p> Case<'p> {
         stopped: bool,
     ) -> Result<Option<Outcome>, Box<Counterexample>> {
         let runs = progress.drive.running.is_some() && !progress.drive.fault;
-        let running = runs || self.start.ran();
+        let running = runs || self.start.has_stopped();
         let step = match run.next(&progress.words, self.profile, running, progress.now + late) {
             Next::Done => return Ok(Some(run.success())),
             Next::Wait(until) => {
@@ -392,7 +392,7 @@ impl<'p> Case<'p> {
         // The drive changes nothing between two looks at its state, so there need not be many.
         let again = progress.frames.iter().rev().take(2).all(Frame::is_read) && progress.frames.len() > 1;
         progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
-        self.look(&step, progress, stopped, stood)?;
+        self.check(&step, progress, stopped, stood)?;
         if step.purpose == StepPurpose::Look && matches!(fate, None | Some(Fate::Repeated)) {
             run.sees(runs);
             return Ok(None);
@@ -424,7 +424,7 @@ impl<'p> Case<'p> {
         if reset.setting.holds(*word) {
             progress.reset_at = Some(progress.now);
         } else if let Some(at) = progress.reset_at.take()
-            && progress.now.saturating_duration_since(at) < reset.hold
+            && progress.now.saturating_duration_since(at) < reset.pulse
             && !reset.setting.once
             && !self.control.is_stop(place, *word)
         {
@@ -434,14 +434,14 @@ impl<'p> Case<'p> {
     }
 
     /// Checks what must hold after every request.
-    fn look(
+    fn check(
         &self,
         step: &Step,
         progress: &Progress<'p>,
         stopped: bool,
         stood: bool,
     ) -> Result<(), Box<Counterexample>> {
-        let starts = self.says(ModelPoint::Run) == Some(true) && !stopped;
+        let starts = self.shows(ModelPoint::Run) == Some(true) && !stopped;
         if progress.drive.running.is_some() && !progress.ran && !starts {
             return Err(self.wrong("the motor starts without a run command", progress));
         }
@@ -508,7 +508,7 @@ impl<'p> Case<'p> {
         let sequence = matches!(self.control.run, Run::Steps(_));
         let refused = matches!(outcome, Outcome::Exception(_) | Outcome::Refused(_));
         // A drive that was stopped at its panel starts at any write of a run command.
-        let late = self.start == Start::StoppedSince && self.says(ModelPoint::Run) == Some(true);
+        let late = self.start == Start::StoppedSince && self.shows(ModelPoint::Run) == Some(true);
         if !outcome.is_ok() && runs && !progress.ran && !late && (sequence || refused) {
             return Err(self.wrong("the command failed but the motor runs", progress));
         }
@@ -522,8 +522,8 @@ impl<'p> Case<'p> {
     fn judge_effect(&self, outcome: &Outcome, progress: &Progress<'p>) -> Result<(), Box<Counterexample>> {
         use Start::{PoweredUp, Prepared, Stopped, StoppedOtherwise};
         let stands = matches!(self.start, PoweredUp | Stopped | Prepared | StoppedOtherwise(_));
-        let starts = self.says(ModelPoint::Run) == Some(true);
-        let direction = self.says(ModelPoint::Reverse);
+        let starts = self.shows(ModelPoint::Run) == Some(true);
+        let direction = self.shows(ModelPoint::Reverse);
         if starts && stands {
             if !outcome.is_ok() || progress.drive.running.is_none() {
                 return Err(self.wrong("a run command does not start the motor", progress));
@@ -532,7 +532,7 @@ impl<'p> Case<'p> {
                 return Err(self.wrong("the motor runs in the wrong direction", progress));
             }
         }
-        let resets = self.says(ModelPoint::FaultReset) == Some(true);
+        let resets = self.shows(ModelPoint::FaultReset) == Some(true);
         use Start::{FaultedRunning, FaultedSince, FaultedStopped};
         let faulted = matches!(self.start, FaultedRunning | FaultedStopped | FaultedSince);
         if resets && faulted && progress.drive.fault {

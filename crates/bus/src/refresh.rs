@@ -12,14 +12,14 @@ mod round;
 use std::time::{Duration, Instant};
 
 pub(crate) use self::end::End;
-use self::ordered::{Does, Ordered, does, reference_of};
+use self::ordered::{InForce, Ordered, does, reference_of};
 use self::round::Round;
 pub(super) use self::round::requests;
 use crate::codec::{RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem};
 use crate::drive::{ModelPoint, Profile, Repeats};
 use crate::order::written;
-use crate::process_image::{Hold, Reading};
+use crate::process_image::{Reading, RestoreLock};
 
 /// Periods in which a drive that does not answer may come back.
 const PERIODS: u32 = 3;
@@ -38,7 +38,7 @@ enum Beginner {
 /// A refresh that has started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Going {
-    does: Does,
+    does: InForce,
     /// When the order that started it ended: earlier reads are not valid.
     since: Instant,
     /// Stops of the drive that were accepted before.
@@ -265,7 +265,7 @@ impl Refresh {
     }
 
     /// Looks at the drive, to which no order is under way. Why that ends the refresh, if it does.
-    pub(super) fn look(&mut self, reading: &Reading<'_>, around: Around) -> Option<End> {
+    pub(super) fn check(&mut self, reading: &Reading<'_>, around: Around) -> Option<End> {
         let (every, _) = self.settings?;
         let going = self.repeated.going.as_mut()?;
         let now = reading.now;
@@ -276,9 +276,9 @@ impl Refresh {
             .is_some_and(|lost| now.saturating_duration_since(lost) > PERIODS * every)
         {
             Some(End::Silent)
-        } else if reading.hold.and_then(Hold::why).is_some() {
+        } else if reading.restore_lock.and_then(RestoreLock::reason).is_some() {
             Some(End::Restore)
-        } else if going.does == Does::Run && around.stops != going.stops && !around.delayed {
+        } else if going.does == InForce::Run && around.stops != going.stops && !around.delayed {
             Some(End::Stop)
         } else {
             going.is_contradicted(reading)
@@ -291,12 +291,12 @@ impl Refresh {
     pub(super) fn due(&self) -> Option<Instant> {
         let going = self.repeated.going?;
         // A run command is repeated to a motor that was seen to run by it.
-        (going.does == Does::Stop || going.seen).then_some(going.due)
+        (going.does == InForce::Stop || going.seen).then_some(going.due)
     }
 
     /// Whether a run command is what stands.
     pub(super) fn runs(&self) -> bool {
-        self.repeated.going.is_some_and(|going| going.does == Does::Run)
+        self.repeated.going.is_some_and(|going| going.does == InForce::Run)
     }
 
     /// Whether a drill's order started the refresh.
@@ -325,9 +325,9 @@ impl Going {
             return Some(End::Local);
         }
         match (self.does, shown(ModelPoint::Running)) {
-            (Does::Run, Some(false)) if self.seen => return Some(End::Stands),
-            (Does::Stop, Some(true)) if self.seen => return Some(End::Starts),
-            (Does::Run, Some(true)) | (Does::Stop, Some(false)) => self.seen = true,
+            (InForce::Run, Some(false)) if self.seen => return Some(End::Stands),
+            (InForce::Stop, Some(true)) if self.seen => return Some(End::Starts),
+            (InForce::Run, Some(true)) | (InForce::Stop, Some(false)) => self.seen = true,
             _ => {}
         }
         None

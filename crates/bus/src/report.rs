@@ -158,9 +158,9 @@ impl Report {
             return Wanted::default();
         };
         let monitors = self.compare_selection(*drive, read, *at);
-        let new_fault = self.look_at_fault(*drive, now);
-        self.look_at_state(*drive, now);
-        self.look_at_own_response(*drive, now);
+        let new_fault = self.check_fault(*drive, now);
+        self.report_state(*drive, now);
+        self.check_own_response(*drive, now);
         Wanted {
             fault: new_fault.then_some(*drive),
             monitors,
@@ -195,7 +195,7 @@ impl Report {
     }
 
     /// The thread of the bus was stalled.
-    pub(super) fn stood(&self, stall: Stall) {
+    pub(super) fn after_stall(&self, stall: Stall) {
         if stall.is_pause() {
             self.events.publish_pause(stall, SystemTime::now());
         }
@@ -293,7 +293,7 @@ impl Report {
     }
 
     /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did in between.
-    fn look_at_own_response(&mut self, index: DriveIndex, now: Instant) {
+    fn check_own_response(&mut self, index: DriveIndex, now: Instant) {
         let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
             return;
         };
@@ -326,7 +326,7 @@ impl Report {
     }
 
     /// Reports faults that appeared or cleared with the last poll. Returns whether one appeared.
-    fn look_at_fault(&mut self, index: DriveIndex, now: Instant) -> bool {
+    fn check_fault(&mut self, index: DriveIndex, now: Instant) -> bool {
         let Some(drive) = self.drive(index) else { return false };
         let reading = drive.reading(now, RECENT);
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
@@ -406,7 +406,7 @@ impl Report {
         began: Instant,
     ) -> Option<Tap> {
         tap::tape(&self.image, index, frame, Verdict::Sent, began);
-        if !self.image.trace.wanted() {
+        if !self.image.trace.has_listener() {
             return None;
         }
         let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);
@@ -437,7 +437,7 @@ impl Report {
     }
 
     /// Reports that another master read a drive.
-    pub(super) fn heard(
+    pub(super) fn foreign_read(
         &mut self,
         index: DriveIndex,
         (table, start): (Table, u16),
@@ -456,8 +456,8 @@ impl Report {
         });
         let mut fast = false;
         drive.update(|snapshot| fast = snapshot.hear(table, start, words, at));
-        self.look_at_fault(index, now);
-        self.look_at_state(index, now);
+        self.check_fault(index, now);
+        self.report_state(index, now);
         fast
     }
 

@@ -157,7 +157,11 @@ impl Selections {
             }
             let Some(own) = value(compared.point) else { continue };
             let Some((before, monitored)) = compared.open.take() else {
-                wanted.extend(compared.wants(point, own, &runs, now).map(|at| (compared.monitor, at)));
+                wanted.extend(
+                    compared
+                        .comparison_due(point, own, &runs, now)
+                        .map(|at| (compared.monitor, at)),
+                );
                 compared.last = own;
                 continue;
             };
@@ -222,7 +226,7 @@ impl Compared {
     }
 
     /// When it is to be compared, where process data that was just read gives a reason.
-    fn wants(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
+    fn comparison_due(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
         let Trust::Unproven(next, pause) = self.trust else {
             return None;
         };

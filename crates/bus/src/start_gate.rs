@@ -75,7 +75,7 @@ impl StartGate {
     }
 
     /// The thread was stalled.
-    pub(super) fn stood(&mut self, stall: Stall) {
+    pub(super) fn after_stall(&mut self, stall: Stall) {
         self.stood = Some(stall.ended);
     }
 
@@ -96,11 +96,11 @@ impl StartGate {
     }
 
     /// Updates the state of a drive.
-    pub(super) fn look(&self, index: DriveIndex, drive: &mut DriveState, reading: &Reading<'_>) {
+    pub(super) fn update(&self, index: DriveIndex, drive: &mut DriveState, reading: &Reading<'_>) {
         if let Some(run) = drive.acknowledged.take() {
             self.guards.acknowledged(index, run, reading.now);
         }
-        self.guards.look(index, reading);
+        self.guards.update(index, reading);
     }
 
     /// Whether a drive has to be looked at.
@@ -109,12 +109,12 @@ impl StartGate {
     }
 
     /// Takes the results to report.
-    pub(super) fn take_told(&mut self) -> Vec<News> {
+    pub(super) fn take_news(&mut self) -> Vec<News> {
         std::mem::take(&mut self.told)
     }
 
     /// Stops a motor that runs though an interlock that stops it does not hold.
-    pub(super) fn look_at_interlocks(
+    pub(super) fn check_interlocks(
         &mut self,
         bus: &BusHandle,
         (index, image): (DriveIndex, &Arc<DriveImage>),

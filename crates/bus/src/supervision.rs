@@ -148,7 +148,7 @@ impl Supervision {
     }
 
     /// Whether the drive runs and no client has commanded it since the gateway started.
-    pub(super) fn runs_unheard(&self) -> bool {
+    pub(super) fn runs_unclaimed(&self) -> bool {
         self.lease.state == State::RunsUnheard
     }
 
@@ -179,7 +179,7 @@ impl Supervision {
     }
 
     /// The action due at `now`.
-    pub(super) fn look(
+    pub(super) fn due_action(
         &mut self,
         reading: &Reading<'_>,
         words: &KnownWords,
@@ -208,7 +208,7 @@ impl Supervision {
                 Demand::None
             }
             State::Ended | State::RunsUnheard => {
-                self.tell_failure(news, drive);
+                self.report_failure(news, drive);
                 Demand::None
             }
             // The action of the previous lease, which a client that is back has suspended permanently.
@@ -224,7 +224,7 @@ impl Supervision {
             }
             State::RanOut => {
                 self.note_answer(now);
-                self.tell_failure(news, drive);
+                self.report_failure(news, drive);
                 match self.lease.state {
                     // Suspended: anyone who is back decides, if the order reaches the wire.
                     State::RanOut if held && self.answer.is_some() => Demand::Withdraw,
@@ -259,7 +259,7 @@ impl Supervision {
         if acts {
             let holds = matches!(
                 reading.spec.supervision.as_ref().map(|s| &s.action),
-                Some(LeaseAction::Hold)
+                Some(LeaseAction::LeaveRunning)
             );
             self.lease = if holds { State::Ended } else { State::RanOut }.into();
             self.begin_anew();
@@ -342,7 +342,7 @@ impl Supervision {
     }
 
     /// Reports a failed action, and one that succeeded after that.
-    fn tell_failure(&mut self, news: &mut Vec<News>, drive: DriveIndex) {
+    fn report_failure(&mut self, news: &mut Vec<News>, drive: DriveIndex) {
         if let Some(outcome) = self.failure.take() {
             self.failures = self.failures.saturating_add(1);
             let why = outcome.to_string();

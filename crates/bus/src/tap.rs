@@ -60,7 +60,7 @@ impl Tap {
     }
 
     /// Bytes arrived.
-    pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
+    pub(super) fn received(&mut self, bytes: &[u8], now: Instant) {
         self.hearing.add(bytes, now);
     }
 

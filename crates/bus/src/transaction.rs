@@ -188,7 +188,7 @@ impl Transaction {
                 && let Some((frame, _)) = self.unless_another.take_if(|_| self.received.contains(&b'\r'))
             {
                 self.foreign += 1;
-                self.late.came(&frame);
+                self.late.has_arrived(&frame);
             }
             match self
                 .late

@@ -120,7 +120,7 @@ impl Stalls {
                 .filter(|slept| *slept > TICK)
                 .unwrap_or_default(),
         };
-        self.stood(stall);
+        self.note_stall(stall);
         Some(stall)
     }
 
@@ -130,7 +130,7 @@ impl Stalls {
     }
 
     /// A stall that was found by other means.
-    pub fn stood(&mut self, stall: Stall) {
+    pub fn note_stall(&mut self, stall: Stall) {
         if stall.is_pause() {
             self.pause = Some(stall);
         }
@@ -144,7 +144,7 @@ impl Stalls {
     }
 
     /// When the thread ran last.
-    pub fn ran(&self) -> Instant {
+    pub fn last_run(&self) -> Instant {
         self.ran
     }
 

@@ -400,8 +400,9 @@ impl Daemon {
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
-        let hold = |spec: &DriveSpec| self.north.parameters.hold(&bus.spec.machine(spec));
-        let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_hold(hold(spec)));
+        let hold = |spec: &DriveSpec| self.north.parameters.restore_lock(&bus.spec.machine(spec));
+        let image =
+            |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_restore_lock(hold(spec)));
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
         let guards = BusGuards::of(&self.guards, &bus.spec, &bus.drives);
@@ -568,7 +569,7 @@ fn stop_all(plant: SharedPlant, orders: Arc<StopAll>) -> tokio::task::JoinHandle
     tokio::spawn(async move {
         loop {
             orders.begun().await;
-            while orders.look(&plant.load(), Instant::now()) {
+            while orders.advance(&plant.load(), Instant::now()) {
                 tokio::time::sleep(LOOK).await;
             }
         }
@@ -583,7 +584,7 @@ fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
             ticks.tick().await;
             let plant = plant.load();
             plant.report_refusals(Instant::now());
-            plant.tell_holds(Instant::now(), SystemTime::now());
+            plant.publish_holds(Instant::now(), SystemTime::now());
         }
     })
 }

@@ -341,11 +341,11 @@ fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending
     }
     let id = match allowed.next().filter(|line| line.id.is_empty()) {
         Some(line) => Some(line.id.clone()),
-        None => match said(&mut one) {
-            Said::Nothing if now.saturating_duration_since(one.since) < PATIENCE => return Some(one),
-            Said::Nothing => None,
-            Said::Gone => return None,
-            Said::Text => {
+        None => match read_greeting(&mut one) {
+            Greeting::Nothing if now.saturating_duration_since(one.since) < PATIENCE => return Some(one),
+            Greeting::Nothing => None,
+            Greeting::Gone => return None,
+            Greeting::Text => {
                 let ids = state
                     .lines
                     .iter()
@@ -372,26 +372,26 @@ fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending
     None
 }
 
-enum Said {
+enum Greeting {
     Nothing,
     Text,
     Gone,
 }
 
 /// Reads the text that a device sends first, and no byte further: the bytes behind the text belong to the line.
-fn said(one: &mut Pending) -> Said {
+fn read_greeting(one: &mut Pending) -> Greeting {
     let mut byte = [0];
     match one.stream.read(&mut byte) {
-        Ok(0) => Said::Gone,
+        Ok(0) => Greeting::Gone,
         Ok(_) => {
             one.said.extend(byte);
-            Said::Text
+            Greeting::Text
         }
         Err(error) if error.kind() == io::ErrorKind::WouldBlock => match one.said.is_empty() {
-            true => Said::Nothing,
-            false => Said::Text,
+            true => Greeting::Nothing,
+            false => Greeting::Text,
         },
-        Err(_) => Said::Gone,
+        Err(_) => Greeting::Gone,
     }
 }
 

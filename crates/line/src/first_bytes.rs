@@ -44,7 +44,7 @@ pub(super) struct FirstBytes {
 
 impl FirstBytes {
     /// A request is sent.
-    pub(super) fn asked(&mut self, frame: &[u8]) {
+    pub(super) fn sent(&mut self, frame: &[u8]) {
         if let [address, function, ..] = *frame
             && self.asked.len() < ASKED
             && !self.asked.contains(&[address, function])
@@ -69,7 +69,7 @@ impl FirstBytes {
     }
 
     /// Notes received bytes; returns `None` while the kind of server is not decided.
-    pub(super) fn came(&mut self, bytes: &[u8]) -> Option<Server> {
+    pub(super) fn received(&mut self, bytes: &[u8]) -> Option<Server> {
         let room = ENOUGH - self.came.len().min(ENOUGH);
         self.came.extend(bytes.iter().take(room));
         match (is_greeting(&self.came), self.is_modbus_tcp()) {
@@ -123,8 +123,8 @@ mod tests {
     /// The server recognised when these bytes come one by one after the request.
     fn seen(request: &[u8], bytes: &[u8]) -> Option<Server> {
         let mut first = FirstBytes::default();
-        first.asked(request);
-        bytes.iter().find_map(|byte| first.came(&[*byte]))
+        first.sent(request);
+        bytes.iter().find_map(|byte| first.received(&[*byte]))
     }
 
     #[test]
@@ -137,8 +137,8 @@ mod tests {
         ] {
             assert_eq!(seen(&request, reply), Some(Server::ModbusTcp), "{reply:02X?}");
             let mut first = FirstBytes::default();
-            first.asked(&request);
-            assert_eq!(first.came(reply), Some(Server::ModbusTcp));
+            first.sent(&request);
+            assert_eq!(first.received(reply), Some(Server::ModbusTcp));
             assert_eq!(
                 seen(&frame(2, &[3, 0, 0, 0, 1]), reply),
                 Some(Server::Raw),
@@ -166,9 +166,9 @@ mod tests {
         #[test]
         fn any_bytes(asked in prop::collection::vec(any::<u8>(), 0..9), pieces in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..5), 0..9)) {
             let mut first = FirstBytes::default();
-            first.asked(&asked);
+            first.sent(&asked);
             for piece in pieces {
-                let _ = first.came(&piece);
+                let _ = first.received(&piece);
             }
         }
 

@@ -50,7 +50,7 @@ impl Mbap {
         let mut raw = [0; 512];
         let count = read(self.stream.as_fd(), &mut raw)?;
         let came = raw.get(..count).unwrap_or_default();
-        let frame = self.session.borrow_mut().came(came).map_err(Lost::new)?;
+        let frame = self.session.borrow_mut().received(came).map_err(Lost::new)?;
         for (place, byte) in buffer.iter_mut().zip(&frame) {
             *place = *byte;
         }
@@ -90,7 +90,7 @@ impl Session {
     }
 
     /// Bytes came; the RTU frame of the reply to the last request, empty while it is not whole.
-    fn came(&mut self, bytes: &[u8]) -> Result<Vec<u8>, &'static str> {
+    fn received(&mut self, bytes: &[u8]) -> Result<Vec<u8>, &'static str> {
         self.received.extend_from_slice(bytes);
         let mut reply = Vec::new();
         loop {
@@ -147,10 +147,13 @@ mod tests {
         );
         let reply = of(1, 255, &[3, 2, 0, 7]);
         for byte in &reply[..reply.len() - 1] {
-            assert_eq!(session.came(&[*byte]), Ok(vec![]));
+            assert_eq!(session.received(&[*byte]), Ok(vec![]));
         }
-        assert_eq!(session.came(&reply[reply.len() - 1..]), Ok(frame(255, &[3, 2, 0, 7])));
-        assert_eq!(session.came(&reply), Ok(vec![]), "it came twice");
+        assert_eq!(
+            session.received(&reply[reply.len() - 1..]),
+            Ok(frame(255, &[3, 2, 0, 7]))
+        );
+        assert_eq!(session.received(&reply), Ok(vec![]), "it came twice");
     }
 
     #[test]
@@ -159,9 +162,9 @@ mod tests {
         session.ask(&frame(1, &[3, 0, 0, 0, 1]));
         session.ask(&frame(1, &[3, 0, 5, 0, 1]));
         let (late, own) = (of(1, 1, &[3, 2, 0, 1]), of(2, 1, &[3, 2, 0, 2]));
-        assert_eq!(session.came(&late), Ok(vec![]));
+        assert_eq!(session.received(&late), Ok(vec![]));
         let all = [&late[..], &own, &late, &own].concat();
-        assert_eq!(session.came(&all), Ok(frame(1, &[3, 2, 0, 2])));
+        assert_eq!(session.received(&all), Ok(frame(1, &[3, 2, 0, 2])));
     }
 
     #[test]
@@ -171,7 +174,7 @@ mod tests {
             ..Session::default()
         };
         assert_eq!(session.ask(&frame(1, &[7])).unwrap()[..2], [0, 0]);
-        assert_eq!(session.came(&of(0, 1, &[7, 0])), Ok(frame(1, &[7, 0])));
+        assert_eq!(session.received(&of(0, 1, &[7, 0])), Ok(frame(1, &[7, 0])));
     }
 
     #[test]
@@ -182,7 +185,7 @@ mod tests {
             &[0, 1, 0, 0, 1, 0, 1],
             b"HTTP/1.1 400 Bad Request",
         ] {
-            assert_eq!(Session::default().came(bad), Err(NO_MODBUS_TCP), "{bad:?}");
+            assert_eq!(Session::default().received(bad), Err(NO_MODBUS_TCP), "{bad:?}");
         }
         assert_eq!(Session::default().ask(&[1, 3, 0]), None, "no frame");
     }
@@ -195,7 +198,7 @@ mod tests {
             let mut session = Session::default();
             let sent = session.ask(&frame(9, &[3, 0, 0, 0, 1])).unwrap();
             for piece in pieces {
-                let Ok(reply) = session.came(&piece) else { return Ok(()) };
+                let Ok(reply) = session.received(&piece) else { return Ok(()) };
                 prop_assert!(reply.is_empty() || session.last.to_be_bytes() == sent[..2]);
                 prop_assert!(session.received.len() <= HEADER + 254 + 40);
             }

@@ -53,7 +53,7 @@ impl Raw {
     /// Gives a whole frame to the server.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         if let Some(first) = self.first.borrow_mut().as_mut() {
-            first.asked(frame);
+            first.sent(frame);
             if first.is_empty() {
                 self.other.nothing_came(&self.stream, self.opened, frame);
             }
@@ -69,7 +69,7 @@ impl Raw {
         let count = read(self.stream.as_fd(), buffer).map_err(|lost| self.explained(lost))?;
         let mut first = self.first.borrow_mut();
         let Some(seen) = first.as_mut() else { return Ok(count) };
-        match seen.came(buffer.get(..count).unwrap_or_default()) {
+        match seen.received(buffer.get(..count).unwrap_or_default()) {
             None => Ok(count),
             Some(Server::Raw) => {
                 *first = None;

@@ -17,7 +17,7 @@ pub(super) fn enable(
     options: &LineOptions,
     driver: impl FnOnce(&mut SerialRs485) -> io::Result<()>,
 ) -> io::Result<Vec<String>> {
-    let asked = wanted(options);
+    let asked = requested_settings(options);
     let mut took = asked;
     driver(&mut took)?;
     if took.flags & ENABLED == 0 {
@@ -26,7 +26,7 @@ pub(super) fn enable(
     Ok(differences(&asked, &took))
 }
 
-fn wanted(options: &LineOptions) -> SerialRs485 {
+fn requested_settings(options: &LineOptions) -> SerialRs485 {
     let inverted = options.rs485 == Rs485::KernelInverted;
     let chosen = [
         (!inverted, RTS_ON_SEND),

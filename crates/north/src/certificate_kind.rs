@@ -154,7 +154,7 @@ impl KeyKind {
         } else {
             algorithm
         };
-        let (name, known) = words(told);
+        let (name, known) = describe(told);
         KeyKind {
             name,
             verifies: known,
@@ -172,10 +172,10 @@ pub(super) fn algorithm(identifier: &[u8]) -> String {
         Ok::<_, der::Error>(second.filter(|_| first == EC_KEY).unwrap_or(first))
     };
     let told = SliceReader::new(identifier).and_then(|mut reader| read(&mut reader));
-    told.map_or_else(|_| "an unknown algorithm".to_string(), |told| words(told).0)
+    told.map_or_else(|_| "an unknown algorithm".to_string(), |told| describe(told).0)
 }
 
-fn words(identifier: ObjectIdentifier) -> (String, bool) {
+fn describe(identifier: ObjectIdentifier) -> (String, bool) {
     let dotted = identifier.to_string();
     let known = ALGORITHMS.iter().find(|(id, ..)| *id == dotted);
     known.map_or((dotted, false), |(_, name, supported)| (name.to_string(), *supported))

@@ -44,18 +44,6 @@ const REVERSE: u16 = 1 << 1;
 const STALE: u16 = 1 << 14;
 const ONLINE: u16 = 1 << 15;
 
-/// Bits 0 to 7 of the status register.
-pub(crate) const STATUS_BITS: [ModelPoint; 8] = [
-    ModelPoint::Ready,
-    ModelPoint::Running,
-    ModelPoint::Reversed,
-    ModelPoint::Fault,
-    ModelPoint::Warning,
-    ModelPoint::AtReference,
-    ModelPoint::ZeroSpeed,
-    ModelPoint::Remote,
-];
-
 /// How a value is encoded in registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
@@ -322,7 +310,7 @@ impl<'r> DriveView<'r> {
     /// A bit that is not good is 0 and marks the word as stale.
     fn status(&self) -> u16 {
         let mut word = if self.stale { STALE } else { 0 };
-        for (bit, point) in (0u16..).zip(STATUS_BITS) {
+        for (bit, point) in (0u16..).zip(ModelPoint::STATUS_WORD) {
             word |= self.bit(point).map_or(STALE, |set| u16::from(set) << bit);
         }
         let online = self.bus == BusState::Up && self.reading.snapshot.link.is_online();

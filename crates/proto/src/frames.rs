@@ -49,7 +49,7 @@ pub struct Piece {
 }
 
 /// Result of looking for a frame at one place in the bytes.
-enum Look {
+enum FrameSearch {
     Is(usize, Cut),
     /// The bytes may become a frame when more arrive. `true`: the part received already makes a reply likely.
     MayBecome(bool),
@@ -130,16 +130,16 @@ impl Frames {
             // After more than a glitch no reply is accepted: the request that it belongs to may be in the garbage.
             let open = open.filter(|_| at <= GLITCH);
             match rtu_at(rest, open) {
-                Look::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {
+                FrameSearch::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {
                     return self.cut(at + length, cut);
                 }
-                Look::Is(..) if at > 0 => return self.cut(at, Cut::Garbage),
-                Look::Is(length, cut) => return self.cut(length, cut),
-                Look::MayBecome(true) if !silent => {
+                FrameSearch::Is(..) if at > 0 => return self.cut(at, Cut::Garbage),
+                FrameSearch::Is(length, cut) => return self.cut(length, cut),
+                FrameSearch::MayBecome(true) if !silent => {
                     incomplete = true;
                     break;
                 }
-                Look::MayBecome(false) if !silent => incomplete = true,
+                FrameSearch::MayBecome(false) if !silent => incomplete = true,
                 _ => {}
             }
         }
@@ -186,19 +186,19 @@ impl Frames {
 }
 
 /// Looks for a frame at the beginning of `bytes` on a Modbus RTU line.
-fn rtu_at(bytes: &[u8], open: Option<&Request>) -> Look {
-    let reply = open.map_or(Look::Nothing, |open| rtu_reply(bytes, open));
+fn rtu_at(bytes: &[u8], open: Option<&Request>) -> FrameSearch {
+    let reply = open.map_or(FrameSearch::Nothing, |open| rtu_reply(bytes, open));
     match (reply, rtu_request(bytes)) {
-        (Look::Is(length, cut), _) => Look::Is(length, cut),
+        (FrameSearch::Is(length, cut), _) => FrameSearch::Is(length, cut),
         // The first three bytes fit the expected reply; a request would have another byte count there.
-        (Look::MayBecome(true), _) => Look::MayBecome(true),
-        (_, Look::Is(length, cut)) => Look::Is(length, cut),
-        (Look::MayBecome(_), _) => Look::MayBecome(false),
-        (Look::Nothing, request) => request,
+        (FrameSearch::MayBecome(true), _) => FrameSearch::MayBecome(true),
+        (_, FrameSearch::Is(length, cut)) => FrameSearch::Is(length, cut),
+        (FrameSearch::MayBecome(_), _) => FrameSearch::MayBecome(false),
+        (FrameSearch::Nothing, request) => request,
     }
 }
 
-fn rtu_reply(bytes: &[u8], open: &Request) -> Look {
+fn rtu_reply(bytes: &[u8], open: &Request) -> FrameSearch {
     let head = [Some(open.address), Some(open.pdu.function()), announced(&open.pdu)];
     let refusal = [Some(open.address), Some(open.pdu.function() | 0x80), None];
     let fits = |head: [Option<u8>; 3]| {
@@ -208,19 +208,19 @@ fn rtu_reply(bytes: &[u8], open: &Request) -> Look {
             .all(|(byte, wanted)| wanted.is_none_or(|wanted| *byte == wanted))
     };
     if !fits(head) && !fits(refusal) {
-        return Look::Nothing;
+        return FrameSearch::Nothing;
     }
     match rtu::decode_reply(open, bytes) {
         Decoded::Reply { used, reply } => {
             let pdu = bytes.get(1..used.saturating_sub(2)).unwrap_or_default();
             match reply_or_request(open, &reply, pdu) {
-                Some(cut) => Look::Is(used, cut),
-                None => Look::Nothing,
+                Some(cut) => FrameSearch::Is(used, cut),
+                None => FrameSearch::Nothing,
             }
         }
         // Two bytes fit a request too.
-        Decoded::Incomplete => Look::MayBecome(bytes.len() > 2 && announced(&open.pdu).is_some()),
-        Decoded::Foreign { .. } | Decoded::Corrupt(_) => Look::Nothing,
+        Decoded::Incomplete => FrameSearch::MayBecome(bytes.len() > 2 && announced(&open.pdu).is_some()),
+        Decoded::Foreign { .. } | Decoded::Corrupt(_) => FrameSearch::Nothing,
     }
 }
 
@@ -246,12 +246,12 @@ fn reply_or_request(open: &Request, reply: &Reply, pdu: &[u8]) -> Option<Cut> {
     })
 }
 
-fn rtu_request(bytes: &[u8]) -> Look {
+fn rtu_request(bytes: &[u8]) -> FrameSearch {
     let (Some(&address), Some(&function)) = (bytes.first(), bytes.get(1)) else {
-        return Look::MayBecome(false);
+        return FrameSearch::MayBecome(false);
     };
     if address > 247 || !rtu::is_known(function) {
-        return Look::Nothing;
+        return FrameSearch::Nothing;
     }
     // These bytes must agree with a count before them.
     let counted = match function {
@@ -262,15 +262,15 @@ fn rtu_request(bytes: &[u8]) -> Look {
     };
     let announced = bytes.get(counted.1).map(|byte| usize::from(*byte));
     if announced.is_some_and(|bytes| bytes != counted.0 || bytes == 0) {
-        return Look::Nothing;
+        return FrameSearch::Nothing;
     }
     let whole = rtu::request_len(bytes).and_then(|length| Some((length, bytes.get(..length)?)));
     let Some((length, frame)) = whole else {
-        return Look::MayBecome(announced.is_some());
+        return FrameSearch::MayBecome(announced.is_some());
     };
     match rtu::decode_request(frame) {
-        Some((address, pdu)) => Look::Is(length, Cut::Request { address, pdu: pdu.ok() }),
-        None => Look::Nothing,
+        Some((address, pdu)) => FrameSearch::Is(length, Cut::Request { address, pdu: pdu.ok() }),
+        None => FrameSearch::Nothing,
     }
 }
 

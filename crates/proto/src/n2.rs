@@ -66,7 +66,7 @@ pub enum Session {
 pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
     match pdu {
         RequestPdu::Read { table, start, count } => {
-            let object = Object::at(*table, *start).filter(|object| object.items() == *count)?;
+            let object = Object::containing(*table, *start).filter(|object| object.items() == *count)?;
             let attribute = object.region.value_attribute();
             Some(Command::Read { object, attribute })
         }
@@ -77,7 +77,7 @@ pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
         },
         RequestPdu::WriteRegisters { start, values } => match values.as_slice() {
             [high, low] => {
-                let object = Object::at(Table::Holding, *start)?;
+                let object = Object::containing(Table::Holding, *start)?;
                 let data = [high.to_be_bytes(), low.to_be_bytes()].concat();
                 Some(Command::Override { object, data })
             }
@@ -86,7 +86,7 @@ pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
         RequestPdu::N2(Session::Identify) => Some(Command::Identify),
         RequestPdu::N2(Session::Poll { again }) => Some(Command::Poll { again: *again }),
         RequestPdu::N2(Session::Release { table, address }) => {
-            let object = Object::at(*table, *address)?;
+            let object = Object::containing(*table, *address)?;
             Some(Command::Release { object })
         }
         _ => None,
@@ -124,7 +124,7 @@ pub fn pdu_of(command: &Command) -> Option<RequestPdu> {
 }
 
 fn switch(address: u16, on: bool) -> Option<Command> {
-    let object = Object::at(Table::Coil, address)?;
+    let object = Object::containing(Table::Coil, address)?;
     let data = vec![u8::from(on)];
     Some(Command::Override { object, data })
 }

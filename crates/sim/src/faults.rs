@@ -215,7 +215,7 @@ impl FaultPlan {
     /// Sets the fault for the request with this number. The first sound request to a drive that answers, counted from
     /// when the plan takes effect, is number 1.
     #[must_use]
-    pub fn at(mut self, number: u64, fault: Fault) -> FaultPlan {
+    pub fn on_request(mut self, number: u64, fault: Fault) -> FaultPlan {
         self.script.insert(number, fault);
         self
     }
@@ -361,7 +361,7 @@ mod tests {
             "the same seed, the same faults"
         );
 
-        let mut script = FaultPlan::default().at(2, Fault::Echo).only(&[7]);
+        let mut script = FaultPlan::default().on_request(2, Fault::Echo).only(&[7]);
         let seen: Vec<_> = [1, 7, 1, 7, 7].map(|address| script.next(address, || false)).to_vec();
         assert_eq!(seen, [None, None, None, Some(Fault::Echo), None]);
     }

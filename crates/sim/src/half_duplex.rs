@@ -11,7 +11,7 @@
 use super::SimTime;
 use super::faults::{Burst, Fault, FaultPlan, Kind};
 use super::framing;
-use super::slave::{Asked, Heard, Slaves, refuse};
+use super::slave::{Asked, FrameMeaning, Slaves, refuse};
 use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
 use crate::codec::{Exception, LineFormat, Protocol, rtu};
 use std::collections::BTreeMap;
@@ -385,11 +385,11 @@ impl HalfDuplex {
     /// The drives hear a frame that was over at `now`.
     fn hear(&mut self, frame: &Incoming, now: SimTime) {
         match self.slaves.hear(self.rules.protocol, &frame.bytes, now) {
-            Heard::BadFrame => self.statistics.bad_crc += 1,
-            Heard::Nobody(_) => self.statistics.unanswered += 1,
-            Heard::Broadcast => self.statistics.broadcasts += 1,
-            Heard::Request(asked) => self.reply(frame, &asked, now),
-            Heard::Damaged(asked, exception) => {
+            FrameMeaning::BadFrame => self.statistics.bad_crc += 1,
+            FrameMeaning::Nobody(_) => self.statistics.unanswered += 1,
+            FrameMeaning::Broadcast => self.statistics.broadcasts += 1,
+            FrameMeaning::Request(asked) => self.reply(frame, &asked, now),
+            FrameMeaning::Damaged(asked, exception) => {
                 self.statistics.bad_crc += 1;
                 let mut reply = Vec::new();
                 refuse(&asked, exception, &mut reply);
@@ -442,7 +442,7 @@ impl HalfDuplex {
         let heard = self.slaves.hear(self.rules.protocol, cut, now);
         if fault == Some(Fault::CutEcho) {
             self.respond(frame, asked, fault, Vec::new(), now);
-        } else if let Heard::Damaged(asked, exception) = heard {
+        } else if let FrameMeaning::Damaged(asked, exception) = heard {
             let mut reply = Vec::new();
             refuse(&asked, exception, &mut reply);
             self.respond(frame, &asked, None, reply, now);

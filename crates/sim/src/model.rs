@@ -134,7 +134,7 @@ pub(crate) trait Model: fmt::Debug {
     /// The exception for a valid frame to this drive whose PDU the protocol does not know, where a plain slave returns
     /// `exception`; `None` for silence.
     fn malformed(&mut self, _pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
-        self.heard(now);
+        self.message_received(now);
         Some(exception)
     }
 
@@ -142,7 +142,7 @@ pub(crate) trait Model: fmt::Debug {
     fn broadcast(&mut self, request: &RequestPdu, now: SimTime);
 
     /// A valid message to this drive or to all was on the bus.
-    fn heard(&mut self, _now: SimTime) {}
+    fn message_received(&mut self, _now: SimTime) {}
 
     /// A valid frame was on the line, for any address. Called before the frame is acted upon.
     fn bus_message(&mut self) {}

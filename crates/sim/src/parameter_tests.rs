@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::model::Command;
 use super::random::Random;
 use super::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive, Writes};
-use super::slave::{Heard, Slaves};
+use super::slave::{FrameMeaning, Slaves};
 use super::*;
 use crate::codec::n2::Session;
 use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
@@ -67,7 +67,7 @@ impl DriveOnLine {
         protocol.encode(&request, &mut frame);
         self.now += Duration::from_millis(1);
         match self.slaves.hear(protocol, &frame, self.now) {
-            Heard::Request(asked) => self.slaves.answer(&asked, self.now, &mut reply),
+            FrameMeaning::Request(asked) => self.slaves.answer(&asked, self.now, &mut reply),
             other => panic!("{request:?}: {other:?}"),
         }
         match protocol.decode(&request, &reply) {

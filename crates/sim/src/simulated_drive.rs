@@ -64,7 +64,8 @@ impl ModelOptions {
     /// not simulated.
     pub fn of_profile(profile: &Arc<Profile>) -> Option<ModelOptions> {
         let named = profile.simulator.as_deref().and_then(ModelOptions::by_name);
-        let by_profile = || ProfileOptions::knows(profile).then(|| ModelOptions::Profile(ProfileOptions::new(profile)));
+        let by_profile =
+            || ProfileOptions::can_simulate(profile).then(|| ModelOptions::Profile(ProfileOptions::new(profile)));
         named.or_else(by_profile)
     }
 
@@ -209,9 +210,9 @@ impl SimulatedDrive {
     }
 
     /// A valid message to this drive or to all was on the line.
-    pub fn heard(&mut self, now: SimTime) {
+    pub fn message_received(&mut self, now: SimTime) {
         self.advance(now);
-        self.model.get_mut().heard(now);
+        self.model.get_mut().message_received(now);
     }
 
     /// A valid frame was on the line, for any address. Call it before the frame is acted upon.
@@ -247,7 +248,7 @@ impl SimulatedDrive {
     }
 
     /// A broadcast was received, which is not answered; a write ends the autopilot for good.
-    pub(crate) fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+    pub(crate) fn broadcast_received(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
         if request.is_write() {
             self.autopilot = None;

@@ -17,7 +17,7 @@ const BROADCAST: u8 = 0;
 
 /// Meaning of a frame to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Heard {
+pub enum FrameMeaning {
     /// The check code is wrong, or the bytes are no frame at all.
     BadFrame,
     /// No drive with this address is on the line, or the drive is dead.
@@ -116,27 +116,27 @@ impl Slaves {
     }
 
     /// Reads a whole frame; a broadcast takes effect at once.
-    pub fn hear(&mut self, protocol: Protocol, frame: &[u8], now: SimTime) -> Heard {
+    pub fn hear(&mut self, protocol: Protocol, frame: &[u8], now: SimTime) -> FrameMeaning {
         if protocol == Protocol::N2 {
             return self.hear_n2(frame);
         }
         let Some((address, decoded)) = framing::open(protocol, frame) else {
             self.drives.values_mut().for_each(SimulatedDrive::bus_error);
-            return self.hear_damaged(protocol, frame).unwrap_or(Heard::BadFrame);
+            return self.hear_damaged(protocol, frame).unwrap_or(FrameMeaning::BadFrame);
         };
         self.drives.values_mut().for_each(SimulatedDrive::bus_message);
         if address == BROADCAST {
             self.broadcast(decoded.ok(), now);
-            return Heard::Broadcast;
+            return FrameMeaning::Broadcast;
         }
         if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
-            return Heard::Nobody(address);
+            return FrameMeaning::Nobody(address);
         }
         let function = match &decoded {
             Ok(request) => request.function(),
             Err((function, _)) => *function,
         };
-        Heard::Request(Asked {
+        FrameMeaning::Request(Asked {
             protocol,
             address,
             function,
@@ -151,7 +151,7 @@ impl Slaves {
 
     /// A damaged frame, answered by drives that report check errors. No manual specifies the address of such an answer:
     /// it carries the address and function that were received, and a broadcast gets none.
-    fn hear_damaged(&self, protocol: Protocol, frame: &[u8]) -> Option<Heard> {
+    fn hear_damaged(&self, protocol: Protocol, frame: &[u8]) -> Option<FrameMeaning> {
         let (address, function) = framing::damaged(protocol, frame)?;
         let drive = self.drives.get(&address).filter(|drive| drive.answers())?;
         let exception = drive.check_error()?;
@@ -163,17 +163,17 @@ impl Slaves {
             request: Err(exception),
             command: None,
         };
-        Some(Heard::Damaged(asked, exception))
+        Some(FrameMeaning::Damaged(asked, exception))
     }
 
-    fn hear_n2(&self, frame: &[u8]) -> Heard {
+    fn hear_n2(&self, frame: &[u8]) -> FrameMeaning {
         let Some((address, command)) = Command::decode(frame) else {
-            return Heard::BadFrame;
+            return FrameMeaning::BadFrame;
         };
         if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
-            return Heard::Nobody(address);
+            return FrameMeaning::Nobody(address);
         }
-        Heard::Request(Asked {
+        FrameMeaning::Request(Asked {
             protocol: Protocol::N2,
             address,
             function: 0,
@@ -190,7 +190,7 @@ impl Slaves {
             return;
         };
         if let (Some(command), Some(board)) = (&asked.command, self.boards.get_mut(&asked.address)) {
-            drive.heard(now);
+            drive.message_received(now);
             board.fed(drive.power_cycles(), now);
             board.answer(command, now, &mut |request| drive.answer(request, now), out);
             return;
@@ -214,9 +214,9 @@ impl Slaves {
 
     fn broadcast(&mut self, request: Option<RequestPdu>, now: SimTime) {
         for drive in self.drives.values_mut().filter(|drive| drive.answers()) {
-            drive.heard(now);
+            drive.message_received(now);
             if let Some(request) = &request {
-                drive.heard_broadcast(request, now);
+                drive.broadcast_received(request, now);
             }
         }
     }
@@ -269,7 +269,7 @@ mod tests {
     fn exchange(line: &mut Slaves, request: &str, seconds: u64) -> String {
         let now = Duration::from_secs(seconds);
         let mut out = Vec::new();
-        if let Heard::Request(asked) = line.hear(RTU, &hex(request), now) {
+        if let FrameMeaning::Request(asked) = line.hear(RTU, &hex(request), now) {
             line.answer(&asked, now, &mut out);
         }
         out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
@@ -325,18 +325,18 @@ mod tests {
     fn silence_for_others_and_for_bad_frames() {
         let mut line = line();
         let good = hex("01 03 08 34 00 0B 47 A3");
-        assert!(matches!(line.hear(RTU, &good, SimTime::ZERO), Heard::Request(_)));
+        assert!(matches!(line.hear(RTU, &good, SimTime::ZERO), FrameMeaning::Request(_)));
         for bit in 0..good.len() * 8 {
             let mut bad = good.clone();
             bad[bit / 8] ^= 1 << (bit % 8);
-            assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), Heard::BadFrame);
+            assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), FrameMeaning::BadFrame);
         }
-        assert_eq!(line.hear(RTU, &good[..5], SimTime::ZERO), Heard::BadFrame);
+        assert_eq!(line.hear(RTU, &good[..5], SimTime::ZERO), FrameMeaning::BadFrame);
         let mut other = Vec::new();
         rtu::encode_frame(2, &[3, 8, 0x34, 0, 11], &mut other);
-        assert_eq!(line.hear(RTU, &other, SimTime::ZERO), Heard::Nobody(2));
+        assert_eq!(line.hear(RTU, &other, SimTime::ZERO), FrameMeaning::Nobody(2));
         line.drive(1).unwrap().set_alive(false);
-        assert_eq!(line.hear(RTU, &good, SimTime::ZERO), Heard::Nobody(1));
+        assert_eq!(line.hear(RTU, &good, SimTime::ZERO), FrameMeaning::Nobody(1));
     }
 
     fn cx_and_teco() -> Slaves {
@@ -353,7 +353,7 @@ mod tests {
     /// Sends a PDU to a drive in the framing of `protocol` and returns the PDU of its answer.
     fn ask(line: &mut Slaves, protocol: Protocol, address: u8, pdu: &[u8]) -> Vec<u8> {
         let mut out = Vec::new();
-        if let Heard::Request(asked) = line.hear(protocol, &framed(protocol, address, pdu), SimTime::ZERO) {
+        if let FrameMeaning::Request(asked) = line.hear(protocol, &framed(protocol, address, pdu), SimTime::ZERO) {
             line.answer(&asked, SimTime::ZERO, &mut out);
         }
         framing::pdu(protocol, &out).unwrap_or_default()
@@ -365,7 +365,7 @@ mod tests {
         let mut line = cx_and_teco();
         let mut bad = framed(RTU, 1, &[2, 0, 0, 0, 1]);
         bad[2] ^= 1;
-        assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), Heard::BadFrame);
+        assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), FrameMeaning::BadFrame);
         ask(&mut line, RTU, 9, &[2, 0, 0, 0, 1]);
         ask(&mut line, RTU, 2, &[2, 0, 9, 0, 1]);
         ask(&mut line, RTU, 0, &[5, 0, 0, 0xFF, 0]);
@@ -404,7 +404,7 @@ mod tests {
         };
         let ascii = Protocol::ModbusAscii;
         let read = [0x03, 0, 0x20, 0, 1];
-        let Heard::Damaged(asked, exception) = line.hear(ascii, &damaged(ascii, 1, &read), SimTime::ZERO) else {
+        let FrameMeaning::Damaged(asked, exception) = line.hear(ascii, &damaged(ascii, 1, &read), SimTime::ZERO) else {
             panic!("silence")
         };
         let mut out = Vec::new();
@@ -414,18 +414,25 @@ mod tests {
         assert_eq!(ask(&mut line, ascii, 1, &[0x03, 0, 0x40, 0, 1]), [3, 2, 0, 10]);
         for (protocol, address) in [(ascii, 2), (ascii, 3), (ascii, 4), (ascii, 0), (RTU, 1)] {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
-            assert_eq!(heard, Heard::BadFrame, "{protocol:?} {address}");
+            assert_eq!(heard, FrameMeaning::BadFrame, "{protocol:?} {address}");
         }
         // The check code is verified first (reference/drives.md 5.6), so a message that lacks a byte fails there. Bytes that are
         // no frame get no reply.
         let whole = damaged(ascii, 1, &read);
         let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());
-        assert!(matches!(line.hear(ascii, &short, SimTime::ZERO), Heard::Damaged(..)));
+        assert!(matches!(
+            line.hear(ascii, &short, SimTime::ZERO),
+            FrameMeaning::Damaged(..)
+        ));
         for broken in [&odd[..], &whole[..whole.len() - 1], &whole[1..], b":01\r\n", b":\r\n"] {
-            assert_eq!(line.hear(ascii, broken, SimTime::ZERO), Heard::BadFrame, "{broken:?}");
+            assert_eq!(
+                line.hear(ascii, broken, SimTime::ZERO),
+                FrameMeaning::BadFrame,
+                "{broken:?}"
+            );
         }
         line.drive(1).unwrap().set_alive(false);
-        assert_eq!(line.hear(ascii, &whole, SimTime::ZERO), Heard::BadFrame);
+        assert_eq!(line.hear(ascii, &whole, SimTime::ZERO), FrameMeaning::BadFrame);
     }
 
     #[test]

@@ -41,7 +41,7 @@ pub(crate) enum ClientError {
     )]
     Unreachable(String, String),
     /// No gateway of the configuration listens at its sockets.
-    #[error("no running gateway was found: {}; start it with this file, use sudo, or join the group of the socket", .0.told())]
+    #[error("no running gateway was found: {}; start it with this file, use sudo, or join the group of the socket", .0.describe())]
     NotFound(NotFound),
     /// A file of the command line cannot be used.
     #[error("{0}")]
@@ -85,7 +85,7 @@ pub(crate) struct NotFound {
 }
 
 impl NotFound {
-    fn told(&self) -> String {
+    fn describe(&self) -> String {
         let reasons: Vec<&str> = self.closed.iter().chain(&self.others).map(String::as_str).collect();
         let why = match reasons.is_empty() {
             true => "no gateway listens".to_string(),

@@ -34,7 +34,7 @@ pub(super) struct CredentialsFile<C: Filed> {
 
 impl<C: Filed> CredentialsFile<C> {
     /// The file at that path.
-    pub(super) fn at(path: &Path) -> CredentialsFile<C> {
+    pub(super) fn open(path: &Path) -> CredentialsFile<C> {
         CredentialsFile {
             path: path.to_path_buf(),
             of: PhantomData,

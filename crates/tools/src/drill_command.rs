@@ -87,7 +87,7 @@ pub(super) fn run(args: &Args) -> Outcome {
             (Some(Shown::Report { gateway, id }), _) => Ok(report::print(&printed(gateway, id).await?)),
             (None, Some(name)) => match drill(name, &args.wish).await? {
                 passed if passed.state == DrillState::Passed => Ok(ExitCode::SUCCESS),
-                ended => Err(format!("{}: {}", said(ended.state), ended.text).into()),
+                ended => Err(format!("{}: {}", state_text(ended.state), ended.text).into()),
             },
             (None, None) => Err(Failure::Misused(
                 "name the drive, or use `list` or `report ID`".to_string(),
@@ -106,14 +106,14 @@ async fn list(gateway: &Gateway, json: bool) -> Outcome {
         let of = |kind: Kind| {
             let step = drill.steps.iter().find(|step| step.kind == kind);
             step.map_or_else(String::new, |step| match step.took_ms {
-                Some(took) => format!("{} {:.1} s", said(step.state), seconds(took)),
-                None => said(step.state),
+                Some(took) => format!("{} {:.1} s", state_text(step.state), seconds(took)),
+                None => state_text(step.state),
             })
         };
         table.add_row([
             drill.id.clone(),
             drill.drive.clone(),
-            said(drill.state),
+            state_text(drill.state),
             of(Kind::Order),
             of(Kind::Client),
             of(Kind::Gateway),
@@ -236,6 +236,6 @@ fn seconds(millis: u64) -> f64 {
     Duration::from_millis(millis).as_secs_f64()
 }
 
-fn said(state: DrillState) -> String {
+fn state_text(state: DrillState) -> String {
     state.name().replace('_', " ")
 }

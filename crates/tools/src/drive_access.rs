@@ -96,7 +96,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> 
     let expected = ExpectedDrive::new(&settings.gateway, &bus.spec, &spec);
     Ok(Target {
         drive: drive_name,
-        client: Client::at(&settings.socket, Expected::Drive(expected)),
+        client: Client::for_socket(&settings.socket, Expected::Drive(expected)),
         configured: Some(Box::new(Configured { settings, bus, spec })),
     })
 }
@@ -121,7 +121,7 @@ impl Target {
             .block_on(self.client.ask(asked))
             .map_err(|error| match (error, &self.configured) {
                 (ClientError::NotFound(missed), Some(configured)) => {
-                    let why = configured.told(&missed, self.client.doors());
+                    let why = configured.not_found_text(&missed, self.client.doors());
                     format!("{why}; the local socket; start the gateway")
                 }
                 (error, _) => error.to_string(),
@@ -178,10 +178,10 @@ impl Configured {
             let others = missed.others.join(", ");
             report::note(&format!("{others}; the command opens the port itself"));
         }
-        Ok(self.told(missed, doors))
+        Ok(self.not_found_text(missed, doors))
     }
 
-    fn told(&self, missed: &NotFound, doors: &[Door]) -> String {
+    fn not_found_text(&self, missed: &NotFound, doors: &[Door]) -> String {
         let reasons: Vec<&str> = missed.closed.iter().chain(&missed.others).map(String::as_str).collect();
         match &self.settings.socket {
             _ if !reasons.is_empty() => reasons.join(", "),

@@ -15,7 +15,7 @@ use crate::bus::Mode;
 use crate::bus::listener::guess::Guess;
 use crate::bus::listener::n2_survey::N2Survey;
 use crate::bus::listener::survey::Survey;
-use crate::bus::listener::{Decoder, Heard};
+use crate::bus::listener::{Decoder, Traffic};
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::profile::Profiles;
 use crate::line::{Lost, Receiver, Woken};
@@ -199,7 +199,7 @@ impl Ear<'_> {
     fn survey(&self, protocol: Protocol, format: &LineFormat) -> Result<(Survey, N2Survey), String> {
         let (mut survey, mut n2) = (Survey::default(), N2Survey::default());
         let mut decoder = Decoder::new(protocol, *format, BTreeMap::new());
-        let mut heard: Vec<Heard> = Vec::new();
+        let mut heard: Vec<Traffic> = Vec::new();
         self.hear(format, Duration::from_secs(self.args.seconds), |bytes, now| {
             if bytes.is_empty() {
                 decoder.on_time(now, &mut heard);

@@ -1,6 +1,6 @@
 //! Log lines: for the journal under systemd, coloured on a terminal, else JSON.
 
-mod journal;
+mod journald;
 mod line;
 
 use std::io::IsTerminal;
@@ -15,8 +15,8 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
-use self::journal::Journal;
-pub(super) use self::journal::reads_stderr;
+use self::journald::Journald;
+pub(super) use self::journald::reads_stderr;
 use self::line::{Form, LogLine};
 use crate::config::{LogFormat, LogSettings};
 use crate::order::SENT;
@@ -81,7 +81,7 @@ impl<'w> MakeWriter<'w> for Ways {
 /// not delay a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
     let takes_entries = matches!(settings.format, LogFormat::Auto | LogFormat::Journal);
-    let journal = Journal::of_stderr().filter(|_| takes_entries);
+    let journal = Journald::of_stderr().filter(|_| takes_entries);
     let form = match journal {
         Some(_) => Form::Entry,
         None => form(settings.format),

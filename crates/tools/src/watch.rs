@@ -117,23 +117,27 @@ fn lines(buses: &Value) -> String {
         "queue",
     ]);
     for bus in buses.as_array().into_iter().flatten() {
-        let load = at(bus, "/load_ratio").as_f64();
+        let load = value_at(bus, "/load_ratio").as_f64();
         table.add_row([
-            text(at(bus, "/name")),
-            text(at(bus, "/state")),
+            text(value_at(bus, "/name")),
+            text(value_at(bus, "/state")),
             format!(
                 "{} {} {}",
-                text(at(bus, "/protocol")),
-                text(at(bus, "/baud")),
-                text(at(bus, "/format"))
+                text(value_at(bus, "/protocol")),
+                text(value_at(bus, "/baud")),
+                text(value_at(bus, "/format"))
             ),
             load.map_or_else(String::new, |load| format!("{:.1} %", load * 100.0)),
-            fixed(at(bus, "/fast/cycle_ms"), 1),
-            fixed(at(bus, "/slow/cycle_ms"), 0),
-            format!("{} of {}", text(at(bus, "/online")), text(at(bus, "/drives"))),
-            text(at(bus, "/transactions")),
-            text(at(bus, "/errors")),
-            text(at(bus, "/queue_depth")),
+            fixed(value_at(bus, "/fast/cycle_ms"), 1),
+            fixed(value_at(bus, "/slow/cycle_ms"), 0),
+            format!(
+                "{} of {}",
+                text(value_at(bus, "/online")),
+                text(value_at(bus, "/drives"))
+            ),
+            text(value_at(bus, "/transactions")),
+            text(value_at(bus, "/errors")),
+            text(value_at(bus, "/queue_depth")),
         ]);
     }
     report::lines(&table)
@@ -158,33 +162,33 @@ fn table(drives: &Value) -> String {
         .as_array()
         .into_iter()
         .flatten()
-        .any(|drive| at(drive, "/hold").is_string());
+        .any(|drive| value_at(drive, "/hold").is_string());
     if held {
         heads.push("held by");
     }
     let mut table = report::table(heads);
     for drive in drives.as_array().into_iter().flatten() {
         let good = |name: &str, digits: usize| {
-            let point = at(drive, &format!("/points/{name}"));
+            let point = value_at(drive, &format!("/points/{name}"));
             // Values that are not good, or that a newer state contradicts, are left out.
-            if at(point, "/quality") == "good" && at(point, "/contradicted") != true {
-                fixed(at(point, "/value"), digits)
+            if value_at(point, "/quality") == "good" && value_at(point, "/contradicted") != true {
+                fixed(value_at(point, "/value"), digits)
             } else {
                 String::new()
             }
         };
         let mut row = vec![
-            text(at(drive, "/name")),
-            text(at(drive, "/unit")),
-            text(at(drive, "/profile")),
+            text(value_at(drive, "/name")),
+            text(value_at(drive, "/unit")),
+            text(value_at(drive, "/profile")),
             state(drive),
-            text(at(drive, "/age_ms")),
+            text(value_at(drive, "/age_ms")),
             good("output_frequency", 2),
             good("motor_speed", 0),
             good("motor_current", 1),
             good("speed_reference", 2),
-            fixed(at(drive, "/turnaround_ms"), 2),
-            text(at(drive, "/fault_text")),
+            fixed(value_at(drive, "/turnaround_ms"), 2),
+            text(value_at(drive, "/fault_text")),
         ];
         if held {
             row.push(holder(drive));
@@ -196,9 +200,15 @@ fn table(drives: &Value) -> String {
 
 /// The holder of the drive, and the seconds left.
 fn holder(drive: &Value) -> String {
-    let who = || format!("{} ({})", text(at(drive, "/holder")), text(at(drive, "/holder_rank")));
-    let left = || at(drive, "/hold_left_s").as_u64().unwrap_or_default();
-    match at(drive, "/hold").as_str() {
+    let who = || {
+        format!(
+            "{} ({})",
+            text(value_at(drive, "/holder")),
+            text(value_at(drive, "/holder_rank"))
+        )
+    };
+    let left = || value_at(drive, "/hold_left_s").as_u64().unwrap_or_default();
+    match value_at(drive, "/hold").as_str() {
         Some("held") => format!("{}, {} s", who(), left()),
         Some("reserved") => format!("reserved for {}, {} s", who(), left()),
         Some("local") => "local control place".to_string(),
@@ -208,15 +218,15 @@ fn holder(drive: &Value) -> String {
 
 /// The state, with the warning that the drive reports.
 fn state(drive: &Value) -> String {
-    let state = at(drive, "/state").as_str().unwrap_or("unknown");
-    let warning = at(drive, "/points/warning");
-    let is_warned = at(warning, "/quality") == "good" && at(warning, "/value") == true;
+    let state = value_at(drive, "/state").as_str().unwrap_or("unknown");
+    let warning = value_at(drive, "/points/warning");
+    let is_warned = value_at(warning, "/quality") == "good" && value_at(warning, "/value") == true;
     let warned = if is_warned { ", warning" } else { "" };
     format!("{state}{warned}")
 }
 
 /// The value at `pointer`, or null.
-fn at<'v>(value: &'v Value, pointer: &str) -> &'v Value {
+fn value_at<'v>(value: &'v Value, pointer: &str) -> &'v Value {
     value.pointer(pointer).unwrap_or(&Value::Null)
 }
 

@@ -17,7 +17,7 @@ use crate::support::process::{Running, free_port, until};
 use crate::support::tools::{python, root, run, run_well, tool};
 
 fn local() -> Options {
-    Options::at(SocketAddr::from(([127, 0, 0, 1], 0)))
+    Options::listening_on(SocketAddr::from(([127, 0, 0, 1], 0)))
 }
 
 async fn of_host(server: &Server, headers: &str) -> Reply {
@@ -246,7 +246,7 @@ async fn https_with_a_certificate_that_is_renewed() {
     let options = |name| Options {
         identity: Some(identity(dir.path(), name)),
         max_connections: 8,
-        ..Options::at(listen)
+        ..Options::listening_on(listen)
     };
     let mut server = Server::with(plant::mixed(), options("first")).await;
     let (ca, port) = (dir.path().join("ca.crt").display().to_string(), server.address.port());
@@ -283,7 +283,7 @@ async fn https_with_a_certificate_that_is_renewed() {
         String::from_utf8_lossy(&second.stderr).contains("CN=second"),
         "{second:?}"
     );
-    server.reload(Options::at(listen)).await;
+    server.reload(Options::listening_on(listen)).await;
     assert!(answered(&curl(&[&plain]).await), "TLS is turned off");
     assert!(!answered(&curl(&["--cacert", &ca, &url]).await));
 }

@@ -41,7 +41,7 @@ fn users(names: &[&str]) -> Users {
 fn options(users: Option<Users>) -> Options {
     Options {
         users,
-        ..Options::at(SocketAddr::from(([127, 0, 0, 1], 0)))
+        ..Options::listening_on(SocketAddr::from(([127, 0, 0, 1], 0)))
     }
 }
 

@@ -433,7 +433,7 @@ async fn pipelined_requests_keep_their_order() {
 async fn an_address_in_use_is_told() {
     let server = Server::of(plant::mixed()).await;
     let shared = Arc::new(ArcSwap::from_pointee(plant::mixed()));
-    let options = Options::at(server.address);
+    let options = Options::listening_on(server.address);
     let error = http::Http::start(options, shared, plant::stats(), CancellationToken::new())
         .await
         .unwrap_err();

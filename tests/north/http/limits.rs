@@ -75,7 +75,7 @@ async fn slow_heads_and_idle_connections_keep_nobody_out() {
 async fn health_has_places_of_its_own() {
     let options = Options {
         max_connections: 4,
-        ..Options::at(SocketAddr::from(([127, 0, 0, 1], 0)))
+        ..Options::listening_on(SocketAddr::from(([127, 0, 0, 1], 0)))
     };
     let server = Server::with(plant::mixed(), options).await;
     let mut open = Vec::new();

@@ -97,7 +97,7 @@ pub(crate) fn supervised(bus: &str, name: &str, address: u8, profile: &Arc<Profi
     image(DriveSpec {
         supervision: Some(Supervision {
             timeout: STALE_AFTER,
-            action: LeaseAction::Hold,
+            action: LeaseAction::LeaveRunning,
             adopt: false,
         }),
         ..monitored(name, bus, address, profile)
@@ -219,7 +219,7 @@ impl Server {
     /// A server with these recorded figures.
     pub(crate) async fn showing(plant: Plant, stats: Arc<NorthState>) -> Server {
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        Server::start(plant, stats, Options::at(listen)).await
+        Server::start(plant, stats, Options::listening_on(listen)).await
     }
 
     pub(crate) async fn with(plant: Plant, options: Options) -> Server {

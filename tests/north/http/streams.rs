@@ -133,12 +133,12 @@ fn frame(direction: Direction, byte: u8) -> FrameRecord {
 async fn frames_of_one_bus() {
     let server = served().await;
     let plant = server.plant();
-    assert!(!plant.buses[0].image.trace.wanted());
+    assert!(!plant.buses[0].image.trace.has_listener());
     let mut stream = EventStream::open(server.address, "/api/v1/trace?bus=line1", "")
         .await
         .opened()
         .await;
-    assert!(plant.buses[0].image.trace.wanted() && !plant.buses[1].image.trace.wanted());
+    assert!(plant.buses[0].image.trace.has_listener() && !plant.buses[1].image.trace.has_listener());
     plant.buses[0].image.trace.publish(|| frame(Direction::Request, 0xAB));
     plant.buses[1].image.trace.publish(|| frame(Direction::Request, 0xCD));
     plant.buses[0].image.trace.publish(|| frame(Direction::Reply, 0xEF));
@@ -152,7 +152,7 @@ async fn frames_of_one_bus() {
     assert_eq!(reply["hex"], json!("01 03 EF"));
     drop(stream);
     let unwanted = async {
-        while plant.buses[0].image.trace.wanted() {
+        while plant.buses[0].image.trace.has_listener() {
             plant.buses[0].image.trace.publish(|| frame(Direction::Request, 0));
             tokio::task::yield_now().await;
         }

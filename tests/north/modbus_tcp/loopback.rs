@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{RequestPdu, Table};
-use drivegate::north::modbus_tcp::Offline;
+use drivegate::north::modbus_tcp::Loopback;
 use drivegate::order::{Authority, Command, Order};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate_testkit::take_next;
@@ -14,7 +14,7 @@ use super::rig::{acknowledge, frame, n2_plant, options, plant, registers, words}
 
 struct OfflineClient {
     plant: SharedPlant,
-    client: Offline,
+    client: Loopback,
     now: Instant,
 }
 
@@ -23,7 +23,7 @@ impl OfflineClient {
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let peer = ([10, 0, 0, 9], 4711).into();
         OfflineClient {
-            client: Offline::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
+            client: Loopback::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
             plant,
             // A time in the future: no clock of this machine has reached it.
             now: Instant::now() + Duration::from_secs(600),

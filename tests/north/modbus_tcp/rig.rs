@@ -199,7 +199,7 @@ fn supervised(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: A
         access,
         supervision: Some(Supervision {
             timeout: HOUR,
-            action: LeaseAction::Hold,
+            action: LeaseAction::LeaveRunning,
             adopt: false,
         }),
         ..monitored(name, bus, unit, profile)

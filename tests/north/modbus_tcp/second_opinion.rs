@@ -7,7 +7,7 @@ use std::time::Instant;
 use arc_swap::ArcSwap;
 use drivegate::codec::RequestPdu;
 use drivegate::codec::Table;
-use drivegate::north::modbus_tcp::{Offline, Uncached};
+use drivegate::north::modbus_tcp::{Loopback, Uncached};
 use drivegate::order::Authority;
 use proptest::prelude::*;
 use tokio_modbus::{Request, Response};
@@ -120,7 +120,7 @@ fn answer(pdu: &[u8]) -> Vec<u8> {
     let mut options = options();
     options.uncached = Uncached::Refuse;
     let plant = Arc::new(ArcSwap::from_pointee(plant()));
-    let mut client = Offline::new(
+    let mut client = Loopback::new(
         options,
         plant,
         Arc::default(),

@@ -435,7 +435,7 @@ fn nothing(kind: &Kind) -> Datum {
 }
 
 fn shown(object: &Object, value: Option<&Datum>) -> Datum {
-    match value.filter(|value| object.kind.takes(value)) {
+    match value.filter(|value| object.kind.accepts(value)) {
         Some(value) => value.clone(),
         None => nothing(&object.kind),
     }

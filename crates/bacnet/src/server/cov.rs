@@ -30,16 +30,16 @@ pub(super) struct Key {
 
 /// The last reported values.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct Told {
+pub(super) struct Reported {
     /// The number, where the value is one.
     pub(super) number: Option<f64>,
     /// Everything except the value, as encoded on the wire.
     pub(super) rest: Vec<u8>,
 }
 
-impl Told {
+impl Reported {
     /// Whether the values differ enough from those last sent to a client to send a notification.
-    fn differs(&self, now: &Told, increment: f64) -> bool {
+    fn differs(&self, now: &Reported, increment: f64) -> bool {
         let moved = match (self.number, now.number) {
             (Some(before), Some(now)) => {
                 let change = (now - before).abs();
@@ -59,7 +59,7 @@ pub(super) struct Subscription {
     /// The increment that the client set for itself.
     pub(super) increment: Option<f32>,
     until: Option<Instant>,
-    told: Option<Told>,
+    told: Option<Reported>,
     /// Number since which the subscription waits for its turn.
     due: Option<u64>,
     lost: u8,
@@ -96,7 +96,7 @@ pub(super) struct Cov {
 }
 
 /// Looks up the present values of a subscription, and the increment of its object.
-pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Told, f64)>;
+pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Reported, f64)>;
 
 impl Cov {
     /// Where all objects belong to one device, it may have as many subscriptions of a host as all devices.
@@ -198,7 +198,7 @@ impl Cov {
     }
 
     /// Compares the subscriptions of a device with its values: those whose clients need a notification become due.
-    pub(super) fn look(&mut self, device: u32, look: Look<'_>) {
+    pub(super) fn compare(&mut self, device: u32, look: Look<'_>) {
         let Some(all) = self.of.get_mut(&device) else { return };
         for subscription in all.iter_mut().filter(|subscription| subscription.due.is_none()) {
             let Some((now, increment)) = look(device, subscription) else {
@@ -230,7 +230,7 @@ impl Cov {
 
     /// Records that a notification was sent: the subscription is no longer due, and later values are compared with
     /// `told`.
-    pub(super) fn told(&mut self, device: u32, key: &Key, told: Option<Told>) {
+    pub(super) fn notified(&mut self, device: u32, key: &Key, told: Option<Reported>) {
         let all = self.of.get_mut(&device);
         if let Some(subscription) = all.and_then(|all| all.iter_mut().find(|s| s.key == *key)) {
             subscription.due = None;
@@ -326,8 +326,8 @@ mod tests {
         }
     }
 
-    fn shows(number: f64, rest: u8) -> Told {
-        Told {
+    fn shows(number: f64, rest: u8) -> Reported {
+        Reported {
             number: Some(number),
             rest: vec![rest],
         }
@@ -381,10 +381,10 @@ mod tests {
         let mut cov = Cov::default();
         cov.subscribe(1, key(1, 7), (false, 10), None, now);
         let mut due = |number: f64, rest: u8| {
-            cov.look(1, &mut |_, _| Some((shows(number, rest), 1.0)));
+            cov.compare(1, &mut |_, _| Some((shows(number, rest), 1.0)));
             let due = cov.next().is_some();
             if due {
-                cov.told(1, &key(1, 7), Some(shows(number, rest)));
+                cov.notified(1, &key(1, 7), Some(shows(number, rest)));
             }
             due
         };
@@ -410,10 +410,10 @@ mod tests {
         let mut cov = Cov::default();
         cov.subscribe(1, key(1, 1), (true, 0), None, now);
         cov.subscribe(1, key(1, 2), (true, 0), None, now);
-        cov.look(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
+        cov.compare(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
         let (device, first, confirmed) = cov.next().unwrap();
         assert!(confirmed);
-        cov.told(device, &first, Some(shows(0.0, 0)));
+        cov.notified(device, &first, Some(shows(0.0, 0)));
         cov.sent(device, first, 9, vec![1], now);
         assert!(cov.next().is_none(), "one outstanding for each subscriber");
         cov.answered(first.subscriber, 1, 8);
@@ -425,13 +425,13 @@ mod tests {
         let mut at = now;
         for _ in 0..LOST {
             assert_eq!(cov.len(), 2);
-            cov.told(1, &second, Some(shows(0.0, 0)));
+            cov.notified(1, &second, Some(shows(0.0, 0)));
             cov.sent(1, second, 10, vec![2], at);
             for again in [1, 1, 0] {
                 at += WAIT;
                 assert_eq!(cov.poll(at).len(), again);
             }
-            cov.look(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
+            cov.compare(1, &mut |_, _| Some((shows(0.0, 0), 1.0)));
         }
         assert_eq!((cov.len(), cov.of(1)[0].key), (1, first));
     }

@@ -54,7 +54,7 @@ impl Server {
         }
         for device in self.asked(target, range, app) {
             let apdu = self.i_am(&device);
-            self.tell(source, device.instance, &apdu, now);
+            self.answer_source(source, device.instance, &apdu, now);
         }
     }
 
@@ -84,7 +84,7 @@ impl Server {
                 None => content.text(crate::object::PORT_NAME),
             };
             let apdu = apdu::unconfirmed(unconfirmed::I_HAVE, content.bytes());
-            self.tell(source, device.instance, &apdu, now);
+            self.answer_source(source, device.instance, &apdu, now);
         }
     }
 
@@ -96,12 +96,12 @@ impl Server {
     }
 
     /// Answers to where a question came from.
-    fn tell(&mut self, source: Source, device: u32, apdu: &[u8], now: Instant) {
+    fn answer_source(&mut self, source: Source, device: u32, apdu: &[u8], now: Instant) {
         match source.way {
             Way::Unicast => self.send(source.address, device, apdu, now),
             Way::Broadcast => {
                 let network = source.address.remote.map(|(network, _)| network);
-                self.tell_all(device, network, apdu, now);
+                self.send_to_all(device, network, apdu, now);
             }
         }
     }
@@ -121,7 +121,7 @@ impl Server {
         };
         if !self.quiet.contains_key(&device) {
             let apdu = self.i_am(&known);
-            self.tell_all(device, None, &apdu, now);
+            self.send_to_all(device, None, &apdu, now);
         }
     }
 }

@@ -212,7 +212,7 @@ impl Server {
             self.send_exempt(to, device, &message, true);
         }
         for device in self.cov.devices() {
-            self.look(device, app, now);
+            self.check_changes(device, app, now);
         }
         self.notify(app, now);
         self.exchanges.poll(now);
@@ -221,7 +221,7 @@ impl Server {
 
     /// Values of that device may have changed.
     pub fn changed(&mut self, device: u32, app: &dyn Application, now: Instant) {
-        self.look(device, app, now);
+        self.check_changes(device, app, now);
         self.notify(app, now);
     }
 

@@ -46,15 +46,15 @@ impl Server {
         match datagram {
             Bvlc::Result(code) => self.foreign.answered(code, now),
             Bvlc::ForBbmd(code) => {
-                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.traffic.received(*from.ip(), bytes.len(), now);
                 self.traffic.answer(from, bvlc::result(code), now);
             }
             Bvlc::Register(_) | Bvlc::ReadForeign | Bvlc::DeleteForeign(_) | Bvlc::Distribute(_) => {
-                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.traffic.received(*from.ip(), bytes.len(), now);
                 self.of_foreign_device(from, datagram, app, now);
             }
             Bvlc::Unicast(npdu) => {
-                self.traffic.came(*from.ip(), bytes.len(), now);
+                self.traffic.received(*from.ip(), bytes.len(), now);
                 self.network(source(from, Way::Unicast), npdu, app, now);
             }
             Bvlc::Broadcast(npdu) => {
@@ -270,7 +270,7 @@ impl Server {
     }
 
     /// Broadcasts a message of a device: on this network, or on the network from which the request came.
-    pub(super) fn tell_all(&mut self, device: u32, network: Option<u16>, apdu: &[u8], now: Instant) {
+    pub(super) fn send_to_all(&mut self, device: u32, network: Option<u16>, apdu: &[u8], now: Instant) {
         let to = network.map(|network| (network, Mac::ALL));
         let npdu = npdu::encode(to, self.station(device), false, Payload::Application(apdu));
         self.broadcast(&npdu, now);

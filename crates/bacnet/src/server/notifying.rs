@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::cov::{Key, Subscription, Told};
+use super::cov::{Key, Reported, Subscription};
 use super::reading::Failure;
 use super::{Application, Server};
 use crate::apdu;
@@ -12,7 +12,7 @@ use crate::services::{PropertyRef, Subscribe, confirmed, unconfirmed};
 use crate::types::{Address, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
 
 /// Properties that cannot be subscribed to: several at once, clocks, and those that a notification itself changes.
-const NEVER_TOLD: [PropertyId; 6] = [
+const NEVER_REPORTED: [PropertyId; 6] = [
     PropertyId::ALL,
     PropertyId::REQUIRED,
     PropertyId::OPTIONAL,
@@ -24,7 +24,7 @@ const NEVER_TOLD: [PropertyId; 6] = [
 const LONGEST: usize = 1024;
 
 /// The properties that a subscription reports.
-fn told_of(of: &Context<'_>, one: Option<PropertyRef>) -> Vec<PropertyRef> {
+fn reported_properties(of: &Context<'_>, one: Option<PropertyRef>) -> Vec<PropertyRef> {
     let whole = |property: PropertyId| PropertyRef { property, index: None };
     match one {
         None => cov_value(of).iter().copied().map(whole).collect(),
@@ -64,7 +64,7 @@ impl Server {
         };
         let known = self.with_object(device, object, app, now, |of| match key.property {
             None => Ok(()),
-            Some(one) if NEVER_TOLD.contains(&one.property) => Err(Error::NOT_COV_PROPERTY),
+            Some(one) if NEVER_REPORTED.contains(&one.property) => Err(Error::NOT_COV_PROPERTY),
             Some(one) => {
                 let mut value = Writer::default();
                 property(&mut value, of, one, &self.environment)?;
@@ -83,12 +83,18 @@ impl Server {
     }
 
     /// The present values of a subscription.
-    fn shows(&self, device: &Device, key: &Key, app: &dyn Application, now: Instant) -> Option<(Told, f64, Vec<u8>)> {
+    fn shows(
+        &self,
+        device: &Device,
+        key: &Key,
+        app: &dyn Application,
+        now: Instant,
+    ) -> Option<(Reported, f64, Vec<u8>)> {
         self.with_object(device, key.object, app, now, |of| {
             let mut values = Writer::default();
-            let mut told = Told::default();
+            let mut told = Reported::default();
             let (number, flags) = of.figure();
-            for one in told_of(of, key.property) {
+            for one in reported_properties(of, key.property) {
                 let mut value = Writer::default();
                 // Values that no longer exist, or are too long now, are sent as empty.
                 if property(&mut value, of, one, &self.environment).is_err() || value.bytes().len() > LONGEST {
@@ -114,13 +120,13 @@ impl Server {
     }
 
     /// Checks whether values of a device have changed enough to notify subscribers.
-    pub(super) fn look(&mut self, instance: u32, app: &dyn Application, now: Instant) {
+    pub(super) fn check_changes(&mut self, instance: u32, app: &dyn Application, now: Instant) {
         if self.cov.of(instance).is_empty() || self.quiet.contains_key(&instance) || !app.answers(instance) {
             return;
         }
         let Some(device) = self.device(instance) else { return };
         let mut cov = std::mem::take(&mut self.cov);
-        cov.look(instance, &mut |_, subscription: &Subscription| {
+        cov.compare(instance, &mut |_, subscription: &Subscription| {
             let (told, increment, _) = self.shows(&device, &subscription.key, app, now)?;
             Some((told, increment))
         });
@@ -133,7 +139,7 @@ impl Server {
             let device = self.device(instance).filter(|_| app.answers(instance));
             let shows = device.and_then(|device| Some((self.shows(&device, &key, app, now)?, device)));
             let Some(((told, _, values), device)) = shows else {
-                self.cov.told(instance, &key, None);
+                self.cov.notified(instance, &key, None);
                 continue;
             };
             let subscription = self.cov.of(instance).iter().find(|s| s.key == key);
@@ -144,7 +150,7 @@ impl Server {
                 .context_object(1, device.id());
             content.context_object(2, key.object).context_unsigned(3, left);
             content.open(4).raw(&values).close(4);
-            self.cov.told(instance, &key, Some(told));
+            self.cov.notified(instance, &key, Some(told));
             self.counters.notifications += 1;
             if confirmed {
                 let invoke = self.cov.number();

@@ -118,7 +118,7 @@ impl Traffic {
     }
 
     /// Counts octets received from an address, which raise the limit of sending to it.
-    pub(super) fn came(&mut self, from: Ipv4Addr, octets: usize, now: Instant) {
+    pub(super) fn received(&mut self, from: Ipv4Addr, octets: usize, now: Instant) {
         let step = self.step(now);
         if let Some(known) = self.known(from, step) {
             known.came.add(step, u32::try_from(octets).unwrap_or(u32::MAX));
@@ -242,7 +242,7 @@ mod tests {
     fn an_address_gets_eight_times_what_it_sent_and_16_kb() {
         let start = Instant::now();
         let mut traffic = Traffic::new(start);
-        traffic.came(*host(1).ip(), 1000, start);
+        traffic.received(*host(1).ip(), 1000, start);
         (0..1000).for_each(|_| traffic.answer(host(1), vec![0; 100], start));
         let first = octets(&mut traffic);
         assert_eq!(first, (16 * 1024 + 8000) / 100 * 100);
@@ -305,13 +305,13 @@ mod tests {
         let mut traffic = Traffic::new(start);
         for n in 0..5000_u32 {
             let address = SocketAddrV4::new(Ipv4Addr::from(n), 1);
-            traffic.came(*address.ip(), 10, start);
+            traffic.received(*address.ip(), 10, start);
             traffic.answer(address, vec![0; 10], start);
         }
         assert_eq!(traffic.known.len(), ADDRESSES);
         assert_eq!(traffic.dropped, 5000 - ADDRESSES as u64);
         let later = start + Duration::from_secs(3);
-        traffic.came(*host(9).ip(), 10, later);
+        traffic.received(*host(9).ip(), 10, later);
         assert!(traffic.known.contains_key(host(9).ip()));
         assert_eq!(traffic.known.len(), ADDRESSES);
     }

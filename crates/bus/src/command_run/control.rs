@@ -7,7 +7,7 @@
 use std::time::{Duration, Instant};
 
 use super::known_words::KnownWords;
-use super::standing::{Holds, Motor, Verdict, Wants, depends_on_motor, judge};
+use super::standing::{KnownRun, Motor, Verdict, Wants, depends_on_motor, judge};
 use super::steps::{Action, Check, Known, Step, StepPurpose};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
@@ -118,7 +118,7 @@ impl AwaitedState {
     }
 
     /// The read of the awaited state.
-    pub(super) fn look(&self) -> Step {
+    pub(super) fn state_read(&self) -> Step {
         let pdu = RequestPdu::Read {
             table: self.raw.table,
             start: self.raw.address,
@@ -165,7 +165,7 @@ pub(super) struct Ordered {
 
 impl Ordered {
     /// Notes the value, if the point follows from `[control]`.
-    pub(super) fn takes(&mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
+    pub(super) fn note_value(&mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         let is = |point: ModelPoint| {
             let model = profile.model_index(point);
             let written = model.and_then(|model| profile.points.get(model)?.write_to);
@@ -189,7 +189,7 @@ impl Ordered {
 
     /// Whether the value decides whether the motor is to run.
     pub(super) fn says_run(mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
-        self.takes(profile, index, value) && self.run.is_some()
+        self.note_value(profile, index, value) && self.run.is_some()
     }
 
     /// The actions, in the order that is safe. `stopped`: a stop went before them.
@@ -263,18 +263,18 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
     let Some(reset) = control.fault_reset else {
         return Vec::new();
     };
-    let hold = Action::Hold(reset.hold);
+    let wait = Action::Wait(reset.pulse);
     let setting = reset.setting;
     let mut actions = Vec::new();
     match setting.place {
         None => {
-            actions.extend(pulse(setting, reset.hold));
+            actions.extend(pulse(setting, reset.pulse));
             if setting.once {
                 actions.truncate(3);
             }
         }
         Some(place) => {
-            // One hold serves both: the run command goes low, and the reset returns to its former value.
+            // One wait serves both: the run command goes low, and the reset returns to its former value.
             if !stopped {
                 actions.push(Action::Word(Word::ResetLow(setting)));
             }
@@ -283,11 +283,11 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
                 actions.push(Action::Send(write(place, low, profile)));
             }
             if !stopped || !setting.once {
-                actions.push(hold.clone());
+                actions.push(wait.clone());
             }
             actions.push(Action::ResetElsewhere(write(place, high, profile)));
             if !setting.once {
-                actions.extend([hold, Action::ResetOver(write(place, low, profile))]);
+                actions.extend([wait, Action::ResetOver(write(place, low, profile))]);
             }
         }
     }
@@ -295,12 +295,12 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
 }
 
 /// A pulse of these bits of the control word.
-pub(super) fn pulse(setting: Setting, hold: Duration) -> [Action; 5] {
+pub(super) fn pulse(setting: Setting, wait: Duration) -> [Action; 5] {
     [
         Action::Word(Word::ResetLow(setting)),
-        Action::Hold(hold),
+        Action::Wait(wait),
         Action::Word(Word::ResetHigh(setting)),
-        Action::Hold(hold),
+        Action::Wait(wait),
         Action::Word(Word::ResetEnd(setting)),
     ]
 }
@@ -324,7 +324,7 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
                 }
                 match step.until {
                     Until::Written => {}
-                    Until::Time(time) => actions.push(Action::Hold(time)),
+                    Until::Time(time) => actions.push(Action::Wait(time)),
                     Until::State(_) => {
                         let state = AwaitedState::of(profile, steps, number);
                         actions.extend(state.map(|state| Action::Await(Box::new(state))));
@@ -494,7 +494,7 @@ fn may_stand(
 }
 
 /// The run command as it is known at the drive; `None` if the drive is known to have a stop.
-fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option<Holds> {
+fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option<KnownRun> {
     let place = control.run_place();
     let own = place == control.at;
     let word = if own {
@@ -503,10 +503,10 @@ fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option
         words.get(place.table, place.address)
     };
     match word {
-        None => Some(Holds::Unknown),
+        None => Some(KnownRun::Unknown),
         Some(word) if control.is_stop(place, word) => None,
-        Some(word) if control.is_run(place, word) && (!own || control.always.holds(word)) => Some(Holds::Run),
-        Some(_) => Some(Holds::Other),
+        Some(word) if control.is_run(place, word) && (!own || control.always.holds(word)) => Some(KnownRun::Run),
+        Some(_) => Some(KnownRun::Other),
     }
 }
 

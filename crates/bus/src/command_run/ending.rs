@@ -88,7 +88,7 @@ impl CommandRun {
         }
         let high = self.actions.iter().any(Action::is_reset);
         self.actions
-            .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Hold(_))));
+            .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Wait(_))));
         // Without the end of a pulse behind them the remaining holds are pointless.
         if !self.actions.iter().any(Action::ends_reset) {
             self.actions.clear();

@@ -23,7 +23,7 @@ impl TakenFunctions {
             RequestPdu::WriteCoil { .. } => self.coils_by_15.unwrap_or(profile.functions.coils_by_15),
             _ => false,
         };
-        match other(&pdu) {
+        match other_function(&pdu) {
             Some(other) if several && !profile.protocols.contains(&Protocol::N2) => other,
             _ => pdu,
         }
@@ -52,7 +52,7 @@ impl TakenFunctions {
 }
 
 /// The write of one item by the other function; none for anything else.
-pub(super) fn other(pdu: &RequestPdu) -> Option<RequestPdu> {
+pub(super) fn other_function(pdu: &RequestPdu) -> Option<RequestPdu> {
     match pdu {
         RequestPdu::WriteRegister { address, value } => Some(RequestPdu::WriteRegisters {
             start: *address,

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::control::{self, Made, Word};
-use super::functions::other;
+use super::functions::other_function;
 use super::steps::{Action, Step, step_of};
 use super::{CommandRun, KnownWords, Next, Phase};
 use crate::codec::Exception;
@@ -30,7 +30,7 @@ impl CommandRun {
             return Next::Wait(at);
         }
         while let Some(action) = self.actions.front() {
-            if let Action::Hold(time) = action {
+            if let Action::Wait(time) = action {
                 let until = now + *time;
                 self.known.motor = None;
                 return self.hold_until(until);
@@ -94,7 +94,7 @@ impl CommandRun {
             Some(Action::Word(word)) => match control::word(*word, words, profile, self.known) {
                 Made::Send(step) => Some(step),
                 Made::Nothing => None,
-                Made::Look => match self.looks(profile) {
+                Made::Look => match self.state_request(profile) {
                     Some(step) => Some(step),
                     None => return First::Changed,
                 },
@@ -115,7 +115,7 @@ impl CommandRun {
     /// The step in the form that the drive takes.
     fn formed(&mut self, mut step: Step, words: &KnownWords, profile: &Profile) -> Step {
         step.pdu = words.functions.form(step.pdu, profile);
-        if let Some(other) = other(&step.pdu).filter(|_| self.by_other_function) {
+        if let Some(other) = other_function(&step.pdu).filter(|_| self.by_other_function) {
             step.pdu = other;
         }
         if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front()
@@ -133,12 +133,12 @@ impl CommandRun {
     fn pass_over(&mut self, words: &KnownWords, profile: &Profile, now: Instant) -> Option<Instant> {
         let fell = self.low_since(words, profile);
         self.pop();
-        let hold = match self.actions.front() {
-            Some(Action::Hold(time)) => *time,
+        let wait = match self.actions.front() {
+            Some(Action::Wait(time)) => *time,
             _ => Duration::ZERO,
         };
-        let high_at = fell.map(|fell| fell + hold).filter(|at| now < *at);
-        if high_at.is_none() && matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
+        let high_at = fell.map(|fell| fell + wait).filter(|at| now < *at);
+        if high_at.is_none() && matches!(self.actions.front(), Some(Action::Wait(_) | Action::Release(_))) {
             self.pop();
         }
         high_at
@@ -162,7 +162,7 @@ impl CommandRun {
         };
         let since = *state.since.get_or_insert(now);
         if now.saturating_duration_since(since) < state.timeout {
-            return Some(state.look());
+            return Some(state.state_read());
         }
         let why = state.not_reached();
         self.give_up(Outcome::NotTaken(why));

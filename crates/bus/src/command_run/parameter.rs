@@ -2,7 +2,7 @@
 //!
 //! A write without a reply is not repeated before its effect has been read.
 
-use super::look::Look;
+use super::state_read::StateRead;
 use super::steps::{Step, StepPurpose};
 use crate::codec::n2::Session;
 use crate::codec::{Reply, RequestPdu, Table};
@@ -43,7 +43,7 @@ pub(super) enum Then {
 pub(super) struct ParameterRun {
     order: ParameterOrder,
     stage: Stage,
-    look: Look,
+    look: StateRead,
     releases: bool,
     /// A write was sent whose effect is not known.
     in_doubt: bool,
@@ -53,7 +53,7 @@ pub(super) struct ParameterRun {
 impl ParameterRun {
     /// A run that has not started; none where the family does not report whether its motor runs.
     pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
-        let look = Look::at_running(profile)?;
+        let look = StateRead::at_running(profile)?;
         let mut run = ParameterRun {
             stage: Stage::Value,
             look,
@@ -142,9 +142,9 @@ impl ParameterRun {
             (Stage::Write, _) if self.order.from.is_none() => Then::Over(Outcome::Acknowledged(Reply::Written)),
             (Stage::Write, _) if self.releases => self.go(Stage::Release),
             (Stage::Write, _) => self.go(Stage::ReadBack),
-            (Stage::Running, reply) => self.heard_running(reply, unanswered),
-            (Stage::Value, reply) => self.heard_value(reply),
-            (Stage::ReadBack, reply) => self.heard_back(reply),
+            (Stage::Running, reply) => self.take_running(reply, unanswered),
+            (Stage::Value, reply) => self.take_value(reply),
+            (Stage::ReadBack, reply) => self.take_read_back(reply),
         }
     }
 
@@ -159,8 +159,8 @@ impl ParameterRun {
         self.go(Stage::Running)
     }
 
-    fn heard_running(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
-        if !self.look.hears(reply) {
+    fn take_running(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
+        if !self.look.take_reply(reply) {
             return Then::Go;
         }
         // A reply without the running state does not prove that the motor stands.
@@ -180,7 +180,7 @@ impl ParameterRun {
         RawValue::of_words(&reply.words().unwrap_or_default())
     }
 
-    fn heard_value(&mut self, reply: &Reply) -> Then {
+    fn take_value(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
             // The client sees from the reply that nothing was written.
@@ -205,7 +205,7 @@ impl ParameterRun {
         })
     }
 
-    fn heard_back(&mut self, reply: &Reply) -> Then {
+    fn take_read_back(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
             return Then::Over(Outcome::Acknowledged(Reply::Written));

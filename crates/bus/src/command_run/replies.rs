@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::control::{LOOK_PAUSE, Word};
-use super::functions::other;
+use super::functions::other_function;
 use super::parameter::Then;
 use super::steps::{Action, Check};
 use super::{CommandRun, Doubt, KnownWords, Phase, Step, StepPurpose};
@@ -150,7 +150,8 @@ impl CommandRun {
             words.functions.refused(&step.pdu);
             return true;
         }
-        let tries = step.purpose == StepPurpose::Execute && other(&step.pdu).is_some() && !self.by_other_function;
+        let tries =
+            step.purpose == StepPurpose::Execute && other_function(&step.pdu).is_some() && !self.by_other_function;
         self.by_other_function |= tries;
         tries
     }
@@ -168,7 +169,7 @@ impl CommandRun {
         match then {
             Then::Go => None,
             Then::Pause => {
-                self.actions.push_front(Action::Hold(LOOK_AGAIN));
+                self.actions.push_front(Action::Wait(LOOK_AGAIN));
                 None
             }
             Then::Over(outcome) => {

@@ -20,7 +20,7 @@ pub(crate) enum Motor {
 
 /// The run command in the drive's word as it is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Holds {
+pub(super) enum KnownRun {
     /// The run command is set.
     Run,
     /// The word is neither a run command nor a stop.
@@ -59,26 +59,26 @@ pub(super) enum Verdict {
 
 /// Decides the word that an order may write to a drive whose known word is not a stop. `told`: the drive itself reported its word
 /// in this command; the word of a running drive is then current, whichever client commands it.
-pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Verdict {
+pub(super) fn judge(wants: Wants, holds: KnownRun, told: bool, motor: Motor) -> Verdict {
     use Verdict::{AsItStands, AtNextStart, WithoutRun};
 
     let motor = match motor {
-        Motor::RunsElsewise if told && holds == Holds::Run => Motor::Runs,
+        Motor::RunsElsewise if told && holds == KnownRun::Run => Motor::Runs,
         motor => motor,
     };
     match (wants, holds, motor) {
-        (Wants::Others, Holds::Run | Holds::Other, _) if told => AsItStands,
-        (Wants::ResetElsewhere, Holds::Unknown, Motor::Runs) => AsItStands,
-        (Wants::ResetEnd, Holds::Unknown | Holds::Other, _) => WithoutRun,
-        (Wants::DirectionElsewhere, _, Motor::Runs) | (_, Holds::Run, Motor::Runs) => AsItStands,
-        (Wants::DirectionElsewhere, ..) | (Wants::Direction, Holds::Run, _) => AtNextStart,
-        (Wants::ResetEnd, Holds::Run, _) => WithoutRun,
-        (_, Holds::Unknown, Motor::Runs) => Verdict::Refused(Refusal::NotKnown(
+        (Wants::Others, KnownRun::Run | KnownRun::Other, _) if told => AsItStands,
+        (Wants::ResetElsewhere, KnownRun::Unknown, Motor::Runs) => AsItStands,
+        (Wants::ResetEnd, KnownRun::Unknown | KnownRun::Other, _) => WithoutRun,
+        (Wants::DirectionElsewhere, _, Motor::Runs) | (_, KnownRun::Run, Motor::Runs) => AsItStands,
+        (Wants::DirectionElsewhere, ..) | (Wants::Direction, KnownRun::Run, _) => AtNextStart,
+        (Wants::ResetEnd, KnownRun::Run, _) => WithoutRun,
+        (_, KnownRun::Unknown, Motor::Runs) => Verdict::Refused(Refusal::NotKnown(
             "the last command to the drive is unknown; include `run` true or false in this command".to_string(),
         )),
         (Wants::Direction, _, Motor::Runs | Motor::RunsElsewise) => AtNextStart,
         (_, _, Motor::Runs | Motor::RunsElsewise) => refused("the motor runs, but by no run command of this gateway"),
-        (Wants::Others, Holds::Run, Motor::Stands | Motor::NotShown) => {
+        (Wants::Others, KnownRun::Run, Motor::Stands | Motor::NotShown) => {
             refused("the motor is not seen to run, and this command would repeat a run command")
         }
         (_, _, Motor::Stands | Motor::NotShown) => WithoutRun,
@@ -86,9 +86,9 @@ pub(super) fn judge(wants: Wants, holds: Holds, told: bool, motor: Motor) -> Ver
 }
 
 /// Whether the verdict depends on the state of the motor.
-pub(super) fn depends_on_motor(wants: Wants, holds: Holds, told: bool) -> bool {
+pub(super) fn depends_on_motor(wants: Wants, holds: KnownRun, told: bool) -> bool {
     match (wants, holds) {
-        (Wants::ResetEnd, Holds::Other | Holds::Unknown) => false,
+        (Wants::ResetEnd, KnownRun::Other | KnownRun::Unknown) => false,
         _ => wants != Wants::Others || !told,
     }
 }
@@ -123,7 +123,7 @@ mod tests {
         Wants::Others,
     ];
     const MOTORS: [Motor; 4] = [Motor::Runs, Motor::RunsElsewise, Motor::Stands, Motor::NotShown];
-    const HELD: [Holds; 3] = [Holds::Run, Holds::Other, Holds::Unknown];
+    const HELD: [KnownRun; 3] = [KnownRun::Run, KnownRun::Other, KnownRun::Unknown];
 
     /// r with the run command as it is, w without run, n at the next start, x refused, ? refused as unknown. One column for
     /// each of `WANTS`.
@@ -179,7 +179,7 @@ mod tests {
         for (wants, holds) in WANTS.into_iter().flat_map(|wants| HELD.map(|holds| (wants, holds))) {
             for told in [true, false]
                 .into_iter()
-                .filter(|told| !told || holds != Holds::Unknown)
+                .filter(|told| !told || holds != KnownRun::Unknown)
             {
                 let all = MOTORS.map(|motor| judge(wants, holds, told, motor));
                 let same = all.iter().all(|verdict| *verdict == all[0]);
@@ -197,7 +197,7 @@ mod tests {
     fn no_run_command_from_memory_reaches_a_motor_that_is_not_seen_to_run() {
         for wants in WANTS {
             for motor in [Motor::RunsElsewise, Motor::Stands, Motor::NotShown] {
-                let verdict = judge(wants, Holds::Run, false, motor);
+                let verdict = judge(wants, KnownRun::Run, false, motor);
                 assert_ne!(verdict, Verdict::AsItStands, "{wants:?} {motor:?}");
             }
         }

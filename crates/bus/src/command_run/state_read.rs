@@ -53,7 +53,7 @@ impl Shown {
 
 /// A look at a drive: the reads that are left, and the words that were read.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Look {
+pub(crate) struct StateRead {
     running: Shown,
     fault: Option<Shown>,
     remote: Option<Shown>,
@@ -64,20 +64,20 @@ pub(crate) struct Look {
     words: BTreeMap<(Table, u16), u16>,
 }
 
-impl Look {
+impl StateRead {
     /// A look at whether the motor runs; `None` if the family does not report that.
-    pub(super) fn at_running(profile: &Profile) -> Option<Look> {
-        Look::of(profile, &[])
+    pub(super) fn at_running(profile: &Profile) -> Option<StateRead> {
+        StateRead::of(profile, &[])
     }
 
     /// The reads that show whether the motor runs by the bus: a faulted drive may show its motor as it was before the fault, and
     /// one that is commanded at its panel does not run by a word of the gateway.
-    pub(crate) fn at_motor(profile: &Profile) -> Option<Look> {
-        Look::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
+    pub(crate) fn at_motor(profile: &Profile) -> Option<StateRead> {
+        StateRead::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
     }
 
     /// The running bit is read last, so that it is the newest.
-    fn of(profile: &Profile, more: &[ModelPoint]) -> Option<Look> {
+    fn of(profile: &Profile, more: &[ModelPoint]) -> Option<StateRead> {
         let shown = |point: ModelPoint| more.contains(&point).then(|| Shown::of(profile, point)).flatten();
         let running = Shown::of(profile, ModelPoint::Running)?;
         let (fault, remote) = (shown(ModelPoint::Fault), shown(ModelPoint::Remote));
@@ -90,7 +90,7 @@ impl Look {
             return None;
         }
         let first = more.remove(0);
-        Some(Look {
+        Some(StateRead {
             running,
             fault,
             remote,
@@ -113,7 +113,7 @@ impl Look {
     }
 
     /// The reply to that. Whether all were answered.
-    pub(crate) fn hears(&mut self, reply: &Reply) -> bool {
+    pub(crate) fn take_reply(&mut self, reply: &Reply) -> bool {
         if let RequestPdu::Read { table, start, .. } = self.request() {
             let words = reply.words().unwrap_or_default();
             let words = (start..=u16::MAX).zip(words);
@@ -148,11 +148,11 @@ impl Look {
 
 impl CommandRun {
     /// The request of a look at the motor; `None` if the family does not report whether it runs.
-    pub(super) fn looks(&mut self, profile: &Profile) -> Option<Step> {
+    pub(super) fn state_request(&mut self, profile: &Profile) -> Option<Step> {
         if self.look.is_none() {
-            self.look = Look::at_motor(profile);
+            self.look = StateRead::at_motor(profile);
         }
-        let pdu = self.look.as_ref().map(Look::request);
+        let pdu = self.look.as_ref().map(StateRead::request);
         if pdu.is_none() {
             self.known.motor = Some(Motor::NotShown);
         }
@@ -161,7 +161,7 @@ impl CommandRun {
 
     /// The drive answered a request of a look.
     pub(super) fn looked(&mut self, reply: &Reply) {
-        if let Some(look) = self.look.take_if(|look| look.hears(reply)) {
+        if let Some(look) = self.look.take_if(|look| look.take_reply(reply)) {
             self.known.motor = Some(look.motor());
         }
     }
@@ -261,8 +261,8 @@ mod tests {
     use super::*;
     use crate::drive::profile::Profiles;
 
-    fn look(name: &str) -> Look {
-        Look::at_motor(Profiles::built_in().get(name).unwrap()).unwrap()
+    fn look(name: &str) -> StateRead {
+        StateRead::at_motor(Profiles::built_in().get(name).unwrap()).unwrap()
     }
 
     /// The drive of a family answers each request with the words that it has at these addresses.
@@ -279,7 +279,7 @@ mod tests {
                 true => Reply::Bits(words.map(|word| word != 0).collect()),
                 false => Reply::Registers(words.collect()),
             };
-            if look.hears(&reply) {
+            if look.take_reply(&reply) {
                 return (look.motor(), asked);
             }
         }
@@ -322,7 +322,7 @@ mod tests {
         for profile in Profiles::built_in().iter().filter(|profile| profile.control.is_some()) {
             let mut look = look(&profile.name);
             assert!(look.more.len() < 3, "{}: {look:?}", profile.name);
-            while !look.hears(&Reply::Registers(Vec::new())) {}
+            while !look.take_reply(&Reply::Registers(Vec::new())) {}
             assert_eq!(look.motor(), Motor::NotShown, "{}", profile.name);
         }
     }

@@ -35,7 +35,7 @@ pub(super) enum Action {
     /// Takes the bit of a pulse away again.
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// Two update periods of the drive, as a rule.
-    Hold(Duration),
+    Wait(Duration),
     /// A word of the control register by `[control]` of the profile.
     Word(Word),
     /// Waits for the state that ends a step of a sequence.
@@ -145,7 +145,7 @@ pub(super) fn unsendable(profile: &Profile, values: &[(PointIndex, Value)]) -> O
             return Some(Refusal::NotWritable(format!("there is no point {index}")));
         };
         let name = &point.name;
-        if Ordered::default().takes(profile, *index, *value) {
+        if Ordered::default().note_value(profile, *index, *value) {
             return None;
         }
         match point.raw().map(|raw| raw.encode(*value, 0)) {
@@ -202,7 +202,7 @@ pub(super) fn actions(
         .as_ref()
         .map(|control| (control.at.table, control.at.address));
     for (index, value) in values {
-        if control.takes(profile, *index, *value) {
+        if control.note_value(profile, *index, *value) {
             continue;
         }
         let Some(point) = profile.points.get(*index) else {
@@ -213,10 +213,10 @@ pub(super) fn actions(
         match raw.form {
             Form::Bit { bit, invert } if point.pulse => {
                 if value.as_bool() {
-                    let hold = 2 * profile.update_period;
+                    let length = 2 * profile.update_period;
                     pulses.extend(match is_control {
-                        true => control::pulse(setting_of(&[(bit, !invert)]), hold),
-                        false => pulse(raw, bit, invert, hold),
+                        true => control::pulse(setting_of(&[(bit, !invert)]), length),
+                        false => pulse(raw, bit, invert, length),
                     });
                 }
             }
@@ -274,7 +274,7 @@ pub(super) fn actions(
 }
 
 /// A bit of another register or coil, set for a time.
-fn pulse(raw: &Raw, bit: u8, invert: bool, hold: Duration) -> [Action; 5] {
+fn pulse(raw: &Raw, bit: u8, invert: bool, length: Duration) -> [Action; 5] {
     let raw = || raw.clone();
     [
         Action::PulseLow {
@@ -282,13 +282,13 @@ fn pulse(raw: &Raw, bit: u8, invert: bool, hold: Duration) -> [Action; 5] {
             bit,
             invert,
         },
-        Action::Hold(hold),
+        Action::Wait(length),
         Action::PulseHigh {
             raw: raw(),
             bit,
             invert,
         },
-        Action::Hold(hold),
+        Action::Wait(length),
         Action::PulseEnd {
             raw: raw(),
             bit,
@@ -328,7 +328,7 @@ pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, kn
     let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
     match action {
         // These actions are converted into requests when their turn comes.
-        Action::Hold(_) | Action::Word(_) | Action::Await(_) => None,
+        Action::Wait(_) | Action::Word(_) | Action::Await(_) => None,
         Action::Send(pdu) | Action::ResetElsewhere(pdu) | Action::ResetOver(pdu) => Some(execute(pdu)),
         Action::Parameter(run) => Some(run.step()),
         Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),

@@ -69,7 +69,7 @@ impl CommandedDrive {
         let now = self.now;
         self.drive.update(|s| s.store(Table::Holding, start, words, now));
         let reading = self.drive.reading(now, Duration::from_secs(1));
-        self.confirmations.look(&reading, now);
+        self.confirmations.take_reading(&reading, now);
     }
 
     fn results(&self) -> Vec<serde_json::Value> {
@@ -98,7 +98,7 @@ fn only_a_read_after_the_acknowledgement_confirms() {
     rig.set("run", Value::Bool(true));
     let reading_before = rig.drive.reading(rig.now, Duration::from_secs(1));
     let now = rig.now;
-    rig.confirmations.look(&reading_before, now);
+    rig.confirmations.take_reading(&reading_before, now);
     assert!(rig.results().is_empty(), "the old sample proves nothing");
     rig.read(2100, &[2]);
     assert_eq!(rig.results(), ["confirmed"]);

@@ -62,7 +62,7 @@ impl DoublingLine {
         };
         let exchanged = what
             .iter()
-            .find_map(|(after, bytes)| self.line.heard(bytes, sent + *after));
+            .find_map(|(after, bytes)| self.line.received(bytes, sent + *after));
         let over = exchanged.or_else(|| self.line.on_time(sent + Duration::from_secs(1)).ok());
         let over = over.expect("it is over");
         let free = self.line.quiet_since() + Duration::from_millis(4);
@@ -150,7 +150,7 @@ fn a_request_waits_for_silence_but_not_for_ever() {
     );
     while !rig.line.babbles(since) {
         now += Duration::from_millis(2);
-        assert!(rig.line.heard(&[0x55], now).is_none());
+        assert!(rig.line.received(&[0x55], now).is_none());
         assert!(rig.line.clear_at(since, rig.line.silence()) > now || rig.line.babbles(since));
     }
     assert!(rig.line.clear_at(since, rig.line.silence()) <= now + Duration::from_millis(4));
@@ -178,7 +178,7 @@ fn a_drive_has_its_own_silence_before_its_request_and_after_its_reply() {
         };
         rig.line
             .send(request, frame, sending, N2LateReplies::default(), rig.now);
-        let over = rig.line.heard(&reply(), rig.line.quiet_since() + REGULAR).unwrap();
+        let over = rig.line.received(&reply(), rig.line.quiet_since() + REGULAR).unwrap();
         assert_eq!(
             rig.line.clear_at(over.at, of_next),
             over.at + expected,
@@ -242,7 +242,7 @@ fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
         bench.line.send(request, frame, sending, N2LateReplies::default(), now);
         let (sent, deadline) = (bench.line.quiet_since(), bench.line.deadline().unwrap());
         let read = sent + REGULAR + late;
-        let over = bench.line.heard(&reply(), read).unwrap();
+        let over = bench.line.received(&reply(), read).unwrap();
         assert!(matches!(over.ended, Ended::Reply(_)));
         assert_eq!(over.at, read.min(deadline));
         assert!(deadline <= sent + Duration::from_millis(100 + 10), "timeout and reply");

@@ -44,7 +44,7 @@ pub struct Commands {
 
 impl Commands {
     /// Processes a write received from `began` to `at`; returns what must be reported of it now.
-    pub fn heard(
+    pub fn process_write(
         &mut self,
         (spec, protocol): (&DriveSpec, Protocol),
         pdu: &RequestPdu,

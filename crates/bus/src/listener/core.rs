@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::commands::{Commanded, Commands};
-use super::decoder::{Decoder, Exchange, Heard};
+use super::decoder::{Decoder, Exchange, Traffic};
 use crate::BusOptions;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
 use crate::core::Closed;
@@ -52,7 +52,7 @@ pub struct ListenCore {
     retries: u32,
     /// Reads of process data in this round of the other master, and when it began.
     round: (Vec<(DriveIndex, Table, u16)>, Option<Instant>),
-    heard: Vec<Heard>,
+    heard: Vec<Traffic>,
     /// Something was received since the port was opened or reconnected.
     heard_any: bool,
 }
@@ -159,7 +159,7 @@ impl ListenCore {
                 self.report.gone(index, &why);
             }
             if let Some(commanded) = due {
-                self.tell(index, commanded);
+                self.report_command(index, commanded);
             }
         }
         self.report.tick(PerDrive::default, now);
@@ -168,14 +168,14 @@ impl ListenCore {
         wake.unwrap_or(now + LOOK).clamp(now, now + LOOK)
     }
 
-    fn take(&mut self, heard: &mut Vec<Heard>, now: Instant) {
+    fn take(&mut self, heard: &mut Vec<Traffic>, now: Instant) {
         for one in heard.drain(..) {
             match one {
-                Heard::Stray { bytes, at, quiet_since } => {
+                Traffic::Stray { bytes, at, quiet_since } => {
                     self.report.noise(&bytes, quiet_since, at);
                     self.report.diagnosis.figures().stray(&bytes);
                 }
-                Heard::Exchange(exchange) => self.exchange(&exchange, now),
+                Traffic::Exchange(exchange) => self.exchange(&exchange, now),
             }
         }
     }
@@ -217,7 +217,7 @@ impl ListenCore {
         let Some(ended) = ended else { return };
         self.report.tape_reply(index, &exchange.heard, ended, exchange.at);
         if let Some(mut tap) = tap {
-            tap.heard(&exchange.heard, exchange.at);
+            tap.received(&exchange.heard, exchange.at);
             tap.ended(ended, exchange.at);
         }
     }
@@ -244,7 +244,7 @@ impl ListenCore {
         let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
             return;
         };
-        self.report.diagnosis.overheard(index, exchange);
+        self.report.diagnosis.foreign_exchange(index, exchange);
         let no_answer = matches!(&exchange.ended, Some(Ended::Reply(Reply::Exception(code))) if code.is_no_answer());
         let answered = matches!(exchange.ended, Some(Ended::Reply(_))) && !no_answer;
         // Bytes behind an unknown command may be its reply.
@@ -328,7 +328,7 @@ impl ListenCore {
         if is_wide(last) {
             words = words.get(..words.len() - 1).unwrap_or_default();
         }
-        if words.is_empty() || !self.report.heard(index, (table, start), words, at, now) {
+        if words.is_empty() || !self.report.foreign_read(index, (table, start), words, at, now) {
             return;
         }
         let key = (index, table, start);
@@ -356,13 +356,13 @@ impl ListenCore {
         let ended = exchange.ended.as_ref();
         let commanded = known
             .commands
-            .heard(of, &request.pdu, ended, (exchange.began, exchange.at));
+            .process_write(of, &request.pdu, ended, (exchange.began, exchange.at));
         if let Some(commanded) = commanded {
-            self.tell(index, commanded);
+            self.report_command(index, commanded);
         }
     }
 
-    fn tell(&self, index: DriveIndex, commanded: Commanded) {
+    fn report_command(&self, index: DriveIndex, commanded: Commanded) {
         let Some(image) = self.bus.image.drives.get(index) else {
             return;
         };

@@ -39,7 +39,7 @@ const BEHIND_MANGLED: &str = "it may be the late reply to a damaged request";
 
 /// A piece of received traffic.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Heard {
+pub enum Traffic {
     /// A request, and the result.
     Exchange(Box<Exchange>),
     /// Bytes that belong to no transaction.
@@ -146,7 +146,7 @@ impl Decoder {
     }
 
     /// Adds bytes; the last of them arrived at `now`.
-    pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Heard>) {
+    pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Traffic>) {
         // A frame whose time for its rest has ended is cut before the new bytes are added.
         self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);
         self.frames.add(bytes, now);
@@ -154,14 +154,14 @@ impl Decoder {
     }
 
     /// Time went by.
-    pub fn on_time(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+    pub fn on_time(&mut self, now: Instant, heard: &mut Vec<Traffic>) {
         self.cut(now, heard);
         if self.open.as_ref().is_some_and(|open| now >= open.sent + PATIENCE) {
             self.give_up(now, heard);
         }
     }
 
-    fn cut(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+    fn cut(&mut self, now: Instant, heard: &mut Vec<Traffic>) {
         loop {
             let open = self.open.as_ref().filter(|open| open.garbage.len() <= GLITCH);
             let request = open.and_then(|open| open.request.as_ref());
@@ -177,7 +177,7 @@ impl Decoder {
         }
     }
 
-    fn asked(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Heard>) {
+    fn asked(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Traffic>) {
         self.give_up(piece.began, heard);
         let Cut::Request { address, pdu } = piece.cut else {
             return;
@@ -217,7 +217,7 @@ impl Decoder {
         }
     }
 
-    fn answered(&mut self, piece: Piece, heard: &mut Vec<Heard>) {
+    fn answered(&mut self, piece: Piece, heard: &mut Vec<Traffic>) {
         let Cut::Reply { reply, ambiguous } = piece.cut else {
             return;
         };
@@ -245,7 +245,7 @@ impl Decoder {
         may_be_late.then_some(MAY_BE_LATE)
     }
 
-    fn garbage(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Heard>) {
+    fn garbage(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Traffic>) {
         if let Some(open) = &mut self.open {
             let room = KEPT.saturating_sub(open.garbage.len());
             open.garbage.extend(piece.bytes.iter().take(room));
@@ -253,7 +253,7 @@ impl Decoder {
         }
         let room = KEPT.saturating_sub(self.garbage.len());
         self.garbage.extend(piece.bytes.iter().take(room));
-        heard.push(Heard::Stray {
+        heard.push(Traffic::Stray {
             bytes: piece.bytes,
             at: piece.ended,
             quiet_since,
@@ -261,7 +261,7 @@ impl Decoder {
     }
 
     /// No reply came to the request that is open: the next request came at `now`, or its time has ended.
-    fn give_up(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+    fn give_up(&mut self, now: Instant, heard: &mut Vec<Traffic>) {
         let Some(open) = &self.open else { return };
         let mangled = open
             .request
@@ -299,7 +299,7 @@ impl Decoder {
         at: Instant,
         replied: Option<Instant>,
         doubt: Option<&'static str>,
-        heard: &mut Vec<Heard>,
+        heard: &mut Vec<Traffic>,
     ) {
         let Some(open) = self.open.take() else { return };
         let mut asked_by = at;
@@ -319,7 +319,7 @@ impl Decoder {
             self.n2_late.answered(request.address, &request.pdu, N2_LATE, at);
             asked_by = self.n2_late.asked_by(request.address, &request.pdu, at).unwrap_or(at);
         }
-        heard.push(Heard::Exchange(Box::new(Exchange {
+        heard.push(Traffic::Exchange(Box::new(Exchange {
             address: open.address,
             request: open.request,
             frame: open.frame,

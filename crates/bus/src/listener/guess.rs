@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use super::decoder::{Decoder, Exchange, Heard};
+use super::decoder::{Decoder, Exchange, Traffic};
 use crate::codec::{LineFormat, Parity, Protocol};
 
 /// Number of requests that decide the guess.
@@ -30,7 +30,7 @@ pub struct Guess {
     /// Characters by parity of their 8 bits and whether bit 7 is set.
     even: u64,
     high: u64,
-    heard: Vec<Heard>,
+    heard: Vec<Traffic>,
 }
 
 impl Guess {
@@ -93,8 +93,8 @@ impl Guess {
     }
 }
 
-fn is_request(heard: &Heard) -> bool {
-    matches!(heard, Heard::Exchange(exchange) if is_sound(exchange))
+fn is_request(heard: &Traffic) -> bool {
+    matches!(heard, Traffic::Exchange(exchange) if is_sound(exchange))
 }
 
 fn is_sound(exchange: &Exchange) -> bool {

@@ -17,4 +17,4 @@ pub mod n2_survey;
 pub mod survey;
 
 pub use self::core::ListenCore;
-pub use decoder::{Decoder, Exchange, Heard};
+pub use decoder::{Decoder, Exchange, Traffic};

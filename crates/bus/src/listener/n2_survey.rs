@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
-use super::decoder::{Exchange, Heard};
+use super::decoder::{Exchange, Traffic};
 use crate::codec::n2::command::checksum;
 use crate::codec::n2::{Answer, Command, Object, Region};
 
@@ -59,10 +59,10 @@ fn count(seen: &mut Seen, what: impl Into<String>) {
 
 impl N2Survey {
     /// Adds what was received to the survey.
-    pub fn add(&mut self, heard: &Heard) {
+    pub fn add(&mut self, heard: &Traffic) {
         match heard {
-            Heard::Exchange(exchange) => self.exchange(exchange),
-            Heard::Stray { bytes, .. } => self.sum(bytes),
+            Traffic::Exchange(exchange) => self.exchange(exchange),
+            Traffic::Stray { bytes, .. } => self.sum(bytes),
         }
     }
 
@@ -263,8 +263,8 @@ mod tests {
     use super::*;
 
     /// A request and its reply, both without the carriage return.
-    fn exchange(began: Instant, request: &str, reply: &str) -> Heard {
-        Heard::Exchange(Box::new(Exchange {
+    fn exchange(began: Instant, request: &str, reply: &str) -> Traffic {
+        Traffic::Exchange(Box::new(Exchange {
             address: 1,
             request: None,
             frame: format!("{request}\r").into_bytes(),

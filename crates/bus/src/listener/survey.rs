@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use super::decoder::{Exchange, Heard};
+use super::decoder::{Exchange, Traffic};
 use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
@@ -106,13 +106,13 @@ pub struct Survey {
 
 impl Survey {
     /// Adds what was received to the survey.
-    pub fn add(&mut self, protocol: Protocol, heard: &Heard) {
+    pub fn add(&mut self, protocol: Protocol, heard: &Traffic) {
         let (began, at) = match heard {
-            Heard::Stray { bytes, at, .. } => {
+            Traffic::Stray { bytes, at, .. } => {
                 self.stray += bytes.len() as u64;
                 (*at, *at)
             }
-            Heard::Exchange(exchange) => {
+            Traffic::Exchange(exchange) => {
                 self.exchange(protocol, exchange);
                 (exchange.began, exchange.sent)
             }

@@ -258,7 +258,7 @@ impl Master {
         for (index, effect) in command.intent.effects.iter() {
             let renews = self.bus.renews(index, origin);
             if let Some(drive) = self.drives.get_mut(index) {
-                drive.heard_order(renews, now);
+                drive.foreign_order(renews, now);
             }
             if let Some(starts) = &self.waits.starts
                 && let Some((image, pdu)) = self.bus.image.drives.get(index).zip(pdu)
@@ -295,7 +295,7 @@ impl Master {
     /// Answers a background transaction that has ended, whatever its result.
     pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         let index = turn.drive;
-        let heard = self.waits.sessions.heard(index, &end.ended);
+        let heard = self.waits.sessions.transaction_ended(index, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(index, now, news);
         }
@@ -374,7 +374,7 @@ impl Master {
             let Some(drive) = self.drives.get_mut(index) else {
                 continue;
             };
-            drive.heard_order(renews, now);
+            drive.foreign_order(renews, now);
             if matches!(outcome, Outcome::Exception(_)) {
                 continue;
             }

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::passed_on::{drop_unwanted, is_ready};
-use super::permission::{AtTurn, wanted};
+use super::permission::{AtTurn, next_need};
 use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
 use crate::command_run::{CommandRun, Step};
@@ -168,7 +168,7 @@ impl Master {
             .enumerate_mut()
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
-        match state.wanted(image, &waits.n2_late, now) {
+        match state.next_need(image, &waits.n2_late, now) {
             Wanted::Step(Urgency::Command, step)
                 if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
@@ -206,8 +206,8 @@ impl Master {
             if !drive.has_runs() {
                 continue;
             }
-            let want = |drive: &mut DriveState| drive.wanted(image, &waits.n2_late, now);
-            match wanted(bus, index, (drive, image), want, now) {
+            let want = |drive: &mut DriveState| drive.next_need(image, &waits.n2_late, now);
+            match next_need(bus, index, (drive, image), want, now) {
                 Wanted::Step(slot, step) => {
                     // The session step that N2 needs first can be blocked by late replies like the step itself.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);

@@ -11,7 +11,7 @@ use crate::process_image::{DriveImage, Reading};
 use crate::supervision::written_run;
 
 /// Reports to the queue whose commands were executed, and whether the drive is under local control.
-pub(super) fn look_at_hold(
+pub(super) fn report_control(
     bus: &BusHandle,
     index: DriveIndex,
     image: &Arc<DriveImage>,

@@ -9,11 +9,11 @@ use crate::stalls::Stall;
 impl Master {
     /// The thread did not run until `now`. Waiting commands are judged by that when they are chosen again. A command of
     /// several steps that a pause interrupted is not continued, except for the end of a pulse.
-    pub(crate) fn stood(&mut self, stall: Stall, now: Instant) {
+    pub(crate) fn after_stall(&mut self, stall: Stall, now: Instant) {
         let slept = stall.slept;
         self.prolong(stall.length());
         if let Some(starts) = &mut self.waits.starts {
-            starts.stood(stall);
+            starts.after_stall(stall);
         }
         let mut queue = self.bus.queue.lock();
         if stall.is_pause() {
@@ -25,7 +25,7 @@ impl Master {
         drop(queue);
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
             match stall.is_pause() {
-                true => drive.refresh.stood(stall.length(), now),
+                true => drive.refresh.after_stall(stall.length(), now),
                 false => drive.refresh.others_go_first(&image.spec.profile),
             }
             for urgency in [Urgency::Command, Urgency::Read] {

@@ -72,7 +72,7 @@ pub(super) fn may_write(
 }
 
 /// The next need of the started commands of a drive, once those that may not go on have ended.
-pub(super) fn wanted(
+pub(super) fn next_need(
     bus: &BusHandle,
     index: DriveIndex,
     (drive, image): (&mut DriveState, &DriveImage),

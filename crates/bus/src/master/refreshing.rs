@@ -25,7 +25,7 @@ enum May {
 
 impl Master {
     /// Ends refreshes that time, samples or accepted orders contradict, and reports which go on.
-    pub(super) fn look_at_refreshes(&mut self, now: Instant, news: &mut Vec<News>) {
+    pub(super) fn check_refreshes(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master { bus, drives, .. } = self;
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if image.spec.refresh.is_none() {
@@ -39,7 +39,7 @@ impl Master {
                     held: drive.supervision.is_held(),
                 };
                 drop(queue);
-                let ended = drive.refresh.look(&image.reading(now, drive.fresh), around);
+                let ended = drive.refresh.check(&image.reading(now, drive.fresh), around);
                 drive.refresh_ended = ended.or(drive.refresh_ended.take());
             }
             // A stop is the usual end, and not reported.

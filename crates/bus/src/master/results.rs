@@ -204,7 +204,7 @@ impl Master {
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.refresh_debt = self.refresh_debt.saturating_sub(end.took);
         // After a session step before the poll this is known already.
-        let heard = self.waits.sessions.heard(poll.drive, &end.ended);
+        let heard = self.waits.sessions.transaction_ended(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
         }
@@ -346,7 +346,7 @@ impl Master {
         if of_tool && slot != Urgency::Stop {
             self.schedule.background_owes(Pace::Brisk, end.took);
         }
-        if self.waits.sessions.heard(index, &end.ended) == Progress::Restarted {
+        if self.waits.sessions.transaction_ended(index, &end.ended) == Progress::Restarted {
             self.restarted(index, now, news);
         }
         let reply = match end.ended {

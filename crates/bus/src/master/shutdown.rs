@@ -63,7 +63,7 @@ impl State {
 
 impl Stop {
     /// Looks at the answer; `now` is when it is ordered again where it failed.
-    fn look(&mut self, now: Instant) {
+    fn check_answer(&mut self, now: Instant) {
         let State::Ordered(answer) = &mut self.state else {
             return;
         };
@@ -139,7 +139,7 @@ impl Shutdown {
 
 impl Master {
     /// Starts a requested shutdown; orders due stops, and ends when all are done or the time has ended.
-    pub(super) fn look_at_shutdown(&mut self, now: Instant) {
+    pub(super) fn check_shutdown(&mut self, now: Instant) {
         // The lock on the queue must be free again when the broadcast is added.
         let stopping = self.bus.queue.lock().take_stopping();
         if let Some(stopping) = stopping {
@@ -159,7 +159,7 @@ impl Master {
         if shutdown.waits_for_broadcast(now) {
             return;
         }
-        shutdown.stops.iter_mut().for_each(|stop| stop.look(now));
+        shutdown.stops.iter_mut().for_each(|stop| stop.check_answer(now));
         if shutdown.stops.iter().all(Stop::is_over) || now >= deadline {
             shutdown.end(bus);
             return;

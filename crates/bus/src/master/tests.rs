@@ -19,7 +19,7 @@ use crate::transaction::MAY_BE_LATE;
 mod background;
 mod drill;
 mod family_drive;
-mod hold;
+mod holder;
 mod late_replies;
 mod pauses;
 mod refreshing;

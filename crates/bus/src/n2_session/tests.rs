@@ -49,7 +49,7 @@ impl N2Drive {
         let mut rig = rig();
         rig.done(IDENTIFY, &identity());
         rig.done(POLL, &changes(b""));
-        rig.sessions.heard(DriveIndex::new(0), &value());
+        rig.sessions.transaction_ended(DriveIndex::new(0), &value());
         assert_eq!(rig.before(None), None);
         rig
     }
@@ -97,7 +97,7 @@ fn two() -> N2Sessions {
     for drive in [0, 1].map(DriveIndex::new) {
         sessions.done(drive, IDENTIFY, &identity(), now);
         sessions.done(drive, POLL, &changes(b""), now);
-        sessions.heard(drive, &value());
+        sessions.transaction_ended(drive, &value());
         assert_eq!(sessions.before(drive, None, now), None);
     }
     sessions
@@ -117,7 +117,7 @@ fn who_is_not_asked_is_polled_all_the_same() {
 fn a_restart_begins_anew() {
     let mut rig = N2Drive::ready();
     assert_eq!(
-        rig.sessions.heard(DriveIndex::new(0), &restarted()),
+        rig.sessions.transaction_ended(DriveIndex::new(0), &restarted()),
         Progress::Restarted
     );
     assert_eq!(rig.before(Some(Urgency::Stop)), Some(IDENTIFY));
@@ -148,10 +148,10 @@ fn drives_that_are_not_to_be_identified() {
     };
     assert_eq!(rig.before(None), Some(POLL));
     rig.done(POLL, &changes(b""));
-    rig.sessions.heard(DriveIndex::new(0), &Ended::Silent);
+    rig.sessions.transaction_ended(DriveIndex::new(0), &Ended::Silent);
     assert_eq!(rig.before(None), None);
-    rig.sessions.heard(DriveIndex::new(0), &value());
-    rig.sessions.heard(DriveIndex::new(0), &restarted());
+    rig.sessions.transaction_ended(DriveIndex::new(0), &value());
+    rig.sessions.transaction_ended(DriveIndex::new(0), &restarted());
     assert_eq!(rig.before(None), Some(IDENTIFY), "it asked for it");
 }
 
@@ -160,5 +160,8 @@ fn other_buses_have_none() {
     let mut sessions = N2Sessions::default();
     assert!(sessions.is_empty());
     assert_eq!(sessions.before(DriveIndex::new(0), None, Instant::now()), None);
-    assert_eq!(sessions.heard(DriveIndex::new(0), &Ended::Silent), Progress::Going);
+    assert_eq!(
+        sessions.transaction_ended(DriveIndex::new(0), &Ended::Silent),
+        Progress::Going
+    );
 }

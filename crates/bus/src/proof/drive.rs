@@ -63,7 +63,7 @@ impl Start {
     }
 
     /// Whether the last poll showed the motor running, and it has stopped since.
-    pub(super) fn ran(self) -> bool {
+    pub(super) fn has_stopped(self) -> bool {
         matches!(self, Start::FaultedSince | Start::RestartedSince | Start::StoppedSince)
     }
 
@@ -218,13 +218,13 @@ impl<'p> Drive<'p> {
         }
         if let Some((table, items)) = written(pdu) {
             for (address, word) in items {
-                self.takes(ControlItem { table, address }, word);
+                self.take_word(ControlItem { table, address }, word);
             }
         }
         Reply::Written
     }
 
-    fn takes(&mut self, place: ControlItem, word: u16) {
+    fn take_word(&mut self, place: ControlItem, word: u16) {
         let before = self.word(place);
         self.put(place, word);
         let here = |setting: &Setting| setting.place.unwrap_or(self.control.at) == place;

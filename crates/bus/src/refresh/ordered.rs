@@ -11,7 +11,7 @@ const LONGEST: usize = 2;
 
 /// The command that is in force.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Does {
+pub(super) enum InForce {
     Run,
     Stop,
 }
@@ -33,7 +33,7 @@ impl Reference {
 /// Words last written by orders of the gateway, as far as the drive acknowledged them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Ordered {
-    pub(super) does: Option<Does>,
+    pub(super) does: Option<InForce>,
     /// The control word, without a reset.
     pub(super) word: Option<u16>,
     pub(super) reference: Option<Reference>,
@@ -60,14 +60,14 @@ impl Ordered {
             return false;
         }
         match reading.words(Table::Holding, reference.start, reference.count) {
-            Ok(words) => !self.tells(&words),
+            Ok(words) => !self.matches_written(&words),
             Err(_) => false,
         }
     }
 
     /// The registers of the reference have these values, or were not read. Returns whether they match the written reference, as
     /// far as the drive reports it.
-    pub(super) fn tells(&mut self, read: &[u16]) -> bool {
+    pub(super) fn matches_written(&mut self, read: &[u16]) -> bool {
         let Some(reference) = self.reference.filter(|r| read.len() == r.words().len()) else {
             return true;
         };
@@ -79,17 +79,17 @@ impl Ordered {
 }
 
 /// Effect of a word at this place on run and stop; none where it has none.
-pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<Does>> {
+pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<InForce>> {
     let word = if place == control.at {
         control.without_reset(word)
     } else {
         word
     };
     if control.is_own_stop(place, word) {
-        return Some(Some(Does::Stop));
+        return Some(Some(InForce::Stop));
     }
     if control.is_run(place, word) {
-        return Some(Some(Does::Run));
+        return Some(Some(InForce::Run));
     }
     // Behind a word that stops by other means, or that is neither, nothing is repeated.
     (place == control.at || place == control.run_place()).then_some(None)

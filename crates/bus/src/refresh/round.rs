@@ -3,9 +3,9 @@
 use std::time::{Duration, Instant};
 
 use super::ordered::{Ordered, Reference, reference_of};
-use super::{Does, End, Refresh};
+use super::{End, InForce, Refresh};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command_run::{Look, Motor};
+use crate::command_run::{Motor, StateRead};
 use crate::drive::Profile;
 use crate::drive::control::Control;
 
@@ -25,7 +25,7 @@ enum Stage {
 #[derive(Debug)]
 pub(super) struct Round {
     stage: Stage,
-    look: Look,
+    look: StateRead,
 }
 
 /// Whether what the drive has is what was written.
@@ -65,7 +65,7 @@ impl Refresh {
             let apart = self.reference_apart(profile, control);
             self.round = Some(Round {
                 stage: apart.map_or(first_read(profile), |_| Stage::Reference),
-                look: Look::at_motor(profile)?,
+                look: StateRead::at_motor(profile)?,
             });
         }
         let round = self.round.as_ref()?;
@@ -177,7 +177,7 @@ impl Refresh {
             },
             Stage::Look => {
                 let Some(round) = &mut self.round else { return Ok(()) };
-                if !round.look.hears(reply) {
+                if !round.look.take_reply(reply) {
                     return Ok(());
                 }
                 let motor = round.look.motor();
@@ -215,7 +215,7 @@ impl Refresh {
             return Fits::No;
         }
         let reference = words.get(1..).unwrap_or_default();
-        let told = self.repeated.ordered.tells(reference);
+        let told = self.repeated.ordered.matches_written(reference);
         match (read == released, told) {
             (_, false) => Fits::No,
             (false, true) => Fits::NotNow,
@@ -231,15 +231,15 @@ impl Refresh {
         match (going.does, motor) {
             (_, Motor::RunsElsewise) => Err(End::Local),
             (_, Motor::NotShown) => Ok(false),
-            (Does::Run, Motor::Runs) => {
+            (InForce::Run, Motor::Runs) => {
                 going.seen = true;
                 Ok(true)
             }
-            (Does::Run, Motor::Stands) => Err(End::Stands),
-            (Does::Stop, Motor::Runs) if going.seen => Err(End::Starts),
+            (InForce::Run, Motor::Stands) => Err(End::Stands),
+            (InForce::Stop, Motor::Runs) if going.seen => Err(End::Starts),
             // The motor comes down.
-            (Does::Stop, Motor::Runs) => Ok(true),
-            (Does::Stop, Motor::Stands) => {
+            (InForce::Stop, Motor::Runs) => Ok(true),
+            (InForce::Stop, Motor::Stands) => {
                 going.seen = true;
                 Ok(true)
             }
@@ -258,7 +258,7 @@ impl Refresh {
     }
 
     /// The thread was stalled for this time, in which nothing was written.
-    pub(crate) fn stood(&mut self, time: Duration, now: Instant) {
+    pub(crate) fn after_stall(&mut self, time: Duration, now: Instant) {
         self.round = None;
         if let Some(going) = &mut self.repeated.going {
             going.lost.get_or_insert(now.checked_sub(time).unwrap_or(now));
@@ -301,7 +301,7 @@ pub(crate) fn requests(profile: &Profile) -> Vec<RequestPdu> {
     };
     let apart = refresh.reference_apart(profile, control);
     let own = (first_read(profile) == Stage::Own).then(|| refresh.read_own(profile, control));
-    let looks = Look::at_motor(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
+    let looks = StateRead::at_motor(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
     apart
         .map(|r| write(profile, r.start, r.words()))
         .into_iter()

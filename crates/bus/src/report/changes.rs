@@ -120,7 +120,7 @@ fn cause(who: &str) -> String {
 impl Report {
     /// Starts, stops, warnings and control places that changed with the last poll. The value at the first read is not
     /// an event; a change while the drive was offline is one.
-    pub(super) fn look_at_state(&mut self, index: DriveIndex, now: Instant) {
+    pub(super) fn report_state(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         let reading = drive.reading(now, RECENT);
         for (place, (point, changes)) in WATCHED.into_iter().enumerate() {

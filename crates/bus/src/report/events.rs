@@ -117,7 +117,7 @@ impl Report {
         drive.count_supervision();
         let action = match supervision.action {
             LeaseAction::Stop => "the drive is being stopped".to_string(),
-            LeaseAction::Hold => "nothing is written".to_string(),
+            LeaseAction::LeaveRunning => "nothing is written".to_string(),
             LeaseAction::SpeedReference(percent) => format!("the speed reference is being set to {percent} %"),
         };
         let timeout = supervision.timeout;

@@ -136,7 +136,7 @@ impl Default for EarlyProbes {
 
 impl EarlyProbes {
     /// The drive answers again.
-    pub(super) fn came(&mut self, now: Instant) {
+    pub(super) fn answers_again(&mut self, now: Instant) {
         (self.online_since, self.outage) = (Some(now), None);
     }
 

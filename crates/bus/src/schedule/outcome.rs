@@ -24,7 +24,7 @@ impl Schedule {
         let came = drive.presence != Presence::Online;
         if came {
             drive.presence = Presence::Online;
-            drive.early.came(now);
+            drive.early.answers_again(now);
             drive.probes = 0;
             // The drive answers again, but not the read after which it counted as away.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {

@@ -197,7 +197,8 @@ impl SupervisedDrive {
 
     /// Sends the next step of the started command.
     fn send(&mut self) -> (Urgency, Step) {
-        let Wanted::Step(urgency, step) = self.drive.wanted(&self.image(), &N2LateReplies::default(), self.now) else {
+        let Wanted::Step(urgency, step) = self.drive.next_need(&self.image(), &N2LateReplies::default(), self.now)
+        else {
             panic!("nothing to send")
         };
         self.drive.sent(urgency, &step, self.now);
@@ -250,7 +251,7 @@ fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     rig.heartbeat();
     assert!(rig.after(10_000, false).is_none());
     assert_eq!(rig.reported(), 0);
-    let mut rig = SupervisedDrive::new(LeaseAction::Hold);
+    let mut rig = SupervisedDrive::new(LeaseAction::LeaveRunning);
     rig.heartbeat();
     assert!(rig.after(10_000, true).is_none());
     assert_eq!(rig.reported(), 1);
@@ -422,7 +423,7 @@ fn an_action_that_is_due_outlives_the_bus() {
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
         |spec| spec.supervision = None,
-        |spec| spec.supervision.as_mut().unwrap().action = LeaseAction::Hold,
+        |spec| spec.supervision.as_mut().unwrap().action = LeaseAction::LeaveRunning,
     ] {
         let mut rig = SupervisedDrive::new(LeaseAction::Stop);
         rig.heartbeat();

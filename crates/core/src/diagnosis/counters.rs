@@ -71,7 +71,7 @@ pub(super) struct InPhase {
 }
 
 impl InPhase {
-    pub(super) fn look(&mut self, at: Instant, length: Duration, damaged: bool) {
+    pub(super) fn add(&mut self, at: Instant, length: Duration, damaged: bool) {
         if let Some(last) = self.last {
             let since = at.saturating_duration_since(last);
             if since > IN_PHASE {

@@ -9,7 +9,7 @@ const MOST_VERDICTS: usize = 24;
 
 /// A finding that is held.
 #[derive(Debug, Clone, PartialEq)]
-struct Held {
+struct Debounced {
     finding: Finding,
     /// Steps in which the rule held, minus steps in which it did not.
     holds: u32,
@@ -31,8 +31,8 @@ pub enum Change {
 
 /// The findings that are held.
 #[derive(Debug, Clone, Default)]
-pub struct Hold {
-    held: Vec<Held>,
+pub struct Debounce {
+    held: Vec<Debounced>,
 }
 
 /// Steps for which a rule must hold, besides those in which it did not. Causes that only say that nothing else was
@@ -46,7 +46,7 @@ fn patience(cause: Cause) -> u32 {
     }
 }
 
-impl Hold {
+impl Debounce {
     /// Takes the findings of the rules in this step; returns the changes.
     pub fn take(&mut self, found: Vec<Finding>) -> Vec<Change> {
         let mut changes = Vec::new();
@@ -72,14 +72,14 @@ impl Hold {
     }
 
     fn found(&mut self, finding: Finding, changes: &mut Vec<Change>) {
-        let same = |held: &&mut Held| held.finding.cause == finding.cause && held.finding.drive == finding.drive;
+        let same = |held: &&mut Debounced| held.finding.cause == finding.cause && held.finding.drive == finding.drive;
         let Some(held) = self.held.iter_mut().find(same) else {
             if self.held.len() < MOST_VERDICTS {
                 let shown = patience(finding.cause) <= 1;
                 if shown {
                     changes.push(Change::Came(finding.clone()));
                 }
-                self.held.push(Held {
+                self.held.push(Debounced {
                     finding,
                     holds: 1,
                     missing: 0,
@@ -142,34 +142,37 @@ mod tests {
     fn a_verdict_comes_by_lasting_evidence_and_goes_without_it() {
         let fits = || vec![finding(Cause::Bias, Certainty::Fits)];
         let likely = || vec![finding(Cause::Bias, Certainty::Likely)];
-        let mut hold = Hold::default();
+        let mut debounce = Debounce::default();
         // Once is chance, also again and again.
         for _ in 0..10 {
-            assert_eq!(hold.take(fits()), []);
-            assert_eq!(hold.take(Vec::new()), []);
+            assert_eq!(debounce.take(fits()), []);
+            assert_eq!(debounce.take(Vec::new()), []);
         }
-        assert_eq!(hold.take(fits()), []);
-        assert_eq!(hold.take(fits()), [Change::Came(finding(Cause::Bias, Certainty::Fits))]);
+        assert_eq!(debounce.take(fits()), []);
         assert_eq!(
-            hold.take(likely()),
+            debounce.take(fits()),
+            [Change::Came(finding(Cause::Bias, Certainty::Fits))]
+        );
+        assert_eq!(
+            debounce.take(likely()),
             [Change::Firmer(finding(Cause::Bias, Certainty::Likely))]
         );
-        assert_eq!(hold.take(fits()), [], "it does not become less certain");
+        assert_eq!(debounce.take(fits()), [], "it does not become less certain");
         for step in 1..GOES_AFTER {
-            assert_eq!(hold.take(Vec::new()), [], "{step}");
-            assert_eq!(hold.shown().count(), 1);
+            assert_eq!(debounce.take(Vec::new()), [], "{step}");
+            assert_eq!(debounce.shown().count(), 1);
         }
         assert_eq!(
-            hold.take(Vec::new()),
+            debounce.take(Vec::new()),
             [Change::Went(finding(Cause::Bias, Certainty::Likely))]
         );
-        assert_eq!(hold.shown().count(), 0);
+        assert_eq!(debounce.shown().count(), 0);
     }
 
     #[test]
     fn what_only_fits_because_nothing_else_does_waits() {
-        let mut hold = Hold::default();
-        let steps = (1..).find(|_| !hold.take(vec![finding(Cause::Noise, Certainty::Likely)]).is_empty());
+        let mut debounce = Debounce::default();
+        let steps = (1..).find(|_| !debounce.take(vec![finding(Cause::Noise, Certainty::Likely)]).is_empty());
         assert_eq!(steps, Some(5));
     }
 }

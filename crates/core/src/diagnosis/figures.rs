@@ -334,7 +334,7 @@ impl Figures {
             }
             drive.replied_after(turnaround);
         }
-        drive.mains.look(middle, length, false);
+        drive.mains.add(middle, length, false);
     }
 
     fn damaged(&mut self, exchange: &Exchange<'_>, shape: Shape) {
@@ -358,7 +358,7 @@ impl Figures {
                     drive.add(Sign::Overlong);
                 }
                 if let Some(at) = damage {
-                    drive.mains.look(at, Duration::ZERO, true);
+                    drive.mains.add(at, Duration::ZERO, true);
                 }
                 self.running.add(1.0, 1.0, exchange.at);
             }

@@ -13,14 +13,14 @@
 //! - [`words`]: the texts of causes and remedies.
 
 pub mod counters;
+pub mod debounce;
 pub mod figures;
-pub mod hold;
 mod known;
 pub mod own_timeout;
 pub mod rules;
 pub mod signature;
+pub mod texts;
 pub mod unanswered;
-pub mod words;
 
 use std::fmt;
 use std::time::{Duration, SystemTime};

@@ -94,7 +94,7 @@ impl Rules<'_> {
         self.found.iter().any(|found| found.cause == cause)
     }
 
-    fn is_told(&self, place: DriveIndex) -> bool {
+    fn is_reported(&self, place: DriveIndex) -> bool {
         self.found.iter().any(|found| found.drive == Some(place))
     }
 
@@ -272,7 +272,7 @@ impl Rules<'_> {
         let mut known: Vec<Known> = self
             .known
             .iter()
-            .filter(|one| !self.is_told(one.place))
+            .filter(|one| !self.is_reported(one.place))
             .copied()
             .collect();
         if self.waiting * 10 > self.figures.drives.len() || known.len() < 3 || sums(&known).0 <= self.disturbed {
@@ -328,7 +328,7 @@ impl Rules<'_> {
             return;
         }
         for (place, asked, address) in silent {
-            if self.is_told(place) {
+            if self.is_reported(place) {
                 continue;
             }
             let evidence = format!(
@@ -412,7 +412,7 @@ impl Rules<'_> {
         let rest: Vec<Known> = self
             .known
             .iter()
-            .filter(|one| !self.is_told(one.place))
+            .filter(|one| !self.is_reported(one.place))
             .copied()
             .collect();
         if sums(&rest).0 <= self.disturbed {

@@ -131,12 +131,12 @@ impl Cause {
 
     /// The steps in the words of these profiles: what to check and to set at their drives.
     pub fn steps_of<'p>(self, profiles: impl IntoIterator<Item = &'p Profile>) -> Vec<String> {
-        told(profiles, self.steps())
+        step_lines(profiles, self.steps())
     }
 }
 
 /// The lines of these steps, each behind the names of its profiles, without repetition.
-pub fn told<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step]) -> Vec<String> {
+pub fn step_lines<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step]) -> Vec<String> {
     let mut seen = BTreeSet::new();
     let profiles: Vec<&Profile> = profiles.into_iter().filter(|one| seen.insert(&one.name)).collect();
     let line = |Shared { profiles, line }: Shared<'_>| format!("{}: {line}", profiles.join(", "));

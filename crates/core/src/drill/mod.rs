@@ -220,9 +220,9 @@ impl Drills {
     }
 
     /// Looks at the drill that is under way, and drops one that was armed and not started. Whether one is under way.
-    pub fn look(&self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+    pub fn advance(&self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let mut state = self.state();
-        let goes_on = state.look(plant, now, time);
+        let goes_on = state.advance(plant, now, time);
         state.publish(plant, now, time);
         goes_on
     }
@@ -334,7 +334,7 @@ impl Drills {
 }
 
 impl State {
-    fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+    fn advance(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         self.drop_armed(now, time);
         if self.run.is_none() {
             self.stop_cut_off(plant, now, time);
@@ -343,7 +343,7 @@ impl State {
         if run.report().state == DrillState::Armed {
             return false;
         }
-        if run.look(plant, now, time) {
+        if run.advance(plant, now, time) {
             return true;
         }
         self.end();
@@ -481,7 +481,7 @@ fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefus
     if reading.is_set(ModelPoint::Running) || reading.is_set(ModelPoint::Run) {
         return Err(not_now("the motor is running; stop it first"));
     }
-    if let Some(why) = drive.image.hold.why() {
+    if let Some(why) = drive.image.restore_lock.reason() {
         return Err(not_now(why.to_string()));
     }
     Ok(())

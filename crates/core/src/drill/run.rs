@@ -389,7 +389,7 @@ impl Run {
     }
 
     /// Evaluates the progress of the drill. Returns whether it goes on.
-    pub(super) fn look(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
+    pub(super) fn advance(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let gap = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
         self.paused = self.paused.max(Some(gap).filter(|gap| *gap > PAUSE));
         if !matches!(self.step, Step::CutOff | Step::Ending(..) | Step::Over)
@@ -409,19 +409,19 @@ impl Run {
             Step::Keeping(generation) => self.step = Step::Keeping(generation),
             Step::Waiting if now.saturating_duration_since(self.since) < AGAIN => self.step = Step::Waiting,
             Step::Waiting => self.give_start(now),
-            Step::Starting(placed) => self.look_at_start(placed, now),
-            Step::SpeedingUp(turned) => self.look_at_speed(turned, &reading, now),
-            Step::Steady => self.look_steady(&reading, now, time),
-            Step::Caused(cause, how) => self.look_at_cause(cause, how, &reading, (now, time)),
-            Step::Clearing(stop) => self.look_cleared(stop, plant, now),
-            Step::CutOff => self.look_cut_off(plant, now),
-            Step::Ending(state, stop) => self.look_at_end(state, stop, plant, (now, time)),
+            Step::Starting(placed) => self.check_start(placed, now),
+            Step::SpeedingUp(turned) => self.check_speed(turned, &reading, now),
+            Step::Steady => self.check_steady(&reading, now, time),
+            Step::Caused(cause, how) => self.check_cause(cause, how, &reading, (now, time)),
+            Step::Clearing(stop) => self.check_cleared(stop, plant, now),
+            Step::CutOff => self.check_cut_off(plant, now),
+            Step::Ending(state, stop) => self.check_end(state, stop, plant, (now, time)),
             Step::Over => {}
         }
         !matches!(self.step, Step::Over)
     }
 
-    fn look_at_start(&mut self, mut placed: Placed, now: Instant) {
+    fn check_start(&mut self, mut placed: Placed, now: Instant) {
         match placed.answer() {
             None => self.step = Step::Starting(placed),
             Some(answer) if answer.outcome.is_ok() => {
@@ -442,7 +442,7 @@ impl Run {
         }
     }
 
-    fn look_at_speed(&mut self, turned: Option<Instant>, reading: &Reading<'_>, now: Instant) {
+    fn check_speed(&mut self, turned: Option<Instant>, reading: &Reading<'_>, now: Instant) {
         // The lease is kept only by a client that shows it is alive; the drill does so until it goes silent on purpose.
         self.drive.heartbeat(&self.own, now);
         let turns = matches!(reading.standstill(None), Standstill::Turns(_));
@@ -473,7 +473,7 @@ impl Run {
         self.step = Step::SpeedingUp(turned);
     }
 
-    fn look_steady(&mut self, reading: &Reading<'_>, now: Instant, time: SystemTime) {
+    fn check_steady(&mut self, reading: &Reading<'_>, now: Instant, time: SystemTime) {
         self.drive.heartbeat(&self.own, now);
         let passed = now.saturating_duration_since(self.since);
         // A motor that stands before the cause of the drill proves nothing about that cause.
@@ -529,10 +529,10 @@ impl Run {
     }
 
     /// The motor is stopped and stands before the next way is tried.
-    fn look_cleared(&mut self, mut stop: OneStop, plant: &Plant, now: Instant) {
-        stop.look(plant, now);
+    fn check_cleared(&mut self, mut stop: OneStop, plant: &Plant, now: Instant) {
+        stop.advance(plant, now);
         self.stops = self.drive.stops();
-        if stop.is_acknowledged() && stop.stands(plant, now) {
+        if stop.is_acknowledged() && stop.motor_stands(plant, now) {
             self.at += 1;
             return self.begin_step(now);
         }
@@ -546,7 +546,7 @@ impl Run {
     }
 
     /// Stops the motor once the drive is online; a stop to one that is not would fail.
-    fn look_cut_off(&mut self, plant: &Plant, now: Instant) {
+    fn check_cut_off(&mut self, plant: &Plant, now: Instant) {
         if let Some(drive) = plant.drive_at(&self.machine) {
             self.drive = drive;
         }
@@ -558,8 +558,8 @@ impl Run {
         self.end(DrillState::Aborted, CUT_OFF_TEXT.to_string(), now);
     }
 
-    fn look_at_end(&mut self, state: DrillState, mut stop: OneStop, plant: &Plant, (now, time): (Instant, SystemTime)) {
-        stop.look(plant, now);
+    fn check_end(&mut self, state: DrillState, mut stop: OneStop, plant: &Plant, (now, time): (Instant, SystemTime)) {
+        stop.advance(plant, now);
         let over = stop.is_acknowledged() || stop.is_refused();
         if !over && now.saturating_duration_since(self.since) <= LAST_STOP {
             self.step = Step::Ending(state, stop);

@@ -24,7 +24,7 @@ impl<T: Copy + Default> Buckets<T> {
         let mut new = Buckets::new(steps);
         let oldest = (self.newest + 1).saturating_sub(self.len());
         for number in oldest..=self.newest {
-            if let (Some(kept), Some(slot)) = (self.get(number), new.at(number)) {
+            if let (Some(kept), Some(slot)) = (self.get(number), new.step_mut(number)) {
                 *slot = kept;
             }
         }
@@ -50,7 +50,7 @@ impl<T: Copy + Default> Buckets<T> {
     }
 
     /// A step to be changed; a newer one than all before takes the place of the oldest. `None` where it is too old to be kept.
-    pub(super) fn at(&mut self, number: u64) -> Option<&mut T> {
+    pub(super) fn step_mut(&mut self, number: u64) -> Option<&mut T> {
         if number == self.newest {
             return self.slots.get_mut(self.place);
         }
@@ -85,7 +85,7 @@ mod tests {
     fn the_newest_steps_stay_when_there_is_room_for_fewer_or_more() {
         let mut buckets = Buckets::new(10);
         for number in 0..25_u64 {
-            *buckets.at(number).unwrap() = number;
+            *buckets.step_mut(number).unwrap() = number;
         }
         buckets.resize(4);
         assert_eq!(
@@ -97,7 +97,7 @@ mod tests {
             (buckets.get(17), buckets.get(21), buckets.steps()),
             (Some(0), Some(21), 8)
         );
-        *buckets.at(25).unwrap() = 25;
+        *buckets.step_mut(25).unwrap() = 25;
         assert_eq!((buckets.get(24), buckets.get(25)), (Some(24), Some(25)));
     }
 }

@@ -83,7 +83,7 @@ impl LineHistory {
     }
 
     /// Looks at the counters of the bus if that is due.
-    pub fn look(&mut self, bus: &BusImage, now: Instant) {
+    pub fn sample_if_due(&mut self, bus: &BusImage, now: Instant) {
         if self
             .looked
             .is_some_and(|looked| now.saturating_duration_since(looked) < LOOK)
@@ -98,14 +98,14 @@ impl LineHistory {
             (&mut self.cycle, health.fast.last.map(|cycle| cycle.as_secs_f64())),
         ];
         for (buckets, figure) in figures {
-            if let (Some(bucket), Some(figure)) = (buckets.at(step), figure.filter(|_| health.up)) {
+            if let (Some(bucket), Some(figure)) = (buckets.step_mut(step), figure.filter(|_| health.up)) {
                 bucket.add(figure as f32);
             }
         }
         for (line, image) in self.drives.iter_mut().zip(&bus.drives) {
             let counted = exchanges(image);
             let since = |now: u64, before: u64| u32::try_from(now.saturating_sub(before)).unwrap_or(u32::MAX);
-            if let Some(bucket) = line.steps.at(step) {
+            if let Some(bucket) = line.steps.step_mut(step) {
                 let bucket = bucket.get_or_insert_default();
                 bucket.all = bucket.all.saturating_add(since(counted.0, line.before.0));
                 bucket.failed = bucket.failed.saturating_add(since(counted.1, line.before.1));

@@ -313,7 +313,7 @@ impl LineRing {
         let (entries, lost) = self.bus.tape.take();
         self.lost += lost;
         let mut last_hour = self.last_hour.lock().unwrap_or_else(PoisonError::into_inner);
-        last_hour.look(&self.bus, clock.now);
+        last_hour.sample_if_due(&self.bus, clock.now);
         drop(last_hour);
         for entry in entries {
             match entry {
@@ -337,7 +337,7 @@ impl LineRing {
                 }
             }
         }
-        self.drives.iter_mut().for_each(DriveRing::look_at_link);
+        self.drives.iter_mut().for_each(DriveRing::check_link);
     }
 
     fn answers(&self, drive: DriveIndex) -> bool {
@@ -377,7 +377,7 @@ impl LineRing {
 
 impl DriveRing {
     /// Handles drives that went offline. Call it once all earlier readings were taken in.
-    fn look_at_link(&mut self) {
+    fn check_link(&mut self) {
         let link = self.image.snapshot().link;
         let before = std::mem::replace(&mut self.link, link);
         if before.is_online() && before != link {
@@ -407,7 +407,7 @@ impl DriveRing {
         }
         let base = &mut self.base;
         self.samples.push(&read, |at, packed| leave(base, at, packed));
-        self.watch.look(&reading, at, options.warnings)
+        self.watch.check(&reading, at, options.warnings)
     }
 
     fn trigger(&mut self, trigger: Trigger, clock: Clock) -> Option<String> {

@@ -27,7 +27,7 @@ pub(super) fn of(recording: &Recording, trigger: &str, profile: &Profile) -> Str
     parts.extend(errors(recording));
     let values: Vec<String> = TOLD
         .iter()
-        .filter_map(|(points, name)| points.iter().find_map(|point| told(recording, point, name)))
+        .filter_map(|(points, name)| points.iter().find_map(|point| last_value(recording, point, name)))
         .collect();
     if !values.is_empty() {
         parts.push(values.join(", "));
@@ -77,7 +77,7 @@ fn errors(recording: &Recording) -> Option<String> {
 }
 
 /// The last value before the trigger, and its tendency.
-fn told(recording: &Recording, point: &str, name: &str) -> Option<String> {
+fn last_value(recording: &Recording, point: &str, name: &str) -> Option<String> {
     let values = recording.values_of(point);
     let before: Vec<(f64, f64)> = values
         .iter()

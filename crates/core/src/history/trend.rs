@@ -327,12 +327,12 @@ impl Kept {
             if let Some((at, before)) = between.filter(|(at, _)| at + 1 < number) {
                 let first = at.max(number.saturating_sub(buckets.steps() as u64)) + 1;
                 for between in first..number {
-                    if let Some(bucket) = buckets.at(between) {
+                    if let Some(bucket) = buckets.step_mut(between) {
                         bucket.add(before);
                     }
                 }
             }
-            if let Some(bucket) = buckets.at(number) {
+            if let Some(bucket) = buckets.step_mut(number) {
                 bucket.add(value);
             }
         }

@@ -135,7 +135,7 @@ pub(super) struct Watch {
 
 impl Watch {
     /// Looks at a drive that was read at `at`.
-    pub(super) fn look(&mut self, reading: &Reading<'_>, at: Instant, warnings: bool) -> Option<Trigger> {
+    pub(super) fn check(&mut self, reading: &Reading<'_>, at: Instant, warnings: bool) -> Option<Trigger> {
         let fault = self.fault(reading);
         let warning = self.warning(reading).filter(|_| warnings);
         let point = self.points(reading, at);
@@ -178,7 +178,7 @@ impl Watch {
                 continue;
             }
             let (since, done) = state.get_or_insert((at, false));
-            if !*done && at.saturating_duration_since(*since) >= trigger.hold {
+            if !*done && at.saturating_duration_since(*since) >= trigger.lasts {
                 *done = true;
                 let point = reading.spec.profile.points.get(trigger.point);
                 let (name, unit) = point.map_or(("", ""), |point| (point.name.as_str(), point.unit.as_str()));

@@ -32,7 +32,7 @@ impl Asks {
     }
 
     /// Whether the order takes the hold of a free drive.
-    pub fn takes(self) -> bool {
+    pub fn takes_hold(self) -> bool {
         matches!(self, Asks::Run | Asks::Steer)
     }
 }

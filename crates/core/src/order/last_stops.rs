@@ -15,7 +15,7 @@ pub struct LastStops {
 impl LastStops {
     /// A stop was taken in.
     pub fn note(&mut self, connection: &Connection, at: Instant) {
-        let at = self.at().map_or(at, |last| last.max(at));
+        let at = self.time().map_or(at, |last| last.max(at));
         match &mut self.last {
             Some((last, since)) if last == connection => *since = at,
             last => self.of_another = last.replace((connection.clone(), at)),
@@ -23,7 +23,7 @@ impl LastStops {
     }
 
     /// When the last stop was accepted.
-    pub fn at(&self) -> Option<Instant> {
+    pub fn time(&self) -> Option<Instant> {
         self.last.as_ref().map(|(_, at)| *at)
     }
 

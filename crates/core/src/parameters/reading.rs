@@ -284,7 +284,7 @@ impl Reading {
             let id = Id::new(&list.id(*address)?);
             let label = names
                 .get(&id)
-                .or_else(|| list.at(*address).map(|parameter| &parameter.label));
+                .or_else(|| list.by_address(*address).map(|parameter| &parameter.label));
             let note = label.map_or(String::new(), |label| note(label, value.as_ref().ok().copied()));
             let value = value.clone();
             Some((id, Entry { value, note }))
@@ -318,7 +318,14 @@ impl ParameterFile {
     #[must_use]
     pub fn named(mut self, profile: &Profile, names: &Names) -> ParameterFile {
         for (id, entry) in &mut self.values {
-            let own = || Some(&profile.parameters.at(profile.parameters.address(id.name())?)?.label);
+            let own = || {
+                Some(
+                    &profile
+                        .parameters
+                        .by_address(profile.parameters.address(id.name())?)?
+                        .label,
+                )
+            };
             if let Some(label) = names.get(id).or_else(own) {
                 entry.note = note(label, entry.value.as_ref().ok().copied());
             }

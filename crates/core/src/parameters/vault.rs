@@ -10,7 +10,7 @@ use super::journal::JournalFile;
 use super::names::Names;
 use super::plan::Plan;
 use super::store::Store;
-use crate::process_image::{Hold, Machine};
+use crate::process_image::{Machine, RestoreLock};
 
 /// How far the reading of a drive is.
 #[derive(Debug, Clone, PartialEq)]
@@ -81,7 +81,7 @@ impl RestoreStatus {
 struct State {
     numbered: u64,
     restores: BTreeMap<Machine, RestoreStatus>,
-    holds: BTreeMap<Machine, Arc<Hold>>,
+    restore_locks: BTreeMap<Machine, Arc<RestoreLock>>,
     /// Machines whose journal was searched for.
     looked_for: BTreeSet<Machine>,
     /// Journals without a drive that an event has reported.
@@ -204,9 +204,9 @@ impl Vault {
         }
     }
 
-    /// The hold of that drive, the same for any configuration.
-    pub fn hold(&self, drive: &Machine) -> Arc<Hold> {
-        self.lock().holds.entry(drive.clone()).or_default().clone()
+    /// The restore lock of that drive, the same for any configuration.
+    pub fn restore_lock(&self, drive: &Machine) -> Arc<RestoreLock> {
+        self.lock().restore_locks.entry(drive.clone()).or_default().clone()
     }
 
     /// Path of the journal of a restore that begins, by the name of the drive; `None` without a store.

@@ -12,7 +12,7 @@ use crate::drive::{Derived, ModelPoint, Point, PointIndex, Source, Value};
 use crate::order::{
     Admitted, Authority, Becomes, FrequencyRange, Order, ParameterOrder, Refusal, Urgency, as_held, becomes, rests_on,
 };
-use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
+use crate::process_image::{Access, DriveSpec, ParamsAccess, Reading, RestoreLock};
 
 /// Values of an enumeration that a refusal names.
 const MOST_TEXTS: usize = 12;
@@ -66,7 +66,7 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
 fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal> {
     let (spec, id) = (drive.spec, &order.id);
     may_restore(spec).map_err(Refusal::NotAllowed)?;
-    if drive.hold.and_then(Hold::why).is_none() {
+    if drive.restore_lock.and_then(RestoreLock::reason).is_none() {
         return Err(Refusal::NotAllowed(format!(
             "parameter {id} of `{}` can only be written by a restore; nothing was written",
             spec.name

@@ -259,7 +259,7 @@ impl Gate {
     /// Whether a stop waits until its motor has run for `min_run`.
     pub(crate) fn may_be_delayed(&self, stop: &Command) -> bool {
         let (drive, origin) = (stop.intent.drive, stop.ticket.origin());
-        let last = self.drives.get(&drive).and_then(|drive| drive.last_stops.at());
+        let last = self.drives.get(&drive).and_then(|drive| drive.last_stops.time());
         let starts = self.starts.as_ref().filter(|_| origin.kind.stops_may_be_delayed());
         starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
     }

@@ -24,7 +24,7 @@ mod rules;
 pub use admit::{admit, authority, converted, may_restore, sets_twice};
 pub use gate::{DrillLock, Gate, Unheld};
 pub use holder::{
-    Claim, Denial, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Told, Verb, What,
+    Claim, Denial, HoldChange, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Verb, What,
 };
 pub use judge::{Ask, Facts, Seen, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};

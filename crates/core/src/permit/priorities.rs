@@ -167,7 +167,7 @@ impl Priorities {
     }
 
     /// The entry in a slot.
-    pub fn stands(&self, what: Commanded, priority: u8) -> Option<&Entry> {
+    pub fn entry(&self, what: Commanded, priority: u8) -> Option<&Entry> {
         self.slot(what, priority)?.stands.as_ref()
     }
 
@@ -407,7 +407,7 @@ impl Priorities {
 
     /// The entries that survive a restart: inactives of `run` that protect people.
     pub fn kept(&self) -> impl Iterator<Item = (u8, &Entry)> {
-        let standing = |priority: u8| Some((priority, self.stands(Commanded::Run, priority)?));
+        let standing = |priority: u8| Some((priority, self.entry(Commanded::Run, priority)?));
         (1..=PROTECTING)
             .filter_map(standing)
             .filter(|(_, entry)| !entry.value.as_bool())

@@ -8,7 +8,7 @@ use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
 use crate::order::{Asks, Authority, Command, Origin, Refusal};
 use crate::permit::{
-    self, Claim, HoldState, HoldView, KeptReservation, Rules, Stage, Told, Unheld, Verb, What, client_access,
+    self, Claim, HoldChange, HoldState, HoldView, KeptReservation, Rules, Stage, Unheld, Verb, What, client_access,
 };
 
 impl BusHandle {
@@ -18,12 +18,12 @@ impl BusHandle {
     }
 
     /// Publishes the changes of the holds of its drives.
-    pub fn tell_holds(&self, events: &Events, now: Instant, time: SystemTime) {
+    pub fn publish_holds(&self, events: &Events, now: Instant, time: SystemTime) {
         if !self.queue.has_authority() {
             return;
         }
         let mut queue = self.queue.lock();
-        let told = queue.gate.take_told(now);
+        let told = queue.gate.take_changes(now);
         let unheld = queue.gate.take_unheld();
         let rules = queue.gate.rules().cloned();
         drop(queue);
@@ -67,7 +67,7 @@ impl BusHandle {
                 self.queue.lock().gate.hold_ends(index, why);
             }
         }
-        self.tell_holds(events, now, time);
+        self.publish_holds(events, now, time);
     }
 
     /// Whether a command whose turn came renews the lease of its drive.
@@ -119,7 +119,7 @@ impl DriveHandle {
     fn act(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
         permit::authority(&self.reading(now), authority)?;
         client_access(Stage::Accept, false, origin, &self.image.spec.bus)?;
-        if let (Some(why), Verb::Take | Verb::Break) = (self.image.hold.why(), verb) {
+        if let (Some(why), Verb::Take | Verb::Break) = (self.image.restore_lock.reason(), verb) {
             return Err(Refusal::NotAllowed(why.to_string()));
         }
         let mut queue = self.bus.queue.lock();
@@ -242,15 +242,15 @@ impl Plant {
 
     /// Publishes what happened to the holds of the drives until `now`, which is `time` on the calendar; to be called several times a
     /// second.
-    pub fn tell_holds(&self, now: Instant, time: SystemTime) {
+    pub fn publish_holds(&self, now: Instant, time: SystemTime) {
         self.buses
             .iter()
-            .for_each(|bus| bus.tell_holds(&self.events, now, time));
+            .for_each(|bus| bus.publish_holds(&self.events, now, time));
     }
 }
 
 /// The event for a change of a hold.
-fn words(told: &Told, rules: &Rules) -> (EventKind, String) {
+fn words(told: &HoldChange, rules: &Rules) -> (EventKind, String) {
     let named = |claim: &Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
     let who = named(&told.who);
     match &told.what {

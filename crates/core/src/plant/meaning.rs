@@ -79,7 +79,7 @@ impl Formerly {
     }
 
     /// The meaning at `asked` of the name or unit of the drive; the first change after that time has it.
-    fn at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
+    fn meaning_at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
         let all = self.lock();
         let mut of_drive = all.get(&drive)?.iter();
         of_drive
@@ -154,7 +154,7 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
 impl DriveHandle {
     /// The machine that an order of this kind meant when it arrived, if its name means another machine by now.
     pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
-        let former = self.bus.formerly.at(self.index, By::of(kind)?, arrival.asked)?;
+        let former = self.bus.formerly.meaning_at(self.index, By::of(kind)?, arrival.asked)?;
         let there = former.machine.and_then(|served| {
             let bus = BusHandle {
                 image: served.image.upgrade()?,

@@ -317,7 +317,7 @@ impl DriveHandle {
                 let (origin, stops) = (command.ticket.origin().clone(), command.is_stop());
                 let facts = self.bus.at_accept(self.stale_after, now);
                 let refusal = self.bus.queue.submit(command, &facts, now);
-                self.tell_refused(&what, refusal, &origin, now);
+                self.report_refusal(&what, refusal, &origin, now);
                 if stops {
                     self.events.pauses().note_stop();
                 }
@@ -374,13 +374,13 @@ impl DriveHandle {
                     set.behind = Some(end);
                 }
                 let [of_stop_refused, of_rest] = self.bus.queue.submit_parts(stop, rest, &facts, now);
-                self.tell_refused(&of_stop, of_stop_refused, &request.origin, now);
-                self.tell_refused(what, of_rest, &request.origin, now);
+                self.report_refusal(&of_stop, of_stop_refused, &request.origin, now);
+                self.report_refusal(what, of_rest, &request.origin, now);
             }
             Err(unsent) => {
                 let (ticket, outcome) = *unsent;
                 let refused = self.bus.queue.submit(stop, &facts, now);
-                self.tell_refused(&of_stop, refused, &request.origin, now);
+                self.report_refusal(&of_stop, refused, &request.origin, now);
                 self.turn_away(ticket, what, outcome, true, now);
             }
         }
@@ -461,7 +461,7 @@ impl DriveHandle {
     }
 
     /// Publishes the refusal of a command that the gate refused and answered.
-    fn tell_refused(&self, what: &str, refusal: Option<Refusal>, origin: &Origin, now: Instant) {
+    fn report_refusal(&self, what: &str, refusal: Option<Refusal>, origin: &Origin, now: Instant) {
         if let Some(refusal) = refusal {
             self.publish_refusal(what, &refusal, origin, now);
         }

@@ -79,7 +79,7 @@ mod tests {
         let all = &*queue.gate.priorities(crate::drive::DriveIndex::new(0));
         let stand = |what| {
             (1..=16)
-                .filter(move |priority| all.stands(what, *priority).is_some())
+                .filter(move |priority| all.entry(what, *priority).is_some())
                 .map(move |p| (what, p))
         };
         let left = Commanded::ALL.into_iter().flat_map(stand).collect();

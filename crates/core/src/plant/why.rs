@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 use crate::order::{AuditRecord, CONFIRMED, Guarded, Origin, Reason, SourceKind, WriteStats};
-use crate::process_image::{Access, BusImage, Hold, Link, Reading};
+use crate::process_image::{Access, BusImage, Link, Reading, RestoreLock};
 
 /// Whether the drive of `reading`, on that bus, runs, and why not.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
@@ -18,7 +18,10 @@ pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Ex
         contact: contact(reading, bus),
         read_at: reading.snapshot.fast_at,
         is_commandable: spec.access == Access::Control,
-        held: reading.hold.and_then(Hold::why).map(|why| why.to_string()),
+        held: reading
+            .restore_lock
+            .and_then(RestoreLock::reason)
+            .map(|why| why.to_string()),
         order: &order,
     };
     why::explain(&spec.profile, &|point| reading.sample(point), &situation)

@@ -14,7 +14,7 @@ mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
 pub use reading::Reading;
-pub use restore_lock::Hold;
+pub use restore_lock::RestoreLock;
 pub use snapshot::{Cadence, Link, Snapshot, Unavailable};
 pub use standstill::Standstill;
 pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
@@ -44,7 +44,7 @@ pub struct DriveImage {
     /// The requests that read the drive.
     pub plan: Plan,
     /// Why the drive accepts only stops, if so.
-    pub hold: Arc<Hold>,
+    pub restore_lock: Arc<RestoreLock>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
     /// Process data of a line that cannot be faster is not stale before that age, ns; a reload may change it.
@@ -77,7 +77,7 @@ impl DriveImage {
         DriveImage {
             spec,
             plan,
-            hold: Arc::default(),
+            restore_lock: Arc::default(),
             slow_cycle,
             stale_floor: AtomicU64::new(0),
             snapshot,
@@ -95,10 +95,10 @@ impl DriveImage {
         }
     }
 
-    /// Uses the hold of an earlier image of the drive.
+    /// Uses the restore lock of an earlier image of the drive.
     #[must_use]
-    pub fn with_hold(self, hold: Arc<Hold>) -> DriveImage {
-        DriveImage { hold, ..self }
+    pub fn with_restore_lock(self, restore_lock: Arc<RestoreLock>) -> DriveImage {
+        DriveImage { restore_lock, ..self }
     }
 
     /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
@@ -174,7 +174,8 @@ impl DriveImage {
     /// A view of the drive for a reader at `now`.
     pub fn reading(&self, now: Instant, stale_after: Duration) -> Reading<'_> {
         let stale_after = stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed)));
-        Reading::new(&self.spec, self.snapshot(), now, stale_after, self.slow_cycle).held(&self.hold)
+        Reading::new(&self.spec, self.snapshot(), now, stale_after, self.slow_cycle)
+            .with_restore_lock(&self.restore_lock)
     }
 
     /// Counts a transaction.

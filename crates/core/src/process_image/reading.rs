@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::snapshot::{Cell, Snapshot, Unavailable};
-use super::{DriveSpec, Hold};
+use super::{DriveSpec, RestoreLock};
 use crate::codec::Table;
 use crate::drive::model::Kind;
 use crate::drive::profile::MOST_REGISTERS;
@@ -19,7 +19,7 @@ pub struct Reading<'d> {
     /// Configuration of the drive.
     pub spec: &'d DriveSpec,
     /// Why the drive accepts only stops, if so; none for a past state.
-    pub hold: Option<&'d Hold>,
+    pub restore_lock: Option<&'d RestoreLock>,
     /// The snapshot.
     pub snapshot: Arc<Snapshot>,
     /// Time of the reading.
@@ -49,7 +49,7 @@ impl<'d> Reading<'d> {
         let limits = [stale_after, stale_after + 2 * slow_cycle];
         Reading {
             spec,
-            hold: None,
+            restore_lock: None,
             snapshot,
             now,
             stale_after,
@@ -59,9 +59,9 @@ impl<'d> Reading<'d> {
     }
 
     /// The reading of a drive that accepts only stops while `hold` is set.
-    pub fn held(self, hold: &'d Hold) -> Reading<'d> {
+    pub fn with_restore_lock(self, hold: &'d RestoreLock) -> Reading<'d> {
         Reading {
-            hold: Some(hold),
+            restore_lock: Some(hold),
             ..self
         }
     }

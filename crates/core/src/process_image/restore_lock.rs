@@ -4,19 +4,19 @@ use std::sync::Arc;
 
 use arc_swap::ArcSwapOption;
 
-/// Set while the parameters of a drive are being restored, or were left half restored. A drive keeps the same hold under
+/// Set while the parameters of a drive are being restored, or were left half restored. A drive keeps the same lock under
 /// every image that a reload gives it.
 #[derive(Debug, Default)]
-pub struct Hold(ArcSwapOption<String>);
+pub struct RestoreLock(ArcSwapOption<String>);
 
-impl Hold {
+impl RestoreLock {
     /// From now on the drive takes no commands but stops, for the reason given; or all again.
     pub fn set(&self, why: Option<String>) {
         self.0.store(why.map(Arc::new));
     }
 
     /// Why the drive accepts only stops, and what ends that; `None` if it accepts all commands.
-    pub fn why(&self) -> Option<Arc<String>> {
+    pub fn reason(&self) -> Option<Arc<String>> {
         self.0.load_full()
     }
 }

@@ -147,21 +147,21 @@ impl Tape {
     }
 
     /// Whether the tape records this kind.
-    pub fn takes(&self, taping: Taping) -> bool {
+    pub fn records(&self, taping: Taping) -> bool {
         self.taping.load(Ordering::Relaxed) >= taping as u8
     }
 
     /// Records a read of the drive with this index. `read` is only called while someone takes the entries. Only the bus
     /// itself may call this.
     pub fn read(&self, drive: DriveIndex, read: impl FnOnce() -> TapedRead) {
-        if self.takes(Taping::Reads) {
+        if self.records(Taping::Reads) {
             self.append(Taped::Read(drive, read()));
         }
     }
 
     /// Records a frame on the line, to be read by [`Tape::read`].
     pub fn frame(&self, frame: impl FnOnce() -> TapedFrame) {
-        if self.takes(Taping::Everything) {
+        if self.records(Taping::Everything) {
             self.append(Taped::Frame(frame()));
         }
     }

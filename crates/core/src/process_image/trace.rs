@@ -51,13 +51,13 @@ impl Default for Trace {
 
 impl Trace {
     /// Whether someone listens.
-    pub fn wanted(&self) -> bool {
+    pub fn has_listener(&self) -> bool {
         self.0.receiver_count() > 0
     }
 
     /// Publishes a frame to the listeners; the record is only built when there are any.
     pub fn publish(&self, record: impl FnOnce() -> FrameRecord) {
-        if self.wanted() {
+        if self.has_listener() {
             // The last subscriber may be gone meanwhile, which is not an error.
             let _ = self.0.send(Arc::new(record()));
         }

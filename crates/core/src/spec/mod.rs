@@ -41,7 +41,7 @@ pub enum LeaseAction {
     /// Stop the drive.
     Stop,
     /// An expired lease only raises the event.
-    Hold,
+    LeaveRunning,
     /// Set the speed reference, percent.
     SpeedReference(f64),
 }
@@ -62,7 +62,7 @@ pub struct Supervision {
 pub enum OnShutdown {
     /// At shutdown nothing is written.
     #[default]
-    Hold,
+    LeaveRunning,
     /// At shutdown the stop is written and its acknowledgement awaited.
     Stop,
 }
@@ -139,7 +139,7 @@ pub struct PointTrigger {
     pub point: PointIndex,
     pub limit: TriggerLimit,
     /// Time for which the condition must hold without interruption.
-    pub hold: Duration,
+    pub lasts: Duration,
 }
 
 /// The side of a limit that triggers.
@@ -232,7 +232,7 @@ impl DriveSpec {
             access: Access::Monitor,
             limits: BTreeMap::new(),
             supervision: None,
-            on_shutdown: OnShutdown::Hold,
+            on_shutdown: OnShutdown::LeaveRunning,
             frequency_range: None,
             triggers: Vec::new(),
             raw_writes: RawWrites::Points,
@@ -243,7 +243,7 @@ impl DriveSpec {
     }
 
     /// Whether starts of the drive count: for itself or for others.
-    pub fn is_guarded(&self) -> bool {
+    pub fn counts_starts(&self) -> bool {
         self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
     }
 

@@ -40,7 +40,7 @@ struct Beat {
 
 impl Heartbeat {
     /// The thread runs at `now`.
-    pub fn ran(&self, now: Instant) {
+    pub fn note_run(&self, now: Instant) {
         self.0.ran.store(self.since_base(now), Ordering::Relaxed);
     }
 
@@ -142,7 +142,7 @@ mod tests {
         assert!(!pauses.is_deaf(now + SECOND), "there is none");
         let (one, other) = (pauses.reader(now), pauses.reader(now));
         assert!(!pauses.is_deaf(now + UNNOTICED));
-        one.ran(now + SECOND);
+        one.note_run(now + SECOND);
         assert_eq!(one.last(), now + SECOND);
         assert!(pauses.is_deaf(now + SECOND), "the other one does not run");
         drop(other);

@@ -93,7 +93,7 @@ impl Guards {
     }
 
     /// Notes that something changed that must be written to disk.
-    pub(super) fn tell_change(&self) {
+    pub(super) fn notify_change(&self) {
         self.changed.notify_one();
     }
 
@@ -120,7 +120,7 @@ impl Guards {
             failed: None,
         };
         drop(ledger);
-        self.tell_change();
+        self.notify_change();
     }
 
     /// The state to save, with its generation; `None` if it is saved already, or failed.

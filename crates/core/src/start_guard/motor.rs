@@ -349,7 +349,7 @@ impl Motor {
     }
 
     /// No reading shows whether the motor runs; it is taken to stand from now on.
-    pub(super) fn begin_untold(&mut self, now: Instant) {
+    pub(super) fn begin_unreported(&mut self, now: Instant) {
         if self.running.is_none() {
             self.stands_since.get_or_insert(now);
         }

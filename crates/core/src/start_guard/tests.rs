@@ -74,7 +74,7 @@ impl GuardedDrives {
         // Words of the image: the status word (running, or at zero speed), and the output frequency.
         let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
         read(image, 2100, &words, at);
-        self.guards.look(DriveIndex::new(drive), &image.reading(at, SECOND));
+        self.guards.update(DriveIndex::new(drive), &image.reading(at, SECOND));
     }
 
     fn refused(&self, drive: usize, seconds: f64) -> Option<&'static str> {
@@ -288,7 +288,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     // While the drive was away, its motor may have run.
     rig.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
     rig.guards
-        .look(DriveIndex::new(0), &rig.images[0].reading(rig.at(180.0), SECOND));
+        .update(DriveIndex::new(0), &rig.images[0].reading(rig.at(180.0), SECOND));
     assert_eq!(rig.refused(0, 180.0), Some("min_off"));
     rig.read(0, false, 190.0);
     assert_eq!((rig.refused(0, 219.0), rig.refused(0, 220.0)), (Some("min_off"), None));

@@ -53,7 +53,7 @@ impl BusGuards {
         drives: impl IntoIterator<Item = &'d DriveSpec>,
     ) -> Option<Arc<BusGuards>> {
         let drives = drives.into_iter().map(|drive| {
-            if !drive.is_guarded() {
+            if !drive.counts_starts() {
                 return None;
             }
             let profile = &drive.profile;
@@ -230,7 +230,7 @@ impl BusGuards {
             }
         }
         if changed {
-            self.shared.tell_change();
+            self.shared.notify_change();
         }
         let mut clearance = Clearance::Go;
         for of in &started {
@@ -269,7 +269,7 @@ impl BusGuards {
     pub fn start_written(&self, drive: DriveIndex, number: u64, client: &Arc<str>, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().start_written(&of.machine, number, client, now);
-            self.shared.tell_change();
+            self.shared.notify_change();
         }
     }
 
@@ -298,7 +298,7 @@ impl BusGuards {
     }
 
     /// Updates the state of the drive.
-    pub fn look(&self, drive: DriveIndex, reading: &Reading<'_>) {
+    pub fn update(&self, drive: DriveIndex, reading: &Reading<'_>) {
         let Some(of) = self.of_drive(drive) else { return };
         let seen = seen(reading);
         let is_away = matches!(reading.snapshot.link, Link::Offline(_));
@@ -308,7 +308,7 @@ impl BusGuards {
             None => {
                 ledger.with(&of.machine, |motor| match is_away {
                     true => motor.away(),
-                    false if !of.tells_running => motor.begin_untold(reading.now),
+                    false if !of.tells_running => motor.begin_unreported(reading.now),
                     false => motor.unseen(),
                 });
                 false
@@ -316,7 +316,7 @@ impl BusGuards {
         };
         drop(ledger);
         if started {
-            self.shared.tell_change();
+            self.shared.notify_change();
         }
     }
 

@@ -154,9 +154,9 @@ impl StopAll {
 
     /// Looks the result of the stops, commands those again that failed, and answers what is done. Whether a command is
     /// still in progress.
-    pub fn look(&self, plant: &Plant, now: Instant) -> bool {
+    pub fn advance(&self, plant: &Plant, now: Instant) -> bool {
         let mut state = self.state();
-        state.look(plant, now);
+        state.advance(plant, now);
         !state.orders.is_empty()
     }
 
@@ -198,11 +198,11 @@ impl State {
         }
     }
 
-    fn look(&mut self, plant: &Plant, now: Instant) {
+    fn advance(&mut self, plant: &Plant, now: Instant) {
         let mut cx = Context::from_waker(Waker::noop());
         self.broadcasts
             .retain_mut(|(exchange, until)| exchange.poll(&mut cx).is_pending() && now < *until);
-        self.stops.iter_mut().for_each(|stop| stop.look(plant, now));
+        self.stops.iter_mut().for_each(|stop| stop.advance(plant, now));
         for mut order in std::mem::take(&mut self.orders) {
             let concerned = || self.stops.iter().filter(|stop| order.machines.contains(&stop.machine));
             let is_answered = concerned().all(|stop| stop.is_acknowledged() || stop.has_failed());

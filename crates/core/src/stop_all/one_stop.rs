@@ -113,7 +113,7 @@ impl OneStop {
     }
 
     /// Whether a read since shows that the motor stands.
-    pub(crate) fn stands(&self, plant: &Plant, now: Instant) -> bool {
+    pub(crate) fn motor_stands(&self, plant: &Plant, now: Instant) -> bool {
         self.outcome(plant, now).outcome == Stopped::Standing
     }
 
@@ -123,7 +123,7 @@ impl OneStop {
     }
 
     /// Looks the result, and places it again where it failed. A reload may have put the drive elsewhere.
-    pub(crate) fn look(&mut self, plant: &Plant, now: Instant) {
+    pub(crate) fn advance(&mut self, plant: &Plant, now: Instant) {
         match &mut self.step {
             Step::Placed(placed) => {
                 let accepted = placed.accepted();

@@ -79,10 +79,10 @@ fn second_order(then: impl Fn(&Plant, &StopAll, Instant)) -> (Plant, usize) {
     order(&origin, now).unwrap();
     let stop = crate::testkit::take_next(&plant.buses[0].queue, now).unwrap();
     stop.answer(&crate::order::Outcome::Acknowledged(crate::codec::Reply::Written), now);
-    assert!(all.look(&plant, now));
+    assert!(all.advance(&plant, now));
     then(&plant, &all, now);
     let later = now + Duration::from_millis(900);
-    all.look(&plant, later);
+    all.advance(&plant, later);
     let bob = Origin::new(SourceKind::Http, "bob");
     order(&bob, later).unwrap();
     let placed = plant.buses[0].queue.lock().len();
@@ -116,7 +116,7 @@ fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
     let (_, placed) = second_order(|plant, all, now| {
         // The motor stood, and turns.
         read(plant, after(now, 200), 0x41, 0);
-        all.look(plant, after(now, 250));
+        all.advance(plant, after(now, 250));
         read(plant, after(now, 500), 0x03, 0);
     });
     assert_eq!(placed, 1, "somebody at the drive started it");
@@ -155,8 +155,8 @@ fn orders_without_end_are_all_answered() {
     let answered: Vec<StopReport> = answered.collect();
     assert_eq!(answered.len(), 10, "the oldest");
     assert!(answered.iter().all(|report| !report.ok && report.drives.len() == 2));
-    assert!(all.look(&plant, now));
-    assert!(!all.look(&plant, now + WAIT));
+    assert!(all.advance(&plant, now));
+    assert!(!all.advance(&plant, now + WAIT));
     let left = orders.iter_mut().filter_map(|order| order.report.try_recv().ok());
     assert_eq!(left.count(), MOST_ORDERS);
 }

@@ -333,7 +333,7 @@ fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTr
     Some(PointTrigger {
         point,
         limit: limit?,
-        hold,
+        lasts: hold,
     })
 }
 
@@ -527,7 +527,7 @@ fn read_action(table: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -
 
 fn check_action(action: &LeaseAction, profile: &Profile, limits: &Limits) -> Result<(), Finding> {
     let needed = match action {
-        LeaseAction::Hold => return Ok(()),
+        LeaseAction::LeaveRunning => return Ok(()),
         LeaseAction::Stop => ModelPoint::Run,
         LeaseAction::SpeedReference(_) => ModelPoint::SpeedReference,
     };

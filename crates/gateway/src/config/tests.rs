@@ -219,7 +219,7 @@ sparkplug = { group = "plant", primary_host = "scada" }
     assert_eq!(drive.frequency_range, Some(10.0..=50.0));
     let lease = crate::process_image::Supervision {
         timeout: Duration::from_secs(5),
-        action: crate::process_image::LeaseAction::Hold,
+        action: crate::process_image::LeaseAction::LeaveRunning,
         adopt: true,
     };
     assert_eq!(drive.supervision, Some(lease));
@@ -409,7 +409,7 @@ fn the_recorder_keeps_its_files_in_the_state_directory() {
     assert_eq!((all.recordings.max_bytes, all.recordings.max_count), (256 << 20, 200));
     let trigger = &all.buses[0].drives[0].triggers[0];
     assert_eq!(trigger.limit, TriggerLimit::Above(120.0));
-    assert_eq!(trigger.hold, Duration::ZERO);
+    assert_eq!(trigger.lasts, Duration::ZERO);
     let elsewhere = settings("[gateway]\nname = \"g\"\nstate_dir = \"/srv\"\n[recordings]\nmax_count = 0\n");
     assert_eq!(
         (elsewhere.recordings.max_count, elsewhere.state_dir.as_path()),
@@ -511,7 +511,7 @@ fn guards_and_interlocks_of_a_drive() {
         &format!("{control}group = \"wet\"\nguard = {{ stagger = \"5s\" }}"),
         "",
     ));
-    assert!(!alone.buses[0].drives[1].is_guarded());
+    assert!(!alone.buses[0].drives[1].counts_starts());
     for (pump, says) in [
         ("guard = { min_off = \"1s\" }", "the drive is only monitored"),
         (

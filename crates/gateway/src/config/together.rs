@@ -281,7 +281,7 @@ fn warn_of_refreshes(reader: &Reader<'_>, buses: &[bus::Found]) {
                     format!("{remedy}, or switch that timeout off, or let it count any request, if the drive can"),
                 );
             }
-            (Some(_), Some(supervision)) if supervision.action == LeaseAction::Hold => reader.document().warning(
+            (Some(_), Some(supervision)) if supervision.action == LeaseAction::LeaveRunning => reader.document().warning(
                 place,
                 format!(
                     "{key} of drive `{name}` ends when its lease expires, and then the drive acts by its own timeout: action = \

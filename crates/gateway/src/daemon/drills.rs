@@ -67,8 +67,8 @@ pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -
             // The end of the wait by time or by a signal is a reason to look.
             let _ = tokio::time::timeout(IDLE, drills.begun()).await;
             loop {
-                let goes_on = drills.look(&plant.load(), Instant::now(), SystemTime::now());
-                writer.look(&drills, &file).await;
+                let goes_on = drills.advance(&plant.load(), Instant::now(), SystemTime::now());
+                writer.advance(&drills, &file).await;
                 if !goes_on && writer.writing.is_none() {
                     break;
                 }
@@ -90,7 +90,7 @@ struct Writer {
 
 impl Writer {
     /// Takes the result of a write that is done, and begins the next one that is due.
-    async fn look(&mut self, drills: &Drills, file: &DrillsFile) {
+    async fn advance(&mut self, drills: &Drills, file: &DrillsFile) {
         if let Some(writing) = self.writing.take_if(|writing| writing.is_finished()) {
             match writing.await {
                 Ok((generation, Ok(()))) => {
@@ -148,7 +148,7 @@ pub(super) async fn end(
     // The drill may have ended meanwhile, so an error is ignored.
     let _ = drills.abort(&report.id, &who, Instant::now(), SystemTime::now());
     let until = Instant::now() + LAST_STOP;
-    while Instant::now() < until && drills.look(&plant.load(), Instant::now(), SystemTime::now()) {
+    while Instant::now() < until && drills.advance(&plant.load(), Instant::now(), SystemTime::now()) {
         tokio::time::sleep(LOOK).await;
     }
     let ended = drills

@@ -131,7 +131,7 @@ mod tests {
             }),
             http: Some(http::Options {
                 max_connections: http,
-                ..http::Options::at(([127, 0, 0, 1], 9488).into())
+                ..http::Options::listening_on(([127, 0, 0, 1], 9488).into())
             }),
         }
     }

@@ -82,7 +82,7 @@ fn word(word: &str) -> Option<Finding> {
 mod tests {
     use super::*;
 
-    fn told(source: &str, line: usize) -> String {
+    fn message(source: &str, line: usize) -> String {
         named(source, Some(line)).map_or(String::new(), |found| format!("{}; {}", found.what, found.remedy))
     }
 
@@ -93,9 +93,9 @@ mod tests {
             ("# mine\n---\nbus:\n", "YAML"),
             ("bus:\n  - name: line1\n", "YAML"),
         ] {
-            assert!(told(source, 1).starts_with(&format!("the file looks like {format}; write TOML")));
+            assert!(message(source, 1).starts_with(&format!("the file looks like {format}; write TOML")));
         }
-        assert_eq!(told("[gateway]\nname = \"a: b\"\nx = = 1\n", 1), "");
+        assert_eq!(message("[gateway]\nname = \"a: b\"\nx = = 1\n", 1), "");
     }
 
     #[test]
@@ -115,7 +115,7 @@ mod tests {
             ("a = -1.5e3 true", "`-1.5e3 true` has no quotes; write \"-1.5e3 true\""),
             ("name = \"line1", ""),
         ] {
-            assert_eq!(told(&format!("x = 1\n{line}\n"), 2), wanted, "{line}");
+            assert_eq!(message(&format!("x = 1\n{line}\n"), 2), wanted, "{line}");
         }
     }
 }

@@ -145,7 +145,7 @@ impl Document {
             let named = mistakes::named(source, line);
             let found = named.unwrap_or_else(|| Finding::new(message, ""));
             let what = format!("not valid TOML: {}", found.what);
-            let problem = document.at(&place, Finding::new(what, found.remedy));
+            let problem = document.problem_at(&place, Finding::new(what, found.remedy));
             document.syntax.push(problem);
         }
         document
@@ -202,17 +202,17 @@ impl Document {
 
     /// Adds a problem.
     pub fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
-        let problem = self.at(place, Finding::new(what, remedy));
+        let problem = self.problem_at(place, Finding::new(what, remedy));
         self.problems.borrow_mut().push(problem);
     }
 
     /// Adds a warning: the document can be used, but part of it will not do what it seems to.
     pub fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
-        let warning = self.at(place, Finding::new(what, remedy));
+        let warning = self.problem_at(place, Finding::new(what, remedy));
         self.warnings.borrow_mut().push(warning);
     }
 
-    fn at(&self, place: &Place, finding: Finding) -> Problem {
+    fn problem_at(&self, place: &Place, finding: Finding) -> Problem {
         Problem {
             file: place.env.clone().unwrap_or_else(|| self.file.clone()),
             line: place.line,

@@ -22,7 +22,7 @@ impl Control {
     }
 
     /// Whether a command sets one of these bits at this place.
-    fn takes(&self, place: ControlItem, bits: u16) -> bool {
+    fn sets(&self, place: ControlItem, bits: u16) -> bool {
         self.settings()
             .any(|setting| setting.place.unwrap_or(self.at) == place && setting.mask & bits != 0)
     }
@@ -44,7 +44,7 @@ impl Profile {
             .chain([control.at]);
         places.any(|place| {
             let shares = match raw.form {
-                Form::Bit { bit, .. } if control.own_word == OwnWord::Kept => control.takes(place, 1u16 << bit.min(15)),
+                Form::Bit { bit, .. } if control.own_word == OwnWord::Kept => control.sets(place, 1u16 << bit.min(15)),
                 _ => true,
             };
             shares && raw.covers(place.table, place.address)

@@ -195,7 +195,7 @@ pub struct Reset {
     /// The bits to set, and to invert afterwards.
     pub setting: Setting,
     /// Time for which the bits are held.
-    pub hold: Duration,
+    pub pulse: Duration,
     /// Whether more than one source has it.
     pub verified: bool,
 }

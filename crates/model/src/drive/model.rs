@@ -317,6 +317,18 @@ model_points! {
 }
 
 impl ModelPoint {
+    /// The bits of the common status word (register 0x8000), bit 0 first.
+    pub const STATUS_WORD: [ModelPoint; 8] = [
+        ModelPoint::Ready,
+        ModelPoint::Running,
+        ModelPoint::Reversed,
+        ModelPoint::Fault,
+        ModelPoint::Warning,
+        ModelPoint::AtReference,
+        ModelPoint::ZeroSpeed,
+        ModelPoint::Remote,
+    ];
+
     /// The point of that name.
     pub(crate) fn from_name(name: &str) -> Option<ModelPoint> {
         ModelPoint::ALL.iter().copied().find(|p| p.name() == name)

@@ -92,7 +92,7 @@ const TOLERANCE: f64 = 1e-6;
 
 impl Parameter {
     /// Whether the drive takes the value, as far as its family is known.
-    pub fn takes(&self, raw: RawValue) -> bool {
+    pub fn accepts(&self, raw: RawValue) -> bool {
         let scale = match raw {
             RawValue::Word(_) if self.label.scale > 0.0 => self.label.scale,
             RawValue::Word(_) | RawValue::Float(_) => 1.0,
@@ -224,14 +224,14 @@ impl ParameterList {
     }
 
     /// The parameter at an address, if its name is known.
-    pub fn at(&self, address: u16) -> Option<&Parameter> {
+    pub fn by_address(&self, address: u16) -> Option<&Parameter> {
         let index = self.named.binary_search_by_key(&address, |parameter| parameter.address);
         index.ok().and_then(|index| self.named.get(index))
     }
 
     /// The id in files of the parameter at an address.
     pub fn id(&self, address: u16) -> Option<String> {
-        if let Some(parameter) = self.at(address) {
+        if let Some(parameter) = self.by_address(address) {
             return Some(parameter.id.clone());
         }
         let span = self
@@ -293,10 +293,10 @@ mod tests {
             },
             range: Some(0.01..=10.0),
         };
-        let takes = |parameter: &Parameter, words: [u16; 4]| words.map(|word| parameter.takes(RawValue::Word(word)));
+        let takes = |parameter: &Parameter, words: [u16; 4]| words.map(|word| parameter.accepts(RawValue::Word(word)));
         assert_eq!(takes(&parameter, [0, 1, 1000, 1001]), [false, true, true, false]);
         let floats = [0.009f32, 0.01, 10.0, 10.01];
-        let taken = floats.map(|value| parameter.takes(RawValue::Float(value.to_bits())));
+        let taken = floats.map(|value| parameter.accepts(RawValue::Float(value.to_bits())));
         assert_eq!(taken, [false, true, true, false]);
         parameter.label.scale = 0.0;
         assert_eq!(

@@ -43,14 +43,6 @@ impl PlannedRead {
 
 /// The points that decide the drive's state.
 const DECIDING: [ModelPoint; 3] = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
-/// The other bits of the status word (register 0x8000).
-const STATUS_BITS: [ModelPoint; 5] = [
-    ModelPoint::Reversed,
-    ModelPoint::Warning,
-    ModelPoint::AtReference,
-    ModelPoint::ZeroSpeed,
-    ModelPoint::Remote,
-];
 
 /// All requests to one drive, the fast ones first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -121,7 +113,11 @@ impl Plan {
             behind_status_word: Vec::new(),
         };
         plan.behind_state = plan.behind(profile, &DECIDING, PollClass::Fast);
-        plan.behind_status_word = plan.behind(profile, &STATUS_BITS, PollClass::Slow);
+        let others: Vec<ModelPoint> = ModelPoint::STATUS_WORD
+            .into_iter()
+            .filter(|point| !DECIDING.contains(point))
+            .collect();
+        plan.behind_status_word = plan.behind(profile, &others, PollClass::Slow);
         let is_trial = |read: &&PlannedRead| {
             let range = profile.range(read.table, read.start);
             read.class == PollClass::Fast && range.is_some_and(|range| read.count > range.read)

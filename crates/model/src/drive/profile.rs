@@ -502,7 +502,7 @@ impl Profile {
             reverse: setting(ModelPoint::Reverse, true).map(within),
             fault_reset: reset.map(|setting| Reset {
                 setting,
-                hold: 2 * self.update_period,
+                pulse: 2 * self.update_period,
                 verified: true,
             }),
             restarts_on_reset: false,

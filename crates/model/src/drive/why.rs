@@ -175,7 +175,7 @@ pub struct Situation<'s> {
 
 /// Why the drive does not run; `sample` has its points, by their index in the profile.
 pub fn explain(profile: &Profile, sample: &dyn Fn(PointIndex) -> Sample, situation: &Situation<'_>) -> Explanation {
-    let look = Look {
+    let look = Examination {
         profile,
         sample,
         situation,
@@ -215,13 +215,13 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(PointIndex) -> Sample, situati
     }
 }
 
-struct Look<'l> {
+struct Examination<'l> {
     profile: &'l Profile,
     sample: &'l dyn Fn(PointIndex) -> Sample,
     situation: &'l Situation<'l>,
 }
 
-impl Look<'_> {
+impl Examination<'_> {
     fn age(&self, at: Option<Instant>) -> Option<u64> {
         let age = self.situation.now.saturating_duration_since(at?);
         Some(u64::try_from(age.as_millis()).unwrap_or(u64::MAX))

@@ -93,7 +93,7 @@ impl Desk {
 
     /// Announces the devices with I-Am.
     pub(super) fn start(&mut self, now: Instant) {
-        self.view.look(now);
+        self.view.set_time(now);
         self.server.start(&self.view, now);
     }
 
@@ -120,7 +120,7 @@ impl Desk {
 
     /// A datagram arrived.
     pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
-        self.view.look(now);
+        self.view.set_time(now);
         self.server.receive(from, datagram, &self.view, now);
     }
 
@@ -142,13 +142,13 @@ impl Desk {
 
     /// Values of that device may have changed.
     pub(super) fn changed(&mut self, device: u32, now: Instant) {
-        self.view.look(now);
+        self.view.set_time(now);
         self.server.changed(device, &self.view, now);
     }
 
     /// Processes the writes of clients until one of them must wait for its drive.
     pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
-        self.view.look(now);
+        self.view.set_time(now);
         while let Some(job) = self.server.take_job() {
             let arrival = self.arrival(job.asked);
             match writes::begin(&self.view, &job, arrival, now) {
@@ -170,14 +170,14 @@ impl Desk {
                 self.uncertain.insert(device);
             }
         }
-        self.view.look(now);
+        self.view.set_time(now);
         let result = writes::error(&ended.outcome);
         self.server.written(ended.token, result, &self.view, now);
     }
 
     /// Does all that is due at `now`.
     pub(super) fn poll(&mut self, now: Instant) {
-        self.view.look(now);
+        self.view.set_time(now);
         self.note_leases();
         self.resolve_slots(now);
         self.announce(now);

@@ -65,7 +65,7 @@ pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], no
         let origin = Origin::of(Arc::from(slot.client.as_str()), SourceKind::Bacnet, slot.who.clone());
         let origin = origin.with_right(rights.of_name(&slot.who));
         drive.priorities(|all| {
-            if all.stands(Commanded::Run, slot.priority).is_none() {
+            if all.entry(Commanded::Run, slot.priority).is_none() {
                 all.restore(
                     Commanded::Run,
                     slot.priority,

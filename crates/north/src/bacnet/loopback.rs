@@ -14,19 +14,19 @@ use crate::plant::SharedPlant;
 
 /// A server without sockets. Time is an argument.
 #[derive(Debug)]
-pub struct Offline {
+pub struct Loopback {
     options: Arc<Options>,
     desk: Desk,
     waiting: Vec<(u64, Waiting)>,
 }
 
-impl Offline {
+impl Loopback {
     /// A server at the address of `options`, on a network with a mask of 8 bits.
-    pub fn new(options: Options, plant: SharedPlant, now: Instant) -> Offline {
+    pub fn new(options: Options, plant: SharedPlant, now: Instant) -> Loopback {
         let (options, at) = (Arc::new(options.clone()), (options.listen, 8));
         let mut desk = Desk::new(options.clone(), HostRights::new(&options), plant, at, now);
         desk.start(now);
-        Offline {
+        Loopback {
             options,
             desk,
             waiting: Vec::new(),

@@ -8,8 +8,8 @@ mod desk;
 pub mod ede;
 mod kept;
 pub mod listing;
+mod loopback;
 pub mod objects;
-mod offline;
 mod rights;
 mod sockets;
 mod task;
@@ -31,7 +31,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 pub use self::kept::discard as discard_kept_slots;
-pub use self::offline::Offline;
+pub use self::loopback::Loopback;
 
 use self::rights::HostRights;
 use self::sockets::Sockets;

@@ -12,7 +12,6 @@ use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
 use crate::order::Commanded;
 use crate::process_image::{Access, BusSpec, DriveSpec};
-use crate::register_map::STATUS_BITS;
 
 /// Analog inputs from 1 on.
 const ANALOG: [ModelPoint; 12] = [
@@ -202,7 +201,7 @@ fn model(spec: &DriveSpec, all: &mut Objects) {
         }
     }
     // Binary inputs from 1 on.
-    for (number, point) in (1..).zip(STATUS_BITS) {
+    for (number, point) in (1..).zip(ModelPoint::STATUS_WORD) {
         if let Some(index) = index(point) {
             let texts = (point.name(), describe(spec, index));
             let kind = binary(spec.profile.points.get(index));

@@ -129,11 +129,11 @@ impl Task {
                         self.take(&mut buffer, None);
                     }
                 }
-                place = heard(&self.sockets.broadcasts), if !self.retired => self.take(&mut buffer, Some(place)),
+                place = broadcast_received(&self.sockets.broadcasts), if !self.retired => self.take(&mut buffer, Some(place)),
                 Some(ended) = self.writes.next(), if waits => self.desk.ended(&ended, Instant::now()),
                 () = self.news.notified(), if subscribed && !due => due = true,
                 () = tokio::time::sleep_until(next_look.into()), if due => {
-                    self.look();
+                    self.report_changes();
                     (next_look, due) = (Instant::now() + LOOK, false);
                 }
             }
@@ -234,7 +234,7 @@ impl Task {
     }
 
     /// Reports changes of drives with subscriptions.
-    fn look(&mut self) {
+    fn report_changes(&mut self) {
         let now = Instant::now();
         let subscribed = self.desk.server.subscribed();
         let mut changed = BTreeSet::new();
@@ -405,7 +405,7 @@ fn waiting_reader() -> Reader {
 }
 
 /// Waits for a broadcast; returns the index of the socket that received one.
-async fn heard(sockets: &[UdpSocket]) -> usize {
+async fn broadcast_received(sockets: &[UdpSocket]) -> usize {
     std::future::poll_fn(|cx| {
         // Any error of the socket shows when the socket is read.
         let ready = sockets.iter().position(|socket| socket.poll_recv_ready(cx).is_ready());

@@ -77,7 +77,7 @@ impl ControlledDrive {
     /// Everything that is planned was read just now, each register that value.
     fn read(&self, word: u16) {
         read_all(&self.drive().image, self.now, |_| word);
-        self.view.look(self.now);
+        self.view.set_time(self.now);
     }
 
     fn place(&self, object: ObjectId) -> usize {

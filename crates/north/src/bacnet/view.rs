@@ -92,7 +92,7 @@ impl View {
         [self.gateway.device.clone()].into_iter().chain(drives).collect()
     }
 
-    pub(super) fn look(&self, now: Instant) {
+    pub(super) fn set_time(&self, now: Instant) {
         self.now.set((now, SystemTime::now()));
     }
 
@@ -367,7 +367,7 @@ impl Application for View {
             Commands {
                 slots: std::array::from_fn(|place| {
                     let priority = u8::try_from(place + 1).unwrap_or(u8::MAX);
-                    all.stands(what, priority).map(|entry| self.slot(entry))
+                    all.entry(what, priority).map(|entry| self.slot(entry))
                 }),
                 current: all.shown(what).map(|(priority, _)| priority),
                 default,

@@ -124,7 +124,7 @@ impl<'d> Drive<'d> {
             fault_text: reading.fault_text(),
             blocked_by: why.words(),
             why: why.causes,
-            held: image.hold.why().map(|why| why.to_string()),
+            held: image.restore_lock.reason().map(|why| why.to_string()),
             stop_waits_ms: drive.stop_waits(clock.now).map(millis),
             refreshing: image.is_refreshing(),
             hold: drive.hold_view(None, clock.now).map(|(view, _)| view.into()),

@@ -17,25 +17,25 @@ use super::routes;
 use crate::plant::SharedPlant;
 
 /// An HTTP server without its socket.
-pub struct Offline {
+pub struct Loopback {
     service: TowerToHyperService<Router>,
     runtime: Runtime,
     client: Client,
     reached: Reached,
 }
 
-impl fmt::Debug for Offline {
+impl fmt::Debug for Loopback {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("Offline")
+        f.write_str("Loopback")
     }
 }
 
-impl Offline {
+impl Loopback {
     /// A server of that plant.
     ///
     /// # Errors
     /// The system does not provide what a timer needs.
-    pub fn new(plant: SharedPlant) -> io::Result<Offline> {
+    pub fn new(plant: SharedPlant) -> io::Result<Loopback> {
         let router = routes::router(
             plant,
             Default::default(),
@@ -49,7 +49,7 @@ impl Offline {
             coverage: Coverage::Everything,
         };
         let runtime = Builder::new_current_thread().enable_time().build()?;
-        Ok(Offline {
+        Ok(Loopback {
             service,
             runtime,
             client,

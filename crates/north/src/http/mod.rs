@@ -14,8 +14,8 @@ mod hosts;
 mod in_use;
 mod limits;
 mod line;
+mod loopback;
 pub mod messages;
-mod offline;
 mod openapi;
 mod operating;
 mod options;
@@ -78,7 +78,7 @@ use crate::plant::{DriveHandle, SharedPlant};
 use crate::tcp_server::{TcpServer, TcpService};
 
 pub use self::credentials::{Credential, CredentialError, Credentials};
-pub use self::offline::Offline;
+pub use self::loopback::Loopback;
 pub use self::tokens::{Scope, Token, Tokens};
 pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, Users};
 

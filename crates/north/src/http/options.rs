@@ -27,7 +27,7 @@ pub struct Options {
 
 impl Options {
     /// Listens on that address, open to everyone, without TLS.
-    pub fn at(listen: SocketAddr) -> Options {
+    pub fn listening_on(listen: SocketAddr) -> Options {
         Options {
             listen,
             hosts: Vec::new(),

@@ -142,7 +142,7 @@ fn described() -> Api {
         .get(
             "/api/v1/drives/{name}/params/restore",
             Doc::object::<Restore>("Progress of the restore of parameters"),
-            operating::parameters::look,
+            operating::parameters::restore_progress,
         )
         .post(
             "/api/v1/drives/{name}/params/restore",

@@ -343,7 +343,7 @@ pub(super) fn read_parts(
 fn object_around(table: Table, address: u16) -> Option<(u16, u16)> {
     let (first, object) = [address, address.saturating_sub(1)]
         .into_iter()
-        .find_map(|first| Some((first, Object::at(table, first)?)))?;
+        .find_map(|first| Some((first, Object::containing(table, first)?)))?;
     let items = object.items();
     (address < first.checked_add(items)?).then_some((first, items))
 }

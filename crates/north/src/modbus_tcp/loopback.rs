@@ -16,9 +16,9 @@ use crate::order::Authority;
 use crate::plant::SharedPlant;
 use crate::reading::{Reader, Watch};
 
-/// A client of a server without sockets. Time is an argument of [`Offline::receive`].
+/// A client of a server without sockets. Time is an argument of [`Loopback::receive`].
 #[derive(Debug)]
-pub struct Offline {
+pub struct Loopback {
     dialogue: Dialogue,
     watch: Arc<Watch>,
     /// The reader, from the opening of the connection on.
@@ -28,7 +28,7 @@ pub struct Offline {
     closed: bool,
 }
 
-impl Offline {
+impl Loopback {
     /// A client at `peer` that sees the whole plant. Of the options only `uncached` is used.
     pub fn new(
         options: Options,
@@ -36,24 +36,24 @@ impl Offline {
         stats: Arc<NorthState>,
         peer: SocketAddr,
         authority: Authority,
-    ) -> Offline {
+    ) -> Loopback {
         let (state, view) = (
             ServerState::new(options, stats, CancellationToken::new()),
             PlantView::new(plant, Arc::default(), View::default()),
         );
         let client = Client::new(peer, None, authority);
         let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
-        Offline::of(session, Watch::in_virtual_time())
+        Loopback::of(session, Watch::in_virtual_time())
     }
 
     /// Another client of the same server, by the `name` in its certificate if it has shown one.
-    pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Offline {
+    pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Loopback {
         let session = self.dialogue.session().beside(Client::new(peer, name, authority));
-        Offline::of(session, self.watch.clone())
+        Loopback::of(session, self.watch.clone())
     }
 
-    fn of(session: ClientSession, watch: Arc<Watch>) -> Offline {
-        Offline {
+    fn of(session: ClientSession, watch: Arc<Watch>) -> Loopback {
+        Loopback {
             dialogue: Dialogue::new(session),
             watch,
             reader: None,
@@ -75,7 +75,7 @@ impl Offline {
         self.take(bytes, false, now)
     }
 
-    /// Takes bytes like [`Offline::receive`], from a client that closed the connection behind `bytes`.
+    /// Takes bytes like [`Loopback::receive`], from a client that closed the connection behind `bytes`.
     pub fn receive_last(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let answers = self.take(bytes, true, now);
         if let Some(reader) = &self.reader {

@@ -13,7 +13,7 @@ mod dialogue;
 mod forwarded_request;
 pub(crate) mod frame;
 pub(crate) mod identify;
-mod offline;
+mod loopback;
 mod open_clients;
 mod routes;
 mod session;
@@ -44,7 +44,7 @@ use crate::refusals::Refusals;
 use crate::tcp_server::{TcpServer, TcpService};
 use crate::{NorthState, ServerError, ServerKind, certificate};
 
-pub use self::offline::Offline;
+pub use self::loopback::Loopback;
 pub use self::routes::{Registers, View};
 pub use self::tls::{Identity, Role, Tls};
 

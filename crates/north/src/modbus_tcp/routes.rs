@@ -72,11 +72,11 @@ impl Registers {
 
     /// Whether clients see the drive's own registers from `start` on.
     pub fn shows_the_drives(self, start: u16, count: u16) -> bool {
-        self.at(start, count) == At::Drive
+        self.locate(start, count) == At::Drive
     }
 
     /// Where the registers from `start` on are; a span that reaches from one kind into another is nowhere.
-    pub(super) fn at(self, start: u16, count: u16) -> At {
+    pub(super) fn locate(self, start: u16, count: u16) -> At {
         let last = u32::from(start) + u32::from(count.saturating_sub(1));
         let Ok(last) = u16::try_from(last) else {
             return At::Nowhere;
@@ -296,7 +296,11 @@ mod tests {
             (Registers::ModelAtZero, 0x7FFF, 1, Drive),
             (Registers::ModelAtZero, 0x8000, 1, Nowhere),
         ] {
-            assert_eq!(registers.at(start, count), expected, "{registers:?} {start:#x} {count}");
+            assert_eq!(
+                registers.locate(start, count),
+                expected,
+                "{registers:?} {start:#x} {count}"
+            );
         }
         let around = |start, count| Registers::ModelAtZero.around_the_command_word(start, count);
         assert_eq!((around(0x0100, 17), around(0x0100, 16)), (Some(0x80F0), None));
@@ -309,11 +313,11 @@ mod tests {
             let mut listed = 0;
             for address in FIRST..=FIRST + 0x2FF {
                 if let Some(shown) = registers.of_model(address) {
-                    assert_eq!(registers.at(shown, 1), At::Model(address), "{registers:?}");
+                    assert_eq!(registers.locate(shown, 1), At::Model(address), "{registers:?}");
                     listed += 1;
                 }
             }
-            let seen = (0..=u16::MAX).filter(|shown| matches!(registers.at(*shown, 1), At::Model(FIRST..=0x82FF)));
+            let seen = (0..=u16::MAX).filter(|shown| matches!(registers.locate(*shown, 1), At::Model(FIRST..=0x82FF)));
             assert_eq!(listed, seen.count(), "{registers:?}");
         }
         assert_eq!(Registers::ModelAtZero.of_model(0x8100), Some(0x0110));

@@ -247,7 +247,7 @@ impl ClientSession {
             return stop_of_default(frame.header, drive, request);
         }
         match request {
-            RequestPdu::Read { table, start, count } if !table.is_bits() => match registers.at(start, count) {
+            RequestPdu::Read { table, start, count } if !table.is_bits() => match registers.locate(start, count) {
                 At::Model(start) => self.common(drive, request, start, count, now),
                 At::Drive if has_function => self.raw_read(frame.header, drive, request, now),
                 At::Drive => Exception::FUNCTION.into(),
@@ -301,7 +301,7 @@ impl ClientSession {
         now: Instant,
     ) -> Decision {
         let count = u16::try_from(values.len()).unwrap_or(u16::MAX);
-        match self.routes.registers().at(start, count) {
+        match self.routes.registers().locate(start, count) {
             At::Model(start) => self.command(header, drive, request, start, values, now),
             At::Drive if has_function(&drive.image.spec.profile, 6) => {
                 let order = match request {
@@ -329,7 +329,7 @@ impl ClientSession {
         (start, count): (u16, u16),
         now: Instant,
     ) -> Decision {
-        let at = self.routes.registers().at(start, count);
+        let at = self.routes.registers().locate(start, count);
         let then = ReadBehind { at, start, count };
         let refused = self.judge_read(header, drive, then, now).err();
         match self.write(header, drive, request, write, now) {

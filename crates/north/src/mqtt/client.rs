@@ -407,7 +407,7 @@ impl session::Client for PlainClient {
         self.count_lost(now);
     }
 
-    fn look(&mut self) {
+    fn publish_due(&mut self) {
         let (now, wall) = (Instant::now(), SystemTime::now());
         self.common.look_at = match (self.is_alive(), self.options.telemetry.history) {
             (true, _) => {

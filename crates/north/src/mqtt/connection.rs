@@ -262,7 +262,7 @@ impl Connection {
             }
             _ => {}
         }
-        self.silence.heard(Instant::now());
+        self.silence.packet_received(Instant::now());
         match event {
             Step::Subscribed(_) if self.silence.answered() => Step::Nothing,
             Step::Subscribed(answers) => {
@@ -300,7 +300,7 @@ impl Connection {
             && self.client.try_subscribe_many([question.clone()]).is_ok()
         {
             self.backlog.trail().subscribes(1);
-            self.silence.asked();
+            self.silence.test_sent();
         }
         verdict == Verdict::Lost
     }

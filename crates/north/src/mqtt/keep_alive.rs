@@ -43,7 +43,7 @@ impl Silence {
     }
 
     /// The broker sent a packet.
-    pub(super) fn heard(&mut self, now: Instant) {
+    pub(super) fn packet_received(&mut self, now: Instant) {
         (self.heard, self.pinged) = (now, None);
     }
 
@@ -53,7 +53,7 @@ impl Silence {
     }
 
     /// A test subscription was sent.
-    pub(super) fn asked(&mut self) {
+    pub(super) fn test_sent(&mut self) {
         self.asked = true;
     }
 
@@ -98,18 +98,18 @@ mod tests {
             if pings.is_some_and(|every| second % every == 0) {
                 silence.pinged(now);
                 if answers {
-                    silence.heard(now);
+                    silence.packet_received(now);
                 }
             }
             match silence.judge(interval, now) {
                 Verdict::Fine => {}
                 Verdict::Lost => return (asked, Some(second)),
                 Verdict::Ask => {
-                    silence.asked();
+                    silence.test_sent();
                     asked.push(second);
                     if answers {
                         assert!(silence.answered());
-                        silence.heard(now);
+                        silence.packet_received(now);
                     }
                 }
             }

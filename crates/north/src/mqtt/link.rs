@@ -309,7 +309,7 @@ impl BrokerLink {
             tracing::debug!(target: "drivegate::north::mqtt", "{prefix}no connection to the broker at {broker}: {why}");
         }
         if closed && self.takeovers.closed(now) {
-            let words = Takeovers::words(&self.client_id);
+            let words = Takeovers::log_text(&self.client_id);
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}{broker}: {words}");
         }
         before

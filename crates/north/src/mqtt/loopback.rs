@@ -34,9 +34,9 @@ impl From<Message> for Published {
 }
 
 /// The commands of an MQTT client without its connection. Time is an argument; the calendar advances with it from
-/// [`Offline::new`] on.
+/// [`Loopback::new`] on.
 #[derive(Debug)]
-pub struct Offline {
+pub struct Loopback {
     plant: SharedPlant,
     commands: Commands,
     /// Messages that stay with the broker because there is no room for more commands.
@@ -47,16 +47,16 @@ pub struct Offline {
     connection: Connection,
 }
 
-impl Offline {
+impl Loopback {
     /// A client that serves the set topics below `base`, at `now`, which is `time` on the calendar.
-    pub fn new(base: &str, plant: SharedPlant, now: Instant, time: SystemTime) -> Offline {
+    pub fn new(base: &str, plant: SharedPlant, now: Instant, time: SystemTime) -> Loopback {
         let gateway = plant.load().gateway.clone();
         let rules = Rules {
             responses: ResponseTopics::new(base, &gateway, Vec::new()),
             require_id: false,
             right: Right::lasting(),
         };
-        Offline {
+        Loopback {
             plant,
             commands: Commands::new(
                 Topics::new(base, &gateway),
@@ -73,7 +73,7 @@ impl Offline {
     }
 
     /// Receives a message. Its command is in the queue of its bus when this returns, unless so many wait that the
-    /// broker keeps the message until a later [`Offline::poll`].
+    /// broker keeps the message until a later [`Loopback::poll`].
     pub fn receive(&mut self, mut message: Incoming, now: Instant) {
         let connection = self.connection.clone();
         message.arrival.get_or_insert_with(|| Arrival::over(connection, now));
@@ -131,7 +131,7 @@ mod tests {
     fn forty_pairs_in_virtual_time() {
         let start = Instant::now();
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
-        let mut client = Offline::new("drivegate", plant.clone(), start, SystemTime::UNIX_EPOCH);
+        let mut client = Loopback::new("drivegate", plant.clone(), start, SystemTime::UNIX_EPOCH);
         let run = plant
             .load()
             .drive("p1")

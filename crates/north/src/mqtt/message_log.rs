@@ -47,9 +47,9 @@ struct Segment {
 
 /// The messages on disk, and after them the messages in memory.
 #[derive(Debug)]
-pub(super) struct Journal {
+pub(super) struct MessageLog {
     /// `None`: everything stays in memory.
-    place: Option<JournalDir>,
+    place: Option<MessageLogDir>,
     segments: VecDeque<Segment>,
     next_segment: u64,
     /// Loaded from disk, not taken yet.
@@ -75,7 +75,7 @@ pub(super) struct Journal {
 }
 
 #[derive(Debug)]
-struct JournalDir {
+struct MessageLogDir {
     dir: PathBuf,
     /// First part of the names of the files.
     name: &'static str,
@@ -86,10 +86,10 @@ struct JournalDir {
     lock: File,
 }
 
-impl Journal {
+impl MessageLog {
     /// A journal without a disk.
-    pub(super) fn in_memory() -> Journal {
-        Journal {
+    pub(super) fn in_memory() -> MessageLog {
+        MessageLog {
             place: None,
             segments: VecDeque::new(),
             next_segment: 1,
@@ -112,18 +112,18 @@ impl Journal {
     ///
     /// # Errors
     /// The directory cannot be used, or another process uses it (`WouldBlock`).
-    pub(super) fn open(dir: &Path, name: &'static str, max_bytes: u64) -> io::Result<Journal> {
+    pub(super) fn open(dir: &Path, name: &'static str, max_bytes: u64) -> io::Result<MessageLog> {
         fs::create_dir_all(dir)?;
         let lock = lock(dir, name)?;
-        let mut journal = Journal {
-            place: Some(JournalDir {
+        let mut journal = MessageLog {
+            place: Some(MessageLogDir {
                 dir: dir.to_path_buf(),
                 name,
                 max_bytes,
                 create: |path| OpenOptions::new().read(true).write(true).create_new(true).open(path),
                 lock,
             }),
-            ..Journal::in_memory()
+            ..MessageLog::in_memory()
         };
         for (number, path) in segments(dir, name)? {
             journal.next_segment = number.saturating_add(1);
@@ -529,7 +529,7 @@ impl Journal {
 
     /// Keeps a copy of bytes that are no records.
     fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        let Some(JournalDir { dir, name, .. }) = &self.place else {
+        let Some(MessageLogDir { dir, name, .. }) = &self.place else {
             return Ok(());
         };
         let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));

@@ -224,7 +224,7 @@ impl Publisher {
         let mut updates = Vec::new();
         let (pace, most) = (self.pace, self.max_packet);
         let mut reduced = std::mem::take(&mut self.reduced);
-        let all = self.look(now, |drive| {
+        let all = self.visit_due(now, |drive| {
             let fits = drive.fits;
             drive.tick(pace, most, now, wall, &mut updates);
             if drive.fits < fits {
@@ -246,7 +246,7 @@ impl Publisher {
     pub(super) fn record(&mut self, now: Instant, wall: SystemTime) -> (Vec<Update>, Instant) {
         let mut updates = Vec::new();
         let (pace, mode, most) = (self.pace, self.telemetry.history, self.max_packet);
-        let all = self.look(now, |drive| {
+        let all = self.visit_due(now, |drive| {
             let fresh = drive.is_fresh();
             let reading = drive.drive.reading(now);
             if reading.age().is_none() {
@@ -278,7 +278,7 @@ impl Publisher {
     }
 
     /// Looks at the drives that are due, a few in one call; whether none is left.
-    fn look(&mut self, now: Instant, mut look: impl FnMut(&mut DriveTopics)) -> bool {
+    fn visit_due(&mut self, now: Instant, mut look: impl FnMut(&mut DriveTopics)) -> bool {
         let drives = &self.drives;
         let is_due = |place| drives.get(place).is_some_and(|drive: &DriveTopics| drive.is_due(now));
         let (due, all) = rounds::due(&mut self.cursor, drives.len(), is_due);

@@ -97,7 +97,7 @@ pub(super) trait Client {
     fn check(&mut self, now: Instant);
 
     /// Looks at the drives that were updated or are due, and sets when to look again.
-    fn look(&mut self);
+    fn publish_due(&mut self);
 
     /// Publishes pending messages, as far as the connection allows.
     fn publish(&mut self);
@@ -124,8 +124,8 @@ pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
         tokio::select! {
             () = cancel.cancelled() => return,
             step = client.next() => apply(client, step),
-            () = fresh.notified() => client.look(),
-            () = tokio::time::sleep_until(look_at) => client.look(),
+            () = fresh.notified() => client.publish_due(),
+            () = tokio::time::sleep_until(look_at) => client.publish_due(),
             _ = checks.tick() => check(client, Instant::now()).await,
         }
         follow(client).await;
@@ -155,7 +155,7 @@ async fn check(client: &mut impl Client, now: Instant) {
         Due::Nothing => {}
     }
     client.check(now);
-    client.look();
+    client.publish_due();
 }
 
 /// Follows the plant of the last reload.

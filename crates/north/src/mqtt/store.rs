@@ -14,7 +14,7 @@ use flume::{Receiver, RecvTimeoutError, Sender, TrySendError};
 use tokio::sync::mpsc;
 
 use super::Buffer;
-use super::journal::Journal;
+use super::message_log::MessageLog;
 use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
 use crate::{MqttKind, NorthState};
@@ -262,7 +262,7 @@ impl Disk {
 /// The thread that owns the files.
 struct Thread {
     dir: PathBuf,
-    journal: Journal,
+    journal: MessageLog,
     report: mpsc::Sender<Loaded>,
     shared: Arc<Shared>,
     /// The topics to be kept for the next run.
@@ -280,7 +280,7 @@ impl Thread {
         let mut attempts = LOCK_ATTEMPTS;
         let journal = loop {
             attempts -= 1;
-            match Journal::open(&dir, name, buffer.max_bytes) {
+            match MessageLog::open(&dir, name, buffer.max_bytes) {
                 Ok(journal) => break journal,
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
                     std::thread::sleep(LOCK_WAIT);
@@ -290,7 +290,7 @@ impl Thread {
                         target: "drivegate::north::mqtt", "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
                         dir.display()
                     );
-                    break Journal::in_memory();
+                    break MessageLog::in_memory();
                 }
             }
         };
@@ -312,7 +312,7 @@ impl Thread {
             synced: Instant::now(),
         };
         let topics = thread.read_topics();
-        thread.tell(Loaded::Opened { waiting, topics });
+        thread.report(Loaded::Opened { waiting, topics });
         thread
     }
 
@@ -372,10 +372,10 @@ impl Thread {
         let taken = self.journal.take(most);
         let messages: Vec<_> = taken.into_iter().map(|(n, m)| (self.number(n), m)).collect();
         let through = self.number(self.journal.through());
-        self.tell(Loaded::Messages { messages, through });
+        self.report(Loaded::Messages { messages, through });
     }
 
-    fn tell(&self, loaded: Loaded) {
+    fn report(&self, loaded: Loaded) {
         // At most two reports are in progress; the client may be gone.
         let _ = self.report.try_send(loaded);
     }

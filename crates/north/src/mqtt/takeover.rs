@@ -32,7 +32,7 @@ impl Takeovers {
     }
 
     /// The text about the takeover, and what to do about it.
-    pub(super) fn words(client_id: &str) -> String {
+    pub(super) fn log_text(client_id: &str) -> String {
         format!(
             "the broker closed {CLOSED} connections within a minute without giving a reason; this usually means that \
              another client also uses the client id `{client_id}`, and the two disconnect each other; give each \

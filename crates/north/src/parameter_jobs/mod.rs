@@ -171,7 +171,7 @@ fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &Para
         return;
     }
     vault.count_changed(&spec.bus, &spec.name, changes.len() as u64);
-    let text = told(&spec.name, &last.time, &changes);
+    let text = event_text(&spec.name, &last.time, &changes);
     drive.publish(Event {
         bus: spec.bus.clone(),
         drive: Some(spec.name.clone()),
@@ -180,7 +180,7 @@ fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &Para
 }
 
 /// The text of an event.
-fn told(drive: &str, since: &str, changes: &[Difference]) -> String {
+fn event_text(drive: &str, since: &str, changes: &[Difference]) -> String {
     let named: Vec<String> = changes.iter().take(NAMED_CHANGES).map(Difference::line).collect();
     let more = match changes.len().saturating_sub(NAMED_CHANGES) {
         0 => String::new(),

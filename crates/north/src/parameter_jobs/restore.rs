@@ -61,7 +61,7 @@ pub fn prepare(
 }
 
 fn not_held(drive: &DriveHandle) -> Result<(), String> {
-    match drive.image.hold.why() {
+    match drive.image.restore_lock.reason() {
         Some(why) => Err(why.to_string()),
         None => Ok(()),
     }
@@ -247,16 +247,16 @@ pub async fn release(
     };
     let stage = match released {
         Err(why) => RestoreStage::Failed(why),
-        Ok(None) if drive.image.hold.why().is_none() => RestoreStage::Failed(format!(
+        Ok(None) if drive.image.restore_lock.reason().is_none() => RestoreStage::Failed(format!(
             "no restore of `{}` was interrupted: nothing is held",
             spec.name
         )),
         Ok(None) => {
-            drive.image.hold.set(None);
+            drive.image.restore_lock.set(None);
             RestoreStage::Ended(format!("`{}` accepts commands again; the journal is gone", spec.name))
         }
         Ok(Some(aside)) => {
-            drive.image.hold.set(None);
+            drive.image.restore_lock.set(None);
             tracing::warn!(
                 target: "drivegate::north::parameter_jobs", bus = %spec.bus, drive = %spec.name, source = origin.kind.name(), client = %origin.who,
                 "the restore of its parameters was released half done; the journal is {}", aside.display()
@@ -323,7 +323,7 @@ fn start(
     origin: Origin,
 ) {
     let (spec, machine) = (&drive.image.spec, drive.machine());
-    vault.hold(&machine).set(Some(held_while_written(&spec.name)));
+    vault.restore_lock(&machine).set(Some(held_while_written(&spec.name)));
     let run = Run {
         name: spec.name.clone(),
         machine,
@@ -507,7 +507,7 @@ impl Run {
                 drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
             }
         }
-        self.vault.hold(&self.machine).set(held);
+        self.vault.restore_lock(&self.machine).set(held);
         self.vault.update_restore(&self.machine, |restore| {
             (restore.stage, restore.waits) = (stage, None);
         });

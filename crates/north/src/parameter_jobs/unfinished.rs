@@ -203,14 +203,14 @@ pub async fn hold_unfinished<'a>(
     let drives: Vec<Configured> = drives.map(configured).collect();
     let Some(store) = vault.store() else { return };
     for drive in drives.iter().filter(|drive| drive.is_new) {
-        vault.hold(&drive.machine).set(Some(format!(
+        vault.restore_lock(&drive.machine).set(Some(format!(
             "a restore of the parameters of `{}` may have been interrupted; until its journal is read, the drive \
              accepts only stops",
             drive.spec.name
         )));
     }
     let (vault, events) = (vault.clone(), events.clone());
-    let looked = patience.read(move || look(&vault, &events, store.dir(), &drives));
+    let looked = patience.read(move || check_unfinished(&vault, &events, store.dir(), &drives));
     if let Err(why) = looked.await {
         tracing::warn!(
             target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {why}; the drives accept \
@@ -219,7 +219,7 @@ pub async fn hold_unfinished<'a>(
     }
 }
 
-fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
+fn check_unfinished(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
     let journals = match found(params) {
         Ok(journals) => journals,
         Err(error) => {
@@ -243,7 +243,7 @@ fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
         let claimed = claim.and_then(|(journal, claim)| Some((journals.get(journal)?, claim)));
         match claimed {
             Some((journal, claim)) => hold(vault, events, drive, why_held(&drive.spec, journal, claim)),
-            None => vault.hold(&drive.machine).set(None),
+            None => vault.restore_lock(&drive.machine).set(None),
         }
     }
     let orphans = claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan));
@@ -260,7 +260,7 @@ fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
     let spec = &drive.spec;
     tracing::error!(target: "drivegate::north::parameter_jobs", bus = %spec.bus, drive = %spec.name, "{why}");
     events.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
-    vault.hold(&drive.machine).set(Some(why));
+    vault.restore_lock(&drive.machine).set(Some(why));
 }
 
 /// Why a drive is held because of the journal that concerns it.

@@ -68,7 +68,7 @@ impl Reader {
     /// `is_there` returns whether there is something.
     pub(crate) fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
         let matters = self.watch.turn(now, None);
-        let left = matters && self.watch.just_stood(now) && is_there();
+        let left = matters && self.watch.just_stalled(now) && is_there();
         let mut state = self.state();
         (state.waited, state.fresh) = (true, true);
         if !left {

@@ -101,9 +101,9 @@ impl Watch {
                 () = pauses.next_stop() => {}
             }
             let now = Instant::now();
-            beat.ran(now);
+            beat.note_run(now);
             self.runs(now);
-            self.tell();
+            self.publish_pauses();
         }
     }
 
@@ -131,7 +131,7 @@ impl Watch {
         self.ran.store(at, Ordering::Relaxed);
     }
 
-    fn tell(&self) {
+    fn publish_pauses(&self) {
         let untold = std::mem::take(&mut *self.untold.lock().unwrap_or_else(PoisonError::into_inner));
         for pause in untold {
             if let Some(events) = self.events.get() {
@@ -166,7 +166,7 @@ impl Watch {
         }
         if slept || worker_stood || at.saturating_sub(ran) > unnoticed {
             let boot = boot.unwrap_or_else(|| self.since_boot());
-            self.stood((now, boot), ran, worker_stood.then_some(worker));
+            self.note_stall((now, boot), ran, worker_stood.then_some(worker));
         } else if self.single {
             self.ran.fetch_max(at, Ordering::Relaxed);
         }
@@ -174,7 +174,7 @@ impl Watch {
     }
 
     /// Notes that the runtime, or one of its workers, did not run since `ran`.
-    fn stood(&self, (now, boot): (Instant, Duration), ran: u64, worker: Option<u64>) {
+    fn note_stall(&self, (now, boot): (Instant, Duration), ran: u64, worker: Option<u64>) {
         let at = |nanos: u64| self.base + Duration::from_nanos(nanos);
         let mut stalls = self.stalls();
         let ahead = self.boot_ahead.load(Ordering::Relaxed);
@@ -182,7 +182,7 @@ impl Watch {
         let all = stalls.observe(now, boot);
         let of_worker = worker.map(|since| Stall::new(at(since), now));
         if let Some(stall) = of_worker {
-            stalls.stood(stall);
+            stalls.note_stall(stall);
         }
         let until = stalls.matters_until().map_or(0, |until| self.nanos(until));
         self.matters_until.store(until, Ordering::Relaxed);
@@ -203,7 +203,7 @@ impl Watch {
     }
 
     /// Whether a reader that finds nothing now may miss bytes that arrived during a stall just before.
-    pub(super) fn just_stood(&self, now: Instant) -> bool {
+    pub(super) fn just_stalled(&self, now: Instant) -> bool {
         self.stalls().last().is_some_and(|stall| now <= stall.read_by())
     }
 
@@ -279,7 +279,7 @@ mod tests {
                 assert!(turn(&watch, now + MS));
                 let dated = watch.date(start - MS, true, now + MS);
                 assert_eq!(dated.asked, start, "{single}, {task_first}");
-                assert!(dated.stall.is_some() && watch.just_stood(now + MS));
+                assert!(dated.stall.is_some() && watch.just_stalled(now + MS));
                 for later in [100, 200, 251] {
                     let at = now + later * MS;
                     watch.tick(at, boot(&watch, at));

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
-use super::framing::{Framing, Said};
+use super::framing::{Framing, ToolFrame};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::terms::{Decision, Tool, Work};
 use crate::SlotOutcome;
@@ -101,12 +101,12 @@ impl Dialogue {
         let mut any = false;
         while let Some(said) = self.framing.next(now) {
             match said {
-                Said::Request(request) => {
+                ToolFrame::Request(request) => {
                     any = true;
                     let arrival = self.framing.arrival().unwrap_or_else(|| Arrival::now(now));
                     self.asked_for(request, arrival, now);
                 }
-                Said::Broken => self.tool.count(SlotOutcome::Broken),
+                ToolFrame::Broken => self.tool.count(SlotOutcome::Broken),
             }
         }
         if self.held.as_ref().is_some_and(|held| held.until <= now)
@@ -307,7 +307,7 @@ mod tests {
     use crate::order::{Interruption, Refusal};
 
     /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, none is silence.
-    fn told(protocol: Protocol, outcome: &Outcome) -> Option<u8> {
+    fn answer_code(protocol: Protocol, outcome: &Outcome) -> Option<u8> {
         let pdu = RequestPdu::WriteRegisters {
             start: 2000,
             values: vec![0, 9000],
@@ -366,9 +366,9 @@ mod tests {
             (Outcome::Purged, None, None),
         ] {
             for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
-                assert_eq!(told(protocol, &outcome), modbus, "{protocol:?} {outcome:?}");
+                assert_eq!(answer_code(protocol, &outcome), modbus, "{protocol:?} {outcome:?}");
             }
-            assert_eq!(told(Protocol::N2, &outcome), n2, "N2 {outcome:?}");
+            assert_eq!(answer_code(Protocol::N2, &outcome), n2, "N2 {outcome:?}");
         }
         let of = |outcome| counted(&outcome);
         assert_eq!(of(only(refused(Refusal::BadValue))), SlotOutcome::Refused);

@@ -18,7 +18,7 @@ const HALF_FRAME: Duration = Duration::from_millis(250);
 
 /// A request of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Said {
+pub(super) enum ToolFrame {
     /// A valid request.
     Request(ToolRequest),
     /// Bytes that are not answered: a wrong check code, half a frame, no frame at all.
@@ -52,14 +52,14 @@ impl Framing {
     }
 
     /// The next message of the tool, as far as it is clear at `now`.
-    pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
+    pub(super) fn next(&mut self, now: Instant) -> Option<ToolFrame> {
         loop {
             let piece = self.frames.next(None, now)?;
             self.arrival = self.arrivals.take(piece.bytes.len());
             if !self.is_blank(&piece.bytes) {
                 return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
-                    Some(request) => Said::Request(request),
-                    None => Said::Broken,
+                    Some(request) => ToolFrame::Request(request),
+                    None => ToolFrame::Broken,
                 });
             }
         }
@@ -103,7 +103,7 @@ mod tests {
         Framing::new(protocol, LineFormat::new(9600, "8N1").unwrap())
     }
 
-    fn all(framing: &mut Framing, now: Instant) -> Vec<Said> {
+    fn all(framing: &mut Framing, now: Instant) -> Vec<ToolFrame> {
         std::iter::from_fn(|| framing.next(now)).collect()
     }
 
@@ -112,8 +112,8 @@ mod tests {
         RequestPdu::read(table, start, count)
     }
 
-    fn asks(address: u8, start: u16, count: u16) -> Said {
-        Said::Request(ToolRequest {
+    fn asks(address: u8, start: u16, count: u16) -> ToolFrame {
+        ToolFrame::Request(ToolRequest {
             address,
             function: 3,
             meaning: Meaning::Read(read(start, count)),
@@ -151,7 +151,7 @@ mod tests {
         assert!(framing.has_begun());
         let until = framing.patience().unwrap();
         assert!(until >= now + HALF_FRAME && until < now + 2 * HALF_FRAME);
-        assert_eq!(all(&mut framing, until), [Said::Broken]);
+        assert_eq!(all(&mut framing, until), [ToolFrame::Broken]);
         let mut broken = frame.clone();
         broken[7] ^= 1;
         // The request follows a broken frame and half a frame without a pause.
@@ -161,7 +161,15 @@ mod tests {
             until,
         );
         let said = all(&mut framing, until);
-        assert_eq!(said, [Said::Broken, asks(1, 2100, 11), Said::Broken, asks(1, 2100, 11)]);
+        assert_eq!(
+            said,
+            [
+                ToolFrame::Broken,
+                asks(1, 2100, 11),
+                ToolFrame::Broken,
+                asks(1, 2100, 11)
+            ]
+        );
     }
 
     #[test]
@@ -172,7 +180,7 @@ mod tests {
         assert_eq!(framing.next(now), None);
         let until = framing.patience().unwrap();
         assert!(until < now + Duration::from_millis(40), "sooner than half a frame");
-        let Some(Said::Request(request)) = framing.next(until) else {
+        let Some(ToolFrame::Request(request)) = framing.next(until) else {
             panic!("no request")
         };
         assert_eq!(
@@ -194,7 +202,10 @@ mod tests {
         let mut broken = line.clone();
         broken[5] = b'7';
         add(&mut framing, &broken, now);
-        assert_eq!(all(&mut framing, now), [asks(3, 32, 4), asks(3, 32, 4), Said::Broken]);
+        assert_eq!(
+            all(&mut framing, now),
+            [asks(3, 32, 4), asks(3, 32, 4), ToolFrame::Broken]
+        );
         // Lower case, and a function that is not decoded.
         add(&mut framing, &line.to_ascii_lowercase(), now);
         let mut unknown = Vec::new();
@@ -203,7 +214,7 @@ mod tests {
         let said = all(&mut framing, now);
         assert_eq!(said[0], asks(3, 32, 4));
         assert!(
-            matches!(&said[1], Said::Request(request) if request.function == 0x41),
+            matches!(&said[1], ToolFrame::Request(request) if request.function == 0x41),
             "{said:?}"
         );
 
@@ -212,14 +223,14 @@ mod tests {
         let input = RequestPdu::read(Table::Input, 2, 2);
         let said = all(&mut framing, now);
         assert!(
-            matches!(&said[..], [Said::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input),
+            matches!(&said[..], [ToolFrame::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input),
             "{said:?}"
         );
         assert!(!framing.has_begun(), "a line feed begins no request");
         add(&mut framing, b">0111020389\r", now);
         assert_eq!(
             all(&mut framing, now),
-            [Said::Broken],
+            [ToolFrame::Broken],
             "nobody answers a wrong checksum"
         );
     }
@@ -281,7 +292,7 @@ mod tests {
             }
             add(&mut framing, &frame, now);
             let said = all(&mut framing, now);
-            prop_assert!(matches!(&said[..], [Said::Request(_)]), "{:?}", said);
+            prop_assert!(matches!(&said[..], [ToolFrame::Request(_)]), "{:?}", said);
         }
     }
 }

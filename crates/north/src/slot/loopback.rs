@@ -15,17 +15,17 @@ use crate::plant::SharedPlant;
 
 /// A tool of a slot without sockets.
 #[derive(Debug)]
-pub struct Offline {
+pub struct Loopback {
     terms: Arc<Terms>,
     dialogue: Dialogue,
     /// The connection over which all bytes come, once the first ones have come.
     connection: Option<Connection>,
 }
 
-impl Offline {
+impl Loopback {
     /// The tool at `peer`.
-    pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthState>, peer: &str) -> Offline {
-        Offline::of(
+    pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthState>, peer: &str) -> Loopback {
+        Loopback::of(
             Arc::new(Terms {
                 current: Arc::new(ArcSwap::from_pointee(Options {
                     slots: vec![slot.clone()],
@@ -49,13 +49,13 @@ impl Offline {
     }
 
     /// Another tool of the same slot.
-    pub fn beside(&self, peer: &str) -> Offline {
-        Offline::of(self.terms.clone(), peer)
+    pub fn beside(&self, peer: &str) -> Loopback {
+        Loopback::of(self.terms.clone(), peer)
     }
 
-    fn of(terms: Arc<Terms>, peer: &str) -> Offline {
+    fn of(terms: Arc<Terms>, peer: &str) -> Loopback {
         let tool = Arc::new(Tool::new(terms.clone(), peer, peer, Proof::Nothing));
-        Offline {
+        Loopback {
             terms,
             dialogue: Dialogue::new(tool),
             connection: None,
@@ -63,7 +63,7 @@ impl Offline {
     }
 
     /// Takes the bytes of the tool, if any, and returns its answer by `now`. A request is in the queue of the bus when this
-    /// returns, or waits until [`Offline::wake_at`].
+    /// returns, or waits until [`Loopback::wake_at`].
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
         let arrival = Arrival::over(connection.clone(), now);

@@ -8,7 +8,7 @@ mod connection;
 mod dialogue;
 mod framing;
 mod listener;
-mod offline;
+mod loopback;
 mod pty;
 mod request;
 mod rights;
@@ -35,7 +35,7 @@ use crate::codec::{LineFormat, Protocol};
 use crate::plant::SharedPlant;
 use crate::tcp_server::{TcpServer, TcpService};
 
-pub use self::offline::Offline;
+pub use self::loopback::Loopback;
 
 /// Tools that one address of a slot serves at one time, in turns.
 pub const MAX_TOOLS: usize = 4;

@@ -77,7 +77,7 @@ mod tests {
 
     use drivegate_testkit::{nx_plant, online, read_nx};
 
-    use super::super::Offline;
+    use super::super::Loopback;
     use super::*;
     use crate::codec::{LineFormat, Protocol, RequestPdu, rtu};
     use crate::plant::SharedPlant;
@@ -121,7 +121,7 @@ mod tests {
     }
 
     struct Tool {
-        tool: Offline,
+        tool: Loopback,
         plant: SharedPlant,
         now: Instant,
     }
@@ -134,7 +134,7 @@ mod tests {
             read_nx(&plant, "p1", 1, 0, now);
             let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
             Tool {
-                tool: Offline::new(slot(access), plant.clone(), Arc::default(), "127.0.0.1:1"),
+                tool: Loopback::new(slot(access), plant.clone(), Arc::default(), "127.0.0.1:1"),
                 plant,
                 now,
             }

@@ -90,7 +90,7 @@ pub struct Object {
 
 impl Object {
     /// The object whose first item is at that address; 255 of a kind at most.
-    pub fn at(table: Table, address: u16) -> Option<Object> {
+    pub fn containing(table: Table, address: u16) -> Option<Object> {
         let (region, index) = match table {
             Table::DiscreteInput => (Region::Bi, address),
             Table::Coil => (Region::Bo, address),

@@ -385,7 +385,7 @@ proptest! {
     #[test]
     fn objects_round_trip(table in 0usize..4, address: u16) {
         let table = [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding][table];
-        if let Some(object) = Object::at(table, address) {
+        if let Some(object) = Object::containing(table, address) {
             prop_assert_eq!(object.place(), Some((table, address)));
         }
     }

@@ -1,6 +1,6 @@
 //! How a drive reacts to the words written to it, by `[control]` of its profile: for drives without hand-written words.
 
-use super::words::{Does, Known, Told};
+use super::reactions::{Known, MotorEffect, WordEffect};
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
 
 fn place_of(setting: &Setting, control: &Control) -> ControlItem {
@@ -8,7 +8,7 @@ fn place_of(setting: &Setting, control: &Control) -> ControlItem {
 }
 
 /// The effect of a word written to one of the places of the profile's commands.
-pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> Told {
+pub(super) fn effect_of(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> WordEffect {
     let own = place == control.at;
     let here = |setting: &Setting| place_of(setting, control) == place;
     let holds = |setting: &Setting| match place_of(setting, control) {
@@ -22,23 +22,23 @@ pub(super) fn told(control: &Control, known: &Known<'_>, place: ControlItem, wor
     });
     let reverse = || control.reverse.as_ref().is_some_and(holds);
     let does = match (&control.run, next_step(control, known.position, place, word)) {
-        (Run::Steps(steps), Some(step)) if step + 1 == steps.len() => Does::Runs { reverse: reverse() },
-        (Run::Steps(_), Some(step)) => Does::Prepares(step + 1),
-        _ if here(&control.stop) && holds(&control.stop) => Does::Stops,
-        _ if control.is_stop(place, word) => Does::Coasts,
+        (Run::Steps(steps), Some(step)) if step + 1 == steps.len() => MotorEffect::Runs { reverse: reverse() },
+        (Run::Steps(_), Some(step)) => MotorEffect::Prepares(step + 1),
+        _ if here(&control.stop) && holds(&control.stop) => MotorEffect::Stops,
+        _ if control.is_stop(place, word) => MotorEffect::Coasts,
         // A word without its constant bits has no effect.
-        _ if own && !control.always.holds(word) => Does::Nothing,
-        (Run::One(run), _) if holds(run) && concerns_run(control, place) => Does::Runs { reverse: reverse() },
+        _ if own && !control.always.holds(word) => MotorEffect::Nothing,
+        (Run::One(run), _) if holds(run) && concerns_run(control, place) => MotorEffect::Runs { reverse: reverse() },
         (Run::Pair { forward, reverse }, _) if here(forward) || here(reverse) => {
             match (holds(forward), holds(reverse)) {
-                (true, false) => Does::Runs { reverse: false },
-                (false, true) => Does::Runs { reverse: true },
-                _ => Does::Nothing,
+                (true, false) => MotorEffect::Runs { reverse: false },
+                (false, true) => MotorEffect::Runs { reverse: true },
+                _ => MotorEffect::Nothing,
             }
         }
-        _ => Does::Nothing,
+        _ => MotorEffect::Nothing,
     };
-    Told { does, resets, word }
+    WordEffect { does, resets, word }
 }
 
 /// The farthest step of the sequence whose word that is and whose turn it can be.

@@ -70,7 +70,7 @@ impl ProfileDrive {
     /// Commands hold 0 until somebody writes.
     fn is_kept_back(&self, point: &Point, raw: &Raw) -> bool {
         let is_place = |control: &crate::drive::control::Control| {
-            let places = super::said::places(control);
+            let places = super::effect::places(control);
             places.iter().any(|place| raw.covers(place.table, place.address))
         };
         let reference = matches!(
@@ -166,7 +166,7 @@ impl ProfileDrive {
     /// Whether that is a place of the commands that reads back what was written there.
     fn is_place(&self, (table, address): Key) -> bool {
         let holds = |control: &Control| {
-            let places = super::said::places(control);
+            let places = super::effect::places(control);
             let here = places
                 .iter()
                 .any(|place| (place.table, place.address) == (table, address));

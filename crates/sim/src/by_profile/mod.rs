@@ -1,21 +1,21 @@
 //! A drive or meter of any profile. Its registers come from the points of the profile; its reaction to the control word comes from
 //! the hand-written [`words`] where the family is known, else from `[control]` ([`said`]). Pure.
 
+mod effect;
 mod figures;
+mod reactions;
 mod registers;
-mod said;
 mod status;
 #[cfg(test)]
 mod tests;
 mod wishes;
-mod words;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use self::reactions::{FAMILIES, Family, Known, MotorEffect, WordEffect};
 use self::registers::Registers;
-use self::words::{Does, FAMILIES, Family, Known, Told};
 use super::SimTime;
 use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD};
 use super::motor::{Feed, Load, Ratings};
@@ -66,7 +66,7 @@ impl ProfileOptions {
 
     /// Whether drives of the profile can be simulated: not those of an N2 board, and not those whose `simulator` is an unknown
     /// name.
-    pub fn knows(profile: &Profile) -> bool {
+    pub fn can_simulate(profile: &Profile) -> bool {
         let named = profile.simulator.as_deref();
         let known = named.is_none_or(|name| name == BY_CONTROL || FAMILIES.iter().any(|family| family.name == name));
         known && !profile.protocols.contains(&crate::codec::Protocol::N2)
@@ -169,7 +169,7 @@ impl ProfileDrive {
     }
 
     /// A value that was written to a place that may take commands.
-    fn told(&mut self, place: ControlItem, word: u16, now: SimTime) {
+    fn apply_word(&mut self, place: ControlItem, word: u16, now: SimTime) {
         let Some(control) = self.control.clone() else {
             return;
         };
@@ -189,10 +189,10 @@ impl ProfileDrive {
             Some(family) => (family.other)(place.table, place.address, word).or_else(|| {
                 // The write may have changed the direction, for example, so the control word is evaluated again.
                 let again = (family.word)(&known, self.word);
-                let plain = Told { resets: false, ..again };
-                matches!(plain.does, Does::Runs { .. }).then_some(plain)
+                let plain = WordEffect { resets: false, ..again };
+                matches!(plain.does, MotorEffect::Runs { .. }).then_some(plain)
             }),
-            None if said::places(&control).contains(&place) => Some(said::told(&control, &known, place, word)),
+            None if effect::places(&control).contains(&place) => Some(effect::effect_of(&control, &known, place, word)),
             None => None,
         };
         let Some(told) = told else {
@@ -204,7 +204,7 @@ impl ProfileDrive {
         self.obey(told, now);
     }
 
-    fn obey(&mut self, told: Told, now: SimTime) {
+    fn obey(&mut self, told: WordEffect, now: SimTime) {
         let once = self.acts_once();
         let restarts = self.family.map_or_else(
             || self.control.as_ref().is_some_and(|control| control.restarts_on_reset),
@@ -219,31 +219,31 @@ impl ProfileDrive {
         }
         let faulted = self.body.latch.fault() != 0;
         match told.does {
-            Does::Nothing => {}
-            Does::Prepares(position) => {
+            MotorEffect::Nothing => {}
+            MotorEffect::Prepares(position) => {
                 self.halt();
                 self.come_to(if faulted { 0 } else { position }, now);
             }
-            Does::Runs { .. } if faulted && once => {}
-            Does::Runs { reverse } => {
+            MotorEffect::Runs { .. } if faulted && once => {}
+            MotorEffect::Runs { reverse } => {
                 (self.run, self.reverse, self.coasts) = (Some(reverse), reverse, false);
                 self.position = self.position.max(self.steps().saturating_sub(1));
             }
-            Does::Stops => {
+            MotorEffect::Stops => {
                 self.halt();
                 self.position = 0;
             }
-            Does::Coasts => {
+            MotorEffect::Coasts => {
                 self.halt();
                 (self.position, self.coasts) = (0, true);
             }
-            Does::Trips => self.trip(1),
+            MotorEffect::Trips => self.trip(1),
         }
     }
 
     /// Whether a run command acts only at the moment when it is written.
     fn acts_once(&self) -> bool {
-        let said = || self.control.as_ref().is_some_and(said::acts_once);
+        let said = || self.control.as_ref().is_some_and(effect::acts_once);
         self.family.map_or_else(said, |family| family.acts_once)
     }
 

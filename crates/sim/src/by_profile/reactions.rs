@@ -5,7 +5,7 @@ use crate::codec::Table;
 
 /// Effect of a word on the motor and the start sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Does {
+pub(super) enum MotorEffect {
     /// The drive goes on as before.
     Nothing,
     /// The drive has come to this position in its start sequence; the motor is not fed.
@@ -24,8 +24,8 @@ pub(super) enum Does {
 
 /// All effects of a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Told {
-    pub(super) does: Does,
+pub(super) struct WordEffect {
+    pub(super) does: MotorEffect,
     /// Whether the word resets a fault, before anything else.
     pub(super) resets: bool,
     /// The word that counts from now on.
@@ -52,9 +52,9 @@ pub(super) struct Family {
     /// Name in profiles.
     pub(super) name: &'static str,
     /// Effect of the control word.
-    pub(super) word: fn(&Known<'_>, u16) -> Told,
+    pub(super) word: fn(&Known<'_>, u16) -> WordEffect,
     /// Effect of another register or coil.
-    pub(super) other: fn(Table, u16, u16) -> Option<Told>,
+    pub(super) other: fn(Table, u16, u16) -> Option<WordEffect>,
     /// Words act once, when they are written, and are not kept as a standing command.
     pub(super) acts_once: bool,
     /// A reset while a run command stands starts the motor.
@@ -63,7 +63,7 @@ pub(super) struct Family {
     pub(super) status: fn(&Shows) -> Words,
 }
 
-const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> Told, status: fn(&Shows) -> Words) -> Family {
+const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> WordEffect, status: fn(&Shows) -> Words) -> Family {
     Family {
         name,
         word,
@@ -125,216 +125,224 @@ const fn any(word: u16, mask: u16) -> bool {
     word & mask != 0
 }
 
-fn told(does: Does, resets: bool, word: u16) -> Told {
-    Told { does, resets, word }
+fn effect(does: MotorEffect, resets: bool, word: u16) -> WordEffect {
+    WordEffect { does, resets, word }
 }
 
 fn rises(known: &Known<'_>, word: u16, bit: u16) -> bool {
     any(word & !known.before, bit)
 }
 
-fn runs(reverse: bool) -> Does {
-    Does::Runs { reverse }
+fn runs(reverse: bool) -> MotorEffect {
+    MotorEffect::Runs { reverse }
 }
 
 /// Two bits for two directions; both together are no run command.
-fn pair(bits: u16) -> Does {
+fn pair(bits: u16) -> MotorEffect {
     match bits {
         1 => runs(false),
         2 => runs(true),
-        _ => Does::Stops,
+        _ => MotorEffect::Stops,
     }
 }
 
 /// OFF1 to OFF3 are bits 0 to 2, also without bit 10, without which all else counts for nothing; a run command needs bits 0 to 6,
 /// and bit 0 must have been off before.
-fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> Told {
+fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> WordEffect {
     let valid = is(word, 0x0400);
     let word = if valid { word } else { known.before & (word | !0x0007) };
     let does = match word {
-        _ if !is(word, 0x0006) => Does::Coasts,
-        _ if !is(word, 0x0001) => Does::Prepares(1),
-        _ if !is(word, 0x0008) => Does::Coasts,
+        _ if !is(word, 0x0006) => MotorEffect::Coasts,
+        _ if !is(word, 0x0001) => MotorEffect::Prepares(1),
+        _ if !is(word, 0x0008) => MotorEffect::Coasts,
         _ if is(word, 0x007F) && known.position > 0 => runs(reverse),
-        _ => Does::Nothing,
+        _ => MotorEffect::Nothing,
     };
-    told(does, rises(known, word, 0x0080), word)
+    effect(does, rises(known, word, 0x0080), word)
 }
 
-fn abb(known: &Known<'_>, word: u16) -> Told {
+fn abb(known: &Known<'_>, word: u16) -> WordEffect {
     off_words(known, word, false)
 }
 
-fn profidrive(known: &Known<'_>, word: u16) -> Told {
+fn profidrive(known: &Known<'_>, word: u16) -> WordEffect {
     off_words(known, word, is(word, 0x0800))
 }
 
 /// Without bit 10 a word is ignored; bits 2 to 5 off brake, coast, stop quickly and freeze.
-fn danfoss(known: &Known<'_>, word: u16) -> Told {
+fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
     if !is(word, 0x0400) {
-        return told(Does::Nothing, false, known.before);
+        return effect(MotorEffect::Nothing, false, known.before);
     }
     let does = match word {
-        _ if !is(word, 0x0008) => Does::Coasts,
-        _ if !is(word, 0x0054) => Does::Stops,
+        _ if !is(word, 0x0008) => MotorEffect::Coasts,
+        _ if !is(word, 0x0054) => MotorEffect::Stops,
         // Frozen, or a jog.
-        _ if !is(word, 0x0020) || any(word, 0x0100) => Does::Nothing,
+        _ if !is(word, 0x0020) || any(word, 0x0100) => MotorEffect::Nothing,
         _ => runs(is(word, 0x8000)),
     };
-    told(does, rises(known, word, 0x0080), word)
+    effect(does, rises(known, word, 0x0080), word)
 }
 
 /// 6 shutdown, 7 switch on, 15 enable operation, each from the state before it.
-fn cia402(known: &Known<'_>, word: u16) -> Told {
+fn cia402(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word & 0x000F {
-        _ if known.faulted => Does::Coasts,
-        low if !is(low, 0x0002) => Does::Coasts,
-        low if !is(low, 0x0004) => Does::Stops,
-        0x06 | 0x0E => Does::Prepares(1),
-        0x07 if known.position >= 1 => Does::Prepares(2),
+        _ if known.faulted => MotorEffect::Coasts,
+        low if !is(low, 0x0002) => MotorEffect::Coasts,
+        low if !is(low, 0x0004) => MotorEffect::Stops,
+        0x06 | 0x0E => MotorEffect::Prepares(1),
+        0x07 if known.position >= 1 => MotorEffect::Prepares(2),
         0x0F if known.position >= 2 => runs(is(word, 0x0800)),
-        _ => Does::Nothing,
+        _ => MotorEffect::Nothing,
     };
-    told(does, rises(known, word, 0x0080), word)
+    effect(does, rises(known, word, 0x0080), word)
 }
 
 /// Bit 2 is an external fault; a reset counts only without a run command.
-fn yaskawa(known: &Known<'_>, word: u16) -> Told {
-    let does = if is(word, 0x0004) { Does::Trips } else { pair(word & 3) };
-    told(does, rises(known, word, 0x0008) && !any(word, 3), word)
+fn yaskawa(known: &Known<'_>, word: u16) -> WordEffect {
+    let does = if is(word, 0x0004) {
+        MotorEffect::Trips
+    } else {
+        pair(word & 3)
+    };
+    effect(does, rises(known, word, 0x0008) && !any(word, 3), word)
 }
 
 /// Bits 1 and 0 run (10) or stop (01), bits 5 and 4 say the direction; 0 does nothing.
-fn delta(known: &Known<'_>, word: u16) -> Told {
+fn delta(known: &Known<'_>, word: u16) -> WordEffect {
     let reverse = match word >> 4 & 3 {
         1 => false,
         2 => true,
         _ => known.reverse,
     };
     let does = match word & 3 {
-        1 => Does::Stops,
+        1 => MotorEffect::Stops,
         2 => runs(reverse),
-        _ => Does::Nothing,
+        _ => MotorEffect::Nothing,
     };
-    told(does, false, word)
+    effect(does, false, word)
 }
 
 /// 0x2002: bit 0 external fault, bit 1 reset, bit 2 base block.
-fn delta_reset(table: Table, address: u16, word: u16) -> Option<Told> {
+fn delta_reset(table: Table, address: u16, word: u16) -> Option<WordEffect> {
     let does = match word {
-        _ if is(word, 1) => Does::Trips,
-        _ if is(word, 4) => Does::Coasts,
-        _ => Does::Nothing,
+        _ if is(word, 1) => MotorEffect::Trips,
+        _ if is(word, 4) => MotorEffect::Coasts,
+        _ => MotorEffect::Nothing,
     };
-    ((table, address) == (Table::Holding, 0x2002)).then(|| told(does, is(word, 2), word))
+    ((table, address) == (Table::Holding, 0x2002)).then(|| effect(does, is(word, 2), word))
 }
 
 /// The codes act when they are written; jogs are not simulated.
-fn invt(_: &Known<'_>, word: u16) -> Told {
+fn invt(_: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
         1 | 2 => pair(word),
-        5 => Does::Stops,
-        6 => Does::Coasts,
-        _ => Does::Nothing,
+        5 => MotorEffect::Stops,
+        6 => MotorEffect::Coasts,
+        _ => MotorEffect::Nothing,
     };
-    told(does, word == 7, word)
+    effect(does, word == 7, word)
 }
 
-fn mitsubishi(_: &Known<'_>, word: u16) -> Told {
-    told(pair(word >> 1 & 3), false, word)
+fn mitsubishi(_: &Known<'_>, word: u16) -> WordEffect {
+    effect(pair(word >> 1 & 3), false, word)
 }
 
 /// Register 1 restarts the drive: the motor coasts, and the fault is gone.
-fn mitsubishi_restart(table: Table, address: u16, word: u16) -> Option<Told> {
-    ((table, address) == (Table::Holding, 1)).then(|| told(Does::Coasts, true, word))
+fn mitsubishi_restart(table: Table, address: u16, word: u16) -> Option<WordEffect> {
+    ((table, address) == (Table::Holding, 1)).then(|| effect(MotorEffect::Coasts, true, word))
 }
 
 /// Bit 3 coasts, bit 1 stops by the second ramp; both go before bit 0.
-fn invertek(known: &Known<'_>, word: u16) -> Told {
+fn invertek(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
-        _ if is(word, 0x0008) => Does::Coasts,
-        _ if is(word, 0x0002) => Does::Stops,
+        _ if is(word, 0x0008) => MotorEffect::Coasts,
+        _ if is(word, 0x0002) => MotorEffect::Stops,
         _ if is(word, 0x0001) => runs(false),
-        _ => Does::Stops,
+        _ => MotorEffect::Stops,
     };
-    told(does, rises(known, word, 0x0004), word)
+    effect(does, rises(known, word, 0x0004), word)
 }
 
 /// Bits 0 and 1 both, bit 2 forward; without bit 4 the panel commands.
-fn weg(known: &Known<'_>, word: u16) -> Told {
+fn weg(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
-        _ if !is(word, 0x0010) => Does::Nothing,
-        _ if !is(word, 0x0002) => Does::Coasts,
+        _ if !is(word, 0x0010) => MotorEffect::Nothing,
+        _ if !is(word, 0x0002) => MotorEffect::Coasts,
         _ if is(word, 0x0001) && !any(word, 0x0040) => runs(!is(word, 0x0004)),
-        _ => Does::Stops,
+        _ => MotorEffect::Stops,
     };
-    told(does, rises(known, word, 0x0080), word)
+    effect(does, rises(known, word, 0x0080), word)
 }
 
 /// Rising bit 15 resets, and the run command that stands starts the motor then.
-fn fuji(known: &Known<'_>, word: u16) -> Told {
-    told(pair(word & 3), rises(known, word, 0x8000), word)
+fn fuji(known: &Known<'_>, word: u16) -> WordEffect {
+    effect(pair(word & 3), rises(known, word, 0x8000), word)
 }
 
 /// S14: 1 resets.
-fn fuji_reset(table: Table, address: u16, word: u16) -> Option<Told> {
-    ((table, address) == (Table::Holding, 0x070E)).then(|| told(Does::Nothing, is(word, 1), word))
+fn fuji_reset(table: Table, address: u16, word: u16) -> Option<WordEffect> {
+    ((table, address) == (Table::Holding, 0x070E)).then(|| effect(MotorEffect::Nothing, is(word, 1), word))
 }
 
 /// Bits 15 and 10 run; bit 9 reverse, bit 11 coasts, bit 12 emergency off, bit 13 resets.
-fn toshiba(known: &Known<'_>, word: u16) -> Told {
+fn toshiba(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
-        _ if is(word, 0x1000) => Does::Trips,
-        _ if !is(word, 0x8000) => Does::Nothing,
-        _ if is(word, 0x0800) => Does::Coasts,
+        _ if is(word, 0x1000) => MotorEffect::Trips,
+        _ if !is(word, 0x8000) => MotorEffect::Nothing,
+        _ if is(word, 0x0800) => MotorEffect::Coasts,
         _ if is(word, 0x0400) => runs(is(word, 0x0200)),
-        _ => Does::Stops,
+        _ => MotorEffect::Stops,
     };
-    told(does, rises(known, word, 0x2000), word)
+    effect(does, rises(known, word, 0x2000), word)
 }
 
 /// Bit 0 stops, bits 1 and 2 run, bit 3 resets, bit 4 is the emergency stop; 0 does nothing.
-fn ls(known: &Known<'_>, word: u16) -> Told {
+fn ls(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word & 0x07 {
-        _ if is(word, 0x0010) => Does::Coasts,
-        1 => Does::Stops,
+        _ if is(word, 0x0010) => MotorEffect::Coasts,
+        1 => MotorEffect::Stops,
         2 => runs(false),
         4 => runs(true),
-        _ => Does::Nothing,
+        _ => MotorEffect::Nothing,
     };
-    told(does, rises(known, word, 0x0008), word)
+    effect(does, rises(known, word, 0x0008), word)
 }
 
 /// Bit 2 is an external fault.
-fn teco(known: &Known<'_>, word: u16) -> Told {
+fn teco(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
-        _ if is(word, 0x0004) => Does::Trips,
+        _ if is(word, 0x0004) => MotorEffect::Trips,
         _ if is(word, 0x0001) => runs(is(word, 0x0002)),
-        _ => Does::Stops,
+        _ => MotorEffect::Stops,
     };
-    told(does, rises(known, word, 0x0008), word)
+    effect(does, rises(known, word, 0x0008), word)
 }
 
 /// The run command that stands starts the motor after a reset.
-fn vacon(known: &Known<'_>, word: u16) -> Told {
-    let does = if is(word, 1) { runs(is(word, 2)) } else { Does::Stops };
-    told(does, rises(known, word, 0x0004), word)
+fn vacon(known: &Known<'_>, word: u16) -> WordEffect {
+    let does = if is(word, 1) {
+        runs(is(word, 2))
+    } else {
+        MotorEffect::Stops
+    };
+    effect(does, rises(known, word, 0x0004), word)
 }
 
 /// Coil 0 runs, coil 1 = 1 is reverse.
-fn hitachi(known: &Known<'_>, word: u16) -> Told {
+fn hitachi(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
-        0 => Does::Stops,
+        0 => MotorEffect::Stops,
         _ => runs((known.at)(Table::Coil, 1) != 0),
     };
-    told(does, false, word)
+    effect(does, false, word)
 }
 
 /// Coil 2 is an external trip, coil 3 resets.
-fn hitachi_coils(table: Table, address: u16, word: u16) -> Option<Told> {
+fn hitachi_coils(table: Table, address: u16, word: u16) -> Option<WordEffect> {
     match (table, address) {
-        (Table::Coil, 2) if word != 0 => Some(told(Does::Trips, false, word)),
-        (Table::Coil, 3) => Some(told(Does::Nothing, word != 0, word)),
+        (Table::Coil, 2) if word != 0 => Some(effect(MotorEffect::Trips, false, word)),
+        (Table::Coil, 3) => Some(effect(MotorEffect::Nothing, word != 0, word)),
         _ => None,
     }
 }

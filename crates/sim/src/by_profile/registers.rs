@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::super::SimTime;
 use super::super::model::Model;
 use super::ProfileDrive;
-use super::said;
+use super::effect;
 use super::wishes::Key;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, OwnWord};
@@ -26,7 +26,7 @@ impl Registers {
         for raw in profile.points.iter().filter_map(Point::raw) {
             all.extend(raw.addresses().map(|address| ((raw.table, address), 0)));
         }
-        let places = control.map(said::places).unwrap_or_default();
+        let places = control.map(effect::places).unwrap_or_default();
         all.extend(places.into_iter().map(|place| ((place.table, place.address), 0)));
         for expected in profile.identify.iter().filter(|expected| expected.values) {
             let probe = expected.probe;
@@ -56,7 +56,7 @@ impl Registers {
 
     /// Takes over what a drive keeps without supply: settings, but no commands.
     pub(super) fn keep_settings(&mut self, from: &Registers, profile: &Profile, control: Option<&Control>) {
-        let places = control.map(said::places).unwrap_or_default();
+        let places = control.map(effect::places).unwrap_or_default();
         let is_place = |key: Key| places.iter().any(|place| (place.table, place.address) == key);
         for (key, held) in &mut self.0 {
             let mut points = profile
@@ -197,7 +197,7 @@ impl ProfileDrive {
             if !self.control.as_ref().is_some_and(shadow) {
                 self.registers.set(key, value)?;
             }
-            self.told(place, value, now);
+            self.apply_word(place, value, now);
         }
         Ok(Reply::Written)
     }

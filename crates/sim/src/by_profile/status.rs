@@ -1,6 +1,6 @@
 //! The status words of the families, by hand from their manuals: no profile is read here.
 
-use super::words::is;
+use super::reactions::is;
 use crate::drive::profile::Part;
 
 /// The state that a status word shows.

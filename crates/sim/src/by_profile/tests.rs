@@ -488,18 +488,6 @@ fn shown(rig: &mut ProfiledDrive, profile: &Profile, point: ModelPoint) -> Optio
     }
 }
 
-/// What a drive shows: ready, running, reversed, fault, warning, at reference, zero speed, remote.
-const SHOWN: [ModelPoint; 8] = [
-    ModelPoint::Ready,
-    ModelPoint::Running,
-    ModelPoint::Reversed,
-    ModelPoint::Fault,
-    ModelPoint::Warning,
-    ModelPoint::AtReference,
-    ModelPoint::ZeroSpeed,
-    ModelPoint::Remote,
-];
-
 /// Each state reads back by the profile as what it is, and as nothing else.
 #[test]
 fn every_family_shows_each_state_and_no_other() {
@@ -508,7 +496,7 @@ fn every_family_shows_each_state_and_no_other() {
         let profile = Profiles::built_in().get(name).unwrap().clone();
         let mut rig = ProfiledDrive::named(name);
         let check = |rig: &mut ProfiledDrive, when: &str, expected: [bool; 8]| {
-            for (point, expected) in SHOWN.into_iter().zip(expected) {
+            for (point, expected) in ModelPoint::STATUS_WORD.into_iter().zip(expected) {
                 let found = shown(rig, &profile, point);
                 // Some families are ready only while they stand.
                 let moving = point == ModelPoint::Ready && !["stopped", "tripped"].contains(&when);

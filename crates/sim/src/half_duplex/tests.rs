@@ -155,7 +155,7 @@ fn talking_into_a_reply_is_a_collision_and_spoils_it() {
 
 #[test]
 fn faults_come_over_the_wire_and_are_not_the_masters_doing() {
-    let plan = |fault| FaultPlan::default().at(1, fault);
+    let plan = |fault| FaultPlan::default().on_request(1, fault);
     let exchange = exchange_time(&rules().format);
     let deliveries = |fault| {
         let mut line = line(rules(), plan(fault));

@@ -371,13 +371,13 @@ impl Model for NxDrive {
 
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
         self.advance(now);
-        self.heard(now);
+        self.message_received(now);
         Some(self.reply(request, now))
     }
 
     fn broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
-        self.heard(now);
+        self.message_received(now);
         if matches!(
             request,
             RequestPdu::WriteRegister { .. } | RequestPdu::WriteRegisters { .. }
@@ -387,7 +387,7 @@ impl Model for NxDrive {
     }
 
     /// Restarts the supervision.
-    fn heard(&mut self, now: SimTime) {
+    fn message_received(&mut self, now: SimTime) {
         self.heard = Some(now);
         self.lost_master = false;
     }

@@ -108,7 +108,7 @@ proptest! {
                         prop_assert_eq!(Reply::decode(request, &pdu), Ok(reply), "{:?}", request);
                     }
                 }
-                Event::Broadcast(request) => drive.heard_broadcast(request, now),
+                Event::Broadcast(request) => drive.broadcast_received(request, now),
                 Event::Malformed(pdu) => {
                     drive.malformed(pdu, Exception::VALUE, now);
                 }

@@ -93,7 +93,11 @@ fn dead_drives_faults_and_direct_access() {
     assert!(ask(1, short).is_empty());
     bus.set_alive(1, true);
     assert_eq!(ask(REPLY.len(), LONG), REPLY);
-    bus.set_faults(FaultPlan::default().at(1, Fault::Exception(6)).at(2, Fault::Drop));
+    bus.set_faults(
+        FaultPlan::default()
+            .on_request(1, Fault::Exception(6))
+            .on_request(2, Fault::Drop),
+    );
     assert_eq!(ask(5, LONG)[..3], [1, 0x83, 6]);
     assert!(ask(1, short).is_empty());
     assert_eq!(ask(REPLY.len(), LONG), REPLY);

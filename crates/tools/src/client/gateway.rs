@@ -86,7 +86,7 @@ impl Client {
     /// # Errors It cannot be reached in any way.
     pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
         let socket = Settings::socket_of(config, environment());
-        let mut client = Client::at(&socket, Expected::Configuration(absolute(config)));
+        let mut client = Client::for_socket(&socket, Expected::Configuration(absolute(config)));
         if socket == SocketPath::Off {
             let url = http_of(config)?;
             let (ca, token_file) = (None, None);
@@ -97,7 +97,7 @@ impl Client {
     }
 
     /// A client of the expected gateway, at its socket.
-    pub(crate) fn at(socket: &SocketPath, expected: Expected) -> Client {
+    pub(crate) fn for_socket(socket: &SocketPath, expected: Expected) -> Client {
         let paths = socket.of_client(&RuntimeDirectories::of_this_process());
         Client {
             doors: paths.into_iter().map(Door::Socket).collect(),

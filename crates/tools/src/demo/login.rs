@@ -33,7 +33,7 @@ impl Login {
         let password: String = secret.chars().rev().take(LENGTH).collect();
         let user = User::new(Login::USER, &password).map_err(|why| failed(why.to_string()))?;
         let file = directory.join("users");
-        CredentialsFile::at(&file).put(&user, true).map_err(failed)?;
+        CredentialsFile::open(&file).put(&user, true).map_err(failed)?;
         Ok(Login { password, file })
     }
 }
@@ -48,7 +48,7 @@ mod tests {
         let place = folder.path().join("demo");
         let first = Login::new(&place).unwrap();
         let alice = User::new("alice", "a long password").unwrap();
-        CredentialsFile::at(&first.file).put(&alice, true).unwrap();
+        CredentialsFile::open(&first.file).put(&alice, true).unwrap();
         let second = Login::new(&place).unwrap();
         assert_ne!(first.password, second.password);
         assert_eq!(second.password.chars().count(), LENGTH);

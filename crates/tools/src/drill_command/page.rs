@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::{said, seconds};
+use super::{seconds, state_text};
 use crate::drill::{DrillReport, DrillStep, Kind};
 
 const STYLE: &str = "body{font:11pt sans-serif;max-width:48em;margin:2em auto}table{border-collapse:collapse;width:100%}\
@@ -16,7 +16,7 @@ pub(super) fn of(drill: &DrillReport) -> String {
         <h1>Drill of drive {drive}</h1>\n<p class=\"result\">Result: <strong>{state}</strong>: {text}</p>\n<table>\n",
         id = escaped(&drill.id),
         drive = escaped(&drill.drive),
-        state = said(drill.state),
+        state = state_text(drill.state),
         text = escaped(&drill.text),
     );
     let not = "unknown".to_string();
@@ -78,7 +78,7 @@ fn row(kind: Kind, step: Option<&DrillStep>) -> String {
     });
     format!(
         "<tr><td>{way}</td><td>{}</td><td>{}</td><td>{took}</td><td>{}</td></tr>\n",
-        said(step.state),
+        state_text(step.state),
         escaped(step.cause_at.as_deref().unwrap_or_default()),
         escaped(&step.seen)
     )

@@ -59,7 +59,7 @@ impl Direct {
             bus.spec.cycle = RESTFUL.max(bus.spec.cycle);
         }
         // The drive keeps what was commanded when this process ends.
-        spec.on_shutdown = OnShutdown::Hold;
+        spec.on_shutdown = OnShutdown::LeaveRunning;
         spec.supervision = None;
         let name = spec.name.clone();
         let all = target.settings.buses.iter();

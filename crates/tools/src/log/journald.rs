@@ -20,17 +20,17 @@ const LONGEST: usize = 64 << 10;
 
 /// The socket of the journal.
 #[derive(Debug, Clone)]
-pub(super) struct Journal(Arc<UnixDatagram>);
+pub(super) struct Journald(Arc<UnixDatagram>);
 
-impl Journal {
+impl Journald {
     /// The journal, if standard error is connected to it, which `JOURNAL_STREAM` shows.
-    pub(super) fn of_stderr() -> Option<Journal> {
+    pub(super) fn of_stderr() -> Option<Journald> {
         if !reads_stderr() {
             return None;
         }
         let socket = UnixDatagram::unbound().ok()?;
         socket.connect(SOCKET).ok()?;
-        Some(Journal(Arc::new(socket)))
+        Some(Journald(Arc::new(socket)))
     }
 }
 
@@ -41,7 +41,7 @@ pub(crate) fn reads_stderr() -> bool {
     matches!((stderr, stream), (Ok(stderr), Ok(stream)) if stream == format!("{}:{}", stderr.dev(), stderr.ino()))
 }
 
-impl Write for Journal {
+impl Write for Journald {
     /// Sends one entry. While journald is being restarted, it goes to standard error, which journald reads afterwards.
     fn write(&mut self, entry: &[u8]) -> io::Result<usize> {
         let sent = self.0.send(entry).or_else(|_| {

@@ -11,7 +11,7 @@ use tracing_subscriber::fmt::format::{Format, Json, Writer};
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
-use super::{AUDIT, journal};
+use super::{AUDIT, journald};
 use crate::printable;
 
 /// Shortest time between two lines of one kind that a library logs.
@@ -85,7 +85,7 @@ where
             Form::Entry => {
                 let target = metadata.target();
                 let message = format!("{target}: {text}");
-                return writer.write_str(&journal::entry(priority(*metadata.level()), target, &message, event));
+                return writer.write_str(&journald::entry(priority(*metadata.level()), target, &message, event));
             }
             Form::Priority | Form::Text => self.head(metadata, &mut writer)?,
             Form::Json => {}

@@ -115,7 +115,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     let shown = std::cell::Cell::new(false);
     let agreed = |prepared: &Restore| {
         line.borrow().end();
-        report::print(&told(prepared));
+        report::print(&plan_text(prepared));
         shown.set(true);
         match agrees(drive, how) {
             Ok(()) => true,
@@ -148,7 +148,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     match ended.stage {
         Stage::Done => {
             if !shown.get() {
-                report::print(&told(&ended));
+                report::print(&plan_text(&ended));
             }
             report::note(&text);
             Ok(ExitCode::SUCCESS)
@@ -168,7 +168,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
 }
 
 /// The plan, as text.
-fn told(prepared: &Restore) -> String {
+fn plan_text(prepared: &Restore) -> String {
     let plan = prepared.plan.clone().unwrap_or_default();
     let risks = prepared
         .risks

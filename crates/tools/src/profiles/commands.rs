@@ -37,7 +37,7 @@ pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, 
     }
     lines.extend(control.reverse.as_ref().map(|reverse| ("reverse", setting(reverse))));
     if let Some(reset) = &control.fault_reset {
-        let hold = format_duration(reset.hold);
+        let hold = format_duration(reset.pulse);
         lines.push(("fault reset", format!("{}, for {hold}", setting(&reset.setting))));
     }
     lines.push(("own timeout", refresh(profile, control)));

@@ -64,7 +64,7 @@ async fn start(mut settings: Settings) -> Result<Daemon, String> {
     let mut port = HTTP;
     loop {
         let address = demo::free_port("the status page", port)?;
-        settings.http = Some(http::Options::at(address));
+        settings.http = Some(http::Options::listening_on(address));
         match Daemon::start(settings.clone()).await {
             // Another program has taken the port since the port was found free.
             Err(error) if error.address_in_use().is_some() => port = address.port().saturating_add(1),

@@ -39,12 +39,12 @@ fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig,
         rig.step();
         assert!(rig.now < until, "it does not end: {:?}", drills.report(&id));
         meanwhile(&mut rig, &drills.report(&id).unwrap());
-        if !drills.look(&plant, rig.now, time) {
+        if !drills.advance(&plant, rig.now, time) {
             break;
         }
     }
     assert!(!rig.runs(0), "every drill ends with a stop");
-    assert_eq!(rig.bus.image.drives[0].hold.why(), None);
+    assert_eq!(rig.bus.image.drives[0].restore_lock.reason(), None);
     assert_eq!(rig.bus.queue.quiet(rig.now), None);
     let report = drills.report(&id).unwrap();
     assert_eq!(report.last_stop.as_deref(), Some("acknowledged"), "{report:#?}");
@@ -268,7 +268,7 @@ fn look(rig: &mut Rig, (plant, drills): &(Plant, Drills), at: SystemTime, span: 
     let mut goes_on = true;
     while rig.now < until {
         rig.step();
-        goes_on = drills.look(plant, rig.now, at);
+        goes_on = drills.advance(plant, rig.now, at);
     }
     goes_on
 }

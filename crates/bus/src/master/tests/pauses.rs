@@ -12,7 +12,7 @@ impl Rig {
         let began = self.now;
         self.now += time;
         let stall = Stall::new(began, self.now);
-        self.master.stood(stall, self.now);
+        self.master.after_stall(stall, self.now);
         stall
     }
 

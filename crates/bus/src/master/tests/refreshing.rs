@@ -46,7 +46,7 @@ impl Plant {
                 supervision: Some(Settings {
                     timeout: Duration::from_secs(3600),
                     // A stop would end the refresh, too.
-                    action: LeaseAction::Hold,
+                    action: LeaseAction::LeaveRunning,
                     adopt: false,
                 }),
                 ..spec
@@ -234,7 +234,7 @@ fn a_refresh_ends_for_good_with_everything_that_contradicts_it() {
             plant.rig.drives[0].silent = false;
         }),
         ("broadcast", |plant| {
-            plant.rig.master.drives[0].heard_order(false, plant.rig.now);
+            plant.rig.master.drives[0].foreign_order(false, plant.rig.now);
         }),
         ("lease", |plant| {
             let lease = Lease::held(plant.rig.now - Duration::from_secs(3601));
@@ -370,7 +370,8 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
 fn stands_still(rig: &mut Rig, ms: u64) {
     let began = rig.now;
     rig.now += Duration::from_millis(ms);
-    rig.master.stood(crate::stalls::Stall::new(began, rig.now), rig.now);
+    rig.master
+        .after_stall(crate::stalls::Stall::new(began, rig.now), rig.now);
 }
 
 /// Values read in a round no longer hold when the port was lost, or the thread was stalled, before its write.

@@ -61,7 +61,7 @@ fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
     // A drive that is to run on, or that may not be commanded, rules out the broadcast for all.
     let hold = |spec: DriveSpec| DriveSpec {
         on_shutdown: if spec.address == 4 {
-            OnShutdown::Hold
+            OnShutdown::LeaveRunning
         } else {
             OnShutdown::Stop
         },

@@ -32,7 +32,7 @@ fn answered(rig: &mut Rig, plant: &Plant, stop_all: &StopAll, order: &mut StopOr
     let begin = rig.now;
     loop {
         rig.step();
-        stop_all.look(plant, rig.now);
+        stop_all.advance(plant, rig.now);
         if let Ok(report) = order.report.try_recv() {
             return report;
         }
@@ -133,7 +133,7 @@ fn a_silent_drive_is_named_and_stopped_once_it_is_back() {
     let begin = rig.now;
     while first.acknowledged.is_empty() {
         rig.step();
-        stop_all.look(&plant, rig.now);
+        stop_all.advance(&plant, rig.now);
         assert!(rig.now < begin + Duration::from_secs(2), "the first failure is told");
     }
     assert_eq!(first.acknowledged.try_recv(), Ok(false));
@@ -155,7 +155,7 @@ fn a_silent_drive_is_named_and_stopped_once_it_is_back() {
     let begin = rig.now;
     while rig.now < begin + Duration::from_secs(3) {
         rig.step();
-        stop_all.look(&plant, rig.now);
+        stop_all.advance(&plant, rig.now);
     }
     rig.drives[1].silent = false;
     let report = answered(&mut rig, &plant, &stop_all, &mut second);
@@ -178,7 +178,7 @@ fn a_second_order_joins_stops_that_wait_and_sends_those_that_were_acknowledged_a
     let mut third = order(&rig, &plant, &stop_all, &Scope::Gateway);
     assert!(answered(&mut rig, &plant, &stop_all, &mut third).ok);
     assert!(!rig.runs(2));
-    assert!(!stop_all.look(&plant, rig.now), "nothing is under way");
+    assert!(!stop_all.advance(&plant, rig.now), "nothing is under way");
 }
 
 #[test]

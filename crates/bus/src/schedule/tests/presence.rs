@@ -334,7 +334,7 @@ fn a_drive_that_comes_and_goes_has_no_more_early_probes_than_it_saved_up() {
     let mut early = Vec::new();
     for _ in 0..20 {
         drive.presence = Presence::Online;
-        drive.early.came(now);
+        drive.early.answers_again(now);
         now += ms(500);
         let times = probes(&mut drive, now, took, ms(2_500));
         early.push(times.iter().filter(|time| **time <= ms(2_000)).count());
@@ -343,7 +343,7 @@ fn a_drive_that_comes_and_goes_has_no_more_early_probes_than_it_saved_up() {
     assert_eq!(early[0], 3);
     assert!(early[10..].iter().sum::<usize>() <= 12, "{early:?}");
     drive.presence = Presence::Online;
-    drive.early.came(now);
+    drive.early.answers_again(now);
     let times = probes(&mut drive, now + Duration::from_secs(30), took, ms(2_500));
     assert_eq!(times[..3], [ms(500), ms(1_000), ms(2_000)], "saved up again");
 }

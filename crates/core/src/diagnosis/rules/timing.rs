@@ -17,7 +17,7 @@ impl Rules<'_> {
         for (place, drive) in figures.drives.enumerate() {
             let own = self.sum(place, Sign::Late);
             let lasts = drive.steps(&[Sign::Late]) >= LASTING;
-            if own < FEW || !lasts || self.is_told(place) || own * 2 <= late {
+            if own < FEW || !lasts || self.is_reported(place) || own * 2 <= late {
                 continue;
             }
             let latest = drive.slowest_ms();

@@ -23,7 +23,7 @@ enum Seen {
 }
 
 impl Run {
-    pub(super) fn look_at_cause(
+    pub(super) fn check_cause(
         &mut self,
         cause: Instant,
         mut how: Cause,

@@ -209,7 +209,7 @@ fn a_point_beyond_its_limit_for_its_time_makes_one_recording() {
     let above = PointTrigger {
         point: nx.point_index("motor_current").unwrap(),
         limit: TriggerLimit::Above(120.0),
-        hold: 2 * SECOND,
+        lasts: 2 * SECOND,
     };
     let mut rig = Rig::new(options(), 1, &[above]);
     let made = rig.polls(60 * SECOND, |rig, n| {
@@ -381,9 +381,9 @@ fn a_reload_keeps_what_stays_and_ends_what_goes() {
             .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
             .is_empty()
     );
-    assert!(bus.tape.takes(Taping::Reads));
+    assert!(bus.tape.records(Taping::Reads));
     let made = rig.recorder.adopt(&[], STALE_AFTER, clock);
-    assert!(!bus.tape.takes(Taping::Reads));
+    assert!(!bus.tape.records(Taping::Reads));
     let [recording] = &made.iter().map(assemble).collect::<Vec<_>>()[..] else {
         panic!()
     };

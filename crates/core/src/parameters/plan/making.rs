@@ -70,7 +70,7 @@ impl<'a> Making<'a> {
     /// The plan, or every reason against it.
     pub(super) fn make(mut self) -> Result<(Plan, Vec<Risk>), Vec<String>> {
         self.compare_drives();
-        self.look_for_named();
+        self.find_named();
         self.collect();
         self.note_what_one_side_has();
         self.check_ratings();
@@ -145,7 +145,7 @@ impl<'a> Making<'a> {
     }
 
     /// Parameters named by the user must exist on both sides.
-    fn look_for_named(&mut self) {
+    fn find_named(&mut self) {
         let missing = |id: &Id| {
             let side = [(self.wanted, "the file"), (self.present, "the drive")];
             side.into_iter()
@@ -213,7 +213,7 @@ impl<'a> Making<'a> {
     }
 
     fn has_name(&self, address: u16) -> bool {
-        let parameter = self.profile.parameters.at(address);
+        let parameter = self.profile.parameters.by_address(address);
         parameter.is_some_and(|parameter| !parameter.label.name.is_empty())
     }
 
@@ -225,8 +225,8 @@ impl<'a> Making<'a> {
                  drive's family"
             ));
         }
-        let parameter = self.profile.parameters.at(address);
-        match parameter.and_then(|parameter| parameter.range.as_ref().filter(|_| !parameter.takes(to))) {
+        let parameter = self.profile.parameters.by_address(address);
+        match parameter.and_then(|parameter| parameter.range.as_ref().filter(|_| !parameter.accepts(to))) {
             None => Ok(()),
             Some(range) => Err(format!(
                 "{}: outside the drive's range, {} to {}; restore the others with --only",

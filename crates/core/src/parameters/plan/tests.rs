@@ -103,7 +103,7 @@ fn legal_values(profile: &Profile, seeds: &[u16]) -> Values {
     let places = addresses(list);
     let values = places.iter().zip(seeds.iter().cycle());
     let mut values: Values = values
-        .map(|(&address, &seed)| (address, legal(profile, list.at(address), seed)))
+        .map(|(&address, &seed)| (address, legal(profile, list.by_address(address), seed)))
         .collect();
     while let Some(limit) = list.rules.limits.iter().find(|limit| !keeps(&values, limit)) {
         let upper = values[&limit.upper];

@@ -88,7 +88,7 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
 
 /// On N2 a write sets one whole object: an address within an object is refused, and so is another length.
 fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
-    let object = Object::at(table, first)
+    let object = Object::containing(table, first)
         .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;
     let items = object.items();
     if count != usize::from(items) {

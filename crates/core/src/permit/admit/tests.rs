@@ -339,9 +339,9 @@ fn a_parameter_where_the_drive_is_commanded_is_not_written() {
         params: ParamsAccess::Write,
         ..DriveSpec::new("pump-1", "line1", 1, Arc::clone(&profile))
     };
-    let hold = Arc::new(Hold::default());
-    hold.set(Some("it is being restored".to_string()));
-    let image = DriveImage::new(spec, Duration::from_secs(1)).with_hold(hold);
+    let restore_lock = Arc::new(RestoreLock::default());
+    restore_lock.set(Some("it is being restored".to_string()));
+    let image = DriveImage::new(spec, Duration::from_secs(1)).with_restore_lock(restore_lock);
     let reading = image.reading(Instant::now(), Duration::from_secs(1));
     for (address, passes) in [(100, true), (2000, false), (2002, true)] {
         let order = ParameterOrder {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::{DriveGate, Gate};
 use crate::drive::DriveIndex;
 use crate::order::{Asks, Command, Holder, Origin, Refusal};
-use crate::permit::holder::{Claim, Denial, HoldView, Holding, Mode, Rules, Told, Verb};
+use crate::permit::holder::{Claim, Denial, HoldChange, HoldView, Holding, Mode, Rules, Verb};
 use crate::permit::judge::Ask;
 
 /// Most changes of holds waiting to be published, which happens several times a second; beyond that the oldest is
@@ -19,7 +19,7 @@ const UNHELD_LOGGED: Duration = Duration::from_secs(60);
 /// Changes of holds that are to be published, and commands to be logged.
 #[derive(Debug, Default)]
 pub(super) struct HoldNews {
-    told: Vec<(DriveIndex, Told)>,
+    told: Vec<(DriveIndex, HoldChange)>,
     unheld: Vec<(DriveIndex, Unheld)>,
     /// When a command of a client that did not hold its drive was last logged.
     logged: BTreeMap<Arc<str>, Instant>,
@@ -35,7 +35,7 @@ pub struct Unheld {
 }
 
 impl HoldNews {
-    fn tell(&mut self, drive: DriveIndex, told: Vec<Told>) {
+    fn record_changes(&mut self, drive: DriveIndex, told: Vec<HoldChange>) {
         self.told.extend(told.into_iter().map(|told| (drive, told)));
         let beyond = self.told.len().saturating_sub(MOST_TOLD);
         self.told.drain(..beyond);
@@ -62,12 +62,12 @@ impl Gate {
     fn with_hold<T>(
         &mut self,
         drive: DriveIndex,
-        change: impl FnOnce(&mut Holding, &Rules, &mut Vec<Told>) -> T,
+        change: impl FnOnce(&mut Holding, &Rules, &mut Vec<HoldChange>) -> T,
     ) -> Option<T> {
         let rules = self.rules.clone()?;
         let mut told = Vec::new();
         let changed = change(&mut self.drive(drive).holding, &rules, &mut told);
-        self.hold_news.tell(drive, told);
+        self.hold_news.record_changes(drive, told);
         Some(changed)
     }
 
@@ -261,7 +261,7 @@ impl Gate {
     }
 
     /// Ends what has expired, and returns the changes since the last call.
-    pub fn take_told(&mut self, now: Instant) -> Vec<(DriveIndex, Told)> {
+    pub fn take_changes(&mut self, now: Instant) -> Vec<(DriveIndex, HoldChange)> {
         let drives: Vec<DriveIndex> = self.drives.keys().copied().collect();
         for drive in drives {
             self.with_hold(drive, |holding, rules, told| holding.settle(rules, now, told));

@@ -87,7 +87,7 @@ pub struct HoldView {
 
 /// A change of a hold, for an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Told {
+pub struct HoldChange {
     /// The holder.
     pub who: Claim,
     /// The change.
@@ -125,7 +125,7 @@ struct Waiting {
 
 /// A client whose last command word was a stop.
 #[derive(Debug, Clone)]
-struct Stood {
+struct LastStop {
     name: Arc<str>,
     /// Whether the drive acknowledged the stop.
     acknowledged: bool,
@@ -141,7 +141,7 @@ pub struct Holding {
     /// Clients that must take the drive; at most as many as principals.
     waiting: Vec<Waiting>,
     /// The clients whose last command word was a stop.
-    stood: Vec<Stood>,
+    stood: Vec<LastStop>,
     /// Client whose run command was accepted last.
     starter: Option<Claim>,
     /// A client that is not configured as cyclic but ended the hold of another by repeating its last stop, over an interface
@@ -151,7 +151,7 @@ pub struct Holding {
 
 impl Holding {
     /// Ends the hold or reservation if it has expired.
-    pub fn settle(&mut self, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    pub fn settle(&mut self, rules: &Rules, now: Instant, told: &mut Vec<HoldChange>) {
         match &self.state {
             State::Held(_, until) if *until <= now => self.ends("its lease ended", told),
             State::Reserved(_, until) if *until <= now => self.state = State::Free,
@@ -163,9 +163,9 @@ impl Holding {
     }
 
     /// A hold ends; a reservation stays.
-    fn ends(&mut self, why: &str, told: &mut Vec<Told>) {
+    fn ends(&mut self, why: &str, told: &mut Vec<HoldChange>) {
         if let State::Held(who, _) = &self.state {
-            told.push(Told {
+            told.push(HoldChange {
                 who: who.clone(),
                 what: What::Released(why.to_string()),
             });
@@ -203,7 +203,7 @@ impl Holding {
             return Err(Denial::Local);
         }
         if let Some((by, left)) = self.held(now).filter(|(by, _)| !by.is(who)) {
-            let breaks = who.breaks && by.is_below(who) && asks.takes();
+            let breaks = who.breaks && by.is_below(who) && asks.takes_hold();
             if !breaks {
                 return Err(Denial::Held(by.clone(), left));
             }
@@ -223,7 +223,7 @@ impl Holding {
     /// Why the stop of a cyclic client is not sent: it repeats a stop that the drive acknowledged, and another client holds the
     /// drive, or started the motor last.
     fn repeats_in_vain(&self, who: &Claim, now: Instant) -> Option<Denial> {
-        let is_acknowledged = |stood: &Stood| stood.acknowledged && stood.name == who.name;
+        let is_acknowledged = |stood: &LastStop| stood.acknowledged && stood.name == who.name;
         if !who.cyclic || !self.stood.iter().any(is_acknowledged) {
             return None;
         }
@@ -252,12 +252,19 @@ impl Holding {
     }
 
     /// A command was accepted.
-    pub fn accepted(&mut self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    pub fn accepted(
+        &mut self,
+        who: Option<&Claim>,
+        asks: Asks,
+        rules: &Rules,
+        now: Instant,
+        told: &mut Vec<HoldChange>,
+    ) {
         self.settle(rules, now, told);
         let repeats = asks == Asks::Stop && who.is_some_and(|who| self.repeats(who));
         let is_other = |by: &Claim| who.is_some_and(|who| !by.is(who));
         let ends = asks == Asks::Stop && !repeats && self.held(now).is_some_and(|(by, _)| is_other(by));
-        if let Some(who) = who.filter(|who| ends && who.may_repeat && self.has_stood(who)) {
+        if let Some(who) = who.filter(|who| ends && who.may_repeat && self.has_stopped(who)) {
             self.repeater = Some(who.name.clone());
         }
         self.note_word(who, asks);
@@ -275,7 +282,7 @@ impl Holding {
         }
     }
 
-    fn stopped(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    fn stopped(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<HoldChange>) {
         self.said_stop(who);
         match &self.state {
             State::Held(by, _) if by.is(who) => return self.renew(who, rules, now),
@@ -288,7 +295,7 @@ impl Holding {
 
     /// Supervision stops the drive with the rank of the client that went silent. Any other stop of the gateway's own
     /// reserves nothing.
-    pub fn stopped_by_gateway(&mut self, supervision: bool, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    pub fn stopped_by_gateway(&mut self, supervision: bool, rules: &Rules, now: Instant, told: &mut Vec<HoldChange>) {
         self.settle(rules, now, told);
         self.ends("the gateway stopped the drive", told);
         let Some(silent) = self.last.as_ref().filter(|_| supervision) else {
@@ -312,25 +319,25 @@ impl Holding {
         self.waiting.retain(|waiting| !waiting.who.is(who));
     }
 
-    fn taken(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    fn taken(&mut self, who: &Claim, rules: &Rules, now: Instant, told: &mut Vec<HoldChange>) {
         if self.local {
             return;
         }
         let held = What::Held;
         match &self.state {
             State::Held(by, _) if by.is(who) => {}
-            State::Held(by, _) if rules.mode == Mode::Exclusive => told.push(Told {
+            State::Held(by, _) if rules.mode == Mode::Exclusive => told.push(HoldChange {
                 who: by.clone(),
                 what: What::Broken(who.clone()),
             }),
             State::Held(..) => {
                 self.ends(&format!("{} commanded the drive", who.name), told);
-                told.push(Told {
+                told.push(HoldChange {
                     who: who.clone(),
                     what: held,
                 });
             }
-            State::Free | State::Reserved(..) => told.push(Told {
+            State::Free | State::Reserved(..) => told.push(HoldChange {
                 who: who.clone(),
                 what: held,
             }),
@@ -341,9 +348,16 @@ impl Holding {
 
     /// Notes that the turn of an accepted command came and that it passes: the command takes the hold again if that has
     /// ended since.
-    pub(crate) fn turn_came(&mut self, who: &Claim, asks: Asks, rules: &Rules, now: Instant, told: &mut Vec<Told>) {
+    pub(crate) fn turn_came(
+        &mut self,
+        who: &Claim,
+        asks: Asks,
+        rules: &Rules,
+        now: Instant,
+        told: &mut Vec<HoldChange>,
+    ) {
         self.settle(rules, now, told);
-        if asks.takes() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
+        if asks.takes_hold() && rules.mode == Mode::Exclusive && !self.is_held_by(who, now) {
             self.taken(who, rules, now, told);
         }
     }
@@ -368,7 +382,7 @@ impl Holding {
         verb: Verb,
         rules: &Rules,
         now: Instant,
-        told: &mut Vec<Told>,
+        told: &mut Vec<HoldChange>,
     ) -> Result<(), Denial> {
         self.settle(rules, now, told);
         let who = who.ok_or(Denial::Nobody)?;
@@ -393,7 +407,7 @@ impl Holding {
         Ok(())
     }
 
-    fn release(&mut self, who: &Claim, told: &mut Vec<Told>) {
+    fn release(&mut self, who: &Claim, told: &mut Vec<HoldChange>) {
         match &self.state {
             State::Held(by, _) if by.is(who) => self.ends("its holder released it", told),
             State::Reserved(by, _) if by.is(who) => self.state = State::Free,
@@ -403,7 +417,7 @@ impl Holding {
     }
 
     /// Sets whether the drive is under local control. That ends a hold, but not a reservation.
-    pub fn set_local(&mut self, local: bool, told: &mut Vec<Told>) {
+    pub fn set_local(&mut self, local: bool, told: &mut Vec<HoldChange>) {
         if local && !self.local {
             self.ends("the drive was switched to its local control place", told);
         }
@@ -416,9 +430,9 @@ impl Holding {
     }
 
     /// After a reload: principals that are gone hold nothing, those that changed have their new rank.
-    pub(crate) fn keep_known(&mut self, rules: &Rules, told: &mut Vec<Told>) {
+    pub(crate) fn keep_known(&mut self, rules: &Rules, told: &mut Vec<HoldChange>) {
         if let State::Held(by, _) = &self.state
-            && !rules.knows(by)
+            && !rules.is_configured(by)
         {
             self.ends("a reload removed it from [authority]", told);
         }
@@ -432,16 +446,16 @@ impl Holding {
             State::Held(by, _) | State::Reserved(by, _) => rank_of(by),
             State::Free => {}
         }
-        self.last = self.last.take().filter(|last| rules.knows(last));
+        self.last = self.last.take().filter(|last| rules.is_configured(last));
         self.last.iter_mut().for_each(rank_of);
-        self.waiting.retain(|waiting| rules.knows(&waiting.who));
-        let is_known = |stood: &Stood| rules.principals.iter().any(|p| p.name == stood.name);
+        self.waiting.retain(|waiting| rules.is_configured(&waiting.who));
+        let is_known = |stood: &LastStop| rules.principals.iter().any(|p| p.name == stood.name);
         self.stood.retain(is_known);
         self.repeater = None;
     }
 
     /// Ends the hold, for that reason.
-    pub fn end(&mut self, why: &str, told: &mut Vec<Told>) {
+    pub fn end(&mut self, why: &str, told: &mut Vec<HoldChange>) {
         self.ends(why, told);
     }
 
@@ -519,24 +533,24 @@ impl Holding {
         }
     }
 
-    fn has_stood(&self, who: &Claim) -> bool {
+    fn has_stopped(&self, who: &Claim) -> bool {
         self.stood.iter().any(|stood| stood.name == who.name)
     }
 
     /// Whether the last word of this cyclic client was a stop, too.
     pub(crate) fn repeats(&self, who: &Claim) -> bool {
-        who.cyclic && self.has_stood(who)
+        who.cyclic && self.has_stopped(who)
     }
 
     fn note_word(&mut self, who: Option<&Claim>, asks: Asks) {
         let Some(who) = who else { return };
         match asks {
-            Asks::Stop if !self.has_stood(who) => {
+            Asks::Stop if !self.has_stopped(who) => {
                 // The table is bounded: besides the principals there may be any number of users.
                 if self.stood.len() >= MOST_STOOD {
                     self.stood.remove(0);
                 }
-                self.stood.push(Stood {
+                self.stood.push(LastStop {
                     name: who.name.clone(),
                     acknowledged: false,
                 });

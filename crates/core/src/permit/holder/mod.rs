@@ -11,7 +11,7 @@ mod kept;
 mod principal;
 
 pub use denial::Denial;
-pub use holding::{HoldState, HoldView, Holding, Told, Verb, What};
+pub use holding::{HoldChange, HoldState, HoldView, Holding, Verb, What};
 pub use kept::KeptReservation;
 pub use principal::{Claim, Mode, Principal, Rules};
 

@@ -141,9 +141,9 @@ impl Rules {
         match proof {
             Proof::Nothing => None,
             Proof::Certificate(name, address) => {
-                named(&|p| matches(&p.certificate, name)).or_else(|| self.at(*address, |p| &p.modbus_tcp))
+                named(&|p| matches(&p.certificate, name)).or_else(|| self.by_address(*address, |p| &p.modbus_tcp))
             }
-            Proof::Address(address) => self.at(*address, |p| &p.modbus_tcp),
+            Proof::Address(address) => self.by_address(*address, |p| &p.modbus_tcp),
             Proof::User(user) => named(&|p| matches(&p.http_user, user)).map(Claim::never_repeating),
             Proof::Topic(who) => named(&|p| matches(&p.mqtt, who)),
             Proof::Sparkplug => named(&|p| p.sparkplug),
@@ -153,7 +153,7 @@ impl Rules {
             }
             Proof::Pty(path) => Some(first(format!("slot:{path}"))),
             Proof::Bacnet(address, priority) => {
-                let claim = self.at(*address, |p| &p.bacnet)?;
+                let claim = self.by_address(*address, |p| &p.bacnet)?;
                 let rank = claim.rank.max(self.rank_of_priority(*priority));
                 Some(Claim {
                     rank,
@@ -165,7 +165,7 @@ impl Rules {
     }
 
     /// The principal with the longest prefix at an address.
-    fn at(&self, address: IpAddr, networks: impl Fn(&Principal) -> &Vec<IpNet>) -> Option<Claim> {
+    fn by_address(&self, address: IpAddr, networks: impl Fn(&Principal) -> &Vec<IpNet>) -> Option<Claim> {
         let address = address.to_canonical();
         let longest = |p: &Principal| {
             let of = networks(p).iter().filter(|network| network.contains(&address));
@@ -192,7 +192,7 @@ impl Rules {
     }
 
     /// Whether the principal is still configured.
-    pub fn knows(&self, claim: &Claim) -> bool {
+    pub fn is_configured(&self, claim: &Claim) -> bool {
         // Names of principals have no colon.
         claim.name.contains(':') || self.principals.iter().any(|p| p.name == claim.name)
     }

@@ -29,7 +29,7 @@ struct Drive {
     rules: Rules,
     holding: Holding,
     now: Instant,
-    told: Vec<Told>,
+    told: Vec<HoldChange>,
 }
 
 impl Drive {
@@ -96,7 +96,7 @@ impl Drive {
 
     fn told(&mut self) -> Vec<String> {
         let told = std::mem::take(&mut self.told);
-        let word = |told: Told| match told.what {
+        let word = |told: HoldChange| match told.what {
             What::Held => format!("{} held", told.who.name),
             What::Released(why) => format!("{} released: {why}", told.who.name),
             What::Broken(by) => format!("{} broken by {}", told.who.name, by.name),

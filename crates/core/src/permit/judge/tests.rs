@@ -11,7 +11,7 @@ use crate::order::{
     Admitted, Arrival, Command, Commanded, Connection, Entry, Proof, Right, SourceKind, Ticket, Urgency, Window,
 };
 use crate::permit::{DrillLock, Mode, Principal, Rules, Verb};
-use crate::process_image::{DriveImage, Hold};
+use crate::process_image::{DriveImage, RestoreLock};
 use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
 use crate::testkit::{bus_spec, controlled, image, nx, read};
 
@@ -92,12 +92,12 @@ impl Rig {
             }
             _ => {}
         }
-        let hold = Arc::new(Hold::default());
+        let restore_lock = Arc::new(RestoreLock::default());
         let drive_image = image(spec);
         let drive_image = match why {
             Why::Restoring => {
-                hold.set(Some("it is being restored".to_string()));
-                Arc::new(DriveImage::new(drive_image.spec.clone(), SECOND).with_hold(hold))
+                restore_lock.set(Some("it is being restored".to_string()));
+                Arc::new(DriveImage::new(drive_image.spec.clone(), SECOND).with_restore_lock(restore_lock))
             }
             _ => drive_image,
         };
@@ -114,7 +114,7 @@ impl Rig {
         if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {
             guards.begin();
             shared.watch([(bus.machine(&rig.image.spec), rig.image.clone())], 10 * SECOND, asked);
-            guards.look(drive, &rig.image.reading(asked, 10 * SECOND));
+            guards.update(drive, &rig.image.reading(asked, 10 * SECOND));
             rig.gate.set_starts(Some(guards));
         }
         match why {
@@ -151,9 +151,9 @@ impl Rig {
                 let guards = gate.starts().unwrap().clone();
                 guards.start_written(drive, first.intent.number, &Arc::from("bob"), now);
                 read(&rig.image, 2100, &[0x03, 0, 0, 2500], now + Duration::from_millis(1));
-                guards.look(drive, &rig.image.reading(now + Duration::from_millis(1), 10 * SECOND));
+                guards.update(drive, &rig.image.reading(now + Duration::from_millis(1), 10 * SECOND));
                 read(&rig.image, 2100, &[0x41, 0, 0, 0], now + Duration::from_millis(2));
-                guards.look(drive, &rig.image.reading(now + Duration::from_millis(2), 10 * SECOND));
+                guards.update(drive, &rig.image.reading(now + Duration::from_millis(2), 10 * SECOND));
                 rig.gate = gate;
             }
         }

@@ -40,7 +40,7 @@ fn asked(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: 
 }
 
 fn standing(all: &Priorities, what: Commanded) -> Vec<(u8, f64)> {
-    let one = |priority| Some((priority, all.stands(what, priority)?.value.as_f64()));
+    let one = |priority| Some((priority, all.entry(what, priority)?.value.as_f64()));
     (1..=16).filter_map(one).collect()
 }
 

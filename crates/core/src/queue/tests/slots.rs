@@ -30,7 +30,7 @@ fn stand(pending: &mut Pending, drive: usize, priority: u8, run: bool, now: Inst
 fn stands(pending: &mut Pending, drive: usize) -> Vec<u8> {
     let all = pending.gate.priorities(DriveIndex::new(drive));
     (1..=16)
-        .filter(|priority| all.stands(Commanded::Run, *priority).is_some())
+        .filter(|priority| all.entry(Commanded::Run, *priority).is_some())
         .collect()
 }
 

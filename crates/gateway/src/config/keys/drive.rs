@@ -20,7 +20,7 @@ pub(in crate::config) const UNIT_IDS: Number = Number(0..=255, None);
 pub(in crate::config) const N2_ADDRESSES: Number = Number(1..=255, BROADCAST);
 /// The actions that are words.
 pub(in crate::config) const ACTIONS: Words<LeaseAction> =
-    Words(&[("stop", LeaseAction::Stop), ("hold", LeaseAction::Hold)]);
+    Words(&[("stop", LeaseAction::Stop), ("hold", LeaseAction::LeaveRunning)]);
 
 keys! {
     /// One drive.
@@ -52,7 +52,7 @@ keys! {
         interlocks: Present = Own { schema: || each(InterlockTable::schema()), range: "[[bus.drive.interlocks]]" }, or "none";
         /// What is written at [shutdown](commands.md#shutdown): nothing, or a stop. Nothing is ever written to a
         /// monitored drive.
-        on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::Hold), ("stop", OnShutdown::Stop)]), default "hold";
+        on_shutdown: OnShutdown = Words(&[("hold", OnShutdown::LeaveRunning), ("stop", OnShutdown::Stop)]), default "hold";
         /// Time the drive takes to start its reply, used only for the prediction of `check`; the measured value is a
         /// metric.
         turnaround: Duration = Time(Duration::ZERO..=Duration::from_secs(1)), or "the profile's";

@@ -7,18 +7,6 @@ use super::super::profile::{Point, Profile, Raw, Source};
 use crate::document::Reader;
 use crate::drive::{Derived, PointIndex};
 
-/// What a drive says of itself.
-const STATES: [ModelPoint; 8] = [
-    ModelPoint::Ready,
-    ModelPoint::Running,
-    ModelPoint::Reversed,
-    ModelPoint::Fault,
-    ModelPoint::Warning,
-    ModelPoint::AtReference,
-    ModelPoint::ZeroSpeed,
-    ModelPoint::Remote,
-];
-
 pub(super) fn check(reader: &Reader<'_>, profile: &Profile) {
     let Some(control) = &profile.control else { return };
     refuse_own_word(reader, profile, control);
@@ -44,7 +32,7 @@ fn masks(profile: &Profile, control: &Control) -> Vec<(String, Mask)> {
         Source::Derived(Derived::State { any }) => Some((point.name().to_string(), any.clone())),
         _ => None,
     };
-    let states = STATES.iter().filter_map(of_state);
+    let states = ModelPoint::STATUS_WORD.iter().filter_map(of_state);
     let states = states.flat_map(|(name, any)| any.into_iter().map(move |mask| (name.clone(), mask)));
     let steps = match &control.run {
         Run::Steps(steps) => steps.as_slice(),
@@ -69,7 +57,7 @@ fn refuse_own_word(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     let is_own = |raw: &Raw| raw.covers(control.at.table, control.at.address);
     let of_masks = masks(profile, control).into_iter();
     let of_masks = of_masks.filter(|(_, mask)| raw_of(profile, mask.point).is_some_and(is_own));
-    let of_bits = STATES.iter().filter(|point| {
+    let of_bits = ModelPoint::STATUS_WORD.iter().filter(|point| {
         let raw = profile.model_point(**point).filter(|point| !point.write);
         raw.and_then(Point::raw).is_some_and(is_own)
     });

@@ -112,7 +112,7 @@ impl Rules<'_, '_> {
             };
             let label = |address| {
                 self.list
-                    .at(address)
+                    .by_address(address)
                     .map(|parameter| (&parameter.label.unit, parameter.label.scale))
             };
             if label(limit.upper) != label(limit.lower) {
@@ -280,7 +280,7 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
             (&lock.of, lock.point, lock.exception),
             (&vec![4..=5, 50..=50], crate::drive::PointIndex::new(0), Some(0x22))
         );
-        assert_eq!(profile.parameters.at(50).unwrap().range, Some(0.0..=50.0));
+        assert_eq!(profile.parameters.by_address(50).unwrap().range, Some(0.0..=50.0));
         assert_eq!(read("").unwrap().parameters.rules, Default::default());
     }
 

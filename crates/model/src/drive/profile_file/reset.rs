@@ -16,19 +16,19 @@ pub(super) fn read(table: &Reader<'_>, around: &Around<'_>, stop: Option<Setting
         return Some(Reset { verified, ..reset });
     }
     let setting = read_setting(&form, around);
-    let hold = read_time(&form, "hold").unwrap_or(2 * around.update_period);
+    let pulse = read_time(&form, "hold").unwrap_or(2 * around.update_period);
     let verified = form.or("verified", true);
     form.finish();
     Some(Reset {
         setting: setting?,
-        hold,
+        pulse,
         verified,
     })
 }
 
 /// A reset as words: the one that resets for its time, the one behind it, and before them the latter at most. With the bits of
 /// a stop as they are in the word that resets.
-fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, hold: Duration) -> Option<Reset> {
+fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, pulse: Duration) -> Option<Reset> {
     let refuse = |what: &str, remedy: &str| {
         form.problem("steps", what, remedy);
         None
@@ -43,9 +43,9 @@ fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, hold
             );
         }
     };
-    let hold = match set.until {
+    let pulse = match set.until {
         Until::Time(time) => time,
-        Until::Written => hold,
+        Until::Written => pulse,
         Until::State(_) => return refuse("a reset waits for no state", "write `time` in the step that resets"),
     };
     let bits = (set.write.value ^ clear.write.value) & set.write.mask & clear.write.mask;
@@ -64,7 +64,7 @@ fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, hold
     };
     Some(Reset {
         setting,
-        hold,
+        pulse,
         verified: true,
     })
 }

@@ -80,7 +80,7 @@ fn quality_is_told_and_never_better_than_it_is() {
     assert_eq!(reliability(&rig), Reliability::NoFault);
     assert!(rig.view.sample(DEVICE, speed).at.is_some() && rig.view.answers(DEVICE));
     rig.now += Duration::from_secs(5);
-    rig.view.look(rig.now);
+    rig.view.set_time(rig.now);
     assert_eq!(reliability(&rig), Reliability::CommunicationFailure, "stale");
     rig.read(1);
     assert_eq!(reliability(&rig), Reliability::NoFault);

@@ -166,7 +166,7 @@ fn who_comes_to_govern_is_judged_anew_and_gives_its_slot_back_when_refused() {
     let drive = rig.drive();
     drive
         .image
-        .hold
+        .restore_lock
         .set(Some("its parameters are being restored".to_string()));
     let order = rig.order("127.0.0.7", RUN, 5, NULL, done());
     assert_eq!(

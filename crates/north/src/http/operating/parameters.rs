@@ -56,7 +56,7 @@ pub(in crate::http) async fn restore(
 }
 
 /// `GET …/params/restore`: progress of the restore.
-pub(in crate::http) async fn look(
+pub(in crate::http) async fn restore_progress(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
 ) -> Replied<Json<Restore>> {

@@ -213,7 +213,7 @@ async fn a_reload_while_the_broker_is_away_keeps_the_history_so_far() {
     options.telemetry.history = History::All;
     let mut client = client_with(options).await;
     fixture::read(&client.common.plant.load(), "p1", 0x0023, 2500, Instant::now());
-    client.look();
+    client.publish_due();
     assert_eq!(waiting(&mut client), [""; 0], "no array is complete");
     reload(&client);
     session::follow_plant(&mut client);

@@ -13,18 +13,18 @@ fn number(message: &Message) -> usize {
     text.trim_matches(|c: char| !c.is_ascii_digit()).parse().unwrap()
 }
 
-fn open(dir: &Path, max: u64) -> Journal {
-    Journal::open(dir, "mqtt-events", max).unwrap()
+fn open(dir: &Path, max: u64) -> MessageLog {
+    MessageLog::open(dir, "mqtt-events", max).unwrap()
 }
 
-fn append(journal: &mut Journal, range: std::ops::Range<usize>) {
+fn append(journal: &mut MessageLog, range: std::ops::Range<usize>) {
     for n in range {
         journal.append(event(n), false);
         journal.write().unwrap();
     }
 }
 
-fn take_all(journal: &mut Journal) -> Vec<(u64, usize)> {
+fn take_all(journal: &mut MessageLog) -> Vec<(u64, usize)> {
     let mut all = Vec::new();
     loop {
         let taken = journal.take(usize::MAX);
@@ -365,7 +365,7 @@ fn messages_beyond_the_memory_are_lost_and_counted_once() {
 
 #[test]
 fn without_a_disk_messages_wait_in_memory() {
-    let mut journal = Journal::in_memory();
+    let mut journal = MessageLog::in_memory();
     append(&mut journal, 0..10);
     assert_eq!((journal.waiting(), journal.unkept()), (10, 10));
     assert_eq!(numbers(&take_all(&mut journal)), (0..10).collect::<Vec<_>>());
@@ -381,9 +381,9 @@ fn without_a_disk_messages_wait_in_memory() {
 fn a_directory_belongs_to_one_process() {
     let dir = tempfile::tempdir().unwrap();
     let _journal = open(dir.path(), BIG);
-    let error = Journal::open(dir.path(), "mqtt-events", BIG).unwrap_err();
+    let error = MessageLog::open(dir.path(), "mqtt-events", BIG).unwrap_err();
     assert!(error.to_string().contains("another process"), "{error}");
-    Journal::open(dir.path(), "mqtt-history", BIG).unwrap();
+    MessageLog::open(dir.path(), "mqtt-history", BIG).unwrap();
 }
 
 #[test]
@@ -405,7 +405,7 @@ fn files_that_somebody_deletes_are_written_again() {
         assert!(journal.take_wiped() && !journal.take_wiped());
         let after: Vec<_> = files(&inner, SUFFIX).iter().map(number_of).collect();
         assert_eq!(after, before);
-        let error = Journal::open(&inner, "mqtt-events", BIG).unwrap_err();
+        let error = MessageLog::open(&inner, "mqtt-events", BIG).unwrap_err();
         assert_eq!(error.kind(), ErrorKind::WouldBlock, "it is locked again");
     }
     append(&mut journal, 200..210);

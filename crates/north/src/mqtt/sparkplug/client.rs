@@ -168,28 +168,28 @@ impl NodeClient {
         self.cursor = 0;
         let (of_node, samples) = model::node_metrics(&self.common.observed, Moment::present());
         self.session.adopt(of_node, definitions);
-        self.session.tell_node(samples);
+        self.session.set_node(samples);
         // The samples are set all at once: a birth has the present state, and a drive that was there has not gone.
         for place in 0..self.drives.len() {
-            self.tell(place, now, SystemTime::now());
+            self.publish_device(place, now, SystemTime::now());
         }
     }
 
-    fn tell(&mut self, place: usize, now: Instant, wall: SystemTime) {
+    fn publish_device(&mut self, place: usize, now: Instant, wall: SystemTime) {
         let Some(drive) = self.drives.get_mut(place) else {
             return;
         };
         let reading = drive.metrics.drive.reading(now);
         let samples = drive.metrics.samples(&reading, wall);
         let present = reading.snapshot.link.is_online() && drive.metrics.drive.bus_up();
-        self.session.tell(place, present, samples, now);
+        self.session.set_device(place, present, samples, now);
         drive.seen = Some(reading.snapshot);
         drive.look_at = now + LOOK;
     }
 
-    fn tell_node(&mut self, now: Instant, wall: SystemTime) {
+    fn publish_node(&mut self, now: Instant, wall: SystemTime) {
         let (_, samples) = model::node_metrics(&self.common.observed, Moment { now, wall });
-        self.session.tell_node(samples);
+        self.session.set_node(samples);
         self.buses_at = now + LOOK;
     }
 
@@ -276,7 +276,7 @@ impl NodeClient {
         if let Some(drive) = self.drives.get_mut(place) {
             drive.metrics.set_result(finished.code, finished.error);
         }
-        self.tell(place, Instant::now(), SystemTime::now());
+        self.publish_device(place, Instant::now(), SystemTime::now());
         let result = [COMMAND_RESULT, COMMAND_ERROR].map(|name| self.session.metric(place, Some(name), None));
         let metrics = finished.metrics.into_iter().chain(result.into_iter().flatten());
         self.session.repeat(place, metrics);
@@ -402,16 +402,16 @@ impl session::Client for NodeClient {
     }
 
     /// A few drives in one call.
-    fn look(&mut self) {
+    fn publish_due(&mut self) {
         let (now, wall) = (Instant::now(), SystemTime::now());
         let drives = &self.drives;
         let is_due = |place| drives.get(place).is_some_and(|drive: &Drive| drive.is_due(now));
         let (due, all) = rounds::due(&mut self.cursor, drives.len(), is_due);
         for place in due {
-            self.tell(place, now, wall);
+            self.publish_device(place, now, wall);
         }
         if self.buses_at <= now {
-            self.tell_node(now, wall);
+            self.publish_node(now, wall);
         }
         let next = self
             .drives

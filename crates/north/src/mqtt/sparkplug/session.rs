@@ -227,13 +227,13 @@ impl Session {
     }
 
     /// The present values of the node.
-    pub(super) fn tell_node(&mut self, samples: Vec<Sample>) {
+    pub(super) fn set_node(&mut self, samples: Vec<Sample>) {
         self.node.changed = true;
         self.node.now_is = samples;
     }
 
     /// Sets the present samples of a device, and whether it is present.
-    pub(super) fn tell(&mut self, device: usize, present: bool, samples: Vec<Sample>, now: Instant) {
+    pub(super) fn set_device(&mut self, device: usize, present: bool, samples: Vec<Sample>, now: Instant) {
         let count = self.devices.len().max(1);
         let record = self.rules.history && !self.is_alive();
         let Some(device) = self.devices.get_mut(device) else {

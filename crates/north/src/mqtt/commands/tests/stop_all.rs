@@ -18,7 +18,7 @@ impl SetTopics {
         assert!(matches!(order, Order::Points(points) if points[0].1 == Value::Bool(false)));
         self.now += Duration::from_millis(50);
         fixture::read(&self.plant, "p1", 1, 0, self.now);
-        self.stop_all.look(&self.plant, self.now);
+        self.stop_all.advance(&self.plant, self.now);
     }
 }
 
@@ -48,10 +48,10 @@ fn a_drive_that_is_not_proven_to_stand_is_named() {
     assert_eq!(bench.take(stop("{\"wait_s\": 2}")), None);
     drop(bench.take_order().expect("a stop"));
     bench.now += Duration::from_millis(1900);
-    bench.stop_all.look(&bench.plant, bench.now);
+    bench.stop_all.advance(&bench.plant, bench.now);
     assert!(bench.commands.try_finished().is_none());
     bench.now += Duration::from_millis(100);
-    bench.stop_all.look(&bench.plant, bench.now);
+    bench.stop_all.advance(&bench.plant, bench.now);
     let answer = bench.finished().expect("an answer");
     assert_eq!(
         (&answer["ok"], &answer["drives"][0]["outcome"]),

@@ -189,7 +189,7 @@ impl SessionWithHost {
         };
         let devices = (0..devices).map(|n| (format!("p{n}"), definitions(&["a", "b"])));
         bench.session.adopt(definitions(&["Bus/line1/load"]), devices.collect());
-        bench.session.tell_node(vec![sample(0.5, 1_000)]);
+        bench.session.set_node(vec![sample(0.5, 1_000)]);
         bench
     }
 
@@ -203,7 +203,7 @@ impl SessionWithHost {
     fn tell(&mut self, device: usize, present: bool, number: f64) {
         let samples = vec![sample(number, self.time), sample(1.0, 1_000)];
         let now = self.tick().now;
-        self.session.tell(device, present, samples, now);
+        self.session.set_device(device, present, samples, now);
     }
 
     fn connect(&mut self, bd_seq: u8) {
@@ -495,10 +495,10 @@ fn a_reload_keeps_aliases_and_bears_anew() {
         ("p2".to_string(), definitions(&["a"])),
     ];
     bench.session.adopt(node, devices);
-    bench.session.tell_node(vec![sample(0.5, bench.time)]);
+    bench.session.set_node(vec![sample(0.5, bench.time)]);
     bench.tell(0, true, 5.0);
     let now = bench.tick().now;
-    bench.session.tell(1, true, vec![sample(6.0, bench.time)], now);
+    bench.session.set_device(1, true, vec![sample(6.0, bench.time)], now);
     bench.send(9);
     let expected = [
         of(Kind::DeviceDeath, "p0"),
@@ -572,7 +572,7 @@ fn births_have_every_metric_though_nothing_is_known_yet() {
         ("Bus/line1/load", true),
     ];
     assert_eq!(metrics, expected.map(|(name, null)| (name.to_string(), null)));
-    session.tell_node(vec![sample(1.0, 8), sample(2.0, 8)]);
+    session.set_node(vec![sample(1.0, 8), sample(2.0, 8)]);
     let later = Moment {
         now: now.now + Duration::from_secs(2),
         ..now
@@ -595,7 +595,7 @@ fn what_was_left_out_of_a_birth_is_in_no_data() {
     };
     let tell = |session: &mut Session, number: f64| {
         let samples = (0..3).map(|_| sample(number, 1)).collect();
-        session.tell(0, true, samples, start);
+        session.set_device(0, true, samples, start);
     };
     tell(&mut session, 1.0);
     next_metrics(&mut session, Kind::NodeBirth, at(0));

@@ -53,7 +53,7 @@ fn a_thousand_connections() {
                         let names: &[&str] = if dice.below(2) == 0 { &["a", "b"] } else { &["b", "a"] };
                         let devices = (0..5).map(|n| (format!("p{n}"), definitions(names)));
                         bench.session.adopt(definitions(&["Bus/line1/load"]), devices.collect());
-                        bench.session.tell_node(vec![sample(number, bench.time)]);
+                        bench.session.set_node(vec![sample(number, bench.time)]);
                         (0..5).for_each(|n| bench.tell(n, present[n], number));
                     }
                     _ => {}
