@@ -84,7 +84,7 @@ impl Bytes<'_> {
     /// The bytes at that offset, the lowest first.
     fn number<const N: usize>(self, at: usize) -> Result<[u8; N], CaptureError> {
         let bytes = self.file.get(at..).and_then(|rest| rest.first_chunk());
-        let mut bytes = *bytes.ok_or_else(|| error(at, "the file ends in the middle"))?;
+        let mut bytes = *bytes.ok_or_else(|| error(at.min(self.file.len()), "the file ends in the middle"))?;
         if self.big {
             bytes.reverse();
         }
@@ -138,7 +138,7 @@ fn read_pcap(file: &[u8], magic: [u8; 4], packets: &mut Vec<Packet>) -> Result<(
 
 fn part_of(file: &[u8], from: usize, length: usize) -> Result<&[u8], CaptureError> {
     file.get(from..from + length)
-        .ok_or_else(|| error(from, "the file ends in the middle of a packet"))
+        .ok_or_else(|| error(from.min(file.len()), "the file ends in the middle of a packet"))
 }
 
 fn check_link(link: u32, offset: usize) -> Result<(), CaptureError> {
