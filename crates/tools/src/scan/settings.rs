@@ -12,7 +12,17 @@ use crate::document::Finding;
 use crate::report;
 
 /// Bauds of Modbus RTU tried by default: the factory settings of the drives of the built-in profiles, and those often chosen.
-const USUAL_BAUDS: [u32; 4] = [9600, 19_200, 38_400, 115_200];
+const USUAL_BAUDS: [u32; 5] = [9600, 19_200, 38_400, 115_200, 57_600];
+/// The settings of Modbus RTU that drives most often have as delivered, the likeliest first; the other usual ones follow.
+const LIKELY: [(u32, &str); 7] = [
+    (9600, "8N1"),
+    (19_200, "8E1"),
+    (9600, "8E1"),
+    (19_200, "8N1"),
+    (115_200, "8N1"),
+    (9600, "8N2"),
+    (38_400, "8N1"),
+];
 /// Bauds of Modbus ASCII tried by default: all that the switches of the TECO 7300PA can set, the factory setting first.
 const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
 /// Baud that is assumed behind a raw device server, which sets up its line itself: the highest that such lines usually have,
@@ -115,6 +125,10 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
             }
         }
     }
+    if args.baud.is_empty() && args.format.is_empty() {
+        // A stable sort: the protocols keep their order, and so do the settings that are not among the likely ones.
+        settings.sort_by_key(likelihood);
+    }
     check_addresses(args, &settings)?;
     if settings.is_empty() {
         return Err(
@@ -124,6 +138,17 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
         );
     }
     Ok(settings)
+}
+
+/// Rank of a setting among the usual ones of its protocol.
+fn likelihood(setting: &Setting) -> (usize, usize) {
+    let protocol = Protocol::ALL.iter().position(|one| *one == setting.protocol);
+    let is = |(baud, format): &(u32, &str)| setting.format.baud == *baud && setting.format.characters() == *format;
+    let rank = LIKELY
+        .iter()
+        .position(is)
+        .filter(|_| setting.protocol == Protocol::ModbusRtu);
+    (protocol.unwrap_or_default(), rank.unwrap_or(LIKELY.len()))
 }
 
 /// The only setting behind Modbus TCP, where there is no line whose settings could be wrong.
@@ -264,7 +289,36 @@ mod tests {
         let usual = settings_of("").unwrap();
         assert_eq!(usual.first().unwrap(), "modbus-rtu 9600 8N1");
         assert_eq!(usual.last().unwrap(), "n2 9600 8N1");
-        assert_eq!(usual.len(), 4 * 3 + 4 * 3 + 1);
+        assert_eq!(usual.len(), 5 * 3 + 4 * 3 + 1);
+        // As delivered: ABB ACS580, Altivar and WEG, then Danfoss, then the Optidrive Eco.
+        let likely = [
+            "19200 8E1",
+            "9600 8E1",
+            "19200 8N1",
+            "115200 8N1",
+            "9600 8N2",
+            "38400 8N1",
+        ];
+        for (place, setting) in likely.iter().enumerate() {
+            assert_eq!(usual[place + 1], format!("modbus-rtu {setting}"));
+        }
+        for (baud, format) in USUAL_BAUDS
+            .iter()
+            .flat_map(|baud| ["8N1", "8E1", "8N2"].map(|format| (baud, format)))
+        {
+            let setting = format!("modbus-rtu {baud} {format}");
+            assert_eq!(usual.iter().filter(|one| **one == setting).count(), 1, "{setting}");
+        }
+        // Named settings are tried in the order of the command line.
+        assert_eq!(
+            settings_of("--protocol modbus-rtu --baud 38400,9600 --format 8N2,8N1").unwrap(),
+            [
+                "modbus-rtu 38400 8N2",
+                "modbus-rtu 38400 8N1",
+                "modbus-rtu 9600 8N2",
+                "modbus-rtu 9600 8N1"
+            ]
+        );
         // What the switches of a TECO card can set, and nothing else.
         let ascii: Vec<&String> = usual.iter().filter(|one| one.starts_with("modbus-ascii")).collect();
         assert_eq!(ascii[0], "modbus-ascii 19200 7N2");
