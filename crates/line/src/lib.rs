@@ -464,7 +464,7 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
         .open_native()
         .map_err(|error| OpenError::Serial {
             port: port.to_string(),
-            reason: explain(&error),
+            reason: explain(&error, port),
         })?;
     let fd = Exclusive(sys::own(tty));
     let serial = |reason: io::Error| OpenError::Serial {
@@ -537,7 +537,10 @@ fn read_back(fd: &Exclusive) -> Option<String> {
     Some(format!("{} {data}{parity}{stop}", modes.output_speed()))
 }
 
-fn explain(error: &tokio_serial::Error) -> String {
+/// The reason for a port that another program has locked; more follows.
+pub const TAKEN: &str = "another program has it";
+
+fn explain(error: &tokio_serial::Error, port: &str) -> String {
     let text = error.to_string();
     let remedy = match error.kind() {
         tokio_serial::ErrorKind::Io(io::ErrorKind::NotFound) => {
@@ -548,7 +551,9 @@ fn explain(error: &tokio_serial::Error) -> String {
         }
         // A lock, or the kernel's exclusive mode.
         tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(io::ErrorKind::WouldBlock) => {
-            "another program has it; end that program, or use another port for this bus"
+            return format!(
+                "{text}; {TAKEN}; end that program (`sudo fuser -v {port}` names it), or use another port for this bus"
+            );
         }
         _ => {
             "it is not a serial port or does not work as one; give the path of the adapter, such as \

@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 use super::client::{Gateway, encoded};
 use super::failure::Outcome;
+use super::port_users::{self, BusAt, PortUser};
 use super::{printable, report};
 use crate::diagnosis::{Counted, Verdict};
 
@@ -43,23 +44,16 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 async fn diagnose(args: &Args) -> Result<String, String> {
     let client = args.gateway.viewer()?;
-    let names: Vec<String> = match &args.bus {
-        Some(name) => vec![name.clone()],
-        None => {
-            let buses: serde_json::Value = client.view("/api/v1/buses").await?;
-            let names = buses
-                .as_array()
-                .into_iter()
-                .flatten()
-                .filter_map(|bus| bus.get("name")?.as_str());
-            names.map(str::to_string).collect()
-        }
+    let buses: Vec<BusAt> = client.view("/api/v1/buses").await?;
+    let names: Vec<&str> = match &args.bus {
+        Some(name) => vec![name],
+        None => buses.iter().map(|bus| bus.name.as_str()).collect(),
     };
     let mut all = Vec::new();
     for name in names {
         all.push(
             client
-                .view(&format!("/api/v1/buses/{}/diagnosis", encoded(&name)))
+                .view(&format!("/api/v1/buses/{}/diagnosis", encoded(name)))
                 .await?,
         );
     }
@@ -73,12 +67,28 @@ async fn diagnose(args: &Args) -> Result<String, String> {
                 version"
             )
         })?;
-        Ok(text(&diagnosis))
+        // A port of another machine has a name that means nothing here.
+        let here = buses
+            .iter()
+            .filter(|bus| bus.name == diagnosis.bus && args.gateway.network().is_none());
+        let users = here.flat_map(|bus| shared(&bus.port, &port_users::strangers(&bus.port)));
+        Ok(text(&diagnosis) + &users.collect::<String>())
     };
     all.into_iter()
         .map(text)
         .collect::<Result<Vec<String>, String>>()
         .map(|texts| texts.join("\n"))
+}
+
+/// The other programs that read the port of a bus: they take a part of the replies.
+fn shared(port: &str, users: &[PortUser]) -> Option<String> {
+    (!users.is_empty()).then(|| {
+        format!(
+            "\n  {} has the port of this bus open, too, and takes replies from it\n      do: end that program; {}\n",
+            printable::line(&port_users::listed(users)),
+            printable::line(port)
+        )
+    })
 }
 
 /// The drives that have answered nothing so far, in words.

@@ -27,6 +27,7 @@ mod log;
 mod man;
 mod map;
 mod params;
+mod port_users;
 mod printable;
 mod profiles;
 mod read;

@@ -19,7 +19,7 @@ pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome, documented, negative};
-use super::report;
+use super::{port_users, report};
 use crate::bus::Mode;
 use crate::codec::LineFormat;
 use crate::drive::profile::Profiles;
@@ -95,6 +95,16 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
     snippet.text()
 }
 
+/// Reports why probably no drive answered.
+pub(super) fn nobody_answers(search: &Search<'_>, port: &str, tried: &[Setting]) {
+    if let Some(why) = port_users::takes_replies(port) {
+        report::error(&why);
+        return;
+    }
+    report::error(&verdict::nobody_answers(&search.heard, port));
+    report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, tried, &search.profiles));
+}
+
 /// The drives found, as JSON; `error`: what ended the scan early.
 fn document(args: &Args, search: &Search<'_>, error: Option<&String>) -> Json {
     let drive = |found: &Found| {
@@ -132,8 +142,7 @@ fn finish(args: &Args, tried: &[Setting], search: &Search<'_>, outcome: Result<(
     };
     outcome?;
     if search.found.is_empty() {
-        report::error(&verdict::nobody_answers(&search.heard, &args.port));
-        report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, tried, &search.profiles));
+        nobody_answers(search, &args.port, tried);
         return printed;
     }
     if let Some(told) = verdict::beside_answers(&search.heard) {

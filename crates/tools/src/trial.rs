@@ -112,8 +112,7 @@ fn attempt(args: &Args, stop: &Stop) -> Outcome {
         return Err(stopped());
     }
     if search.found.is_empty() {
-        report::error(&verdict::nobody_answers(&search.heard, &port));
-        report::lines_to_stderr(&verdict::at_silent_drives(&search.heard, &settings, &search.profiles));
+        scan::nobody_answers(&search, &port, &settings);
         return negative();
     }
     serving::serve(args, stop, &scan::configuration(&port, &args.options, &search))

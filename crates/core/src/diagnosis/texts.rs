@@ -40,7 +40,8 @@ impl Cause {
         match self {
             Cause::AllSilent => {
                 "check the drives' power supply, A and B (try swapping them), baud rate, format and protocol, and \
-                 that the fieldbus is enabled in the drives; `drivegate scan` tries other settings"
+                 that the fieldbus is enabled in the drives; `sudo fuser -v PORT` names a program that takes the \
+                 replies; `drivegate scan` tries other settings"
             }
             Cause::OneDrive => {
                 "check this drive's cable, terminals and power supply, and that no other drive has its address; if \

@@ -16,6 +16,7 @@ use crate::diagnosis::signature::Shape;
 use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
+use crate::port_users;
 
 /// Bytes received apart from replies.
 #[derive(Debug, Default)]
@@ -272,7 +273,9 @@ impl<'a> Search<'a> {
 
     fn open(&self, format: &LineFormat) -> Result<Line, String> {
         let opened = Line::open(self.port, format, &LineOptions::default());
-        opened.map(|(line, _)| line).map_err(|error| error.to_string())
+        opened
+            .map(|(line, _)| line)
+            .map_err(|error| port_users::taken(self.port, error.to_string()))
     }
 
     fn prober<'l>(&self, line: &'l Line, setting: Setting) -> Prober<'l> {
