@@ -386,11 +386,46 @@ fn read_limits(reader: &Reader<'_>, profile: Option<&Profile>, frequencies: Opti
     };
     for key in table.keys() {
         let pair: Option<Vec<f64>> = table.optional(key);
-        let range = pair.and_then(|pair| table.accept(key, check_limits(&pair, key, profile, frequencies)));
+        let range = pair.and_then(|pair| {
+            let checked = match table.raw(key).and_then(|node| decimal_commas(&node.value)) {
+                Some(meant) => Err(Finding::new(
+                    "a comma separates numbers, and limits are two",
+                    format!("write the decimals with a point: {meant}"),
+                )),
+                None => check_limits(&pair, key, profile, frequencies),
+            };
+            table.accept(key, checked)
+        });
         limits.extend(range.map(|range| (key.to_string(), range)));
     }
     table.finish();
     limits
+}
+
+/// The limits that are meant by numbers with commas in place of points: `[0.0, 80.5]` by `[0.0, 80,5]`.
+fn decimal_commas(list: &Node) -> Option<String> {
+    let Node::Array(items) = list else { return None };
+    let joined = |whole: &Node, decimals: &Node| match (whole, decimals) {
+        (Node::Integer(whole), Node::Integer(decimals @ 0..)) => format!("{whole}.{decimals}").parse::<f64>().ok(),
+        _ => None,
+    };
+    let number = |node: &Node| match node {
+        Node::Integer(number) => Some(*number as f64),
+        Node::Float(number) => Some(*number),
+        _ => None,
+    };
+    let items: Vec<&Node> = items.iter().map(|item| &item.value).collect();
+    let pairs = match items.as_slice() {
+        [a, b, c] => [(number(a), joined(b, c)), (joined(a, b), number(c))],
+        [a, b, c, d] => [(joined(a, b), joined(c, d)), (None, None)],
+        _ => return None,
+    };
+    let meant = pairs.into_iter().filter_map(|(low, high)| Some((low?, high?)));
+    // Where either number can have the comma, the wider limits are meant: [0, 0, 80] is not 0 to 0.8.
+    let (low, high) = meant
+        .filter(|(low, high)| low < high)
+        .max_by(|a, b| a.1.total_cmp(&b.1))?;
+    Some(format!("[{low:?}, {high:?}]"))
 }
 
 fn check_limits(
@@ -468,6 +503,16 @@ fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Findi
 }
 
 fn read_supervision(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<Supervision> {
+    if let Some(Node::Integer(_) | Node::Float(_) | Node::Text(_)) =
+        reader.raw(DRIVE.supervision.name).map(|node| &node.value)
+    {
+        reader.problem(
+            DRIVE.supervision.name,
+            "`supervision` needs a timeout and an action",
+            "write supervision = { timeout = \"5s\", action = \"stop\" }",
+        );
+        return None;
+    }
     let table = DRIVE.supervision.table(reader)?;
     let timeout = SUPERVISION.timeout.read(&table);
     let action = read_action(&table, profile, limits);

@@ -46,22 +46,32 @@ pub(super) fn check_name(text: &str, joints: &str) -> Result<(), Finding> {
     ))
 }
 
-/// An address to listen on.
-pub(super) fn socket(text: &str) -> Result<SocketAddr, Finding> {
+/// An address to listen on, for a server whose usual port is `PORT`.
+pub(super) fn socket<const PORT: u16>(text: &str) -> Result<SocketAddr, Finding> {
     text.parse().map_err(|_| {
         let port = text.rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
         if text.parse::<IpAddr>().is_ok() {
             return Finding::new(
                 format!("`{text}` has no port"),
-                format!("write it with the port of this server, such as \"{text}:1502\" for Modbus TCP, \"{text}:9488\" for HTTP"),
+                format!(
+                    "write it with the port of this server, such as \"{}\"",
+                    with_port(text, PORT)
+                ),
             );
         }
-        let port = port.unwrap_or(1502);
+        let port = port.unwrap_or(PORT);
         Finding::new(
             format!("`{text}` is not an IP address with a port"),
             format!("write for example \"127.0.0.1:{port}\" or \"[::1]:{port}\"; host names are not accepted"),
         )
     })
+}
+
+fn with_port(address: &str, port: u16) -> String {
+    match address.contains(':') {
+        true => format!("[{address}]:{port}"),
+        false => format!("{address}:{port}"),
+    }
 }
 
 /// A network in CIDR notation, or a single address.

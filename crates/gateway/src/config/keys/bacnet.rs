@@ -19,7 +19,7 @@ keys! {
     /// + `unit` on a virtual network of its own.
     BACNET: Bacnet {
         /// Listen address: that of one interface, whose broadcast address is used, or `0.0.0.0`, which needs `allow`.
-        listen: SocketAddr = SOCKET, default "127.0.0.1:47808";
+        listen: SocketAddr = Parsed { parse: values::socket::<PORT>, ..SOCKET }, default "127.0.0.1:47808";
         /// Device instance of the gateway; it and those of all drives must be unique in the whole BACnet network.
         device: u32 = Number(0..=4_194_302, None), default 100;
         /// `"routed"`: each drive is a device on a virtual network. `"flat"`: all objects belong to the gateway's device, with

@@ -18,7 +18,7 @@ pub(super) const TIMES: Time = Time(Duration::from_millis(1)..=HOUR);
 /// Sizes of buffers and files.
 pub(super) const BUFFER_SIZE: Size = Size(64 << 10..=1 << 40);
 pub(super) const SOCKET: Parsed<SocketAddr> = Parsed {
-    parse: values::socket,
+    parse: values::socket::<4001>,
     words: &[],
     pattern: "",
     range: "an address with a port",

@@ -14,7 +14,7 @@ keys! {
     HTTP: Http {
         /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everyone who can connect
         /// unless there is a `tokens_file`.
-        listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
+        listen: SocketAddr = Parsed { parse: values::socket::<9488>, ..SOCKET }, default "127.0.0.1:9488";
         /// Names and addresses, without a port, by which the server is reached in addition to `localhost`, the host
         /// name of this machine and its own addresses. Requests for any other [host](http.md#hosts) get 421.
         hosts: Vec<String> = HOSTS, default [];

@@ -6,9 +6,13 @@ use crate::north::modbus_tcp::{Registers, Role, Uncached};
 const CONNECTIONS: Number = Number(1..=10_000, None);
 pub(in crate::config) const ROLES: Words<Role> = Words(&[("monitor", Role::Monitor), ("control", Role::Control)]);
 const ADDRESSES: List<SocketAddr> = List {
-    parse: values::socket,
+    parse: values::socket::<1502>,
     empty: Some("write for example [\"127.0.0.1:1502\"]"),
     range: "addresses with ports, such as [\"127.0.0.1:1502\"]",
+};
+const TLS_ADDRESSES: List<SocketAddr> = List {
+    parse: values::socket::<802>,
+    ..ADDRESSES
 };
 const BUSES: List<String> = List {
     parse: values::any_text,
@@ -68,7 +72,7 @@ keys! {
     /// Modbus/TCP Security: TLS in which the clients present certificates.
     TLS: Tls {
         /// Listen addresses. Ports below 1024 need [a privilege](installation.md#port-502).
-        listen: Vec<SocketAddr> = ADDRESSES, default ["127.0.0.1:802"];
+        listen: Vec<SocketAddr> = TLS_ADDRESSES, default ["127.0.0.1:802"];
         /// Who may connect.
         allow: Vec<IpNet> = NETWORKS, or "that of `[modbus_tcp]`";
         /// Buses whose drives are served.
