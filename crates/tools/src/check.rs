@@ -1,6 +1,7 @@
 //! `drivegate check`: reports errors in a configuration and predicts the load of its buses.
 
 mod as_service;
+mod privileged;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -107,6 +108,11 @@ pub(super) fn run(args: &Args) -> Outcome {
     if let Some(settings) = &loaded.settings {
         loaded.warnings.extend(orphaned_journals(settings));
         loaded.warnings.extend(unproven_stops(settings));
+        let capable = match args.as_service {
+            true => as_service::may_listen_on_privileged_ports(),
+            false => privileged::may(),
+        };
+        loaded.warnings.extend(privileged::problems(path, settings, capable));
     }
     let printed = if args.json {
         report::print(&json(&loaded))

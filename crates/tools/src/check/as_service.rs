@@ -7,6 +7,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::Command;
 
+use super::privileged;
 use crate::config::{NamedFile, environment, named_files};
 use crate::document::{Finding, Problem};
 
@@ -30,6 +31,8 @@ struct Service {
     groups: BTreeSet<u32>,
     /// Directories whose files the service does not see.
     hidden: Vec<&'static str>,
+    /// Whether it may listen on ports below 1024.
+    listens_anywhere: bool,
     /// User and groups in words.
     shown: String,
 }
@@ -45,7 +48,7 @@ struct Node {
 impl Service {
     /// The properties of the service's unit, as the system reports them.
     fn of_unit() -> Service {
-        let asked = "User,DynamicUser,Group,SupplementaryGroups,LoadState,ProtectHome,PrivateTmp";
+        let asked = "User,DynamicUser,Group,SupplementaryGroups,LoadState,ProtectHome,PrivateTmp,AmbientCapabilities,CapabilityBoundingSet";
         let output = Command::new("systemctl")
             .args(["show", UNIT, &format!("--property={asked}")])
             .output();
@@ -96,6 +99,7 @@ impl Service {
             user,
             groups: names.iter().filter_map(|name| id(group, name)).chain(own).collect(),
             hidden,
+            listens_anywhere: may_listen(user, value("AmbientCapabilities"), value("CapabilityBoundingSet")),
             shown: format!("{who} with {groups}"),
         }
     }
@@ -109,6 +113,17 @@ impl Service {
         };
         node.mode >> shift & wanted == wanted
     }
+}
+
+/// Whether a unit may listen on privileged ports: root with what its bounding set leaves, others with an ambient capability.
+fn may_listen(user: Option<u32>, ambient: &str, bounding: &str) -> bool {
+    let has = |set: &str| set.split_whitespace().any(|name| name == privileged::NAME);
+    has(bounding) && (user == Some(0) || has(ambient))
+}
+
+/// Whether the service may listen on privileged ports.
+pub(super) fn may_listen_on_privileged_ports() -> bool {
+    Service::of_unit().listens_anywhere
 }
 
 /// The number of a user or group, by its name or as it is written.
@@ -200,11 +215,29 @@ mod tests {
     }
 
     #[test]
+    fn the_unit_says_whether_port_502_is_possible() {
+        let may = |unit: &str| Service::parse(&format!("{unit}LoadState=loaded\n"), PASSWD, GROUP).listens_anywhere;
+        let user = "User=gateway\nDynamicUser=no\n";
+        let bounding = "CapabilityBoundingSet=cap_chown cap_net_bind_service\n";
+        assert!(may(&format!(
+            "{user}{bounding}AmbientCapabilities=cap_net_bind_service\n"
+        )));
+        assert!(!may(&format!("{user}{bounding}AmbientCapabilities=\n")));
+        assert!(may(&format!("User=\nDynamicUser=no\n{bounding}")));
+        assert!(!may("User=\nDynamicUser=no\nCapabilityBoundingSet=\n"));
+        assert!(
+            !Service::parse("", PASSWD, GROUP).listens_anywhere,
+            "the shipped unit has no capability"
+        );
+    }
+
+    #[test]
     fn owner_group_and_others_count_in_this_order() {
         let service = Service {
             user: Some(990),
             groups: [20].into(),
             hidden: Vec::new(),
+            listens_anywhere: false,
             shown: String::new(),
         };
         let may = |mode, user, group| service.may(Node { mode, user, group }, READ);
@@ -234,6 +267,7 @@ mod tests {
                 user: is_owner.then(|| fs::metadata(&path).unwrap().uid()),
                 groups: BTreeSet::new(),
                 hidden,
+                listens_anywhere: false,
                 shown: "a user of its own with no group".to_string(),
             };
             let kind = FileKind::Secret;
