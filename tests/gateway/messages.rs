@@ -4,8 +4,8 @@ use std::io::{Read, Write};
 use std::net::TcpListener;
 
 use super::drive_access::{Ran, ran};
-use crate::support::process::drivegate;
-use crate::support::site::{LINE1, MQTT, Site, controlled};
+use crate::support::process::{drivegate, until};
+use crate::support::site::{LINE1, MODBUS_TCP, MQTT, Site, controlled};
 
 fn command(arguments: &[&str]) -> Ran {
     ran(&mut drivegate(arguments))
@@ -46,7 +46,7 @@ fn the_state_and_the_fault_text_are_read_like_points() {
     site.change("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
     let gateway = site.run();
     gateway.until_printed("drive pump-1 is online");
-    let through = crate::support::process::until("the state through the gateway", || {
+    let through = until("the state through the gateway", || {
         Some(command(&words)).filter(|ended| ended.code == 0)
     });
     assert_eq!(through.out, directly.out);
@@ -90,4 +90,159 @@ fn a_broker_without_mqtt_5_is_named_as_such() {
             "{printed}"
         );
     }
+}
+
+/// A program that reads the port without a lock takes the replies.
+#[test]
+fn another_program_at_the_port_is_named() {
+    let site = Site::new();
+    let _line = site.line(&[9]);
+    let port = site.path("line1");
+    let reader = std::fs::File::open(site.file("line1")).unwrap();
+    let mut reader = std::process::Command::new("sleep")
+        .arg("600")
+        .stdin(reader)
+        .spawn()
+        .unwrap();
+    let reading = format!("/proc/{}/fd/0", reader.id());
+    until("the reader", || {
+        std::fs::read_link(&reading)
+            .ok()
+            .filter(|link| link.starts_with("/dev/pts"))
+    });
+    let scan = [
+        "scan",
+        "--port",
+        &port,
+        "--protocol",
+        "modbus-rtu",
+        "--baud",
+        "38400",
+        "--format",
+        "8N1",
+        "--addresses",
+        "1",
+    ];
+    let ended = until("the name of the reader", || {
+        let ended = command(&scan);
+        ended.err.contains("sleep (pid ").then_some(ended)
+    });
+    reader.kill().unwrap();
+    reader.wait().unwrap();
+    assert_eq!(ended.code, 1, "{}", ended.err);
+    let wanted = format!(
+        "error: no drive answered, but sleep (pid {0}) has the port open, too, and takes replies from it; {port}; end that \
+         program (kill {0}) and try again\n",
+        reader.id()
+    );
+    assert!(ended.err.ends_with(&wanted), "{}", ended.err);
+}
+
+/// A port that a gateway has is not that of an unknown program, and `diagnose` names one that reads it, too.
+#[test]
+fn the_gateway_at_the_port_is_named() {
+    let site = Site::of(&[LINE1, &controlled("pump-1", 1, "")]);
+    let _line = site.line(&[1]);
+    let gateway = site.run();
+    gateway.until_printed("drive pump-1 is online");
+    let (port, config) = (site.path("line1"), site.config());
+    let ended = command(&["scan", "--port", &port, "--addresses", "1"]);
+    assert_eq!(ended.code, 1, "{}", ended.err);
+    let wanted = format!(
+        "error: the gateway `test` has the port for its bus `line1`; {port}; `drivegate diagnose line1 --config {config}` \
+         shows what it reads there, or stop the gateway first"
+    );
+    assert!(ended.err.contains(&wanted), "{}", ended.err);
+
+    let diagnose = ["diagnose", "line1", "--config", &config];
+    let alone = command(&diagnose);
+    assert_eq!(alone.code, 0, "{}", alone.err);
+    assert!(!alone.out.contains("has the port of this bus open"), "{}", alone.out);
+    // The exclusive mode of a port does not keep root out.
+    let Ok(reader) = std::fs::File::open(site.file("line1")) else {
+        return;
+    };
+    let mut reader = std::process::Command::new("sleep")
+        .arg("600")
+        .stdin(reader)
+        .spawn()
+        .unwrap();
+    let shared = until("the reader in the diagnosis", || {
+        let ended = command(&diagnose);
+        ended.out.contains("sleep (pid ").then_some(ended)
+    });
+    reader.kill().unwrap();
+    reader.wait().unwrap();
+    let wanted = format!(
+        "sleep (pid {}) has the port of this bus open, too, and takes replies from it",
+        reader.id()
+    );
+    assert!(shared.out.contains(&wanted), "{}", shared.out);
+}
+
+/// What is wrong comes first, what is doubtful after it.
+#[test]
+fn warnings_come_after_errors() {
+    let site = Site::of(&[
+        LINE1,
+        &controlled("pump-1", 1, "limits = { speed_reference = [0.0, 80,0] }"),
+    ]);
+    let config = site.config();
+    for arguments in [["check", "--config", &config], ["run", "--config", &config]] {
+        let ended = command(&arguments);
+        assert_eq!(ended.code, 78, "{}", ended.err);
+        let kinds: Vec<&str> = ended
+            .err
+            .lines()
+            .filter_map(|line| line.split_once(':'))
+            .map(|(kind, _)| kind)
+            .collect();
+        let first = kinds.iter().position(|kind| *kind == "warning").unwrap();
+        assert!(kinds[..first].iter().all(|kind| *kind == "error"), "{}", ended.err);
+        assert!(kinds[first..].iter().all(|kind| *kind == "warning"), "{}", ended.err);
+        assert!(
+            ended.err.contains("write the decimals with a point: [0.0, 80.0]"),
+            "{}",
+            ended.err
+        );
+    }
+}
+
+/// In an exclusive plant a drill needs the hold; the refusal has the command that takes it.
+#[test]
+fn a_drill_without_the_hold_says_how_to_take_it() {
+    let supervised = "supervision = { timeout = \"2s\", action = \"stop\" }";
+    let authority = "[authority]\nmode = \"exclusive\"\n[[authority.principal]]\nname = \"plc\"\nrank = \"automation\"\n\
+        modbus_tcp = [\"127.0.0.1/32\"]\n[drill]\nmax_speed = 20.0\n";
+    let site = Site::of(&[LINE1, &controlled("pump-1", 1, supervised), MODBUS_TCP, authority]);
+    site.change(
+        "name = \"test\"",
+        &format!(
+            "name = \"test\"\nstate_dir = \"{}\"\nsocket = \"own.sock\"",
+            site.path("state")
+        ),
+    );
+    let _line = site.line(&[1]);
+    let gateway = site.run();
+    gateway.until_printed("drive pump-1 is online");
+    let config = site.config();
+    let words = ["drill", "pump-1", "--order", "--config", &config];
+    let drill = || ran(drivegate(&words).stdin(std::process::Stdio::null()));
+    // The drive may be online before it is ready.
+    let refused = until("the refusal", || {
+        Some(drill()).filter(|ended| ended.err.contains("nobody holds"))
+    });
+    assert_eq!(refused.code, 1, "{}", refused.err);
+    assert!(
+        refused
+            .err
+            .contains("nobody holds the drive; take it first: drivegate hold pump-1 take"),
+        "{}",
+        refused.err
+    );
+    let taken = command(&["hold", "pump-1", "take", "--config", &config]);
+    assert_eq!(taken.code, 0, "{}", taken.err);
+    // The motor is not started: nobody types its name.
+    let asked = drill();
+    assert!(!asked.err.contains("nobody holds"), "{}", asked.err);
 }

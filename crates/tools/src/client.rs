@@ -41,7 +41,7 @@ pub(crate) enum ClientError {
     )]
     Unreachable(String, String),
     /// No gateway of the configuration listens at its sockets.
-    #[error("no running gateway was found: {}; start it with this file, use sudo, or join the group of the socket", .0.describe())]
+    #[error("no running gateway was found: {}; {}", .0.describe(), .0.remedy())]
     NotFound(NotFound),
     /// A file of the command line cannot be used.
     #[error("{0}")]
@@ -94,6 +94,15 @@ impl NotFound {
         match &self.file {
             Some(file) => format!("{why}; {}", file.display()),
             None => why,
+        }
+    }
+
+    /// What to do: a socket that cannot be opened needs another user, and without one the gateway does not run.
+    pub(crate) fn remedy(&self) -> String {
+        match &self.file {
+            _ if !self.closed.is_empty() => "use sudo, or join the group of the socket".to_string(),
+            Some(file) => format!("start it: drivegate run --config {}", file.display()),
+            None => "start the gateway".to_string(),
         }
     }
 }
@@ -220,4 +229,36 @@ fn is_cut_off(error: &hyper::Error) -> bool {
 /// A name as a part of a path or query.
 pub(crate) fn encoded(name: &str) -> String {
     percent_encoding::utf8_percent_encode(name, percent_encoding::NON_ALPHANUMERIC).to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_closed_socket_is_not_a_gateway_that_does_not_run() {
+        let missed = |closed: &[&str], file: Option<&str>| NotFound {
+            closed: closed.iter().map(ToString::to_string).collect(),
+            others: Vec::new(),
+            file: file.map(PathBuf::from),
+        };
+        let refused = "cannot connect to /run/drivegate/drivegate.sock: Permission denied (os error 13)";
+        for (missed, wanted) in [
+            (
+                missed(&[refused], Some("/etc/d.toml")),
+                format!("no running gateway was found: {refused}; /etc/d.toml; use sudo, or join the group of the socket"),
+            ),
+            (
+                missed(&[], Some("/etc/d.toml")),
+                "no running gateway was found: no gateway listens; /etc/d.toml; start it: drivegate run --config /etc/d.toml"
+                    .to_string(),
+            ),
+            (
+                missed(&[], None),
+                "no running gateway was found: no gateway listens; start the gateway".to_string(),
+            ),
+        ] {
+            assert_eq!(ClientError::NotFound(missed).to_string(), wanted);
+        }
+    }
 }

@@ -122,7 +122,7 @@ impl Target {
             .map_err(|error| match (error, &self.configured) {
                 (ClientError::NotFound(missed), Some(configured)) => {
                     let why = configured.not_found_text(&missed, self.client.doors());
-                    format!("{why}; the local socket; start the gateway")
+                    format!("{why}; the local socket; {}", missed.remedy())
                 }
                 (error, _) => error.to_string(),
             })

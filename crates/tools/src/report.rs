@@ -74,12 +74,12 @@ pub(super) fn errors(problems: &[Problem]) {
     }
 }
 
-/// Prints warnings and errors of a configuration to stderr, the errors last.
+/// Prints errors and warnings of a configuration to stderr, the errors first: they are what the reader waits for.
 pub(super) fn problems(loaded: &Loaded) {
+    errors(&loaded.errors);
     for problem in &loaded.warnings {
         warning(&problem.to_string());
     }
-    errors(&loaded.errors);
 }
 
 fn line(kind: &str, message: &str) {

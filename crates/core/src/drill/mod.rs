@@ -461,7 +461,10 @@ fn may(drive: &DriveHandle, who: &Origin, now: Instant) -> Result<(), DrillRefus
     {
         return Err(not_now(match view.holder {
             Some(holder) => format!("{holder} holds the drive; only the holder may run a drill"),
-            None => "nobody holds the drive; take it first".to_string(),
+            None => format!(
+                "nobody holds the drive; take it first: drivegate hold {} take",
+                drive.image.spec.name
+            ),
         }));
     }
     let reading = drive.reading(now);
