@@ -206,6 +206,38 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
     }
 }
 
+/// All that the profile names is read before the search for others begins, and what is read now is said.
+#[test]
+fn what_the_profile_names_is_read_first() {
+    let (mut with_search, profiles) = (0, Profiles::built_in());
+    for profile in profiles.iter().filter(|profile| !profile.parameters.is_empty()) {
+        if profile.simulator.as_deref().and_then(ModelOptions::by_name).is_none() {
+            continue;
+        }
+        let mut rig = DriveOnLine::new(profile);
+        let mut reading = Reading::new(profile.clone(), BTreeSet::new());
+        let mut searching = false;
+        while let Some(pdu) = reading.request() {
+            let now = reading.now();
+            let (RequestPdu::Read { start, .. }, Some(now)) = (&pdu, &now) else {
+                break;
+            };
+            let id = profile.parameters.id(*start).unwrap_or_default();
+            assert!(now.contains(&id), "{}: {now} is not {id}", profile.name);
+            searching = searching || now.starts_with("looking for others: ");
+            let is_named = profile.parameters.at(*start).is_some();
+            assert!(!(searching && is_named), "{}: {now}", profile.name);
+            let outcome = match rig.ask(pdu) {
+                Reply::Exception(exception) => Outcome::Exception(exception),
+                reply => Outcome::Acknowledged(reply),
+            };
+            assert_eq!(reading.answered(&outcome), Next::Go);
+        }
+        with_search += u32::from(searching);
+    }
+    assert!(with_search > 3, "{with_search}");
+}
+
 /// Checks that each parameter was written once, and that the drive's memory was written as often.
 fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
     let (profile, is_n2) = (rig.profile.clone(), rig.is_n2());

@@ -176,8 +176,15 @@ type Found = (ParameterFile, std::sync::Arc<crate::drive::Profile>);
 fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Result<Found, Failure> {
     let target = target(gateway, drive)?;
     let mut line = StatusLine::default();
+    let mut begun = false;
     let text = target.read_parameters(how, |outcome| {
         if outcome.total > 0 {
+            if !std::mem::replace(&mut begun, true) {
+                report::note(&format!(
+                    "reading {} addresses of {drive}: first those of the parameters that its profile names",
+                    outcome.total
+                ));
+            }
             line.show(&reading_in_words(outcome));
         }
     });
@@ -238,12 +245,15 @@ impl StatusLine {
 }
 
 fn reading_in_words(outcome: &ParameterReading) -> String {
-    let rest = match (&outcome.waits, outcome.remaining_s) {
-        (Some(why), _) => format!("waits: {why}"),
-        (None, Some(seconds)) => format!("about {} left", seconds_in_words(seconds)),
-        (None, None) => String::new(),
+    let left = outcome
+        .remaining_s
+        .map(|seconds| format!("about {} left", seconds_in_words(seconds)));
+    let rest = match &outcome.waits {
+        Some(why) => vec![format!("waits: {why}")],
+        None => left.into_iter().chain(outcome.now.clone()).collect(),
     };
-    format!("{} of {} addresses, {rest}", outcome.done, outcome.total)
+    let counted = format!("{} of {} addresses", outcome.done, outcome.total);
+    [vec![counted], rest].concat().join(", ")
 }
 
 fn seconds_in_words(seconds: f64) -> String {

@@ -130,6 +130,41 @@ impl Reading {
             }));
         }
         self.todo.extend(block);
+        // What the profile names is what people look for, so it comes before the search for others.
+        let todo = std::mem::take(&mut self.todo);
+        let (named, others): (Vec<Block>, Vec<Block>) = todo.into_iter().partition(|block| self.names(block));
+        self.todo = named.into_iter().chain(others).collect();
+    }
+
+    /// Addresses of a block.
+    fn addresses(&self, block: &Block) -> impl Iterator<Item = u16> {
+        let words = self.profile.parameter_words();
+        (0..block.count).filter_map({
+            let start = block.start;
+            move |place| start.checked_add(place.checked_mul(words)?)
+        })
+    }
+
+    /// Whether the profile names a parameter of the block.
+    fn names(&self, block: &Block) -> bool {
+        let list = &self.profile.parameters;
+        self.addresses(block).any(|address| list.at(address).is_some())
+    }
+
+    /// What is read now: `parameters 101 to 130`, or `looking for others: 1200 to 1229`; none at the end.
+    pub fn now(&self) -> Option<String> {
+        let block = self.todo.front()?;
+        let list = &self.profile.parameters;
+        let ids: Vec<String> = self.addresses(block).filter_map(|address| list.id(address)).collect();
+        let ids = match ids.as_slice() {
+            [] => return None,
+            [one] => one.clone(),
+            [first, .., last] => format!("{first} to {last}"),
+        };
+        Some(match self.names(block) {
+            true => format!("parameters {ids}"),
+            false => format!("looking for others: {ids}"),
+        })
     }
 
     /// The next request to send; none when everything was requested.
@@ -252,19 +287,18 @@ impl Reading {
         self.found.insert(address, value);
     }
 
-    /// Requests each address of a refused block alone, to find the one that is refused.
+    /// Requests each address of a refused block alone, to find the one that is refused; what the profile does not name last.
     fn split(&mut self, block: Block) {
-        let words = self.profile.parameter_words();
-        for place in (0..block.count).rev() {
-            let start = block.start + place * words;
-            if self.profile.parameters.id(start).is_some() {
-                self.todo.push_front(Block {
-                    start,
-                    count: 1,
-                    tries: 0,
-                });
-            }
-        }
+        let alone = |start| Block {
+            start,
+            count: 1,
+            tries: 0,
+        };
+        let list = &self.profile.parameters;
+        let blocks = self.addresses(&block).filter(|address| list.id(*address).is_some());
+        let (named, others): (Vec<Block>, Vec<Block>) = blocks.map(alone).partition(|block| self.names(block));
+        named.into_iter().rev().for_each(|block| self.todo.push_front(block));
+        self.todo.extend(others);
     }
 
     /// No parameter exists at this address. If an earlier reading found one there, all addresses are requested again.

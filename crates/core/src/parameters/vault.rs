@@ -21,6 +21,8 @@ pub struct Status {
     pub progress: (usize, usize),
     /// Estimated remaining time.
     pub remaining: Option<Duration>,
+    /// What is read now.
+    pub now: Option<String>,
     /// Why the reading waits.
     pub waits: Option<String>,
     /// Result of the reading; none while it is in progress.
@@ -177,6 +179,7 @@ impl Vault {
             number,
             progress: (0, 0),
             remaining: None,
+            now: None,
             waits: None,
             result: None,
         };
@@ -192,7 +195,7 @@ impl Vault {
             state.last.insert(drive.clone(), file.clone());
         }
         if let Some(reading) = state.readings.get_mut(drive) {
-            (reading.waits, reading.remaining) = (None, None);
+            (reading.waits, reading.remaining, reading.now) = (None, None, None);
             reading.result = Some(result);
         }
     }

@@ -251,6 +251,9 @@ pub struct ParameterReading {
     /// Estimated remaining time, s.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub remaining_s: Option<f64>,
+    /// What is read now.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub now: Option<String>,
     /// Why the reading waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
@@ -274,6 +277,7 @@ impl ParameterReading {
             done: status.progress.0,
             total: status.progress.1,
             remaining_s: status.remaining.map(|time| time.as_secs_f64()),
+            now: status.now.clone(),
             waits: status.waits.clone(),
             file,
             error,

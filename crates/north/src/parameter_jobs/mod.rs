@@ -81,6 +81,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
             job.waits = looks.waits;
             if job.waits.is_none() {
                 (job.progress, job.remaining) = (looks.progress, remaining(looks.progress, looks.worked));
+                job.now = looks.reading;
             }
         });
     })
@@ -103,6 +104,8 @@ struct Looks {
     progress: (usize, usize),
     /// Time for that, without the pauses.
     worked: Duration,
+    /// What is read next.
+    reading: Option<String>,
     waits: Option<String>,
 }
 
@@ -125,6 +128,7 @@ async fn read(
         let mut looks = Looks {
             progress: reading.progress(),
             worked: begun.elapsed().saturating_sub(paused),
+            reading: reading.now(),
             waits: None,
         };
         match next {
