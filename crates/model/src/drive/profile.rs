@@ -51,6 +51,8 @@ pub struct Profile {
     pub input_is_holding: bool,
     /// Reads that identify the family, for `scan`.
     pub identify: Vec<Expected>,
+    /// What drives of the family call themselves (function 43/14): vendor and beginning of the product, such as `WEG CFW500`.
+    pub nameplates: Vec<String>,
     /// N2 options of the family.
     pub n2: N2Options,
     /// Name of the simulated drive that behaves like the family.

@@ -9,6 +9,7 @@ use super::effect;
 use super::wishes::Key;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, OwnWord};
+use crate::drive::identify::{PRODUCT, VENDOR};
 use crate::drive::profile::Part;
 use crate::drive::{Point, Profile, Value};
 
@@ -87,6 +88,7 @@ impl ProfileDrive {
             15 => has(Table::Coil),
             16 => has(Table::Holding),
             22 => functions.mask_write,
+            43 => !profile.nameplates.is_empty(),
             _ => false,
         }
     }
@@ -127,8 +129,30 @@ impl ProfileDrive {
                 let value = old & and_mask | or_mask & !and_mask;
                 self.write(Table::Holding, *address, &[value], now)
             }
+            RequestPdu::DeviceIdentification { code, object } => self.nameplate(*code, *object),
             _ => Err(Exception::FUNCTION),
         }
+    }
+
+    /// What the drive calls itself: vendor and product, as a stream (code 1) or one object (code 4).
+    fn nameplate(&self, code: u8, object: u8) -> Result<Reply, Exception> {
+        let plate = self.options.profile.nameplates.first().ok_or(Exception::FUNCTION)?;
+        let (vendor, product) = plate.split_once(' ').unwrap_or((plate, ""));
+        let objects = [(VENDOR, vendor), (PRODUCT, product)].into_iter();
+        let wanted: Vec<(u8, &str)> = match code {
+            1 => objects.collect(),
+            4 => objects.filter(|(id, _)| *id == object).collect(),
+            _ => return Err(Exception::VALUE),
+        };
+        if wanted.is_empty() {
+            return Err(Exception::ADDRESS);
+        }
+        let mut body = vec![code, 0x81, 0, 0, wanted.len() as u8];
+        for (id, text) in wanted {
+            body.extend([id, text.len() as u8]);
+            body.extend(text.as_bytes());
+        }
+        Ok(Reply::DeviceIdentification(body))
     }
 
     /// Whether the register is one that no real drive has.

@@ -5,6 +5,9 @@ use drivegate_testkit::{Family, Order, families, number, orders, rows};
 use proptest::prelude::*;
 
 use super::*;
+use crate::codec::Protocol;
+use crate::codec::n2::Session;
+use crate::drive::identify::{self, Nameplate};
 use crate::drive::profile::Profiles;
 use crate::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
 
@@ -565,4 +568,65 @@ fn states_of_a_profile_of_ones_own() {
     assert_eq!(status(&mut rig) & 0x33B, 0x202, "in reverse, and not forward");
     rig.send(&[Word(rig.trip_address, 1)]);
     assert_eq!(status(&mut rig) & 0x30, 0x30, "the equal of a mask is shifted");
+}
+
+/// What a search learns of a drive by its reads: the profiles that fit, and the nameplate.
+fn identified(drive: &mut SimulatedDrive, profiles: &Profiles, protocol: Protocol) -> Vec<String> {
+    if protocol == Protocol::N2 {
+        drive.answer(&RequestPdu::N2(Session::Identify), SimTime::ZERO);
+    }
+    let outcomes = identify::probes(profiles, protocol).into_iter().filter_map(|probe| {
+        let values = !matches!(drive.answer(&probe.pdu(), SimTime::ZERO)?, Reply::Exception(_));
+        Some((probe, values))
+    });
+    let outcomes = outcomes.collect();
+    let mut fitting = identify::fitting(profiles, protocol, &outcomes);
+    let request = RequestPdu::DeviceIdentification { code: 1, object: 0 };
+    if fitting.is_empty()
+        && let Some(Reply::DeviceIdentification(reply)) = drive.answer(&request, SimTime::ZERO)
+    {
+        let mut plate = Nameplate::default();
+        plate.add(&reply);
+        fitting = identify::named(profiles, protocol, &plate);
+    }
+    fitting.iter().map(|profile| profile.name.clone()).collect()
+}
+
+/// Each built-in profile that can be identified is found by its own simulated drive, and by no drive of another family.
+#[test]
+fn a_drive_is_identified_as_its_own_family_or_not_at_all() {
+    let profiles = Profiles::built_in();
+    // The same board, or the same registers.
+    let alike = [("eaton-svx", "eaton-hvx"), ("vacon-nx", "vacon-10")];
+    let mut silent = Vec::new();
+    for profile in profiles.iter() {
+        let Some(model) = ModelOptions::of_profile(profile) else {
+            continue;
+        };
+        let mut drive = SimulatedDrive::new(DriveOptions::new(1, model), SimTime::ZERO);
+        for protocol in &profile.protocols {
+            let names = identified(&mut drive, &profiles, *protocol);
+            // A profile with a base is an application or a kind of the family, which no read shows.
+            let family = profile.base.as_ref().unwrap_or(&profile.name);
+            let mut expected = vec![family.clone()];
+            expected.extend(alike.iter().filter_map(|(one, other)| match family.as_str() {
+                name if name == *one => Some(other.to_string()),
+                name if name == *other => Some(one.to_string()),
+                _ => None,
+            }));
+            expected.sort();
+            let known = profiles.get(family).unwrap();
+            if known.identify.is_empty() && known.nameplates.is_empty() {
+                expected.clear();
+                silent.push(profile.name.as_str());
+            }
+            let mut names = names;
+            names.sort();
+            assert_eq!(names, expected, "{} on {}", profile.name, protocol.name());
+        }
+    }
+    assert!(
+        !silent.contains(&"weg-cfw") && silent.contains(&"delta-ms300"),
+        "{silent:?}"
+    );
 }

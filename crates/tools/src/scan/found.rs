@@ -78,7 +78,7 @@ mod tests {
         // The board's answers do not prove the make of the drive.
         let board = title(&["vacon-nx"], 0);
         assert!(
-            board.ends_with("nx (an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board)"),
+            board.ends_with("nx (a Vacon NX or Eaton with an OPT-C2 board of 2012 or later, or a Vacon 10)"),
             "{board}"
         );
         let board = title(&["eaton-hvx", "eaton-svx"], 0);

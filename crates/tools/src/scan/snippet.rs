@@ -278,7 +278,7 @@ mod tests {
         for wanted in [
             "\n# By reading alone eaton-hvx cannot be distinguished from eaton-svx: check the nameplate.\n# This is \
              an older OPT-C2 board: an Eaton, or a Vacon NX with an older board.\n[[bus.drive]]\nname = \"drive-1\"\n",
-            "\n# This is an OPT-C2 board of 2012 or later: a Vacon NX, or an Eaton with a newer board.\n[[bus.drive]]\nname = \"drive-4\"\n",
+            "\n# This is a Vacon NX or Eaton with an OPT-C2 board of 2012 or later, or a Vacon 10.\n[[bus.drive]]\nname = \"drive-4\"\n",
             "\n# No profile matches the replies of this drive: docs/profiles.md explains how to write one.\n# [[bus.drive]]\n",
             "\n# The family of this drive is unknown, because 2 reads got no reply: scan again with --tries 3.\n# [[bus.drive]]\n",
             "profile = \"vacon-nx\"\nturnaround = \"16ms\"    # measured\n",

@@ -9,6 +9,19 @@ pub(super) fn read(reader: &Reader<'_>) -> Vec<Expected> {
     reader.tables("identify").iter().filter_map(read_one).collect()
 }
 
+/// `nameplates = ["WEG CFW500"]`: a vendor and the beginning of a product, or the vendor alone.
+pub(super) fn nameplates(reader: &Reader<'_>) -> Vec<String> {
+    let plates: Vec<String> = reader.or("nameplates", Vec::new());
+    if plates.iter().any(|plate| plate.trim().is_empty()) {
+        reader.problem(
+            "nameplates",
+            "an empty nameplate fits every drive",
+            "write vendor and beginning of the product, such as [\"WEG CFW500\"]",
+        );
+    }
+    plates
+}
+
 fn read_one(reader: &Reader<'_>) -> Option<Expected> {
     let form = "write table, first PDU address and count, such as \"holding 2100 11\"";
     let probe = reader.parsed("read", |text| {

@@ -348,6 +348,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
         input_is_holding,
         identify: identify::read(reader),
+        nameplates: identify::nameplates(reader),
         simulator: reader.optional("simulator"),
         counts_messages: reader.or("counts_messages", false),
         may_stop_by_itself: reader.or("may_stop_by_itself", false),
