@@ -172,6 +172,13 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     );
     // On a busy machine the drives may need a second request first.
     assert!(shown.contains(" state "), "values before the question: {shown}");
+    // The first drive is shown before the next one is found.
+    let place = |text: &str| shown.find(text).unwrap_or_else(|| panic!("{text} in {shown}"));
+    let first = place("\u{20} address 3: ");
+    assert!(
+        first < place("address 7: vacon-nx") && first < place("Enter ends the search"),
+        "{shown}"
+    );
     let http = page(&shown);
     for drive in ["drive-1", "drive-2"] {
         until("the drive is read", || {
@@ -187,6 +194,40 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     assert_eq!(std::fs::read_to_string(&taken).unwrap(), "mine");
     is_sound(&written);
     assert!(get(http, "/").is_some_and(|(status, _)| status == 200));
+    trial.press("\x03");
+    assert!(trial.ended().success(), "{}", trial.screen());
+    rig.is_only_read();
+}
+
+/// The whole range of addresses takes half a minute; who has seen enough does not wait for it.
+#[test]
+fn enter_ends_the_search() {
+    let rig = TwoDrives::start();
+    let port = rig.path("line");
+    // A drive that the machine holds up is waited for.
+    let line = [
+        "--protocol",
+        "modbus-rtu",
+        "--baud",
+        "38400",
+        "--format",
+        "8N1",
+        "--timeout",
+        "1s",
+    ];
+    let mut trial = OnTerminal::start(&[&["try", "--port", &port][..], &line].concat());
+    trial.until_shown("Enter ends the search and opens the status page");
+    trial.press("\n");
+    let shown = trial.until_shown("Save this as a configuration?");
+    assert!(
+        shown.contains("stopped after ") && shown.contains(" of 247 addresses"),
+        "{shown}"
+    );
+    assert!(shown.contains("\u{20} address 3: "), "{shown}");
+    trial.press("\n");
+    until("the page", || {
+        get(page(&shown), "/").filter(|(status, _)| *status == 200)
+    });
     trial.press("\x03");
     assert!(trial.ended().success(), "{}", trial.screen());
     rig.is_only_read();

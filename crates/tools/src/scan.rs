@@ -5,6 +5,7 @@ mod progress;
 mod search;
 mod settings;
 mod snippet;
+mod values;
 pub(super) mod verdict;
 
 use std::path::PathBuf;
@@ -17,6 +18,7 @@ pub(super) use self::found::Found;
 pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
+pub(super) use self::values::figure;
 use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome, documented, negative};
 use super::{port_users, report};

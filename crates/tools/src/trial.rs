@@ -11,7 +11,7 @@ use std::time::Duration;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-use self::dialog::{check_new, choose_port};
+use self::dialog::{Keyboard, check_new, choose_port};
 use super::failure::{Failure, Outcome, negative};
 use super::scan::{self, Extent, Options, Search, parse_port, verdict};
 use super::{EXIT_FAILED, report};
@@ -86,18 +86,21 @@ fn stopped() -> Failure {
 }
 
 fn attempt(args: &Args, stop: &Stop) -> Outcome {
+    let keyboard = Keyboard::open();
     if let Some(file) = &args.write {
         check_new(file).map_err(Failure::Misused)?;
     }
     let port = match &args.port {
         Some(port) => port.clone(),
-        None => choose_port(stop)?.ok_or_else(stopped)?,
+        None => choose_port(stop, &keyboard)?.ok_or_else(stopped)?,
     };
     let (settings, profiles) = scan::prepare(&args.options, &port)?;
     report::note(&format!(
         "looking for drives on {port}; nothing is written to them; Ctrl-C to stop"
     ));
-    let mut search = Search::new(&port, &args.options, profiles, stop.flag.clone());
+    let enough = Arc::new(AtomicBool::new(false));
+    let search = Search::new(&port, &args.options, profiles, stop.flag.clone());
+    let mut search = search.with_values(enough.clone());
     let outcome = match settings.first() {
         Some(first) => search.listen(*first, LISTEN),
         None => Ok(()),
@@ -105,7 +108,7 @@ fn attempt(args: &Args, stop: &Stop) -> Outcome {
     let outcome = outcome.and_then(|()| match verdict::somebody_speaks(&search.heard, &port, LISTEN) {
         Some(message) => Err(message),
         None if stop.is_wanted() => Ok(()),
-        None => search.run(&settings, Extent::OneSetting),
+        None => keyboard.during(&enough, || search.run(&settings, Extent::OneSetting)),
     });
     outcome?;
     if stop.is_wanted() {
@@ -115,5 +118,6 @@ fn attempt(args: &Args, stop: &Stop) -> Outcome {
         scan::nobody_answers(&search, &port, &settings);
         return negative();
     }
-    serving::serve(args, stop, &scan::configuration(&port, &args.options, &search))
+    let text = scan::configuration(&port, &args.options, &search);
+    serving::serve(args, stop, &keyboard, &text)
 }

@@ -2,8 +2,6 @@
 
 use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::printable;
@@ -29,11 +27,10 @@ pub(super) struct Progress {
     begun: Instant,
     shown: Option<Instant>,
     live: bool,
-    stop: Arc<AtomicBool>,
 }
 
 impl Progress {
-    pub(super) fn new(stop: Arc<AtomicBool>) -> Progress {
+    pub(super) fn new() -> Progress {
         Progress {
             total: 0,
             done: 0,
@@ -42,7 +39,6 @@ impl Progress {
             begun: Instant::now(),
             shown: None,
             live: std::io::stderr().is_terminal(),
-            stop,
         }
     }
 
@@ -83,12 +79,12 @@ impl Progress {
         self.shown = None;
     }
 
-    /// Clears the bar.
-    pub(super) fn end(&mut self) {
+    /// Clears the bar; `early`: before all addresses were asked.
+    pub(super) fn end(&mut self, early: bool) {
         if self.live {
             let _ = write!(std::io::stderr().lock(), "\r\x1b[K");
         }
-        if self.stop.load(Ordering::Relaxed) {
+        if early {
             self.print_line(&format!("stopped after {} of {} addresses", self.done, self.total));
         }
     }
@@ -149,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_plan_can_change() {
-        let mut progress = Progress::new(Arc::default());
+        let mut progress = Progress::new();
         progress.plan(100, Duration::from_secs(10));
         progress.step(Duration::from_millis(100));
         progress.plan(9, Duration::from_secs(1));

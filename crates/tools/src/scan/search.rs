@@ -1,6 +1,7 @@
 //! Looks for drives on a line: one request to each address, then the reads that tell families apart. Only reads.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -8,6 +9,9 @@ use std::time::Duration;
 use super::found::Found;
 use super::progress::Progress;
 use super::settings::{Options, Part, Setting, parts};
+use super::snippet::Snippet;
+use super::values;
+use crate::bus::Mode;
 use crate::bus::prober::{Answer, Prober};
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
@@ -59,6 +63,8 @@ pub(crate) struct Search<'a> {
     pub(crate) heard: Heard,
     progress: Progress,
     stop: Arc<AtomicBool>,
+    /// The first values of each drive are shown; set where that is enough, and the search ends with the drives found so far.
+    enough: Option<Arc<AtomicBool>>,
 }
 
 impl<'a> Search<'a> {
@@ -69,8 +75,18 @@ impl<'a> Search<'a> {
             profiles,
             found: Vec::new(),
             heard: Heard::default(),
-            progress: Progress::new(stop.clone()),
+            progress: Progress::new(),
             stop,
+            enough: None,
+        }
+    }
+
+    /// Shows the first values of each drive as soon as it is found; `enough` ends the search once there is one.
+    #[must_use]
+    pub(crate) fn with_values(self, enough: Arc<AtomicBool>) -> Search<'a> {
+        Search {
+            enough: Some(enough),
+            ..self
         }
     }
 
@@ -99,7 +115,7 @@ impl<'a> Search<'a> {
     pub(crate) fn run(&mut self, settings: &[Setting], extent: Extent) -> Result<(), String> {
         let parts = parts(self.options, settings, extent == Extent::Exhaustive);
         let outcome = self.all(parts, extent);
-        self.progress.end();
+        self.progress.end(self.is_over());
         outcome
     }
 
@@ -116,7 +132,7 @@ impl<'a> Search<'a> {
         while let Some(part) = waiting.pop_front() {
             let before = self.found.len();
             self.one(&part)?;
-            if self.stopped() {
+            if self.is_over() {
                 break;
             }
             if self.found.len() > before && extent == Extent::OneSetting {
@@ -153,7 +169,7 @@ impl<'a> Search<'a> {
         let mut prober = self.prober(&line, part.setting);
         let protocol = part.setting.protocol;
         for address in &part.addresses {
-            if self.stopped() {
+            if self.is_over() {
                 break;
             }
             let at = format!("{}, address {address}", part.setting);
@@ -165,6 +181,7 @@ impl<'a> Search<'a> {
                 let found = self.look_closer(&mut prober, part.setting, *address)?;
                 self.progress
                     .print_line(&format!("found {at}: {}", found.title(&self.profiles)));
+                self.show_values(&mut prober, &found)?;
                 self.found.push(found);
             }
         }
@@ -207,6 +224,37 @@ impl<'a> Search<'a> {
 
     fn lost(&self, why: &str) -> String {
         format!("{why}; {}; plug the adapter in and try again", self.port)
+    }
+
+    /// Shows the first values of a drive that was found, where they are wanted and its profile is known.
+    fn show_values(&mut self, prober: &mut Prober<'_>, found: &Found) -> Result<(), String> {
+        let Some(enough) = &self.enough else { return Ok(()) };
+        if self.found.is_empty() {
+            // A key that was pressed before there was anything to show ends nothing.
+            enough.store(false, Ordering::Relaxed);
+        }
+        if found.profiles.is_empty() {
+            return Ok(());
+        }
+        let snippet = Snippet {
+            port: self.port,
+            found: std::slice::from_ref(found),
+            profiles: &self.profiles,
+            profile_dirs: self.options.profile_dir.clone(),
+            timeout: None,
+            mode: Mode::Master,
+        };
+        let Some(spec) = snippet.first_drive() else {
+            return Ok(());
+        };
+        let figures = values::read(prober, spec).map_err(|lost| self.lost(&lost.to_string()))?;
+        self.progress
+            .print_line(&format!("  address {}: {figures}", found.address));
+        if self.found.is_empty() && std::io::stdin().is_terminal() {
+            self.progress
+                .print_line("looking for more drives; Enter ends the search and opens the status page");
+        }
+        Ok(())
     }
 
     fn look_closer(&mut self, prober: &mut Prober<'_>, setting: Setting, address: u8) -> Result<Found, String> {
@@ -286,6 +334,15 @@ impl<'a> Search<'a> {
 
     fn timeout(&self, protocol: Protocol) -> Duration {
         self.options.timeout.unwrap_or(protocol.usual_timeout())
+    }
+
+    /// Whether the search ends here: by a signal, or because the drives found are enough.
+    fn is_over(&self) -> bool {
+        let enough = self
+            .enough
+            .as_ref()
+            .is_some_and(|enough| enough.load(Ordering::Relaxed));
+        self.stopped() || enough && !self.found.is_empty()
     }
 
     /// Whether a signal has ended the search.

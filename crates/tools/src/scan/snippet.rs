@@ -10,6 +10,7 @@ use crate::codec::LineFormat;
 use crate::config::{BusSettings, Settings};
 use crate::document::format_duration;
 use crate::drive::profile::Profiles;
+use crate::process_image::DriveSpec;
 
 /// Where the status page is.
 const HTTP: &str = "127.0.0.1:9488";
@@ -48,6 +49,13 @@ impl Snippet<'_> {
         let loaded = Settings::parse("found.toml", &draft, std::iter::empty());
         let bus = loaded.settings.as_ref().and_then(|settings| settings.buses.first());
         self.with_cadence(&bus.map_or_else(String::new, cadence))
+    }
+
+    /// The first drive of the configuration.
+    pub(super) fn first_drive(&self) -> Option<DriveSpec> {
+        let loaded = Settings::parse("found.toml", &self.with_cadence(""), std::iter::empty());
+        let bus = loaded.settings?.buses.into_iter().next()?;
+        bus.drives.into_iter().next()
     }
 
     fn with_cadence(&self, cadence: &str) -> String {

@@ -2,7 +2,8 @@
 
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::path::Path;
-use std::sync::mpsc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
 use super::Stop;
@@ -10,39 +11,83 @@ use crate::adapters::{Adapter, adapters};
 use crate::failure::Failure;
 use crate::printable;
 
+/// Interval at which a signal is noticed.
+const LOOK: Duration = Duration::from_millis(50);
+
 /// Whether a person can be asked.
 pub(super) fn is_terminal() -> bool {
     io::stdin().is_terminal() && io::stderr().is_terminal()
 }
 
-/// The answer to a question; `None` at the end of the input or after a signal.
-pub(super) fn ask(question: &str, stop: &Stop) -> Option<String> {
-    let mut stderr = io::stderr().lock();
-    let _ = write!(stderr, "{question} ").and_then(|()| stderr.flush());
-    drop(stderr);
-    let (sender, answer) = mpsc::channel();
-    // A read from the terminal cannot be broken off: the thread ends with the process.
-    std::thread::spawn(move || {
-        let mut line = String::new();
-        let read = io::stdin().lock().read_line(&mut line);
-        let _ = sender.send(read.ok().filter(|count| *count > 0).map(|_| line.trim().to_string()));
-    });
-    while !stop.is_wanted() {
-        match answer.recv_timeout(Duration::from_millis(50)) {
-            Ok(answer) => return answer,
-            Err(mpsc::RecvTimeoutError::Timeout) => {}
-            Err(mpsc::RecvTimeoutError::Disconnected) => return None,
+/// The lines that are typed. One thread reads them all, because a read from the terminal cannot be broken off: what is typed after
+/// a question that is over would answer the next one too late.
+pub(super) struct Keyboard(Mutex<mpsc::Receiver<String>>);
+
+impl Keyboard {
+    /// Reads from now on; the thread ends with the input or the process.
+    pub(super) fn open() -> Keyboard {
+        let (sender, lines) = mpsc::channel();
+        if is_terminal() {
+            std::thread::spawn(move || {
+                let mut line = String::new();
+                while io::stdin().lock().read_line(&mut line).is_ok_and(|count| count > 0) {
+                    if sender.send(line.trim().to_string()).is_err() {
+                        return;
+                    }
+                    line.clear();
+                }
+            });
         }
+        Keyboard(Mutex::new(lines))
     }
-    let _ = writeln!(io::stderr().lock());
-    None
+
+    /// The next line, for `time` at most.
+    fn next(&self, time: Duration) -> Result<String, mpsc::RecvTimeoutError> {
+        let lines = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        lines.recv_timeout(time)
+    }
+
+    /// The answer to a question; `None` at the end of the input or after a signal.
+    pub(super) fn ask(&self, question: &str, stop: &Stop) -> Option<String> {
+        let mut stderr = io::stderr().lock();
+        let _ = write!(stderr, "{question} ").and_then(|()| stderr.flush());
+        drop(stderr);
+        while !stop.is_wanted() {
+            match self.next(LOOK) {
+                Ok(answer) => return Some(answer),
+                Err(mpsc::RecvTimeoutError::Timeout) => {}
+                Err(mpsc::RecvTimeoutError::Disconnected) => return None,
+            }
+        }
+        let _ = writeln!(io::stderr().lock());
+        None
+    }
+
+    /// Sets `enough` at each line that is typed while `work` runs.
+    pub(super) fn during<T>(&self, enough: &AtomicBool, work: impl FnOnce() -> T) -> T {
+        let done = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                while !done.load(Ordering::Relaxed) {
+                    match self.next(LOOK) {
+                        Ok(_) => enough.store(true, Ordering::Relaxed),
+                        Err(mpsc::RecvTimeoutError::Timeout) => {}
+                        Err(mpsc::RecvTimeoutError::Disconnected) => return,
+                    }
+                }
+            });
+            let outcome = work();
+            done.store(true, Ordering::Relaxed);
+            outcome
+        })
+    }
 }
 
 /// Lists the adapters and asks which one to use; `None` after a signal.
 ///
 /// # Errors
 /// There is no adapter, or no terminal for the question.
-pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, Failure> {
+pub(super) fn choose_port(stop: &Stop, keyboard: &Keyboard) -> Result<Option<String>, Failure> {
     let found = adapters();
     if found.is_empty() {
         return Err(
@@ -59,7 +104,7 @@ pub(super) fn choose_port(stop: &Stop) -> Result<Option<String>, Failure> {
         )));
     }
     loop {
-        let Some(answer) = ask(&question(found.len()), stop) else {
+        let Some(answer) = keyboard.ask(&question(found.len()), stop) else {
             return Ok(None);
         };
         match chosen(&answer, &found) {

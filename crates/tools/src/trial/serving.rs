@@ -4,15 +4,16 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use super::dialog::{ask, is_terminal, write_new};
+use super::dialog::{Keyboard, is_terminal, write_new};
 use super::{Args, Stop};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
-use crate::drive::{ModelPoint, Quality, State};
+use crate::drive::{ModelPoint, State};
 use crate::failure::{Failure, Outcome};
 use crate::north::http;
 use crate::north::local::SocketPath;
 use crate::plant::SharedPlant;
+use crate::scan::figure;
 use crate::{EXIT_FAILED, demo, report};
 
 /// Preferred port of the status page.
@@ -21,7 +22,7 @@ const HTTP: u16 = 9488;
 const FIRST_VALUES: Duration = Duration::from_secs(10);
 
 /// Reads the drives of the configuration `text` and serves the status page until a signal.
-pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
+pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -> Outcome {
     let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
     report::errors(&loaded.errors);
     let mut settings = loaded.settings.ok_or(Failure::Reported(EXIT_FAILED))?;
@@ -50,7 +51,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Outcome {
             "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C to stop.\n"
         ));
     }
-    let offered = offer(args, stop, text);
+    let offered = offer(args, stop, keyboard, text);
     if offered.is_ok() {
         runtime.block_on(stop.token.cancelled());
     }
@@ -91,23 +92,14 @@ fn values(plant: &SharedPlant) -> String {
     let mut table = report::table(["drive", "address", "profile", "state", "Hz", "rpm", "A", "fault"]);
     for drive in plant.load().drives() {
         let (spec, reading) = (&drive.image.spec, drive.reading(Instant::now()));
-        // Values whose quality is not good are left out.
-        let good = |point: ModelPoint| {
-            let sample = reading.model(point);
-            let value = sample.value.filter(|_| sample.quality == Quality::Good);
-            crate::process_image::value_or_null(value).as_f64()
-        };
-        let fixed = |point: ModelPoint, digits: usize| {
-            good(point).map_or_else(String::new, |value| format!("{value:.digits$}"))
-        };
         table.add_row([
             spec.name.clone(),
             spec.address.to_string(),
             spec.profile.name.clone(),
             reading.state().map_or("unknown", State::name).to_string(),
-            fixed(ModelPoint::OutputFrequency, 2),
-            fixed(ModelPoint::MotorSpeed, 0),
-            fixed(ModelPoint::MotorCurrent, 1),
+            figure(&reading, ModelPoint::OutputFrequency, 2),
+            figure(&reading, ModelPoint::MotorSpeed, 0),
+            figure(&reading, ModelPoint::MotorCurrent, 1),
             reading.fault_text(),
         ]);
     }
@@ -115,7 +107,7 @@ fn values(plant: &SharedPlant) -> String {
 }
 
 /// Writes the configuration where that is wanted.
-fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
+fn offer(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -> Result<(), String> {
     if let Some(file) = &args.write {
         write_new(file, text)?;
         report::print(&next_steps(file));
@@ -126,7 +118,7 @@ fn offer(args: &Args, stop: &Stop, text: &str) -> Result<(), String> {
         return Ok(());
     }
     while !stop.is_wanted() {
-        let answer = ask(
+        let answer = keyboard.ask(
             "\nSave this as a configuration? Name of a new file, y for drivegate.toml, or Enter for none:",
             stop,
         );
