@@ -191,6 +191,8 @@ fn on_a_terminal_it_ends_with_values_and_a_configuration() {
     let written = rig.path("plant.toml");
     trial.press(&format!("{written}\n"));
     trial.until_shown(&format!("Configuration written to {written}"));
+    let users = rig.path("users");
+    trial.until_shown(&format!("drivegate user add --file {users} alice"));
     assert_eq!(std::fs::read_to_string(&taken).unwrap(), "mine");
     is_sound(&written);
     assert!(get(http, "/").is_some_and(|(status, _)| status == 200));

@@ -2,6 +2,7 @@
 
 mod dialog;
 mod serving;
+mod starting;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -119,5 +120,6 @@ fn attempt(args: &Args, stop: &Stop) -> Outcome {
         return negative();
     }
     let text = scan::configuration(&port, &args.options, &search);
-    serving::serve(args, stop, &keyboard, &text)
+    let before_commands = verdict::before_commands(&search.found, &search.profiles);
+    serving::serve(args, stop, &keyboard, &text, &before_commands)
 }

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use super::dialog::{Keyboard, is_terminal, write_new};
+use super::starting::next_steps;
 use super::{Args, Stop};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
@@ -22,7 +23,8 @@ const HTTP: u16 = 9488;
 const FIRST_VALUES: Duration = Duration::from_secs(10);
 
 /// Reads the drives of the configuration `text` and serves the status page until a signal.
-pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -> Outcome {
+/// `before_commands`: what the drives need first.
+pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str, before_commands: &str) -> Outcome {
     let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
     report::errors(&loaded.errors);
     let mut settings = loaded.settings.ok_or(Failure::Reported(EXIT_FAILED))?;
@@ -42,6 +44,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -
         level: "error".to_string(),
         format: LogFormat::Auto,
     });
+    let buses = settings.buses.clone();
     let runtime = crate::runtime()?;
     let daemon = runtime.block_on(start(settings))?;
     runtime.block_on(first_values(&daemon.plant(), stop));
@@ -51,7 +54,8 @@ pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -
             "\nStatus page, from this machine only: http://{address}/\nThe drives are only read. Ctrl-C to stop.\n"
         ));
     }
-    let offered = offer(args, stop, keyboard, text);
+    let next = |file: &Path| next_steps(file, &buses, before_commands);
+    let offered = offer(args, stop, keyboard, text, next);
     if offered.is_ok() {
         runtime.block_on(stop.token.cancelled());
     }
@@ -107,10 +111,16 @@ fn values(plant: &SharedPlant) -> String {
 }
 
 /// Writes the configuration where that is wanted.
-fn offer(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -> Result<(), String> {
+fn offer(
+    args: &Args,
+    stop: &Stop,
+    keyboard: &Keyboard,
+    text: &str,
+    next: impl Fn(&Path) -> String,
+) -> Result<(), String> {
     if let Some(file) = &args.write {
         write_new(file, text)?;
-        report::print(&next_steps(file));
+        report::print(&next(file));
         return Ok(());
     }
     if !is_terminal() {
@@ -127,7 +137,7 @@ fn offer(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str) -> Result<()
         };
         match write_new(&file, text) {
             Ok(()) => {
-                report::print(&next_steps(&file));
+                report::print(&next(&file));
                 return Ok(());
             }
             Err(message) => report::error(&message),
@@ -143,13 +153,6 @@ fn wanted_file(answer: &str) -> Option<PathBuf> {
         "y" | "yes" | "j" | "ja" | "ok" => Some(PathBuf::from("drivegate.toml")),
         _ => Some(PathBuf::from(answer)),
     }
-}
-
-fn next_steps(file: &Path) -> String {
-    let file = file.display();
-    format!(
-        "Configuration written to {file}. Next, after Ctrl-C:\n  drivegate check --config {file}\n  drivegate run --config {file}\n"
-    )
 }
 
 #[cfg(test)]
