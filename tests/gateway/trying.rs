@@ -235,6 +235,76 @@ fn enter_ends_the_search() {
     rig.is_only_read();
 }
 
+/// A drive of a family that no read shows: its make is asked, or named on the command line.
+#[test]
+fn the_make_that_no_read_shows_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("line");
+    let port = link.display().to_string();
+    let _drive = Running::drivegate(&[
+        "simulate",
+        "--profile",
+        "delta-ms300",
+        "--addresses",
+        "2",
+        "--baud",
+        "9600",
+        "--link",
+        &port,
+    ]);
+    until("the line", || link.exists().then_some(()));
+    let line = [
+        "--protocol",
+        "modbus-rtu",
+        "--baud",
+        "9600",
+        "--format",
+        "8N1",
+        "--addresses",
+        "2",
+        "--timeout",
+        "1s",
+    ];
+    let line = [&["try", "--port", &port][..], &line].concat();
+    let unnamed = ran(drivegate(&line).stdin(std::process::Stdio::null()));
+    assert_eq!(unnamed.code, 1, "{}", unnamed.err);
+    for wanted in [
+        "address 2: a device whose family no read shows",
+        "name its profile: --profile NAME, with one of abb-acs550, ",
+        "delta-ms300",
+    ] {
+        assert!(unnamed.err.contains(wanted), "{wanted}: {}", unnamed.err);
+    }
+
+    let mut trial = OnTerminal::start(&line);
+    let shown = trial.until_shown("Number or name, or Enter for none of these:");
+    assert!(
+        shown.contains("at address 2. Which make is it") && shown.contains("Delta MS300"),
+        "{shown}"
+    );
+    trial.press("delta\n");
+    trial.until_shown("or a name of the list");
+    trial.press("delta-ms300\n");
+    let shown = trial.until_shown("Save this as a configuration?");
+    until("values", || {
+        (api(page(&shown), "drive-1")["profile"] == "delta-ms300").then_some(())
+    });
+    trial.press("\x03");
+    assert!(trial.ended().success(), "{}", trial.screen());
+
+    let written = folder.path().join("plant.toml").display().to_string();
+    let mut named = Running::drivegate(&[&line[..], &["--profile", "delta-ms300", "--write", &written]].concat());
+    named.until_printed("Configuration written to ");
+    let config = std::fs::read_to_string(&written).unwrap();
+    assert!(config.contains("profile = \"delta-ms300\"\n"), "{config}");
+    assert!(config.contains("# Named, not identified: "), "{config}");
+    named.signal("INT");
+    assert!(named.ended().success());
+    let wrong = ran(&mut drivegate(&[&line[..], &["--profile", "delta-300"]].concat()));
+    assert_eq!(wrong.code, 2, "{}", wrong.err);
+    assert!(wrong.err.contains("did you mean `delta-ms300`?"), "{}", wrong.err);
+}
+
 #[test]
 fn ctrl_c_ends_it_at_any_moment() {
     let rig = TwoDrives::start();

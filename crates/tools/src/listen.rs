@@ -147,6 +147,8 @@ impl Ear<'_> {
                 setting: Setting { protocol, format },
                 address: *address,
                 profiles: seen.fitting(profiles, protocol),
+                chosen: false,
+                nameplate: String::new(),
                 unanswered: 0,
                 turnaround: None,
             })

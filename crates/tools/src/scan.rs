@@ -7,6 +7,7 @@ mod settings;
 mod snippet;
 mod values;
 pub(super) mod verdict;
+mod wishes;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -19,6 +20,7 @@ pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 pub(super) use self::values::figure;
+pub(super) use self::wishes::can_be;
 use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome, documented, negative};
 use super::{port_users, report};
@@ -31,6 +33,7 @@ use crate::drive::profile::Profiles;
 #[command(after_help = "Examples:
   drivegate scan --port /dev/ttyUSB0
   drivegate scan --port /dev/ttyUSB0 --protocol modbus-rtu --baud all --format 8N1,8E1 --addresses 1-31
+  drivegate scan --port /dev/ttyUSB0 --profile weg-cfw
 
 Addresses 1 to 10 are tried first with all settings. Once a drive has answered, no other settings are tried, unless
 --exhaustive. The configuration goes to standard output, everything else to standard error.")]
@@ -69,7 +72,9 @@ pub(super) fn run(args: &Args) -> Outcome {
 /// The settings to try, and all profiles.
 pub(super) fn prepare(options: &Options, port: &str) -> Result<(Vec<Setting>, Profiles), Failure> {
     let settings = settings::settings(options, port).map_err(Failure::Misused)?;
-    Ok((settings, super::profiles_of(&options.profile_dir)?))
+    let profiles = super::profiles_of(&options.profile_dir)?;
+    wishes::check(&options.profile, &profiles).map_err(Failure::Misused)?;
+    Ok((settings, profiles))
 }
 
 /// Ctrl-C ends the scan; what was found is still printed.
@@ -116,6 +121,7 @@ fn document(args: &Args, search: &Search<'_>, error: Option<&String>) -> Json {
             "baud": (found.setting.format != LineFormat::NETWORK).then_some(found.setting.format.baud),
             "format": (found.setting.format != LineFormat::NETWORK).then(|| found.setting.format.characters()),
             "profiles": found.profiles,
+            "nameplate": (!found.nameplate.is_empty()).then_some(&found.nameplate),
             "turnaround_ms": found.turnaround.map(|time| time.as_secs_f64() * 1000.0),
         })
     };

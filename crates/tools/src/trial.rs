@@ -1,6 +1,7 @@
 //! `drivegate try`: from an adapter to values on a page, without a file. Only reads.
 
 mod dialog;
+mod make;
 mod serving;
 mod starting;
 
@@ -26,6 +27,7 @@ const LISTEN: Duration = Duration::from_secs(1);
   drivegate try
   drivegate try --port /dev/ttyUSB0
   drivegate try --port tcp://192.168.1.7:4001 --protocol modbus-rtu --baud 19200
+  drivegate try --port /dev/ttyUSB0 --profile weg-cfw
   drivegate try --port /dev/ttyUSB0 --addresses 1-31 --write drivegate.toml
 
 Addresses 1 to 10 are tried first with all settings, then the rest. The status page is on the loopback only, and nothing is
@@ -119,7 +121,14 @@ fn attempt(args: &Args, stop: &Stop) -> Outcome {
         scan::nobody_answers(&search, &port, &settings);
         return negative();
     }
+    if dialog::is_terminal() {
+        make::name_the_unknown(&mut search, stop, &keyboard);
+    }
     let text = scan::configuration(&port, &args.options, &search);
+    if search.found.iter().all(|found| found.profiles.is_empty()) {
+        report::print(&text);
+        return Err(make::nobody_is_known(&search).into());
+    }
     let before_commands = verdict::before_commands(&search.found, &search.profiles);
     serving::serve(args, stop, &keyboard, &text, &before_commands)
 }

@@ -14,6 +14,10 @@ pub(crate) struct Found {
     pub(crate) address: u8,
     /// Profiles that match its answers; none, one, or some that cannot be distinguished by reading.
     pub(crate) profiles: Vec<String>,
+    /// The command line or a person named the profile.
+    pub(crate) chosen: bool,
+    /// What a device calls itself that no read identifies; empty if nothing.
+    pub(crate) nameplate: String,
     /// Reads that tell families apart and got no answer: neither values nor a refusal.
     pub(crate) unanswered: usize,
     /// Time that it takes to begin a reply, the median; absent if it gave no values.
@@ -21,9 +25,18 @@ pub(crate) struct Found {
 }
 
 impl Found {
+    /// Gives the drive the profile that was named for it.
+    pub(crate) fn choose(&mut self, profile: &str) {
+        self.profiles = vec![profile.to_string()];
+        self.chosen = true;
+    }
+
     /// Description of the drive for people.
     pub(crate) fn title(&self, profiles: &Profiles) -> String {
         let names = self.profiles.join(" or ");
+        if self.chosen {
+            return format!("{names} (as named, not identified)");
+        }
         let more = [
             (self.profiles.len() > 1).then(|| "indistinguishable by reading".to_string()),
             self.identified(profiles),
@@ -31,7 +44,8 @@ impl Found {
         let more: Vec<String> = more.into_iter().flatten().collect();
         match (names.as_str(), more.as_slice()) {
             ("", _) if self.unanswered > 0 => format!("family unknown, because {}", self.silence()),
-            ("", _) => "no known profile".to_string(),
+            ("", _) if self.nameplate.is_empty() => "a device whose family no read shows".to_string(),
+            ("", _) => format!("a device whose family no read shows; its nameplate: {}", self.nameplate),
             (names, []) => names.to_string(),
             (names, more) => format!("{names} ({})", more.join("; ")),
         }
@@ -40,6 +54,9 @@ impl Found {
     /// Meaning of the matching answers, where they do not prove the family.
     pub(super) fn identified(&self, profiles: &Profiles) -> Option<String> {
         let text = |name: &String| profiles.get(name).map(|profile| profile.identified.clone());
+        if self.chosen {
+            return None;
+        }
         self.profiles.iter().filter_map(text).find(|text| !text.is_empty())
     }
 
@@ -66,12 +83,14 @@ mod tests {
             },
             address: 1,
             profiles: profiles.iter().map(ToString::to_string).collect(),
+            chosen: false,
+            nameplate: String::new(),
             unanswered,
             turnaround: None,
         };
         let profiles = Profiles::built_in();
         let title = |names: &[&str], unanswered| found(names, unanswered).title(&profiles);
-        assert_eq!(title(&[], 0), "no known profile");
+        assert_eq!(title(&[], 0), "a device whose family no read shows");
         assert_eq!(title(&[], 2), "family unknown, because 2 reads got no reply");
         assert_eq!(title(&["a", "b"], 0), "a or b (indistinguishable by reading)");
         assert_eq!(title(&["vacon-cx"], 1), "vacon-cx");

@@ -10,13 +10,14 @@ use super::found::Found;
 use super::progress::Progress;
 use super::settings::{Options, Part, Setting, parts};
 use super::snippet::Snippet;
-use super::values;
+use super::{values, wishes};
 use crate::bus::Mode;
 use crate::bus::prober::{Answer, Prober};
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
-use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
+use crate::codec::{Exception, LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 use crate::diagnosis::signature::Shape;
+use crate::drive::identify::{Nameplate, PRODUCT, PRODUCT_NAME, VENDOR};
 use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
@@ -257,6 +258,30 @@ impl<'a> Search<'a> {
         Ok(())
     }
 
+    /// What a device calls itself (function 43): as a stream, and by single objects where the stream lacks one.
+    fn nameplate(&mut self, prober: &mut Prober<'_>, address: u8) -> Result<Nameplate, String> {
+        let mut plate = Nameplate::default();
+        let (stream, single) = (1, 4);
+        for (code, object) in [
+            (stream, VENDOR),
+            (single, VENDOR),
+            (single, PRODUCT),
+            (single, PRODUCT_NAME),
+        ] {
+            if plate.get(object).is_some() {
+                continue;
+            }
+            let request = Request::new(address, RequestPdu::DeviceIdentification { code, object });
+            match self.ask(prober, &request)?.ended {
+                Ended::Reply(Reply::DeviceIdentification(reply)) => plate.add(&reply),
+                // Many drives lack the function; some of them do not even refuse it.
+                Ended::Reply(Reply::Exception(Exception::FUNCTION)) | Ended::Silent => break,
+                Ended::Reply(_) | Ended::Corrupt(_) => {}
+            }
+        }
+        Ok(plate)
+    }
+
     fn look_closer(&mut self, prober: &mut Prober<'_>, setting: Setting, address: u8) -> Result<Found, String> {
         let probes = identify::probes(&self.profiles, setting.protocol);
         let mut outcomes: BTreeMap<Probe, bool> = BTreeMap::new();
@@ -275,15 +300,26 @@ impl<'a> Search<'a> {
             }
         }
         turnarounds.sort_unstable();
-        let fitting = identify::fitting(&self.profiles, setting.protocol, &outcomes);
+        let mut fitting = identify::fitting(&self.profiles, setting.protocol, &outcomes);
+        let mut nameplate = Nameplate::default();
+        if fitting.is_empty() && setting.protocol != Protocol::N2 {
+            nameplate = self.nameplate(prober, address)?;
+            fitting = identify::named(&self.profiles, setting.protocol, &nameplate);
+        }
         let fitting = fitting.iter().filter(|profile| profile.addresses.contains(&address));
-        Ok(Found {
+        let mut found = Found {
             setting,
             address,
             profiles: fitting.map(|profile| profile.name.clone()).collect(),
+            chosen: false,
+            nameplate: nameplate.text(),
             unanswered: probes.len() - outcomes.len(),
             turnaround: turnarounds.get(turnarounds.len() / 2).copied(),
-        })
+        };
+        if let Some(remark) = wishes::apply(&self.options.profile, &mut found, &self.profiles) {
+            self.progress.print_line(&format!("note: {remark}"));
+        }
+        Ok(found)
     }
 
     /// Drives that count in longer characters than the format that they answered at ignore some of the requests. If the
@@ -398,6 +434,8 @@ mod tests {
             },
             address: 1,
             profiles: profiles.iter().map(ToString::to_string).collect(),
+            chosen: false,
+            nameplate: String::new(),
             unanswered: 0,
             turnaround: None,
         }

@@ -5,6 +5,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::wishes::{Wish, parse_wish};
 use crate::addresses::{Addresses, parse_addresses};
 use crate::codec::{LineFormat, Protocol};
 use crate::config;
@@ -59,6 +60,9 @@ pub(crate) struct Options {
     /// Include the profiles (*.toml) of this directory; may be repeated.
     #[arg(long, value_name = "DIR")]
     pub(super) profile_dir: Vec<PathBuf>,
+    /// Profile of the drives whose family no read shows, or ADDRESSES=NAME of the drives at those addresses; may be repeated.
+    #[arg(long, value_name = "NAME", value_parser = parse_wish)]
+    pub(super) profile: Vec<Wish>,
 }
 
 /// Protocol and format of the line.

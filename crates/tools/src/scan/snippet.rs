@@ -128,7 +128,7 @@ impl Snippet<'_> {
         let first = match drive.profiles.as_slice() {
             [] => {
                 let why = match drive.unanswered {
-                    0 => "No profile matches the replies of this drive: docs/profiles.md explains how to write one."
+                    0 => "No read shows the family of this device: --profile NAME names it, `drivegate profiles` lists the names."
                         .to_string(),
                     _ => format!(
                         "The family of this drive is unknown, because {}: scan again with --tries 3.",
@@ -145,6 +145,10 @@ impl Snippet<'_> {
                 others.join(" and ")
             ),
             _ => String::new(),
+        };
+        let note = match drive.chosen {
+            true => "# Named, not identified: compare its values with the drive's panel.\n".to_string(),
+            false => note,
         };
         let identified = drive.identified(self.profiles);
         let note = note + &identified.map_or(String::new(), |text| format!("# This is {text}.\n"));
@@ -211,6 +215,8 @@ mod tests {
             setting: Setting { protocol, format },
             address,
             profiles: profiles.iter().map(ToString::to_string).collect(),
+            chosen: false,
+            nameplate: String::new(),
             unanswered: 0,
             turnaround: None,
         }
@@ -287,7 +293,7 @@ mod tests {
             "\n# By reading alone eaton-hvx cannot be distinguished from eaton-svx: check the nameplate.\n# This is \
              an older OPT-C2 board: an Eaton, or a Vacon NX with an older board.\n[[bus.drive]]\nname = \"drive-1\"\n",
             "\n# This is a Vacon NX or Eaton with an OPT-C2 board of 2012 or later, or a Vacon 10.\n[[bus.drive]]\nname = \"drive-4\"\n",
-            "\n# No profile matches the replies of this drive: docs/profiles.md explains how to write one.\n# [[bus.drive]]\n",
+            "\n# No read shows the family of this device: --profile NAME names it, `drivegate profiles` lists the names.\n# [[bus.drive]]\n",
             "\n# The family of this drive is unknown, because 2 reads got no reply: scan again with --tries 3.\n# [[bus.drive]]\n",
             "profile = \"vacon-nx\"\nturnaround = \"16ms\"    # measured\n",
             "\ncycle = \"",

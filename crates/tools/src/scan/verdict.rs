@@ -285,6 +285,8 @@ mod tests {
             setting: at(9600),
             address: 1,
             profiles: names.iter().map(ToString::to_string).collect(),
+            chosen: false,
+            nameplate: String::new(),
             unanswered: 0,
             turnaround: None,
         };

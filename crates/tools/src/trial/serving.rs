@@ -28,14 +28,6 @@ pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str, b
     let loaded = Settings::parse("drivegate.toml", text, std::iter::empty());
     report::errors(&loaded.errors);
     let mut settings = loaded.settings.ok_or(Failure::Reported(EXIT_FAILED))?;
-    if settings.buses.iter().all(|bus| bus.drives.is_empty()) {
-        report::print(text);
-        return Err(
-            "devices answer, but no profile matches any of them, so there is nothing to show; the configuration above; write a \
-             profile (docs/profiles.md) and pass its directory with --profile-dir"
-                .into(),
-        );
-    }
     // A trial writes nothing to disk and has no local socket.
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
