@@ -18,7 +18,8 @@ pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
-/// Most events a listener may lag behind: one of every drive of 66 full lines at once, 16 of each of a thousand drives.
+/// Most events by which a listener may lag behind: one event for each drive of 66 full lines, or 16 events for each
+/// of a thousand drives.
 pub const BURST: usize = 16_384;
 /// Events a listener of a small plant may lag behind: 16 of each of 256 drives. Allocated from the start.
 const SMALL_BURST: usize = 4096;
@@ -49,7 +50,7 @@ pub enum EventKind {
     Warning,
     /// The warning cleared.
     WarningEnd,
-    /// The fieldbus became the control place of a drive, or no longer is.
+    /// A drive came under control from the fieldbus, or left it.
     ControlPlace,
     /// A drive has restarted.
     Restarted,
@@ -61,7 +62,7 @@ pub enum EventKind {
     Supervision,
     /// The action of a lease, or the stop of a shutdown, failed.
     SupervisionFailed,
-    /// A drive that takes commands has neither a lease nor a response of its own to a silent master.
+    /// A controlled drive has neither a lease nor a response of its own to a silent master.
     Unsupervised,
     /// A command was refused.
     RefusedCommand,
@@ -97,7 +98,7 @@ pub enum EventKind {
     Drill,
     /// The process, or one of its threads, did not run for longer than a second.
     Paused,
-    /// A BACnet client lost its right to write, and with it what it had in a slot.
+    /// A BACnet client lost its right to write, and with it the values that it had in a slot.
     SlotVoid,
 }
 
@@ -245,7 +246,7 @@ pub struct Event {
     /// Refused commands only: number of refusals of one client that the event covers.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub count: Option<u64>,
-    /// Starts and stops only: who commanded it, if a command through this gateway was the cause.
+    /// Only for starts and stops: the client whose command caused the event, if a command through this gateway did.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
     /// Description for people.
@@ -286,7 +287,7 @@ impl Event {
     }
 }
 
-/// A run of the process: this one, or an earlier one by its name.
+/// A run of the gateway process: the present one, or an earlier one by its name.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Boot(Option<Arc<str>>);
 
@@ -307,7 +308,7 @@ impl Serialize for Boot {
     }
 }
 
-/// The name of this run of the process, different at every start: with it, the number of an event is unique.
+/// The name of this run of the process, different at every start: together with it, the number of an event is unique.
 pub fn boot() -> &'static str {
     static BOOT: OnceLock<String> = OnceLock::new();
     BOOT.get_or_init(|| {
@@ -329,7 +330,7 @@ pub struct RefusedCommand<'r> {
     pub client: &'r Arc<str>,
     /// Code of the reason.
     pub reason: &'static str,
-    /// The bus and the drive; both empty if it is for none in particular.
+    /// Names of the bus and the drive; both empty if the event concerns no particular one.
     pub bus: &'r str,
     pub drive: &'r str,
     /// Description for people.
@@ -347,8 +348,8 @@ pub struct Events {
 /// The latest events. Events of drives and buses are stored separately from refused commands, and no drive or kind
 /// displaces another.
 ///
-/// Each is kept as its line of JSON, one block of memory: as an [`Event`] it is six blocks and twice the bytes, and as some
-/// thousands of them come and go for months, small blocks are what the free memory ends up scattered between.
+/// Each event is stored as its line of JSON in one block of memory. As an [`Event`] it would take six blocks and
+/// twice the bytes; thousands of such small blocks, freed over months, would fragment the memory.
 #[derive(Debug)]
 struct Store {
     /// Number of the last event of this run.
@@ -367,7 +368,8 @@ impl Default for Events {
 }
 
 impl Events {
-    /// For that number of drives: a listener may lag behind by 16 events of each, at least 4,096 and at most [`BURST`].
+    /// The events of a gateway with this number of drives: a listener may lag behind by 16 events for each, at
+    /// least 4,096 and at most [`BURST`].
     pub fn of_drives(drives: usize) -> Events {
         let burst = drives.saturating_mul(OF_EACH_DRIVE).clamp(SMALL_BURST, BURST);
         Events {
@@ -392,7 +394,7 @@ impl Events {
         self.publish_in(&mut self.store(), event);
     }
 
-    /// Under the lock, so that listeners receive the events in the order of their ids.
+    /// Publishes under the lock, so that listeners receive the events in the order of their ids.
     fn publish_in(&self, store: &mut Store, mut event: Event) {
         store.number += 1;
         event.id = store.number;
@@ -403,7 +405,7 @@ impl Events {
             tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, count = event.count, "{}", event.text);
         }
         store.keep(&event);
-        // Sending fails when there is no subscriber, which is not an error.
+        // Sending fails if there is no subscriber, which is not an error.
         let _ = self.sender.send(Arc::new(event));
     }
 
@@ -412,8 +414,7 @@ impl Events {
         &self.pauses
     }
 
-    /// Publishes a pause of a thread, which has ended at `time` on the calendar. It is published once, whichever threads
-    /// had it.
+    /// Publishes a pause of a thread that ended at the calendar time `time`. A pause of several threads is published once.
     pub fn publish_pause(&self, pause: Stall, time: SystemTime) {
         if !self.pauses.note(pause) {
             return;
@@ -463,13 +464,13 @@ impl Events {
         self.publish_in(store, event);
     }
 
-    /// Receives all events from now on; a listener that lags further behind than [`Events::of_drives`] allows loses the
-    /// oldest.
+    /// Receives all events from now on; a listener that lags behind further than [`Events::of_drives`] allows loses
+    /// the oldest ones.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
         self.sender.subscribe()
     }
 
-    /// Restores the events of earlier runs, oldest first. Call it before the first event of this run.
+    /// Restores the events of earlier runs, oldest first. Must be called before the first event of this run.
     pub fn remember(&self, earlier: Vec<Event>) {
         let mut store = self.store();
         for event in earlier {
@@ -515,7 +516,7 @@ impl Store {
         }
     }
 
-    /// The lines of all kept events with their numbers, the oldest first. The lines are read without the lock, so that
+    /// The lines of all kept events with their numbers, oldest first. They are copied without holding the lock, so
     /// publishers do not wait.
     fn lines(&self) -> Vec<(u64, Arc<str>)> {
         in_order(&self.kept, &self.refused)

@@ -21,7 +21,7 @@ pub mod version;
 use drivegate_model::drive;
 use drivegate_proto as codec;
 
-/// Plants made by hand, for the tests: the source of the package that depends on this one.
+/// Hand-made plants for tests; the source file is shared with the package `testkit`, which depends on this one.
 #[cfg(test)]
 #[path = "../../testkit/src/lib.rs"]
 pub mod testkit;

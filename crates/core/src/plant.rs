@@ -1,4 +1,4 @@
-//! The plant as the servers see it: images to read, queues to write to. No clock: time is an argument.
+//! The plant as the servers use it: images to read, queues to write to. No clock: time is an argument.
 
 mod exchange;
 mod hold;
@@ -28,15 +28,16 @@ pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
 pub use self::why::explain;
 
-/// The plant as it is configured now; a reload puts a new one in its place.
+/// The present plant; a reload replaces it.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
 
 /// The first stop number of the next drive that is started or added.
 static ADDED: AtomicU64 = AtomicU64::new(STOPS_OF_ONE);
-/// More stops than one drive gets. Few enough that the stops of all drives of a bus can be added, after any number of reloads.
+/// More stops than one drive ever gets, yet small enough that the numbers of all drives of a bus can be added after
+/// any number of reloads.
 const STOPS_OF_ONE: u64 = 1 << 32;
 
-/// A bus: its image and its queue.
+/// A bus with its image and its command queue.
 #[derive(Debug, Clone)]
 pub struct BusHandle {
     /// The process image.
@@ -48,10 +49,9 @@ pub struct BusHandle {
 }
 
 impl BusHandle {
-    /// Takes over what the stopped buses `before` a reload know of its drives, and the stops that wait there; a drive is the
-    /// same if it is the same machine, whatever its name.
-    /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
-    /// that name is outdated.
+    /// Takes over the state of the drives, and their waiting stops, from the buses `before` a reload. A drive is
+    /// the same if it is the same machine, whatever its name. The stop counter of an added drive starts at a number
+    /// that no drive had before, so that a counter remembered under its name does not match.
     pub fn take_over(&self, before: &[BusHandle], now: Instant) {
         for (index, drive) in self.image.drives.enumerate() {
             let machine = self.image.spec.machine(&drive.spec);
@@ -107,7 +107,7 @@ pub struct DriveHandle {
 }
 
 impl Plant {
-    /// A plant in which nothing has happened yet.
+    /// A plant without any events so far.
     pub fn new(gateway: impl Into<String>, stale_after: Duration, buses: Vec<BusHandle>) -> Plant {
         Plant {
             gateway: gateway.into(),
@@ -131,7 +131,7 @@ impl Plant {
         turn_away(&self.writes, drive, what, outcome, origin, now)
     }
 
-    /// All drives, bus by bus in the order of the file.
+    /// All drives of the plant, bus by bus in the order of the file.
     pub fn drives(&self) -> impl Iterator<Item = DriveHandle> {
         self.buses.iter().flat_map(move |bus| {
             bus.image
@@ -176,13 +176,13 @@ impl DriveHandle {
         self.bus.image.spec.machine(&self.image.spec)
     }
 
-    /// The drive as it looks at `now`.
+    /// The state of the drive at the time `now`.
     pub fn reading(&self, now: Instant) -> Reading<'_> {
         self.image.reading(now, self.stale_after)
     }
 
-    /// Stops of the drive that were taken in, from some number on; another one when a reload removed and added the drive, or
-    /// changed its address.
+    /// Counter of the stops accepted for the drive, from any first number; the counter changes when a reload
+    /// removed and added the drive, or changed its address.
     pub fn stops(&self) -> u64 {
         self.bus.queue.lock().gate.stops(self.index)
     }
@@ -235,7 +235,7 @@ impl DriveHandle {
         self.events.publish(event);
     }
 
-    /// Passes a request on to the line of the drive, as [`BusHandle::ask`].
+    /// Passes a request on to the line of the drive; see [`BusHandle::ask`].
     pub fn ask_line(&self, question: Question, now: Instant) -> Exchange {
         self.bus.ask(question, &self.writes, now)
     }

@@ -1,8 +1,8 @@
-//! How long a thread did not run, and the effect on the date of the bytes that it reads. Pure: time is an argument.
+//! How long a thread did not run, and what this means for the time of the bytes that it reads. Pure: time is an argument.
 //!
-//! A process can stand still as a whole (it is stopped, its virtual machine is saved, the machine is suspended, the
-//! host is full), and so can one thread. What is found in a socket afterwards may have come at any time in between, in
-//! any order.
+//! A process can stall as a whole (it is stopped, its virtual machine is saved, the machine is suspended, the host
+//! is overloaded), and so can one thread. Bytes found in a socket afterwards may have arrived at any time during
+//! the stall, in any order.
 
 mod pauses;
 
@@ -15,11 +15,11 @@ pub const TICK: Duration = Duration::from_millis(100);
 /// Longest time between two turns of a thread that is not a stall. A tick is late by some milliseconds on any machine;
 /// by half of its time only where the thread did not get the processor. Any stall of 150 ms or more is detected.
 pub const UNNOTICED: Duration = Duration::from_millis(150);
-/// Bytes that came during a stall are read within this time after it, unless the reader finds nothing left before: a
-/// thousand connections are read in a few milliseconds.
+/// Time after a stall within which bytes that arrived during it are read, unless the reader finds nothing left
+/// before: a thousand connections are read in a few milliseconds.
 pub const READ_WITHIN: Duration = Duration::from_millis(250);
-/// A longer stall is a pause: clients may have given up by then (many wait for a second), and sent again. A hiccup of a
-/// busy machine is shorter.
+/// A stall longer than this is a pause: clients may have given up (many wait for a second) and sent again. A hiccup
+/// of a busy machine is shorter.
 const PAUSE: Duration = Duration::from_secs(1);
 /// Longest interval between two retransmissions (RFC 6298 and Linux: 120 s). A client's system sends data undelivered
 /// during a pause again at intervals that double, so within the length of the pause again.
@@ -35,8 +35,8 @@ pub struct Stall {
     pub began: Instant,
     /// When the thread ran again after the stall.
     pub ended: Instant,
-    /// Part of the stall during which the machine was suspended and its clock did not advance: dates before it are
-    /// older by this time.
+    /// Part of the stall during which the machine was suspended and its clock did not advance: times recorded
+    /// before are older by this.
     pub slept: Duration,
 }
 
@@ -55,17 +55,17 @@ impl Stall {
         self.ended.saturating_duration_since(self.began)
     }
 
-    /// Whether the stall was so long that clients may have given up.
+    /// Whether the stall was so long that clients may have given up waiting.
     pub fn is_pause(&self) -> bool {
         self.length() > PAUSE
     }
 
-    /// Until when bytes that came during the stall are read.
+    /// Until when bytes that arrived during the stall may be read.
     pub fn read_by(&self) -> Instant {
         self.ended + READ_WITHIN
     }
 
-    /// Until when bytes that clients sent before the end of the stall may still come.
+    /// Until when bytes that clients sent before the end of the stall may still arrive.
     pub fn over(&self) -> Instant {
         self.ended + self.length().min(RESENT_WITHIN) + ON_ITS_WAY
     }
@@ -74,18 +74,18 @@ impl Stall {
 /// The date of what was read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Dated {
-    /// Earliest time at which the bytes may have come.
+    /// Earliest time at which the bytes may have arrived.
     pub asked: Instant,
-    /// The stall during which the bytes may have come.
+    /// The stall during which the bytes may have arrived.
     pub stall: Option<Stall>,
-    /// The last pause, as long as what was sent before its end may still come.
+    /// The last pause, while bytes sent before its end may still arrive.
     pub pause: Option<Stall>,
 }
 
 /// The stalls of one thread, or of threads that work together.
 #[derive(Debug, Clone)]
 pub struct Stalls {
-    /// When it ran last, and what the clock showed that goes on while the machine is suspended.
+    /// When the thread last ran, and the reading at that time of the clock that continues during a suspend.
     ran: Instant,
     boot: Duration,
     last: Option<Stall>,
@@ -124,7 +124,8 @@ impl Stalls {
         Some(stall)
     }
 
-    /// The thread runs on, and what it did since it ran last was no stall: such as to open a port.
+    /// Notes that the thread runs, and that the time since it last ran was not a stall, for example because it
+    /// opened a port.
     pub fn go_on(&mut self, now: Instant, boot: Duration) {
         (self.ran, self.boot) = (now, boot);
     }
@@ -134,7 +135,7 @@ impl Stalls {
         if stall.is_pause() {
             self.pause = Some(stall);
         }
-        // Bytes that came during the previous stall may still be unread, so both are joined.
+        // Bytes that arrived during the previous stall may still be unread, so both stalls are joined.
         let before = self.last.filter(|last| stall.began < last.ended + TICK);
         self.last = Some(Stall {
             began: before.map_or(stall.began, |before| before.began.min(stall.began)),
@@ -153,20 +154,20 @@ impl Stalls {
         self.last
     }
 
-    /// The last pause, if bytes sent before its end may still come.
+    /// The last pause, if bytes sent before its end may still arrive.
     pub fn pause(&self, now: Instant) -> Option<Stall> {
         self.pause.filter(|pause| now < pause.over())
     }
 
-    /// Until when an earlier stall matters for the date of bytes.
+    /// Until when an earlier stall affects the time of received bytes.
     pub fn matters_until(&self) -> Option<Instant> {
         let last = self.last.map(|last| last.read_by());
         last.max(self.pause.map(|pause| pause.over()))
     }
 
-    /// The date of bytes that are read at `now`. No unread byte came before `floor`: the reader found nothing left then, or
-    /// that is the date of the bytes before these. `waited`: the reader has waited for them since, so that they came just
-    /// now, unless its thread did not run.
+    /// The arrival time of bytes that are read at `now`. No unread byte arrived before `floor`: the reader found
+    /// nothing left then, or the bytes before these arrived then. `waited` means that the reader has been waiting
+    /// since, so the bytes arrived just now unless its thread did not run.
     pub fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
         let since = self.last.filter(|stall| floor < stall.ended);
         let slept = since.map_or(Duration::ZERO, |stall| stall.slept);
@@ -209,7 +210,7 @@ mod tests {
             self.start + MS * ms
         }
 
-        /// The thread runs at each of these times, in milliseconds; the suspended time `slept` is not part of them.
+        /// Lets the thread run at each of these times, in milliseconds; the suspended time `slept` is not part of them.
         fn runs(&mut self, times: &[(u32, u32)]) -> Vec<(i64, i64, u128)> {
             let mut all = Vec::new();
             for (ms, slept) in times {

@@ -1,4 +1,4 @@
-//! Which build of the program this is.
+//! The build of the program: version and commit.
 
 use std::sync::OnceLock;
 
@@ -7,8 +7,8 @@ pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 static COMMIT: OnceLock<&'static str> = OnceLock::new();
 
-/// Notes the commit of the build; `main` does so, because only the program's own package is built again with each
-/// commit. Without effect after the first call.
+/// Sets the commit of the build. `main` calls this, because only the program's own package is rebuilt with each
+/// commit. Later calls have no effect.
 pub fn set_commit(commit: Option<&'static str>) {
     if let Some(commit) = commit {
         let _ = COMMIT.set(commit);

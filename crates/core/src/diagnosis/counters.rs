@@ -62,11 +62,12 @@ impl<const N: usize> Window<N> {
     }
 }
 
-/// Damaged and valid replies of a drive by their phase in the mains period, relative to its last damaged one.
+/// Damaged and valid replies of a drive by their phase in the mains period, measured from the drive's last damaged reply.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct InPhase {
     last: Option<Instant>,
-    /// For each frequency: number and sum of cosines of damaged replies, of valid ones.
+    /// For each mains frequency: number of damaged replies and sum of the cosines of their phases, then both for
+    /// the valid replies.
     pub(super) sums: [[f32; 4]; MAINS.len()],
 }
 
@@ -124,8 +125,9 @@ impl Contrast {
     }
 }
 
-/// A contrast by whether a drive runs. Figures from shortly before a change belong to neither side: the state is read some time after it
-/// changes, and on a slow line some seconds.
+/// A contrast between the time when a drive runs and the time when it does not. Figures from shortly before a
+/// change of the running state are left out: the state is read some time after it changes, and on a slow line some
+/// seconds.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Running {
     pub(super) runs: bool,
@@ -161,7 +163,7 @@ impl Running {
     }
 }
 
-/// Length of the mean vector of the milliseconds on a circle, each step for itself as clocks drift apart.
+/// Length of the mean vector of the milliseconds on a circle. Each step is evaluated separately because clocks drift apart.
 pub(super) fn lock(window: &Window<LATENCY>) -> (f64, u32) {
     let (mut length, mut all) = (0.0, 0);
     for step in &window.steps {

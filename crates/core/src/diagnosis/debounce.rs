@@ -1,10 +1,10 @@
-//! A verdict comes when its rule holds for some time, and goes when it has not held for a minute.
+//! A verdict is published when its rule has held for some time, and withdrawn when the rule has not held for a minute.
 
 use super::{Cause, Certainty, Finding};
 
-/// Steps of 5 s after which a verdict that no longer holds goes.
+/// Steps of 5 s after which a verdict whose rule no longer holds is withdrawn.
 const GOES_AFTER: u32 = 12;
-/// Most verdicts of a line that are held at a time.
+/// Most verdicts of one line that are kept at a time.
 const MOST_VERDICTS: usize = 24;
 
 /// A finding that is held.
@@ -35,8 +35,8 @@ pub struct Debounce {
     held: Vec<Debounced>,
 }
 
-/// Steps for which a rule must hold, besides those in which it did not. Causes that only say that nothing else was
-/// recognised wait until it would have been.
+/// Steps for which a rule must hold, in addition to those in which it did not. Causes that only say that nothing
+/// else was recognised wait until any other cause would have been recognised.
 fn patience(cause: Cause) -> u32 {
     match cause {
         Cause::Noise | Cause::RequestEndLost => 5,
@@ -89,7 +89,7 @@ impl Debounce {
             return;
         };
         let before = held.finding.certainty;
-        // A finding that was shown keeps its certainty in a step with less evidence.
+        // A published finding keeps its certainty in a step that has less evidence.
         let certainty = if held.shown {
             before.max(finding.certainty)
         } else {
@@ -143,7 +143,7 @@ mod tests {
         let fits = || vec![finding(Cause::Bias, Certainty::Fits)];
         let likely = || vec![finding(Cause::Bias, Certainty::Likely)];
         let mut debounce = Debounce::default();
-        // Once is chance, also again and again.
+        // A finding in a single step is chance, even if such single steps repeat.
         for _ in 0..10 {
             assert_eq!(debounce.take(fits()), []);
             assert_eq!(debounce.take(Vec::new()), []);

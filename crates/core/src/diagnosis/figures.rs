@@ -18,17 +18,17 @@ use crate::drive::{DriveIndex, PerDrive};
 pub const BYTES_PER_DRIVE: usize = 512;
 /// Number of requests in a row without a reply that count as absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
-/// A reply within this time behind a request that got none may be a late one.
+/// A reply within this time after a request without a reply may be a late reply to that request.
 const LATE: Duration = Duration::from_secs(5);
 /// Time for which the rest of a damaged reply may be on the line.
 const LEFT_OVER: Duration = Duration::from_millis(50);
-/// Bytes between two transactions that are kept until it is known whether they are a frame.
+/// Most bytes between two transactions that are kept until it is clear whether they are a frame.
 const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
 
-/// Usual baud rates, in their order; a reply that beats them all has no wire after it.
+/// Usual baud rates in rising order. A reply that is too early for all of them did not come over a serial wire.
 pub const BAUDS: [u32; 8] = [2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
 /// How a transaction ended.
@@ -40,18 +40,18 @@ pub enum End {
     Silent,
     /// An invalid reply.
     Damaged,
-    /// A reply that may belong to another request, so no evidence about the line.
+    /// A reply that may belong to another request, so it says nothing about the line.
     Doubtful,
 }
 
 #[derive(Debug, Clone, Copy)]
 pub struct Exchange<'e> {
-    /// Place of the drive on the bus.
+    /// Index of the drive on the bus.
     pub drive: DriveIndex,
     /// The request.
     pub request: &'e Request,
     pub frame: &'e [u8],
-    /// All received bytes.
+    /// All bytes received in this transaction.
     pub seen: &'e [u8],
     /// Bytes after the reply.
     pub behind: &'e [u8],
@@ -61,7 +61,7 @@ pub struct Exchange<'e> {
     pub end: End,
     /// Silence before the request.
     pub gap: Duration,
-    /// When the request began.
+    /// When the request was started.
     pub began: Instant,
     /// When the transaction was over.
     pub at: Instant,
@@ -165,12 +165,12 @@ impl Figures {
         }
     }
 
-    /// A device server closed its connection, and it was remade.
+    /// A device server closed its connection, and the gateway connected again.
     pub fn reconnected(&mut self) {
         self.reconnects.add(0, 1);
     }
 
-    /// How often that was in the last minute, and in how many steps of it.
+    /// How often a device server closed its connection in the last minute, and in how many steps of that minute.
     pub fn reconnects(&self) -> (u32, usize) {
         let steps = self.reconnects.each(0).filter(|count| *count > 0).count();
         (self.reconnects.sum(0), steps)
@@ -214,7 +214,7 @@ impl Figures {
         self.running.runs
     }
 
-    /// While all drives stand, while one runs.
+    /// The contrast of the line: errors while no drive runs and while one runs.
     pub fn while_running(&self) -> &Contrast {
         &self.running.contrast
     }
@@ -287,8 +287,7 @@ impl Figures {
         }
     }
 
-    /// Whether a failure may come of what was left on the line by a transaction with another drive that failed just
-    /// before.
+    /// Whether a failure may be caused by bytes left on the line by a failed transaction with another drive just before.
     fn is_excused(&self, exchange: &Exchange<'_>) -> bool {
         let just_before = exchange.began.saturating_duration_since(self.last_at) < LEFT_OVER;
         exchange.end != End::Answered
@@ -385,7 +384,8 @@ impl Figures {
         }
     }
 
-    /// The middle of a reply on the wire, and for how long it could have been hit where the place of damage is known.
+    /// The time of the middle of a reply on the wire and, for text protocols, where the damaged character is known,
+    /// the time that the whole reply took.
     fn middle(&self, exchange: &Exchange<'_>) -> (Instant, Duration) {
         let length = self.line.format.chars(exchange.seen.len());
         let middle = exchange.heard_at.checked_sub(length / 2).unwrap_or(exchange.at);
@@ -426,7 +426,7 @@ impl Figures {
             return;
         }
         let bytes = std::mem::take(&mut self.idle);
-        // Bytes after a damaged reply may be the rest of that reply.
+        // Bytes that follow a damaged reply may be the rest of that reply.
         if !self.answer_of_another(&bytes, now)
             && let Some((drive, End::Answered)) = self.last
             && let Some(drive) = self.drives.get_mut(drive)
@@ -443,7 +443,7 @@ impl Figures {
         let asked = self.last.map(|(drive, _)| drive);
         let drive = match answering {
             Answering::Address(address) => self.drives.position(|drive| drive.address == address),
-            // An N2 frame has no address: it is a late reply if any drive was silent recently.
+            // An N2 reply has no address, so any drive that was silent recently may have sent it late.
             Answering::Anybody => {
                 let silent = self.drives.enumerate().filter(|(_, drive)| drive.was_silent(at));
                 silent
@@ -492,15 +492,15 @@ impl Figures {
         [lock(&self.arrivals), lock(&self.paced)]
     }
 
-    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to
-    /// it than the valid replies of the same drive, -2 to 2.
+    /// For each mains frequency: number of damaged replies with an earlier one to compare with, and how much closer
+    /// in phase to that one they are than the valid replies of the same drive, -2 to 2.
     pub(crate) fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
         let of = |place: usize| {
             let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));
             let (mut count, mut closer) = (0.0, 0.0);
             for &[bad, bad_cosines, good, good_cosines] in sums.filter(|[bad, _, good, _]| *bad >= 1.0 && *good >= 1.0)
             {
-                // Each drive counts with the smaller of its two sums, which limits the certainty.
+                // Each drive counts with the smaller of its two numbers, since the smaller one limits the certainty.
                 let weight = bad.min(good);
                 count += weight;
                 closer += weight * (bad_cosines / bad - good_cosines / good);

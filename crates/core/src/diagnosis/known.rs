@@ -1,10 +1,10 @@
-//! The known failure rates of the drives of a line, and how much worse one is than the others.
+//! The failure rates of the drives of a line that were polled often enough, and how much worse one is than the others.
 
 use super::Drive;
 use super::figures::Sign;
 use crate::drive::DriveIndex;
 
-/// Transactions in the last minute from which on a drive is known.
+/// Transactions in the last minute from which on the failure rate of a drive is known.
 const KNOWN: u32 = 15;
 /// Anything seen in fewer steps of 5 s is a passing disturbance.
 pub(super) const LASTING: usize = 3;
@@ -12,7 +12,8 @@ pub(super) const LASTING: usize = 3;
 pub(super) const FEW: u32 = 5;
 /// Number of standard deviations that rule out chance.
 pub(super) const SIGNIFICANT: f64 = 5.0;
-/// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
+/// Errors that a drive as bad as another one would have had in its transactions; with this many expected and none
+/// seen, the drive is good: chance gives that less than once in 400 times.
 pub(super) const ENOUGH: f64 = 6.0;
 /// A drive is bad if its errors are this many times as frequent as those of the other drives.
 const TIMES: f64 = 5.0;
@@ -54,7 +55,7 @@ pub(super) fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
     f64::from(failed) > expected + SIGNIFICANT * expected.max(1.0).sqrt()
 }
 
-/// Whether the first `count` of these, the worst first, are all bad, and much worse than the others.
+/// Whether the first `count` of these drives, sorted from the worst, are all bad and much worse than the others.
 pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
     let Some((bad, good)) = known.split_at_checked(count) else {
         return false;
@@ -67,7 +68,7 @@ pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
 }
 
 impl Known {
-    /// The known rates of the drive at that place, if it was polled often enough.
+    /// The known failure rates of the drive at this index, if it was polled often enough.
     pub(super) fn of(place: DriveIndex, drive: &Drive) -> Option<Known> {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);

@@ -1,5 +1,5 @@
-//! Diagnoses a line from its normal traffic: a few counters per drive and rules over them. Pure: transactions and time
-//! are arguments.
+//! Diagnoses a line from its normal traffic with a few counters per drive and rules that evaluate them. Pure:
+//! transactions and time are arguments.
 //!
 //! - [`signature`]: what the bytes of one transaction show: the echo, a stray byte before the reply, a reply without its beginning.
 //! - [`counters`]: the kinds of counters.
@@ -40,11 +40,11 @@ pub enum Cause {
     AllSilent,
     /// A single drive is bad, the others are good.
     OneDrive,
-    /// All drives are bad from one address on.
+    /// All drives from one address upward are bad.
     FromAddress,
     /// A drive has never answered, others do.
     NeverAnswered,
-    /// Two drives answer to one address.
+    /// Two drives reply to the same address.
     AddressTwice,
     /// Errors only while drives run.
     WhileRunning,
@@ -56,28 +56,28 @@ pub enum Cause {
     ReplyStartLost,
     /// Requests do not arrive whole.
     RequestEndLost,
-    /// The adapter receives its own request.
+    /// The adapter receives the requests that it sends.
     Echo,
     /// A USB adapter delivers in steps of 16 ms.
     LatencyTimer,
     /// Requests sent soon after a reply are ignored.
     SilenceTooShort,
-    /// The port was lost again and again.
+    /// The port was lost repeatedly.
     PortResets,
-    /// A device server closes its connection again and again.
+    /// A device server closes its connection repeatedly.
     ConnectionCloses,
     /// Replies arrive faster than the configured baud rate allows.
     FasterThanBaud,
     /// The drive answers, but never reads of certain registers.
     RegisterUnanswered,
-    /// The drive's own timeout tripped it soon after a command.
+    /// A drive was tripped by its own communication timeout soon after a command.
     OwnTimeout,
     /// Errors without a pattern.
     Noise,
 }
 
 impl Cause {
-    /// All causes, in the order of the documentation.
+    /// All causes, in the order in which the documentation lists them.
     pub const ALL: [Cause; 19] = [
         Cause::AllSilent,
         Cause::OneDrive,
@@ -132,14 +132,14 @@ impl Cause {
 pub enum Certainty {
     /// The cause would explain the symptoms, but so would other causes.
     Fits,
-    /// Other causes would usually show in another way.
+    /// The usual cause of such evidence; other causes would usually show different signs.
     Likely,
     /// The cause itself was observed.
     Certain,
 }
 
 impl Certainty {
-    /// The word in payloads.
+    /// The word for the certainty in JSON and MQTT payloads.
     pub const fn name(self) -> &'static str {
         match self {
             Certainty::Fits => "fits",
@@ -149,7 +149,7 @@ impl Certainty {
     }
 }
 
-/// A finding of a rule. Drives are given by their place on the bus.
+/// A finding of a rule. Its drives are given by their index on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     pub cause: Cause,
@@ -159,18 +159,18 @@ pub struct Finding {
     pub certainty: Certainty,
     /// The evidence, as text.
     pub evidence: String,
-    /// The remedy of this finding, where it says more than that of its cause.
+    /// The remedy for this finding, if it is more specific than the remedy of its cause.
     pub remedy: Option<String>,
 }
 
 impl Finding {
-    /// What to do.
+    /// The remedy: what to check or change at the line or the drive.
     pub fn remedy(&self) -> &str {
         self.remedy.as_deref().unwrap_or(self.cause.remedy())
     }
 }
 
-/// A cause with its evidence, as it is shown.
+/// A cause with its evidence, as the gateway shows it to people.
 #[derive(Debug, Clone, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Verdict {
     /// The cause.
@@ -188,7 +188,7 @@ pub struct Verdict {
     pub evidence: String,
     /// The remedy.
     pub remedy: String,
-    /// Points to check and set on drives of these families, from their profiles.
+    /// What to check and set on drives of the affected families, from their profiles.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub steps: Vec<String>,
     /// Since when the verdict holds, RFC 3339.
@@ -221,7 +221,7 @@ pub struct Counted {
     pub damaged: u32,
     /// Replies, damaged or valid, with a stray byte before them.
     pub stray_before: u32,
-    /// Damaged replies that lost their beginning; the rest was valid.
+    /// Damaged replies whose first bytes were missing; the rest was valid.
     pub start_lost: u32,
     /// Replies after the time limit.
     pub late: u32,
@@ -229,15 +229,16 @@ pub struct Counted {
     pub second: u32,
     /// Slowest beginning of a reply, ms.
     pub slowest_ms: f64,
-    /// The drive's own counters, if it has any and there were errors.
+    /// The error counters that the drive keeps itself, if it has any and counted errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by_drive: Option<CountedByDrive>,
 }
 
-/// A drive's own counters since they were cleared (function 08, subfunctions 0B to 0F); they wrap at 65536.
+/// The counters that a drive itself has kept since they were cleared (function 08, subfunctions 0B to 0F); they
+/// wrap at 65536.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct CountedByDrive {
-    /// Sound messages on the line, to whatever address.
+    /// Valid messages that the drive saw on the line, for any address.
     pub messages: u16,
     /// Damaged messages.
     pub damaged: u16,
@@ -250,7 +251,7 @@ pub struct CountedByDrive {
 }
 
 impl CountedByDrive {
-    /// The first subfunction of function 08; the others follow it.
+    /// The first subfunction of function 08 that reads a counter; the other counters follow in order.
     const FIRST: u16 = 0x0B;
 
     /// The request for the next counter.

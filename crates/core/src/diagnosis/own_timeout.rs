@@ -1,4 +1,5 @@
-//! A drive whose own timeout tripped it soon after a command, although the line was sound: many count only writes.
+//! Recognises a drive that was tripped by its own communication timeout soon after a command although the line was
+//! sound. Many drives restart this timeout only on writes.
 
 use std::time::Duration;
 
@@ -19,7 +20,7 @@ pub struct Trip {
     pub repeats: bool,
 }
 
-/// The verdict about a new fault; none where nothing points to the drive's own timeout.
+/// The finding about a new fault; `None` if nothing points to the drive's own communication timeout.
 pub fn finding(drive: DriveIndex, profile: &Profile, trip: Trip) -> Option<Finding> {
     if trip.after > WITHIN {
         return None;

@@ -1,4 +1,4 @@
-//! A rule for each cause. Counts are judged against chance, and a comparison between drives needs most of them.
+//! One rule for each cause. Counts are compared with chance, and a comparison between drives needs figures of most of them.
 
 mod timing;
 
@@ -144,7 +144,7 @@ impl Rules<'_> {
             .drives
             .iter()
             .all(|drive| drive.sum(Sign::Tried) + drive.sum(Sign::Damaged) >= 2);
-        // A single drive that has answered before is just off, which its own event reports.
+        // A single drive that has answered before is just switched off, which its offline event reports.
         let is_one = drives < 2 && figures.answered_since_opened();
         if !each || is_one || tried + damaged < 6 || explained > (tried + damaged) / 4 {
             return false;
@@ -184,8 +184,8 @@ impl Rules<'_> {
                 .is_some_and(|drive| drive.steps(&shows) >= LASTING);
             let of_others = seconds - second - overlong;
             let enough = second >= FEW || (second + overlong >= FEW - 1 && overlong * 5 >= known.damaged * 3);
-            // Second replies that follow those of other drives too come from a line that repeats everything, not from a
-            // second drive.
+            // Duplicate replies from more than one drive mean that the line repeats everything, not that two drives
+            // share an address.
             if !lasts
                 || !enough
                 || of_others * 5 > second + overlong
@@ -247,7 +247,8 @@ impl Rules<'_> {
             .zip(phases)
             .max_by(|(_, a), (_, b)| a.1.total_cmp(&b.1));
         let Some((hertz, (count, closer))) = best else { return };
-        // The difference of two means of cosines, each of which deviates by the root of one half over their number.
+        // The standard deviation of the difference of two mean cosines: each deviates by the root of one half over
+        // its number.
         if count < 40.0 || closer < 0.25 || closer < SIGNIFICANT as f32 / count.sqrt() {
             return;
         }
@@ -283,8 +284,8 @@ impl Rules<'_> {
             return;
         };
         let (bad, good) = known.split_at(count);
-        // Whether one drive or several are bad is known only after all of them were bad for some time and all others had so many
-        // requests that they would have failed by now, too.
+        // Whether one drive or several are bad is decided only after all bad drives have been bad for some time and
+        // every other drive had enough requests to show the same failures.
         let least = bad.iter().map(Known::share).fold(1.0, f64::min);
         let is_good =
             |one: &Known| f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least);
@@ -303,8 +304,8 @@ impl Rules<'_> {
         }
     }
 
-    /// Finds a configured drive that is not there, or has other settings. Such a drive gets a request every ten seconds
-    /// only, so its failures are not compared with others.
+    /// Finds a configured drive that is absent or has other settings. Such a drive gets a request only every ten
+    /// seconds, so its failures are not compared with those of others.
     fn never_answered(&mut self) {
         let silent = |(place, drive): (DriveIndex, &super::Drive)| {
             let asked = drive.in_vain().filter(|asked| *asked >= IN_VAIN)?;
@@ -383,7 +384,7 @@ impl Rules<'_> {
         self.add(Cause::FromAddress, None, certainty, evidence);
     }
 
-    /// Whether errors began about when a drive started, so that it is not known yet whether they are those of running drives.
+    /// Whether errors appeared about when a drive started, so that they may be caused by running drives.
     fn may_be_of_running(&self) -> bool {
         let Contrast { asked, failed } = *self.figures.while_running();
         let (now, of) = self.exchanges();

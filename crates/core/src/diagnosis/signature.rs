@@ -10,15 +10,15 @@ const MOST_LOST: usize = 2;
 /// The shape of the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// Nothing was received.
+    /// No bytes were received.
     Nothing,
-    /// The reply and nothing before it.
+    /// Only the reply was received, without stray bytes.
     Sound,
-    /// Stray bytes, then the reply; whether all of them are zero.
+    /// Stray bytes were received before the reply; `true` if all of them are zero.
     Led(bool),
     /// The reply would be valid with its first bytes.
     StartLost,
-    /// The request came back without its end.
+    /// The echo of the request was received without its last bytes.
     CutEcho,
     /// Longer than the reply could be.
     Overlong,
@@ -33,11 +33,11 @@ pub enum Shape {
 pub struct Signature {
     /// The request was echoed before the reply; `None` if unclear.
     pub echoed: Option<bool>,
-    /// The shape of the other bytes.
+    /// The shape of the received bytes apart from the reply.
     pub shape: Shape,
 }
 
-/// Evaluates `seen`, all bytes received behind the request `frame`; `answered`: a reply was found among them.
+/// Evaluates `seen`, all bytes received after the request `frame` was sent; `answered` means that they contain the reply.
 pub fn of(protocol: Protocol, request: &Request, frame: &[u8], seen: &[u8], answered: bool) -> Signature {
     let is_read = matches!(request.pdu, RequestPdu::Read { .. }) || protocol == Protocol::N2;
     let echoed = is_read && !frame.is_empty() && seen.starts_with(frame);
@@ -99,7 +99,7 @@ fn is_overlong(protocol: Protocol, request: &Request, count: usize) -> bool {
     count > most || (protocol == Protocol::N2 && most < least + 4 && count > least && count < most)
 }
 
-/// The place of a character that no frame of a text protocol has inside, the first if there are several.
+/// Index of the first character that cannot occur inside a frame of a text protocol.
 pub fn misfit(protocol: Protocol, seen: &[u8]) -> Option<usize> {
     if !protocol.is_text() {
         return None;
@@ -111,7 +111,7 @@ pub fn misfit(protocol: Protocol, seen: &[u8]) -> Option<usize> {
         .map(|place| place + 1)
 }
 
-/// Whether a reply may begin so.
+/// Whether a reply from this address may begin with this byte.
 fn begins(protocol: Protocol, address: u8, first: u8) -> bool {
     match protocol {
         Protocol::ModbusRtu => first == address,
@@ -120,8 +120,8 @@ fn begins(protocol: Protocol, address: u8, first: u8) -> bool {
     }
 }
 
-/// Whether the reply is valid once its first bytes are restored: before the received bytes, or in place of their
-/// damaged beginning.
+/// Whether the reply becomes valid when its first bytes are restored, either before the received bytes or in place
+/// of their damaged beginning.
 fn start_lost(protocol: Protocol, request: &Request, heard: &[u8]) -> bool {
     let address = format!("{:02X}", request.address).into_bytes();
     let head: Vec<u8> = match protocol {
@@ -129,7 +129,7 @@ fn start_lost(protocol: Protocol, request: &Request, heard: &[u8]) -> bool {
         Protocol::ModbusAscii => [b":".as_slice(), &address].concat(),
         Protocol::N2 => vec![b'A'],
     };
-    // Two bytes of an acknowledgement are soon restored by chance.
+    // In an acknowledgement of two bytes, restored bytes would often fit by chance.
     if heard.len() < 3 {
         return protocol == Protocol::N2 && heard == b"\r" && is_sound(protocol, request, b"A\r");
     }
@@ -150,7 +150,7 @@ fn is_sound(protocol: Protocol, request: &Request, bytes: &[u8]) -> bool {
 pub enum Answering {
     /// The drive at this address.
     Address(u8),
-    /// Any drive: N2 replies have no address.
+    /// Any drive may have sent the reply: N2 replies have no address.
     Anybody,
 }
 

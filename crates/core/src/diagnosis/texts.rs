@@ -130,13 +130,13 @@ impl Cause {
         }
     }
 
-    /// The steps in the words of these profiles: what to check and to set at their drives.
+    /// The steps of the cause from the profiles of these drives: what to check and what to set.
     pub fn steps_of<'p>(self, profiles: impl IntoIterator<Item = &'p Profile>) -> Vec<String> {
         step_lines(profiles, self.steps())
     }
 }
 
-/// The lines of these steps, each behind the names of its profiles, without repetition.
+/// The text lines of these steps, each after the names of the profiles that have it, without repetition.
 pub fn step_lines<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[Step]) -> Vec<String> {
     let mut seen = BTreeSet::new();
     let profiles: Vec<&Profile> = profiles.into_iter().filter(|one| seen.insert(&one.name)).collect();
@@ -154,7 +154,7 @@ mod tests {
     use crate::codec::Protocol;
     use crate::drive::profile::Profiles;
 
-    /// Every family with a manual has its checks for a silent drive in the text, and nothing is cut off.
+    /// Every family with a manual has its checks for a silent drive in the text, and no check is cut off.
     #[test]
     fn steps_are_those_of_the_families_on_the_line() {
         let all = Profiles::built_in();

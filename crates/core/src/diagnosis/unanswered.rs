@@ -1,9 +1,9 @@
-//! Registers to which a drive never replies, while it answers others: which they are, and what to write in its profile.
+//! Registers to which a drive never replies although it replies to others: lists them, and what to write in the profile.
 
 use super::{Cause, Certainty, Finding};
 use crate::drive::{DriveIndex, PlannedRead, Profile};
 
-/// Most registers and points that one verdict names.
+/// Most registers and points that one verdict lists.
 const NAMED: usize = 6;
 
 /// The verdict about the reads of a drive of that profile that get no reply, none of which can be divided further.

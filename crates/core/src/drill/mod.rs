@@ -1,4 +1,5 @@
-//! Drills: a motor is started at a low speed and stopped in each way by which it is to stop, and how long that took is kept.
+//! Drills: a motor is started at low speed and stopped in each way that must stop it, and the measured stopping
+//! time is kept.
 //!
 //! [`Drills::arm`] prepares a drill, [`Drills::start`] begins it within [`ARMED`] for the same client, and a task of the gateway calls
 //! [`Drills::look`] while it is running. Only one drill runs at a time. Every drill ends with a stop, also one that a crash
@@ -21,9 +22,9 @@ use crate::order::Origin;
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Access, DriveSpec, Machine};
 
-/// Time within which a drill is started after it was armed.
+/// Time within which an armed drill must be started.
 pub const ARMED: Duration = Duration::from_secs(60);
-/// Time between two looks at a drill that is under way.
+/// Interval at which a drill in progress is evaluated.
 pub const LOOK: Duration = Duration::from_millis(20);
 /// Drills that are kept.
 const MOST_REPORTS: usize = 200;
@@ -35,19 +36,19 @@ const MOST_PROOFS: usize = 16_384;
 pub struct DrillOptions {
     /// Highest speed at which a motor is stopped, % of its range.
     pub max_speed: f64,
-    /// Time from the cause in which the motor has to stand.
+    /// Time limit for the motor to stop, measured from the cause of the stop.
     pub limit: Duration,
     /// Age from which a proof is too old.
     pub every: Duration,
 }
 
-/// Why a drill is not armed, started or ended.
+/// Why a drill cannot be armed, started or ended.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DrillRefusal {
     /// No drill has this id.
     #[error("there is no drill `{0}`")]
     Unknown(String),
-    /// The drill is not possible on this drive.
+    /// This drive does not allow the drill, for the reason given.
     #[error("{0}; nothing was started")]
     NotPossible(String),
     /// The drill is not possible now, or not for this client.
@@ -55,7 +56,7 @@ pub enum DrillRefusal {
     NotNow(String),
 }
 
-/// The ways that can be tried on a drive: a silent client stops it where it has supervision.
+/// The ways to stop that can be tested on a drive. The test with a silent client needs supervision.
 pub fn ways(spec: &DriveSpec) -> Vec<Kind> {
     let starts = [ModelPoint::Run, ModelPoint::SpeedReference];
     let can = spec.access == Access::Control && starts.iter().all(|point| spec.profile.model_index(*point).is_some());
@@ -84,7 +85,7 @@ struct State {
     run: Option<Run>,
     ended: VecDeque<DrillReport>,
     proofs: Vec<Proof>,
-    /// Drills interrupted by a crash; their motors may still run.
+    /// Drills that a crash interrupted; their motors may still run.
     cut_off: Vec<DrillReport>,
     /// Ended drills that are not in audit and events yet.
     unpublished: Vec<Ended>,
@@ -110,10 +111,10 @@ impl Drills {
         self.state().options
     }
 
-    /// Arms a drill of these ways, at `speed` % or at `max_speed`.
+    /// Arms a drill that tests these ways to stop, at `speed` % or, without it, at `max_speed`.
     ///
     /// # Errors
-    /// Why the drill cannot be armed; nothing was started.
+    /// If the drill cannot be armed; nothing was started.
     pub fn arm(
         &self,
         drive: &DriveHandle,
@@ -154,7 +155,7 @@ impl Drills {
     /// Starts an armed drill for the client that armed it.
     ///
     /// # Errors
-    /// The drill is not armed, or not by this client; nothing was started.
+    /// If the drill is not armed, or was armed by another client; nothing was started.
     pub fn start(
         &self,
         plant: &Plant,
@@ -166,7 +167,7 @@ impl Drills {
         let mut guard = self.state();
         let state = &mut *guard;
         state.drop_armed(now, time);
-        // First, or this drill would mistake the audit record of another one's end for a command.
+        // This goes first: otherwise the drill would mistake the audit record of the end of another drill for a command.
         state.publish(plant, now, time);
         let known = state.report(id).map(|report| report.state);
         let run = state.run.as_mut().filter(|run| run.report().id == id);
@@ -192,7 +193,7 @@ impl Drills {
         Ok(report)
     }
 
-    /// Ends a drill, which stops the motor. A drill that is over stays as it is.
+    /// Ends a drill, which stops the motor. A drill that has ended does not change.
     ///
     /// # Errors
     /// If no drill has this id.
@@ -219,7 +220,8 @@ impl Drills {
         self.begun.notify_one();
     }
 
-    /// Looks at the drill that is under way, and drops one that was armed and not started. Whether one is under way.
+    /// Evaluates the drill in progress, and drops a drill that was armed and not started in time. Returns whether
+    /// one is in progress.
     pub fn advance(&self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let mut state = self.state();
         let goes_on = state.advance(plant, now, time);
@@ -239,7 +241,7 @@ impl Drills {
         self.state().report(id)
     }
 
-    /// The last proof of each way on that machine.
+    /// The last proof of each way to stop on this machine.
     pub fn proofs(&self, machine: &Machine) -> Vec<Proof> {
         let state = self.state();
         state
@@ -250,7 +252,7 @@ impl Drills {
             .collect()
     }
 
-    /// Results of drills for each way to stop that can be tried on the drive at `time`; none where drills are off.
+    /// Drill results for each way to stop that can be tested on the drive at `time`; `None` if drills are off.
     pub fn stops(&self, drive: &DriveHandle, time: SystemTime) -> Option<Vec<StopProof>> {
         let state = self.state();
         let every = state.options?.every;
@@ -272,7 +274,7 @@ impl Drills {
         Some(ways(&drive.image.spec).into_iter().map(of).collect())
     }
 
-    /// Loads what an earlier process kept. The next looks stop the motor of a drill that was running then.
+    /// Loads what an earlier process saved. If a drill was running then, the next evaluations stop its motor.
     pub fn restore(&self, saved: SavedDrills) {
         let mut state = self.state();
         let known = |state: &State, report: &DrillReport| state.report(&report.id).is_some();
@@ -284,7 +286,7 @@ impl Drills {
         state.bound();
     }
 
-    /// Sets whether drills are kept on disk; if so, they start once they are written.
+    /// Sets whether drills are saved on disk; if so, a drill starts only once that is done.
     pub fn keep(&self, keeps: bool) {
         self.state().keeps = keeps;
     }
@@ -310,7 +312,7 @@ impl Drills {
         state.kept == state.generation
     }
 
-    /// Whether a drill waits for its start to be on disk.
+    /// Whether a drill waits until its start is on disk.
     pub fn waits_for_disk(&self) -> bool {
         self.state().run.as_ref().is_some_and(Run::waits_for_disk)
     }
@@ -412,7 +414,7 @@ impl State {
     }
 }
 
-/// Whether these ways can be tried on that drive.
+/// Checks whether these ways to stop can be tested on this drive.
 fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptions) -> Result<(), DrillRefusal> {
     let spec = &drive.image.spec;
     if kinds.is_empty() {

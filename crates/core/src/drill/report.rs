@@ -6,20 +6,20 @@ use serde::{Deserialize, Serialize};
 
 use crate::process_image::Machine;
 
-/// A way in which a motor must stop.
+/// A way in which a motor must stop, as a drill tests it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
     /// A stop command.
     Order,
-    /// The client of the drill goes silent: the lease of its supervision expires.
+    /// The client of the drill stops sending: the lease of the drive's supervision expires.
     Client,
-    /// The gateway goes silent: the drive's own fieldbus supervision acts.
+    /// The gateway stops sending: the drive's own fieldbus supervision acts.
     Gateway,
 }
 
 impl Kind {
-    /// All, in the order of the tests: after the last one a drive may have a fault.
+    /// All ways to stop in the order of their tests: after the last one a drive may have a fault.
     pub const ALL: [Kind; 3] = [Kind::Order, Kind::Client, Kind::Gateway];
 
     /// Name of the way to stop.
@@ -69,17 +69,17 @@ impl DrillState {
     }
 }
 
-/// The test of one way to stop.
+/// The test of one way to stop, as a step of a drill.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillStep {
     /// Way to stop that is tried.
     pub kind: Kind,
-    /// Progress or result of the step; `armed` until its turn.
+    /// Progress or result of the step; `armed` until the step starts.
     pub state: DrillState,
     /// Time of the cause: the command, or the last sign of life (RFC 3339).
     #[serde(default)]
     pub cause_at: Option<String>,
-    /// From the cause to the read that showed the motor standing, ms.
+    /// Time from the cause of the stop to the read that showed the motor standing, ms.
     #[serde(default)]
     pub took_ms: Option<u64>,
     /// `took_ms` is an upper bound: the drive was not read before.
@@ -156,7 +156,7 @@ pub struct StopProof {
     pub due: bool,
 }
 
-/// The last completed test of a way to stop on a machine.
+/// The last completed test of one way to stop on one machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Proof {
     /// The machine that was tested.
@@ -199,7 +199,7 @@ pub struct SavedDrills {
     drivegate_drills: u32,
     /// The last ones, the oldest first.
     pub reports: Vec<DrillReport>,
-    /// Last proofs by machine and way to stop.
+    /// The last proofs, for each machine and way to stop.
     pub proofs: Vec<Proof>,
 }
 
@@ -212,7 +212,7 @@ impl SavedDrills {
         }
     }
 
-    /// The ways among `kinds` that were not proven on the machine within `every` before `time`.
+    /// The ways to stop among `kinds` without a proof for the machine in the period `every` before `time`.
     pub fn unproven(&self, machine: &Machine, kinds: &[Kind], every: Duration, time: SystemTime) -> Vec<Kind> {
         let proven = |kind: &&Kind| {
             let mut proofs = self

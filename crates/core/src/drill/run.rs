@@ -19,7 +19,7 @@ use crate::stop_all::OneStop;
 
 /// Maximum time to write the start of a drill to disk; after that the operator no longer expects the motor to start.
 const KEEP: Duration = Duration::from_secs(5);
-/// Time within which the start may be sent; a guard may delay it.
+/// Time within which the start command of a drill may be sent; a guard may delay it.
 const START: Duration = Duration::from_secs(60);
 /// How long a start is retried that needs a value not yet read, and the pause between retries.
 const START_AGAIN: Duration = Duration::from_secs(15);
@@ -38,7 +38,8 @@ const READ: Duration = Duration::from_secs(15);
 const PAUSE: Duration = Duration::from_secs(1);
 /// Maximum time for the acknowledgement of a stop, and for standstill before the next test.
 const LAST_STOP: Duration = Duration::from_secs(60);
-/// Maximum age of an interrupted drill whose motor is stopped at the next start; after that, someone may have started it since.
+/// Maximum age of an interrupted drill whose motor is stopped at the next start of the gateway. After more time,
+/// someone else may have started the motor.
 const CUT_OFF: Duration = Duration::from_secs(3600);
 
 /// A drill that is armed or under way.
@@ -49,7 +50,7 @@ pub(super) struct Run {
     drive: DriveHandle,
     /// Client that armed the drill.
     who: Origin,
-    /// The origin of the drill's own commands.
+    /// The origin under which the drill sends its own commands.
     own: Origin,
     options: DrillOptions,
     records: Option<Receiver<Arc<AuditRecord>>>,
@@ -72,7 +73,8 @@ pub(super) struct Run {
 #[derive(Debug)]
 enum Step {
     Armed,
-    /// The start is being written to disk in this generation, so that the next process knows of the running motor.
+    /// The start of the drill is being written to disk in this generation, so that the next process knows of the
+    /// running motor.
     Keeping(u64),
     /// The start was refused and is retried.
     Waiting,
@@ -82,13 +84,13 @@ enum Step {
     SpeedingUp(Option<Instant>),
     /// The motor runs at its speed.
     Steady,
-    /// The stop was caused at this time; the motor should come to standstill.
+    /// The stop was caused at this time; the motor must now come to a standstill.
     Caused(Instant, Cause),
     /// The test is over; the motor is stopped in any case.
     Clearing(OneStop),
-    /// The gateway was killed during it: the motor is stopped once the drive is online.
+    /// The gateway was killed during the drill: the motor is stopped as soon as the drive is online.
     CutOff,
-    /// The drill ended with this result; its last stop is pending.
+    /// The drill ended with this result; the stop that ends it is not acknowledged yet.
     Ending(DrillState, OneStop),
     Over,
 }
@@ -159,7 +161,7 @@ impl Run {
             upper_bound: false,
             seen: String::new(),
         };
-        // A drive that stopped since its gateway fell silent has a fault: that way is tried last.
+        // A drive that was stopped by its own fieldbus supervision has a fault, so this way is tested last.
         let kinds = Kind::ALL.iter().filter(|kind| kinds.contains(kind));
         let stamp: String = text_of(time).chars().filter(|c| !matches!(c, '-' | ':')).collect();
         let report = DrillReport {
@@ -200,7 +202,7 @@ impl Run {
         }
     }
 
-    /// A drill during which the gateway was killed: its motor may still run.
+    /// A drill that was in progress when the gateway was killed: its motor may still run.
     pub(super) fn cut_off(report: DrillReport, drive: &DriveHandle, now: Instant) -> Run {
         let own = Origin::new(SourceKind::Shutdown, "interrupted drill");
         let at = report.steps.iter().position(|step| step.state == DrillState::Running);
@@ -239,7 +241,7 @@ impl Run {
         self.who.client() == who.client()
     }
 
-    /// Ends the drill if it was armed and not started in time; whether that happened.
+    /// Ends the drill if it was armed and not started in time; returns whether it ended it.
     pub(super) fn expires(&mut self, now: Instant, time: SystemTime) -> bool {
         let expired = matches!(self.step, Step::Armed) && now.saturating_duration_since(self.since) > ARMED;
         if expired {
@@ -260,7 +262,7 @@ impl Run {
         (ended, self.proofs)
     }
 
-    /// Starts it; where drills are kept, the motor starts once generation `keep` is on disk.
+    /// Starts the drill. If drills are saved, the motor starts once generation `keep` is on disk.
     pub(super) fn start(&mut self, plant: &Plant, keep: Option<u64>, now: Instant, time: SystemTime) {
         self.records = Some(plant.writes.audit().subscribe());
         self.stops = self.drive.stops();
@@ -276,19 +278,20 @@ impl Run {
         }
     }
 
-    /// Whether the drill waits for its start to be on disk.
+    /// Whether the drill waits until its start is on disk.
     pub(super) fn waits_for_disk(&self) -> bool {
         matches!(self.step, Step::Keeping(_))
     }
 
-    /// Begins the drill if its start is on disk, which holds for all generations up to `kept`.
+    /// Starts the motor if the start of the drill is on disk: all generations up to `kept` are.
     pub(super) fn kept(&mut self, kept: u64, now: Instant) {
         if matches!(self.step, Step::Keeping(generation) if generation <= kept) {
             self.begin_step(now);
         }
     }
 
-    /// The start of the drill cannot be written, so nothing is started. Returns whether the drill was waiting for that.
+    /// The start of the drill cannot be written to disk, so nothing is started. Returns whether the drill was
+    /// waiting for that.
     pub(super) fn not_kept(&mut self, why: &str, time: SystemTime) -> bool {
         let waits = self.waits_for_disk();
         if waits {
@@ -310,7 +313,7 @@ impl Run {
         self.report.steps.get_mut(self.at)
     }
 
-    /// The motor gets its start at the low speed.
+    /// Starts the motor at the low speed of the drill.
     fn begin_step(&mut self, now: Instant) {
         if let Some(step) = self.current() {
             step.state = DrillState::Running;
@@ -341,13 +344,13 @@ impl Run {
     pub(super) fn abort(&mut self, why: &str, now: Instant, time: SystemTime) {
         match self.step {
             Step::Armed | Step::Keeping(_) => self.finish(DrillState::Aborted, why.to_string(), time),
-            // The step already leads to a stop, so the abort changes nothing.
+            // These steps already lead to a stop, so an abort changes nothing.
             Step::CutOff | Step::Ending(..) | Step::Over => {}
             _ => self.end(DrillState::Aborted, why.to_string(), now),
         }
     }
 
-    /// Ends the drill with this result, once its last stop is acknowledged.
+    /// Ends the drill with this result, as soon as its last stop is acknowledged.
     fn end(&mut self, state: DrillState, why: String, now: Instant) {
         self.lock(None);
         if let Some(step) = self.current().filter(|step| !step.state.is_over()) {
@@ -360,7 +363,7 @@ impl Run {
         self.go(Step::Ending(state, stop), now);
     }
 
-    /// From now on no other order to the drive runs, and until then nothing but stops is sent to it.
+    /// Reserves the drive for the drill: other orders are refused, and until `quiet_until` nothing but stops is sent.
     fn lock(&self, quiet_until: Option<Instant>) {
         let who = format!("drill `{}`", self.report.id);
         let lock = DrillLock { who, quiet_until };
@@ -388,7 +391,7 @@ impl Run {
         self.step = Step::Over;
     }
 
-    /// Evaluates the progress of the drill. Returns whether it goes on.
+    /// Evaluates the progress of the drill. Returns whether it continues.
     pub(super) fn advance(&mut self, plant: &Plant, now: Instant, time: SystemTime) -> bool {
         let gap = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
         self.paused = self.paused.max(Some(gap).filter(|gap| *gap > PAUSE));
@@ -443,7 +446,7 @@ impl Run {
     }
 
     fn check_speed(&mut self, turned: Option<Instant>, reading: &Reading<'_>, now: Instant) {
-        // The lease is kept only by a client that shows it is alive; the drill does so until it goes silent on purpose.
+        // A lease needs a client that sends heartbeats; the drill sends them until it goes silent on purpose.
         self.drive.heartbeat(&self.own, now);
         let turns = matches!(reading.standstill(None), Standstill::Turns(_));
         let turned = if turns { turned.or(Some(now)) } else { None };
@@ -476,7 +479,7 @@ impl Run {
     fn check_steady(&mut self, reading: &Reading<'_>, now: Instant, time: SystemTime) {
         self.drive.heartbeat(&self.own, now);
         let passed = now.saturating_duration_since(self.since);
-        // A motor that stands before the cause of the drill proves nothing about that cause.
+        // A motor that stopped before the drill caused the stop proves nothing about that cause.
         let turns = match reading.standstill(Some(self.since)) {
             Standstill::Turns(_) => true,
             Standstill::Stands => {
@@ -528,7 +531,7 @@ impl Run {
         self.go(Step::Caused(now, cause), now);
     }
 
-    /// The motor is stopped and stands before the next way is tried.
+    /// Stops the motor and waits for standstill before the next way to stop is tested.
     fn check_cleared(&mut self, mut stop: OneStop, plant: &Plant, now: Instant) {
         stop.advance(plant, now);
         self.stops = self.drive.stops();

@@ -1,10 +1,10 @@
-//! Keeps the last items of many sources so that no source pushes out those of others.
+//! Keeps the last items of many sources so that no source displaces the items of others.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-/// At most so many items, numbered by the caller in rising order. When it is full, a new one takes the place of the oldest
-/// one of the source that has most; of its own source if that has as many.
+/// Keeps a limited number of items, numbered by the caller in rising order. When the ring is full, a new item
+/// replaces the oldest item of the source that has most, or of its own source if that has as many.
 #[derive(Debug)]
 pub struct FairRing<K, T> {
     capacity: usize,
@@ -39,7 +39,7 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
                 let from = if own >= share { &source } else { &of };
                 self.change(from, |items| {
                     items.pop_front();
-                    // A source that once had most of the ring gives back what it no longer needs.
+                    // A source that once had most of the ring gives back memory that it no longer needs.
                     if items.capacity() > items.len() + 2 * spare(items) {
                         items.shrink_to(items.len() + spare(items));
                     }
@@ -75,13 +75,13 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
     }
 }
 
-/// Places of a source in addition to those of its items. Doubling them would leave each source the most that it ever
-/// had.
+/// Spare places of a source beyond its items. Doubling the memory instead would leave each source the largest size
+/// that it ever had.
 fn spare<T>(items: &VecDeque<T>) -> usize {
     items.len() / 8 + 4
 }
 
-/// The items of two rings that are numbered together, with their numbers, in their order.
+/// The items of two rings that share one numbering, merged by their numbers.
 pub fn in_order<K1: Ord + Clone, K2: Ord + Clone, T: Clone>(
     one: &FairRing<K1, T>,
     other: &FairRing<K2, T>,

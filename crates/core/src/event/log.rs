@@ -1,4 +1,4 @@
-//! The history of events: what is searched for in it, and the form of an event on disk. Pure.
+//! The history of events: the filter of a search, and the form of an event on disk. Pure.
 
 use std::time::SystemTime;
 
@@ -10,7 +10,7 @@ use super::{Boot, Event, EventKind, RecordingMade};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Before {
     Time(SystemTime),
-    /// The event of that number of a run, which itself is left out.
+    /// The event with this number of this run; the event itself is not part of the result.
     Event(Boot, u64),
 }
 
@@ -21,9 +21,9 @@ pub struct Search {
     pub kinds: Vec<EventKind>,
     pub drive: Option<String>,
     pub bus: Option<String>,
-    /// Words that any text of the event has, in upper or lower case.
+    /// Text that one of the event's fields contains, in upper or lower case.
     pub text: Option<String>,
-    /// Only events before this one.
+    /// Only events older than this one.
     pub before: Option<Before>,
     /// Largest number of events.
     pub limit: usize,
@@ -60,7 +60,7 @@ pub(super) fn newest<'l>(
     let words = search.text.as_ref().map(|text| text.to_lowercase());
     let read = |line: &str| from_line(line.as_bytes()).ok();
     let end = match &search.before {
-        // An event that is no longer kept had only older ones before it, which are gone as well.
+        // If an event is no longer kept, no older one is kept either.
         Some(Before::Event(boot, id)) => {
             let is_it = |event: Event| event.boot == *boot && event.id >= *id;
             all.clone().position(|line| read(line).is_some_and(is_it)).unwrap_or(0)
@@ -72,7 +72,7 @@ pub(super) fn newest<'l>(
     found.take(search.limit).collect()
 }
 
-/// Why a line is not an event.
+/// Why a line of the file is not an event.
 #[derive(Debug, thiserror::Error)]
 pub enum LineError {
     /// The line is not a JSON object with the fields of an event.
@@ -83,7 +83,7 @@ pub enum LineError {
     Time(#[from] humantime::TimestampError),
 }
 
-/// An event from its JSON, as [`Event`] is serialized.
+/// Parses an event from its JSON, as [`Event`] is serialized.
 ///
 /// # Errors
 /// The line is not an event, or of a newer version.

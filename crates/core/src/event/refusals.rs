@@ -1,8 +1,8 @@
 //! Limits what refusals cost: a client without a right can cause them at any rate.
 //!
-//! The first refusal of a kind passes at once, then one a second for each client, which stands for all that were
-//! refused meanwhile. So many clients are distinguished; anyone who invents more names shares one place with all that
-//! come later.
+//! Limits refusals: the first refusal of a kind passes at once; after that one a second passes for each client and
+//! stands for all that were refused meanwhile. A limited number of clients is distinguished; all further client
+//! names share one place.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -41,9 +41,9 @@ impl<T> Default for RefusalLimit<T> {
 }
 
 impl<T> RefusalLimit<T> {
-    /// Notes that `client` was refused something for `reason`, by `drive` if a drive of that name exists. Returns what may
-    /// pass now, with the number of refusals that it stands for; the rest is returned by a later call, or by
-    /// [`RefusalLimit::due`].
+    /// Notes that `client` was refused something for `reason`, by `drive` if a drive of that name exists. Returns
+    /// the refusal to report now, with the number of refusals that it stands for; the rest is returned by a later
+    /// call, or by [`RefusalLimit::due`].
     pub fn admit(
         &mut self,
         client: &Arc<str>,

@@ -1,4 +1,4 @@
-//! A thread that keeps something on disk, and its end.
+//! A thread that writes to disk for the gateway, and its orderly end.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ pub struct Keeper {
 }
 
 impl Keeper {
-    /// Starts a thread that works for that directory until the other end of its channel is dropped.
+    /// Starts a thread that works in this directory until the other end of its channel is dropped.
     ///
     /// # Errors
     /// The system gives no thread.
@@ -35,8 +35,8 @@ impl Keeper {
         &self.dir
     }
 
-    /// Writes pending data, as far as the disk accepts it, and ends the thread. A hanging disk blocks this forever:
-    /// wait with a limit.
+    /// Writes pending data, as far as the disk accepts it, and ends the thread. A hanging disk blocks this call
+    /// forever, so callers must set a time limit.
     pub async fn stop(self) {
         let Keeper { end, mut ended, .. } = self;
         drop(end);

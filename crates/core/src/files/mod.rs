@@ -1,10 +1,10 @@
 //! Files that the gateway writes while it runs: lines that are appended, and small files that are replaced.
 //!
-//! - [`rotated`]: a file of lines with older ones next to it, bounded together.
-//! - [`Keeper`]: the thread that writes some of them.
+//! - [`rotated`]: a file of lines with its older files, bounded together.
+//! - [`Keeper`]: the thread that writes some of these files.
 //! - [`Patience`]: how long a start or a reload waits for the disk.
-//! - [`names`]: what the gateway calls its files.
-//! - [`read`]: what one of them has. [`replace`]: a new content in the place of the old one, never a half of either.
+//! - [`names`]: the names of the gateway's files.
+//! - [`read`]: the content of one of them. [`replace`]: writes new content completely or not at all.
 
 mod keeper;
 pub mod names;
@@ -30,7 +30,7 @@ pub fn set_aside(path: &Path, aside: &Path) -> String {
     }
 }
 
-/// The content of a file of at most `longest` bytes; `None` where there is no file.
+/// The content of a file of at most `longest` bytes; `None` if the file does not exist.
 ///
 /// # Errors
 /// The file cannot be read, or is longer and so not written by the gateway.
@@ -45,7 +45,8 @@ pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
     fs::read(path).map(Some).map_err(|error| error.to_string())
 }
 
-/// Puts `bytes` in the place of a file: after a power failure it has the old content or the new one. Makes its directory.
+/// Replaces the content of a file: after a power failure the file has the old content or the new one. Creates the
+/// directory if necessary.
 ///
 /// # Errors
 /// The file cannot be written; the old content is left.

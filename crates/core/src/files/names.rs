@@ -38,7 +38,7 @@ const OWN: [&str; 11] = [
     PARAMS,
 ];
 
-/// Whether the gateway itself keeps something by that name, or may at some time.
+/// Whether the gateway itself keeps a file of this name, or may create one later.
 pub fn is_own(name: &str) -> bool {
     let rest = |own: &&str| name.strip_prefix(*own);
     OWN.iter()

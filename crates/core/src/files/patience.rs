@@ -14,7 +14,7 @@ const NEXT: Duration = Duration::from_millis(100);
 /// The wait for files that are read at a start or a reload. A disk that hangs is waited for once, not once for each file.
 #[derive(Debug, Clone, Default)]
 pub struct Patience {
-    /// Number of waits that were given up while their work is not done yet.
+    /// Number of waits that were given up and whose work is still running.
     overdue: Arc<AtomicUsize>,
     /// Cancelled when the gateway ends: its stops wait for no disk.
     ended: CancellationToken,
@@ -26,8 +26,8 @@ impl Patience {
         self.ended.cancel();
     }
 
-    /// The result of `work`; `None` if the disk does not answer in time: the work goes on then, and its result is dropped.
-    /// Must be called within a Tokio runtime.
+    /// The result of `work`; `None` if the disk does not answer in time: the work then continues, and its result is
+    /// dropped. Must be called within a Tokio runtime.
     pub async fn wait<T: Send + 'static>(&self, work: impl Future<Output = T> + Send + 'static) -> Option<T> {
         let limit = match self.overdue.load(Ordering::Relaxed) {
             0 => DISK,
@@ -54,7 +54,7 @@ impl Patience {
         None
     }
 
-    /// Runs `read` on a thread of its own and waits for its result within the limit.
+    /// Runs `read` on a separate thread and waits for its result within the limit.
     ///
     /// # Errors
     /// The disk does not answer in time, or `read` panicked, which is logged.

@@ -1,4 +1,4 @@
-//! A file of lines that only grows, until it becomes the first of the older ones next to it.
+//! A file of lines that only grows, until it is full and becomes the newest of the older files.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
 
-/// The current file; older ones have `.1`, `.2` and so on after its name.
+/// The current file; the names of older ones end with `.1`, `.2` and so on.
 #[derive(Debug)]
 pub struct Rotated {
     path: PathBuf,
@@ -22,12 +22,12 @@ pub struct Rotated {
 struct Open {
     file: File,
     bytes: u64,
-    /// Whether something was written that is not certain to be on disk.
+    /// Whether data was written that may not be on disk yet.
     unsynced: bool,
 }
 
 impl Rotated {
-    /// A file that shares `max_bytes` with the older files, `files` in all. Nothing is opened yet.
+    /// A file that shares `max_bytes` with its older files, `files` in all. No file is opened yet.
     pub fn new(path: PathBuf, max_bytes: u64, files: u64) -> Rotated {
         Rotated {
             path,
@@ -49,7 +49,7 @@ impl Rotated {
         name.into()
     }
 
-    /// All possible files, oldest first.
+    /// Paths of all files that may exist, oldest first.
     pub fn all(&self) -> Vec<PathBuf> {
         let older = (1..self.files).rev().map(|number| self.older(number));
         older.chain([self.path.clone()]).collect()
@@ -60,7 +60,7 @@ impl Rotated {
         self.open.is_some()
     }
 
-    /// Opens the file for this process alone, with its directory; returns the size of the file in bytes.
+    /// Opens the file with an exclusive lock and creates its directory; returns the size of the file in bytes.
     ///
     /// # Errors
     /// The file cannot be opened, or another process has it open.

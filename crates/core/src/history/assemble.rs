@@ -119,7 +119,7 @@ fn value(reading: &Reading<'_>, point: PointIndex) -> Json {
     value_or_null(reading.sample(point).good())
 }
 
-/// The points that a read covers: those whose registers it has, and those derived from one of them.
+/// The points that a read covers: those whose registers are in the read, and those derived from one of them.
 fn read_of(profile: &Profile, taped: &TapedRead) -> Read {
     let end = usize::from(taped.start) + taped.words.len();
     let has = |point: PointIndex| {

@@ -5,7 +5,7 @@
 pub(super) struct Buckets<T> {
     slots: Box<[T]>,
     newest: u64,
-    /// Where the newest is: a division less for every value.
+    /// Place of the newest step, kept to save a division for every value.
     place: usize,
 }
 
@@ -19,7 +19,7 @@ impl<T: Copy + Default> Buckets<T> {
         }
     }
 
-    /// Keeps this number of steps from now on; the newest steps stay.
+    /// Sets the number of steps to keep; the newest steps stay.
     pub(super) fn resize(&mut self, steps: usize) {
         let mut new = Buckets::new(steps);
         let oldest = (self.newest + 1).saturating_sub(self.len());
@@ -49,7 +49,8 @@ impl<T: Copy + Default> Buckets<T> {
         number <= self.newest && number + self.len() > self.newest
     }
 
-    /// A step to be changed; a newer one than all before takes the place of the oldest. `None` where it is too old to be kept.
+    /// The step with this number, to be changed; a number newer than all before replaces the oldest step. `None` if
+    /// the step is too old to be kept.
     pub(super) fn step_mut(&mut self, number: u64) -> Option<&mut T> {
         if number == self.newest {
             return self.slots.get_mut(self.place);
@@ -70,7 +71,7 @@ impl<T: Copy + Default> Buckets<T> {
         self.slots.get_mut(place).filter(|_| holds)
     }
 
-    /// A step; `None` where it is too old or not started.
+    /// The step with this number; `None` if it is too old or has not begun.
     pub(super) fn get(&self, number: u64) -> Option<T> {
         let slot = self.slots.get(self.place(number)).copied();
         slot.filter(|_| self.holds(number))

@@ -10,14 +10,14 @@ use crate::process_image::{BusSpec, DriveSpec};
 
 /// Memory that the recorder takes for all buses together at most, bytes.
 pub const MOST_BYTES: usize = 20 << 20;
-/// Bytes of events and commands of a drive, where there is room for it.
+/// Bytes for events and commands of a drive, if the memory allows it.
 pub const NOTES: usize = 64 << 10;
 /// Room in addition to the planned reads: retries, reads requested by commands, reads after a fault.
 const RESERVE: f64 = 1.25;
 /// Rings below that size are not worth while.
 const LEAST: usize = 16 << 10;
 
-/// Part of [`MOST_BYTES`] that samples and frames may take before notes become fewer.
+/// Part of [`MOST_BYTES`] that samples and frames may take before the memory for notes is reduced.
 const RINGS: usize = MOST_BYTES / 4 * 3;
 
 /// Memory that the recorder takes for a bus at most.
@@ -53,8 +53,8 @@ impl Budget {
         needs
     }
 
-    /// Memory for the drives of a bus so that nothing is left out of a recording: for reads as often as configured or, where
-    /// the line cannot carry that, as often as it can at best. A bus whose recorder is off needs none.
+    /// Memory that the drives of a bus need for complete recordings, with reads as often as configured or, if the
+    /// line cannot carry that, as often as the line allows at best. A bus without a recorder needs none.
     pub fn of(bus: &BusSpec, drives: &[DriveSpec], options: &RecorderOptions) -> Budget {
         if options.max_count == 0 {
             return Budget {
@@ -109,7 +109,7 @@ impl Budget {
     }
 }
 
-/// The part of `wanted` that fits, in millionths.
+/// The part of `wanted` that fits into `room`, in millionths.
 fn part(room: usize, wanted: usize) -> usize {
     (room.saturating_mul(1_000_000) / wanted.max(1)).min(1_000_000)
 }
@@ -118,7 +118,7 @@ fn scaled(bytes: usize, part: usize) -> usize {
     bytes.saturating_mul(part) / 1_000_000
 }
 
-/// Time of a transaction with a drive that answers at once, on a line without silence: no line is faster.
+/// Shortest possible time of a transaction: the drive answers at once and the line has no silence. No line is faster.
 fn least_wire(bus: &BusSpec, read: &PlannedRead) -> Duration {
     WireTime::of(bus.protocol, &bus.format, &read.pdu()).total(Duration::ZERO, Duration::ZERO)
 }

@@ -24,8 +24,8 @@ const LONGEST: usize = 1 << 20;
 pub struct Packet {
     /// Time of the packet since 1970.
     pub at: Duration,
-    /// Whether the bytes were sent: `at` is then the time when they were given to the port, else the time when the last
-    /// of them had arrived.
+    /// Whether the bytes were sent; `at` is then the time when the port accepted them, otherwise the time of the
+    /// last received byte.
     pub sent: bool,
     pub bytes: Vec<u8>,
 }
@@ -51,11 +51,11 @@ fn error(offset: usize, what: impl Into<String>) -> CaptureError {
 pub struct LineCapture {
     /// The packets with bytes, in the order of the file.
     pub packets: Vec<Packet>,
-    /// Where the file is truncated or broken; everything before is read.
+    /// Where the file is truncated or broken; everything before this place was read.
     pub broken: Option<CaptureError>,
 }
 
-/// Reads a capture as far as it goes. Packets of other interfaces than serial lines are left out.
+/// Reads a capture up to its end or its first defect. Packets of interfaces other than serial lines are left out.
 ///
 /// # Errors
 /// The file is not a capture of a serial line, or is broken before its first packet with bytes.
@@ -176,7 +176,7 @@ fn packet(link: u32, at: Duration, data: &[u8], offset: usize) -> Result<Option<
     }))
 }
 
-/// An interface of a section: its link type, and the number of its ticks in a second.
+/// An interface of a capture section: its link type, and the number of ticks per second of its clock.
 #[derive(Debug, Clone, Copy)]
 struct Interface {
     link: u32,
@@ -230,11 +230,11 @@ fn read_pcapng(file: &[u8], packets: &mut Vec<Packet>) -> Result<(), CaptureErro
         }
         at += length;
     }
-    // Other interfaces are an error only if the capture has no packet of a serial line.
+    // Packets of other interfaces are an error only if the capture has no packet of a serial line.
     not_serial.filter(|_| packets.is_empty()).map_or(Ok(()), Err)
 }
 
-/// The data of a packet block, from `from` in it.
+/// The data of a packet block, from offset `from` in the block.
 fn data_of(block: &[u8], length: usize, from: usize, at: usize) -> Result<&[u8], CaptureError> {
     let room = block.len().saturating_sub(from + 4);
     if length > room {

@@ -24,7 +24,7 @@ pub struct Totals {
 }
 
 impl Totals {
-    /// These totals added to the totals `before`.
+    /// The sum of these totals and the earlier totals `before`.
     #[must_use]
     pub fn after(self, before: Totals) -> Totals {
         Totals {
@@ -45,7 +45,7 @@ impl Totals {
 #[derive(Debug, Default)]
 pub struct Counters {
     totals: Totals,
-    /// Whether the motor ran when that was last read, as long as the drive was not away since.
+    /// Whether the motor ran at the last read, and when that was; `None` once the drive went offline.
     ran: Option<(Instant, bool)>,
 }
 
@@ -86,7 +86,7 @@ impl Counters {
             let Some(passed) = at.checked_duration_since(before).filter(|passed| !passed.is_zero()) else {
                 return;
             };
-            // A motor that stood and still stands adds nothing, so the costly part is skipped.
+            // A motor that was standing and still stands adds nothing, so the expensive part is skipped.
             if ran || running {
                 let seen = passed <= good_for();
                 if seen && ran {
@@ -100,7 +100,7 @@ impl Counters {
         self.ran = Some((at, running));
     }
 
-    /// Notes that the drive was offline, so that its state in that time is unknown.
+    /// Notes that the drive was offline, so its state during that time is unknown.
     pub fn interrupt(&mut self) {
         self.ran = None;
     }

@@ -44,7 +44,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl History {
-    /// The past of the drive with this name; `None` before its bus was started.
+    /// The history of the drive with this name; `None` before its bus was started.
     pub fn drive(&self, name: &str) -> Option<Arc<DriveHistory>> {
         lock(&self.known).drives.get(name).cloned()
     }
@@ -83,8 +83,7 @@ impl History {
         }
     }
 
-    /// The past of a drive, kept over a reload: the counters for ever, the trends as long as bus, address and profile
-    /// are the same.
+    /// The history of a drive, kept over a reload: counters always, trends if bus, address and profile are unchanged.
     pub(super) fn of(&self, spec: &DriveSpec, reach: Reach, clock: Clock) -> Arc<DriveHistory> {
         let mut known = lock(&self.known);
         let before = known.drives.get(&spec.name).cloned();
@@ -111,7 +110,7 @@ impl History {
         new
     }
 
-    /// Forgets all but these buses and their drives; of the others the counters are kept.
+    /// Removes the history of all other buses and their drives, except the counters.
     pub(super) fn keep_only(&self, buses: &[Arc<BusImage>]) {
         let known = &mut *lock(&self.known);
         known
@@ -149,7 +148,7 @@ impl DriveHistory {
         lock(&self.counters).read(reading, known);
     }
 
-    /// The drive was away.
+    /// Notes that the drive was offline.
     pub(super) fn interrupt(&self) {
         self.trend().interrupt();
         lock(&self.counters).interrupt();

@@ -1,6 +1,6 @@
-//! Saves events and counters: a thread that receives every event and reads the counters. Nothing waits for it: while
-//! the disk is slow, full or missing, events are queued, further ones are missing in the file, and everything else
-//! continues.
+//! Saves events and counters in a thread that receives every event and reads the counters. Nothing waits for this
+//! thread: while the disk is slow, full or missing, events are queued, further ones are missing in the file, and
+//! everything else continues.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
@@ -20,7 +20,7 @@ use crate::event::{self, Event, Events};
 use crate::files::names::{COUNTERS, EVENTS};
 use crate::files::{self, Keeper, Rotated};
 
-/// Events reach the disk within that time; a disk that failed is tried again at this interval.
+/// Time within which events reach the disk, and the interval of further attempts after a failure.
 const TICK: Duration = Duration::from_secs(1);
 /// Interval at which counters reach the keeper: with the time for the write, the most that a power cut costs.
 const COUNTERS_EVERY: Duration = Duration::from_secs(45);
@@ -41,8 +41,8 @@ struct CounterFile {
     drives: BTreeMap<String, Totals>,
 }
 
-/// Keeps events and counters in that directory from now on. The channel has the events of earlier runs for the `first` one of
-/// this run, none for a later one.
+/// Saves events and counters in this directory from now on. For the `first` call of this run, the channel yields
+/// the events of earlier runs; later calls yield none.
 ///
 /// # Errors
 /// The system gives no thread.
@@ -180,12 +180,12 @@ impl Writer {
         }
     }
 
-    /// Opens the file of events. At the first time in this run it takes in what was counted before.
+    /// Opens the file of events. On the first call of this run it also takes over the counters and events of earlier runs.
     fn open(&mut self) -> io::Result<()> {
         let (file, bytes) = self.events.open()?;
         let ended = bytes == 0 || ends_with_newline(file, bytes)?;
         if !ended {
-            // A line that a power failure cut stays as it is, and no event is appended to it.
+            // A line cut off by a power failure stays as it is; the line end keeps the next event apart from it.
             self.events.append(b"\n")?;
         }
         if !std::mem::replace(&mut self.counted_on, true) {

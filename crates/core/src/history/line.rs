@@ -40,7 +40,7 @@ pub struct LineHistory {
 #[derive(Debug)]
 struct DriveLine {
     steps: Buckets<Option<Exchanges>>,
-    /// All and failed transactions at the end of the previous step.
+    /// All and failed transactions up to the end of the previous step.
     before: (u64, u64),
 }
 
@@ -56,7 +56,7 @@ pub struct LastHour {
     pub load: Vec<Option<Figures>>,
     /// Cycle of the fast class, s.
     pub cycle: Vec<Option<Figures>>,
-    /// By drive, in the order of the bus; `None` where the gateway did not run.
+    /// Steps of each drive, in the order of the bus; `None` while the gateway did not run.
     pub drives: Vec<Vec<Option<Exchanges>>>,
 }
 
@@ -82,7 +82,7 @@ impl LineHistory {
         }
     }
 
-    /// Looks at the counters of the bus if that is due.
+    /// Reads the counters of the bus when the next step is due.
     pub fn sample_if_due(&mut self, bus: &BusImage, now: Instant) {
         if self
             .looked

@@ -1,5 +1,5 @@
-//! The history of the drives. Trends: their values over the last day, in memory. The trip recorder: samples, commands
-//! and frames from some time before a trigger until some time after it; one file per recording.
+//! The history of the drives. Trends: values of the last day, in memory. Trip recorder: samples, commands and
+//! frames from some time before a trigger until some time after it, in one file per recording.
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
 //! - [`trend`]: least, greatest and last values in steps of time; [`counters`]: starts and run time; [`line`]: the last hour of a
@@ -58,7 +58,7 @@ pub struct RecorderOptions {
     pub after: Duration,
     /// Size of all recordings on disk at most, bytes.
     pub max_bytes: u64,
-    /// Most recordings on disk; with 0, nothing is recorded.
+    /// Most recordings on disk; with 0, no recordings are made.
     pub max_count: usize,
     /// Whether a warning of a drive makes a recording.
     pub warnings: bool,
@@ -70,13 +70,13 @@ impl RecorderOptions {
         self.max_count > 0
     }
 
-    /// Time that a ring must hold: the whole recording, and what passes until it is taken out.
+    /// Time that a ring must cover: the whole recording, and the delay until the recording is taken out.
     pub(crate) fn window(&self) -> Duration {
         self.before + self.after + Duration::from_secs(1)
     }
 }
 
-/// An instant and the time of day at it.
+/// An instant and the time of day at that instant.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
     pub now: Instant,

@@ -1,5 +1,5 @@
-//! A ring of entries packed into bytes, bounded by bytes and by age: a line of 10 ms has thousands of entries, each of them
-//! smaller than the allocations that it would take by itself.
+//! A ring of entries packed into bytes, bounded by bytes and by age. A line with 10 ms cycle has thousands of
+//! entries, each smaller than the allocation that it would need by itself.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -27,7 +27,7 @@ pub(super) trait Packed: Sized {
     fn unpack(at: Instant, bytes: &[u8]) -> Option<Self>;
 }
 
-/// Bytes of memory that a read of `words` words takes.
+/// Bytes that a packed read of `words` words takes.
 pub(super) const fn packed_read(words: usize) -> usize {
     HEAD + 3 + 2 * words
 }
@@ -120,7 +120,7 @@ impl<T: Packed> PackedRing<T> {
         self.bytes.is_empty()
     }
 
-    /// Adds an entry, the newest; `gone` gets those that have to go for it, packed.
+    /// Adds the newest entry; `gone` receives the packed entries that are removed for it.
     pub(super) fn push(&mut self, entry: &T, mut gone: impl FnMut(Instant, &[u8])) {
         let now = entry.at();
         let start = *self.start.get_or_insert(now);
@@ -139,7 +139,7 @@ impl<T: Packed> PackedRing<T> {
         self.bytes.extend(&self.entry);
     }
 
-    /// Keeps at most this number of bytes from now on; `gone` receives the packed entries that are removed for this.
+    /// Limits the ring to this number of bytes; `gone` receives the packed entries that are removed for this.
     pub(super) fn limit(&mut self, most_bytes: usize, mut gone: impl FnMut(Instant, &[u8])) {
         self.most_bytes = most_bytes;
         if let Some(start) = self.start {
@@ -181,7 +181,7 @@ impl<T: Packed> PackedRing<T> {
         (self.bytes.len() >= place + HEAD + length).then_some((length, at))
     }
 
-    /// `length` bytes from `place` on, less or nothing if the ring ends before; copied only where they wrap around.
+    /// Up to `length` bytes from `place` on, fewer if the ring ends before; copied only if they wrap around.
     fn slice(&self, place: usize, length: usize) -> Cow<'_, [u8]> {
         let (first, second) = self.bytes.as_slices();
         match place.checked_sub(first.len()) {

@@ -22,14 +22,14 @@ const COMMENT: u16 = 1;
 const INTERFACE_NAME: u16 = 2;
 const SOFTWARE: u16 = 4;
 
-/// The bytes of the capture. A timeout has no bytes, so it is the comment of an empty packet.
+/// The recording as a pcapng capture. A timeout has no bytes, so it becomes the comment of an empty packet.
 pub fn pcapng(recording: &Recording) -> Vec<u8> {
     let header = &recording.header;
     let mut out = Vec::new();
     let mut section = Vec::new();
     section.extend(0x1A2B_3C4D_u32.to_le_bytes());
     section.extend([1, 0, 0, 0]); // version 1.0
-    section.extend(u64::MAX.to_le_bytes()); // length not given
+    section.extend(u64::MAX.to_le_bytes()); // section length: not specified
     option(&mut section, SOFTWARE, "drivegate");
     option(&mut section, COMMENT, &format!("{}: {}", header.id, header.summary));
     section.extend([0; 4]);

@@ -75,7 +75,7 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     let mut plan = Plan::of(&spec.profile);
     plan.reads.extend_from_slice(&plan.on_fault);
     let mut snapshot = Snapshot::empty(&plan);
-    // Failed reads are not in the samples, so every value there was reported.
+    // Failed reads are not among the samples, so every value in them came from the drive.
     snapshot.link = Link::Online(std::time::SystemTime::UNIX_EPOCH);
     snapshot
 }
@@ -87,7 +87,7 @@ fn leave(base: &mut Arc<Snapshot>, at: Instant, packed: &[u8]) {
     }
 }
 
-/// The reading of a drive at this time, by its samples.
+/// The reading of a drive at this time, from its recorded samples.
 pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Instant) -> Reading<'d> {
     Reading::new(spec, snapshot.clone(), at, ANY_AGE, Duration::ZERO)
 }
@@ -104,7 +104,7 @@ pub struct Capture {
     pub trigger: Trigger,
     /// Further triggers during the recording.
     pub more: Vec<Trigger>,
-    /// First and last time of the recording.
+    /// First and last time that the recording covers.
     pub span: (Instant, Instant),
     /// The state of the drive before the first sample.
     pub base: Arc<Snapshot>,
@@ -122,7 +122,7 @@ pub struct Capture {
 struct DriveRing {
     image: Arc<DriveImage>,
     history: Arc<DriveHistory>,
-    /// Whether the drive answered when it was last checked, and since when.
+    /// Whether the drive answered when its link was last checked, and since when.
     link: Link,
     samples: PackedRing<TapedRead>,
     notes: Ring<Note>,
@@ -149,7 +149,7 @@ struct LineRing {
     last_hour: Arc<Mutex<LineHistory>>,
     drives: PerDrive<DriveRing>,
     frames: PackedRing<TapedFrame>,
-    /// Memory that the rings need so that nothing is left out.
+    /// Memory that the rings need for complete recordings.
     need: Budget,
     errors: LineErrors,
     lost: u64,
@@ -176,8 +176,8 @@ impl Recorder {
         }
     }
 
-    /// Records these buses from now on. Buses that are recorded already keep their rings; recordings of the others end now.
-    /// Process data is stale from `stale_after` on.
+    /// Records these buses from now on. Buses that were recorded already keep their rings; recordings of other
+    /// buses end now. Process data counts as stale after `stale_after`.
     pub fn adopt(&mut self, buses: &[Arc<BusImage>], stale_after: Duration, clock: Clock) -> Vec<Capture> {
         self.stale_after = stale_after;
         let captures = self.leave_all_but(buses, clock);
@@ -220,7 +220,7 @@ impl Recorder {
         captures
     }
 
-    /// Notes what happened to a drive, or to a whole bus.
+    /// Notes an event of a drive, or of a whole bus.
     pub fn note(&mut self, bus: &str, drive: Option<&str>, note: &Note) {
         let lines = self.lines.iter_mut().filter(|line| line.bus.spec.name == bus);
         let drives = lines.flat_map(|line| &mut line.drives);
@@ -236,8 +236,8 @@ impl Recorder {
         })
     }
 
-    /// Starts a recording of a drive, or notes the trigger in the one in progress. Returns its id; none if the drive is
-    /// unknown, or had a trigger of the same kind very recently.
+    /// Starts a recording of a drive, or adds the trigger to the recording in progress. Returns its id; `None` if
+    /// the drive is unknown, or had a trigger of the same kind very recently.
     pub fn trigger(&mut self, drive: &str, trigger: Trigger, clock: Clock) -> Option<String> {
         let mut drives = self.lines.iter_mut().flat_map(|line| &mut line.drives);
         drives
@@ -245,7 +245,7 @@ impl Recorder {
             .trigger(trigger, clock)
     }
 
-    /// Takes in what the buses have taped; the recordings that are complete at `clock.now`.
+    /// Takes the entries from the tapes of the buses; returns the recordings that are complete at `clock.now`.
     pub fn tick(&mut self, clock: Clock) -> Vec<Capture> {
         let mut captures = Vec::new();
         for line in &mut self.lines {
@@ -298,7 +298,7 @@ impl LineRing {
         }
     }
 
-    /// Takes at most `share` of memory from now on, and trends reach back as far as `reach`.
+    /// Sets the memory that the rings may take to `share`, and how far trends reach back to `reach`.
     fn limit(&mut self, share: &Budget, reach: Reach) {
         self.frames.limit(share.frames, |_, _| ());
         for (drive, samples) in self.drives.iter_mut().zip(&share.samples) {
@@ -345,7 +345,7 @@ impl LineRing {
         ring.is_some_and(|ring| ring.image.snapshot().link.is_online())
     }
 
-    /// The recordings that are complete, or all of them.
+    /// Takes out the recordings that are complete, or with `all` every recording.
     fn ended(&mut self, options: &RecorderOptions, clock: Clock, all: bool) -> Vec<Capture> {
         let mut captures = Vec::new();
         for ring in &mut self.drives {
@@ -376,7 +376,7 @@ impl LineRing {
 }
 
 impl DriveRing {
-    /// Handles drives that went offline. Call it once all earlier readings were taken in.
+    /// Handles drives that went offline. Must be called after all earlier readings were taken in.
     fn check_link(&mut self) {
         let link = self.image.snapshot().link;
         let before = std::mem::replace(&mut self.link, link);

@@ -46,7 +46,7 @@ pub struct Header {
     pub to: f64,
     /// The points, in the order of `values` here.
     pub points: Vec<Column>,
-    /// The values known at the trigger, of any age. As JSON of the gateway they are by point.
+    /// The values known at the trigger, of any age. In the JSON of the gateway they are keyed by point.
     #[schema(value_type = BTreeMap<String, Json>)]
     pub values: Vec<Json>,
     /// The reads that the samples are of.
@@ -87,7 +87,7 @@ pub struct Bus {
     pub protocol: String,
     /// Baud rate and character format.
     pub format: String,
-    /// Names of the drives of the bus; a frame refers to a drive by its place here.
+    /// Names of the drives of the bus; a frame refers to a drive by its index in this list.
     pub drives: Vec<String>,
 }
 
@@ -110,11 +110,11 @@ pub struct Read {
     pub start: u16,
     /// Items.
     pub count: u16,
-    /// The points of this read, by their places in the header.
+    /// The points of this read, by their index in the header.
     pub points: Vec<usize>,
 }
 
-/// A read of the drive; its values: [`Recording::values`].
+/// A read of the drive; its values are given by [`Recording::values`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// Time of the read, s from the trigger.
@@ -156,7 +156,7 @@ pub struct CommandNote {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedFrame)]
 pub struct Frame {
-    /// For a request, the time when it was given to the port; otherwise the time of the last byte.
+    /// Time of a request: when the port accepted it. Time of a reply: when its last byte arrived.
     pub t: f64,
     /// Place of the drive that was addressed.
     pub drive: Option<usize>,
@@ -202,7 +202,7 @@ enum Line<'l> {
 struct SampleLine<'l> {
     t: f64,
     read: usize,
-    /// A value for each point of the read; null where there is none.
+    /// A value for each point of the read; null if the point has none.
     values: Cow<'l, [Json]>,
 }
 
@@ -231,7 +231,7 @@ pub struct Recording {
     pub frames: Vec<Frame>,
 }
 
-/// Why bytes are no recording.
+/// Why bytes are not a valid recording.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{what}, at byte {offset}")]
 pub struct RecordingError {
@@ -302,7 +302,7 @@ impl Recording {
         self.samples.push(Sample { t, read, values });
     }
 
-    /// A value for each point of the read of a sample; null where it is none.
+    /// A value for each point of the read of this sample; null if the point has none.
     pub fn values(&self, sample: &Sample) -> &[Json] {
         self.values.get(sample.values.clone()).unwrap_or_default()
     }
@@ -393,7 +393,7 @@ impl Recording {
         Ok(())
     }
 
-    /// The values of a point with their times, as they were read.
+    /// The values of a point with the times at which they were read.
     pub fn values_of(&self, point: &str) -> Vec<(f64, &Json)> {
         let Some(place) = self.header.points.iter().position(|column| column.name == point) else {
             return Vec::new();

@@ -1,7 +1,7 @@
-//! Which recordings go when there are too many. Pure.
+//! Decides which recordings are removed when there are too many. Pure.
 //!
-//! Recordings that follow one another closely are a storm: its first ones show its cause and are kept, later ones make room
-//! for later ones still. What is kept of storms has half of the room, so that there is always some for the next recording.
+//! Recordings that follow one another closely are a storm. The first ones of a storm show its cause and are kept;
+//! each later one replaces earlier later ones. Storms get half of the room, so that the next recording always fits.
 
 use std::time::{Duration, SystemTime};
 
@@ -18,8 +18,8 @@ pub struct Storm {
 }
 
 impl Storm {
-    /// Whether a recording of that time, newer than those before, is among the first of its storm. A single recording is the
-    /// first of a storm that does not come.
+    /// Whether a recording of this time, newer than all before, is among the first of its storm. A single recording
+    /// counts as the first of a storm.
     pub fn is_first(&mut self, time: SystemTime) -> bool {
         let close = self
             .last
@@ -39,8 +39,8 @@ pub struct Kept {
     pub first: bool,
 }
 
-/// The places of those that have to go, of recordings from the oldest to the newest, so that no more than `max_bytes` and
-/// `max_count` are left. The last one, which was just made, stays in any case.
+/// Indices of the recordings to remove, given from the oldest to the newest, so that at most `max_bytes` and
+/// `max_count` remain. The last one, which was just made, always stays.
 pub fn surplus(all: &[Kept], max_bytes: u64, max_count: usize) -> Vec<usize> {
     let mut left: Vec<(usize, Kept)> = all.iter().copied().enumerate().collect();
     let mut gone = Vec::new();
@@ -71,7 +71,7 @@ mod tests {
         SystemTime::UNIX_EPOCH + Duration::from_secs(second)
     }
 
-    /// Times, s, of what is left after the recordings came one after the other, 10 bytes each.
+    /// Times, s, of the recordings that remain after these were made one after the other with 10 bytes each.
     fn left(seconds: impl Iterator<Item = u64>, max_bytes: u64, max_count: usize) -> Vec<u64> {
         let mut storm = Storm::default();
         let mut all: Vec<(u64, Kept)> = Vec::new();

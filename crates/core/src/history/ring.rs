@@ -31,7 +31,7 @@ impl<T: Timed> Ring<T> {
         }
     }
 
-    /// Adds an entry, the newest; `gone` gets those that have to go for it.
+    /// Adds the newest entry; `gone` receives the entries that are removed for it.
     pub(super) fn push(&mut self, entry: T, mut gone: impl FnMut(T)) {
         let now = entry.at();
         self.bytes += entry.size();
@@ -47,7 +47,7 @@ impl<T: Timed> Ring<T> {
         }
     }
 
-    /// Keeps at most this number of bytes from the next entry on.
+    /// Limits the ring to this number of bytes from the next entry on.
     pub(super) fn limit(&mut self, most_bytes: usize) {
         self.most_bytes = most_bytes;
     }

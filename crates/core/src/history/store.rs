@@ -73,7 +73,7 @@ pub enum ReadError {
     Content {
         /// The file.
         path: String,
-        /// The fault and its place.
+        /// The defect of the recording, and its place in the file.
         error: RecordingError,
     },
 }
@@ -81,7 +81,7 @@ pub enum ReadError {
 /// Reads a recording.
 ///
 /// # Errors
-/// The file cannot be read, or it is none.
+/// If the file cannot be read, or is not a recording.
 pub fn read(path: &Path) -> Result<Recording, ReadError> {
     let failed = |error| ReadError::File {
         path: path.display().to_string(),
@@ -141,7 +141,7 @@ pub fn path_of(dir: &Path, id: &str) -> PathBuf {
     dir.join(format!("{id}.{ENDING}"))
 }
 
-/// The directory with its content.
+/// The directory of the recordings with its content.
 #[derive(Debug)]
 pub struct Store {
     dir: PathBuf,
@@ -167,7 +167,7 @@ impl Store {
         let files = fs::read_dir(&options.dir).into_iter().flatten().flatten();
         for path in files.map(|file| file.path()) {
             if path.extension().is_some_and(|ending| ending == PARTIAL) {
-                // Another try follows at the next start.
+                // The next start of the gateway tries again to remove the file.
                 let _ = fs::remove_file(path);
             }
         }
@@ -190,10 +190,10 @@ impl Store {
         &self.entries
     }
 
-    /// Writes a recording at the time `now`, then removes those that have to go for it.
+    /// Writes a recording at the time `now`, then removes the recordings that no longer fit.
     ///
     /// # Errors
-    /// The file cannot be written, or alone exceeds the limit for all recordings; nothing of it is left then.
+    /// If the file cannot be written, or alone exceeds the limit for all recordings; no part of it remains.
     pub fn write(&mut self, recording: &mut Recording, now: SystemTime) -> io::Result<Arc<Entry>> {
         let time = humantime::parse_rfc3339(&recording.header.time).unwrap_or(SystemTime::UNIX_EPOCH);
         recording.header.first = self.storm.is_first(time);

@@ -8,9 +8,9 @@ use super::trigger::TriggerKind;
 use crate::drive::Profile;
 use crate::process_image::Verdict;
 
-/// Time before the trigger in which errors on the line are mentioned, s.
+/// Errors on the line within this time before the trigger are mentioned in the summary, s.
 const ERRORS_BEFORE: f64 = 5.0;
-/// Time over which a value is seen to rise or fall.
+/// Time over which the summary checks whether a value rises or falls.
 const TREND: f64 = 2.0;
 /// Change, as a share of the greater value, that is worth telling.
 const TREND_SHARE: f64 = 0.05;
@@ -81,7 +81,7 @@ fn last_value(recording: &Recording, point: &str, name: &str) -> Option<String> 
     let values = recording.values_of(point);
     let before: Vec<(f64, f64)> = values
         .iter()
-        // At the poll that shows the trigger the drive may have stopped already.
+        // At the poll that shows the trigger the drive may already have stopped, so only earlier values count.
         .filter(|(t, _)| *t < 0.0)
         .filter_map(|(t, value)| Some((*t, value.as_f64()?)))
         .collect();

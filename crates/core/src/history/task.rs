@@ -26,7 +26,7 @@ const WAITING: usize = 64;
 /// Characters of a text of a client that are kept.
 const MOST_TEXT: usize = 300;
 
-/// Why no recording was started.
+/// Why a recording was not started.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NotRecorded {
     /// The recorder is off.
@@ -43,7 +43,7 @@ enum Control {
     Stop,
 }
 
-/// The recordings, as the rest of the gateway sees them.
+/// The recordings, as the servers of the gateway use them.
 #[derive(Debug, Default)]
 pub struct Recordings {
     shared: Mutex<Shared>,
@@ -100,7 +100,8 @@ impl Recordings {
         path.map(|path| store::read(&path))
     }
 
-    /// Starts a recording of a drive, requested by `who`. Returns its id, and the time after which it is complete.
+    /// Starts a recording of a drive, requested by `who`. Returns its id and the time after which the recording is
+    /// complete.
     ///
     /// # Errors
     /// The recorder is off, or no drive has this name.
@@ -133,8 +134,8 @@ pub struct RecorderTask {
 }
 
 impl RecorderTask {
-    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`]. The channel ends when the recordings on disk
-    /// are known.
+    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`]. The channel closes when the
+    /// recordings on disk are known.
     ///
     /// # Errors
     /// The system gives no thread.
@@ -156,7 +157,7 @@ impl RecorderTask {
             shared.options = Some(options.clone()).filter(RecorderOptions::is_on);
             shared.recorder
         };
-        // Without recordings the directory is left alone.
+        // Without recordings the directory is not touched.
         let writer = options.is_on().then(|| {
             let (options, recordings, events) = (options.clone(), recordings.clone(), events.clone());
             move || {
@@ -208,14 +209,14 @@ impl RecorderTask {
             }
         }
         let mut shared = self.recordings.shared();
-        // Another one may be at work since the disk has held up this one.
+        // Another recorder may have taken over while the disk delayed this one.
         if shared.recorder == self.number {
             (shared.control, shared.options) = (None, None);
         }
     }
 }
 
-/// Takes the tapes of the buses.
+/// The thread that takes the entries from the tapes of the buses.
 struct Taker {
     recorder: Recorder,
     events: Events,
@@ -231,7 +232,7 @@ impl Taker {
         loop {
             let order = orders.recv_timeout(TICK);
             let clock = Clock::read();
-            // Notes are taken first, since entries taped before an order belong before it.
+            // Notes are taken first, since entries taped before an order must precede it.
             self.take_notes(clock);
             let mut captures = self.recorder.tick(clock);
             match order {
@@ -244,7 +245,7 @@ impl Taker {
                         at: clock.now,
                         text: format!("requested by {who}"),
                     };
-                    // The client may have gone.
+                    // The client may have disconnected, so an error is ignored.
                     let _ = reply.send(self.recorder.trigger(&drive, trigger, clock));
                 }
                 Ok(Control::Stop) | Err(RecvTimeoutError::Disconnected) => {

@@ -1,7 +1,7 @@
 //! Trends in memory: the least, the greatest and the last value of a point in equal steps of time. Pure: time is an argument.
 //!
-//! Each value goes into every range, so the buckets of a coarse range hold the extremes of what was read, not of what a finer
-//! one kept of it. Times are monotonic; the time of day serves for labels only.
+//! Each value enters every range directly, so the buckets of a coarse range hold the extremes of all readings, not
+//! of the values that a finer range kept. Times are monotonic; the time of day only serves for labels.
 
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant, SystemTime};
@@ -50,7 +50,7 @@ pub const POINTS: [ModelPoint; 9] = [
     ModelPoint::HeatsinkTemperature,
 ];
 
-/// Memory of the trend of a point that reaches back as far as [`RANGES`], from its first value on, bytes.
+/// Memory of the trend of a point that reaches back as far as [`RANGES`], from its first value on, in bytes.
 pub const POINT_BYTES: usize = {
     let [fine, middle, coarse] = RANGES;
     (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
@@ -64,8 +64,8 @@ pub fn bytes_of(profile: &Profile) -> usize {
     points_of(profile).count() * POINT_BYTES
 }
 
-/// How far back trends reach, in thousandths of [`RANGES`]: less where there are so many drives that all of it would take more
-/// than [`MOST_BYTES`].
+/// How far back trends reach, in thousandths of [`RANGES`]: less if all drives together would take more than
+/// [`MOST_BYTES`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reach(u16);
 
@@ -92,7 +92,7 @@ impl Reach {
         })
     }
 
-    /// Memory of the trend of a point, from its first value on, bytes.
+    /// Memory of the trend of a point, from its first value on, in bytes.
     pub(crate) fn point_bytes(self) -> usize {
         let buckets: usize = self.ranges().into_iter().map(Range::buckets).sum();
         buckets * size_of::<Bucket>()
@@ -150,7 +150,7 @@ pub struct Step {
     pub last: f32,
 }
 
-/// A part of a trend.
+/// The part of a trend that a client requested.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Part {
     /// Name of the point.
@@ -162,7 +162,7 @@ pub struct Part {
     pub from: SystemTime,
     /// End of the last one.
     pub to: SystemTime,
-    /// A step each, oldest first; `None` where nothing good was read.
+    /// One entry for each step, oldest first; `None` if nothing good was read in it.
     pub steps: Vec<Option<Step>>,
 }
 
@@ -186,7 +186,7 @@ struct PointTrend {
 #[derive(Debug)]
 struct Kept {
     ranges: [Buckets<Bucket>; RANGES.len()],
-    /// The last value and when it was read, as long as the drive was not away since.
+    /// The last value and when it was read; `None` once the drive went offline.
     last: Option<(Duration, f32)>,
 }
 
@@ -215,7 +215,7 @@ impl DriveTrend {
         }
     }
 
-    /// Reaches back so far from now on; the newest steps stay.
+    /// Sets how far back the trend reaches; the newest steps stay.
     pub(crate) fn set_reach(&mut self, reach: Reach) {
         if std::mem::replace(&mut self.reach, reach) == reach {
             return;
@@ -232,16 +232,17 @@ impl DriveTrend {
         self.reach.ranges()
     }
 
-    /// Adds the values that `read` shows; `reading` has the drive's values right after it. `known` is the drive's image: it knows
-    /// whether a derived point is good, since its sources may have been read before the drive was away, and for how long a value
-    /// is good. A value counts for the steps until the next one, as long as it is good.
+    /// Adds the values of `read`; `reading` has the drive's values right after it. `known` is the reading of the
+    /// drive's image: it shows whether a derived point is good, since the points that it depends on may be from
+    /// before the drive went offline, and how long a value is good. A value counts for each step until the next
+    /// value, as long as it is good.
     pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
         for point in &mut self.points {
             if !point.registers.iter().any(|registers| shows(read, registers)) {
                 continue;
             }
             let sample = reading.sample(point.index);
-            // The words of a value may come in several reads; the value is as old as the oldest one.
+            // The words of a value may come in several reads; the value is as old as the oldest of its words.
             let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
                 continue;
             };
@@ -255,7 +256,7 @@ impl DriveTrend {
         }
     }
 
-    /// The drive was away: no value from before stands for the time since.
+    /// The drive was offline: no earlier value counts for the time since.
     pub fn interrupt(&mut self) {
         for kept in self.points.iter_mut().filter_map(|point| point.kept.as_mut()) {
             kept.last = None;
@@ -268,8 +269,8 @@ impl DriveTrend {
         self.points.iter().map(move |point| (point.point, bytes(point)))
     }
 
-    /// The trend of a point between two times, in the finest range that reaches back as far as `from`. What is older than the
-    /// longest range, or not yet, is left out. `None` where no trend of the point is kept.
+    /// The trend of a point between two times, in the finest range that reaches back to `from`. Times older than
+    /// the longest range, or in the future, are left out. `None` if no trend of the point is kept.
     pub fn part(&self, point: ModelPoint, from: Instant, to: Instant, clock: Clock) -> Option<Part> {
         let trend = self.points.iter().find(|trend| trend.point == point)?;
         let age = clock.now.saturating_duration_since(from);
@@ -345,12 +346,13 @@ pub(super) fn number(since: Duration, step: Duration) -> u64 {
     since.as_secs() / step.as_secs().max(1)
 }
 
-/// A time from which on the steps of all ranges begin at whole steps of the time of day: a longest step ago at most.
+/// A recent time at which the steps of all ranges begin at whole steps of the time of day, at most one step of the
+/// longest range ago.
 pub(super) fn epoch(clock: Clock) -> Instant {
     let [.., Range { step, .. }] = RANGES;
     let since = clock.wall.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let into = Duration::from_nanos((since.as_nanos() % step.as_nanos().max(1)) as u64);
-    // Shortly after the machine was started there may be no such instant.
+    // Shortly after the machine has booted there may be no such instant.
     clock.now.checked_sub(into).unwrap_or(clock.now)
 }
 
@@ -360,7 +362,7 @@ fn shows(read: &TapedRead, (table, addresses): &Registers) -> bool {
     read.table == *table && overlap
 }
 
-/// Where the value of a point is read from, without the ends of a band.
+/// The registers that the value of a point is read from, without those of the ends of its band.
 fn registers_of(profile: &Profile, index: PointIndex) -> Vec<Registers> {
     let Some(point) = profile.points.get(index) else {
         return Vec::new();

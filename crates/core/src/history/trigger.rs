@@ -78,8 +78,8 @@ impl TriggerKind {
         }
     }
 
-    /// Time after a recording of this kind in which the same drive makes no other one of the kind: what repeats by itself,
-    /// or can be repeated by a client, must not push out the other recordings.
+    /// Time after a recording of this kind before the same drive makes another one: a trigger that repeats, or that
+    /// a client can repeat, must not displace the other recordings.
     pub(super) fn pause(self) -> Duration {
         match self {
             TriggerKind::Fault | TriggerKind::Supervision | TriggerKind::Command => Duration::ZERO,
@@ -108,8 +108,8 @@ pub struct Trigger {
     pub text: String,
 }
 
-/// Whether a record is a stop that the drive did not acknowledge, and that nothing newer took the place of. The refused rest of a
-/// write whose stop was carried out is none, though the write repeats the stop.
+/// Whether the record is a stop that the drive did not acknowledge and that no newer command replaced. The refused
+/// rest of a write whose stop was carried out does not count, even if the write repeats the stop.
 pub(super) fn is_refused_stop(record: &AuditRecord) -> bool {
     const TAKEN: [&str; 7] = [
         "acknowledged",
@@ -129,12 +129,12 @@ pub(super) struct Watch {
     fault: Option<bool>,
     code: i64,
     warning: Option<bool>,
-    /// For each trigger of the drive since when it holds, and whether it has made its recording.
+    /// For each trigger of the drive: since when it holds, and whether it has made its recording.
     points: Vec<Option<(Instant, bool)>>,
 }
 
 impl Watch {
-    /// Looks at a drive that was read at `at`.
+    /// Evaluates the triggers for a drive that was read at `at`.
     pub(super) fn check(&mut self, reading: &Reading<'_>, at: Instant, warnings: bool) -> Option<Trigger> {
         let fault = self.fault(reading);
         let warning = self.warning(reading).filter(|_| warnings);
@@ -202,8 +202,8 @@ pub(super) struct LineErrors {
 }
 
 impl LineErrors {
-    /// Notes a failed transaction with a drive that answered before. The drive with most of them, when they are a
-    /// burst.
+    /// Notes a failed transaction with a drive that answered before. Returns the drive with most failures, once
+    /// they are a burst.
     pub(super) fn note(&mut self, at: Instant, drive: DriveIndex) -> Option<(DriveIndex, Trigger)> {
         self.recent.push_back((at, drive));
         while let Some((oldest, _)) = self.recent.front() {

@@ -1,4 +1,4 @@
-//! When an order came, and over which connection. Pure.
+//! When an order arrived, and over which connection. Pure.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -50,24 +50,23 @@ impl PartialEq for Connection {
 /// How and when an order came.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arrival {
-    /// Earliest time at which the first byte may have come.
+    /// Earliest time at which the first byte of the order may have arrived.
     pub asked: Instant,
-    /// Over which connection it came. In what order several connections were written to is not known.
+    /// The connection over which the order arrived. The order in which clients wrote to several connections is not known.
     pub connection: Connection,
-    /// The stall of the reading thread during which its first byte may have come.
+    /// The stall of the reading thread during which the first byte of the order may have arrived.
     pub stall: Option<Stall>,
-    /// The last pause of the reading thread, as long as orders from before that pause may still arrive over old
-    /// connections.
+    /// The last pause of the reading thread, while orders from before that pause may still arrive over old connections.
     pub pause: Option<Stall>,
 }
 
 impl Arrival {
-    /// An order of the gateway itself, which came at `now` over a new connection.
+    /// An order of the gateway itself, which arrived at `now` over a new connection.
     pub fn now(now: Instant) -> Arrival {
         Arrival::over(Connection::opened(now), now)
     }
 
-    /// An order that came at `asked` over this connection, while its reader ran.
+    /// An order that arrived at `asked` over this connection, while its reader ran.
     pub fn over(connection: Connection, asked: Instant) -> Arrival {
         Arrival {
             asked,
@@ -77,7 +76,8 @@ impl Arrival {
         }
     }
 
-    /// This arrival for an order whose last byte came as `last`: a client that sends in two parts may have given up in between.
+    /// This arrival for an order whose last byte arrived as `last`: a client that sends an order in two parts may
+    /// have given up in between.
     #[must_use]
     pub fn completed(self, last: &Arrival) -> Arrival {
         Arrival {

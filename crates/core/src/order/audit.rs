@@ -1,7 +1,7 @@
 //! The audit: commands and their results, in the log, in memory and, if configured, in a file.
 //!
-//! Commands that were sent to a drive are kept separately throughout, so nothing else can displace them. Refusals are
-//! limited per client.
+//! Commands that were sent to a drive have separate memory and queues everywhere, so nothing else can displace
+//! them. Refusals are limited per client.
 
 pub mod chain;
 mod file;
@@ -24,7 +24,7 @@ pub use file::{AuditFile, AuditFileOptions};
 pub const AUDIT_KEPT: usize = 1000;
 /// Records of commands that were not sent, kept in addition.
 const UNSENT_KEPT: usize = 500;
-/// Name of the log events of commands that were sent: the log has a way of its own for them.
+/// Name of the log events for commands that were sent: the log treats them separately.
 pub const SENT: &str = "sent command";
 
 /// A value that a command sets.
@@ -64,7 +64,7 @@ pub struct AuditRecord {
     pub drive: String,
     /// The command in one line.
     pub command: String,
-    /// The points it sets, with the previous values; empty if it was refused before it was parsed.
+    /// The points that the command sets, with their previous values; empty if it was refused before it was parsed.
     pub points: Vec<Change>,
     /// Result code; `confirmed` is an acknowledged command whose effect was read back.
     pub result: &'static str,
@@ -80,7 +80,7 @@ pub struct AuditRecord {
     pub confirmed: Option<Duration>,
     /// Number of commands covered: refusals of one client are counted.
     pub count: u64,
-    /// The client among others: see [`super::Origin::client`].
+    /// The name under which the client shares limits with others; see [`super::Origin::client`].
     #[serde(skip)]
     pub(super) share: Arc<str>,
 }
@@ -189,10 +189,10 @@ struct Records {
     /// Lines of JSON: a record that is kept takes one block of memory instead of eight, between which holes would stay.
     sent: FairRing<Arc<str>, Arc<str>>,
     unsent: FairRing<Arc<str>, Arc<str>>,
-    /// By drive the last command that concerns its run command, or that reset its fault, and when it ended. As many as
-    /// there are drives.
+    /// For each drive, the last command that concerns its run command or reset its fault, and when the command
+    /// ended. As many entries as drives.
     runs: HashMap<String, (Arc<AuditRecord>, Instant)>,
-    /// For each drive, the last order to run or to stop that was sent. There are no more entries than drives.
+    /// For each drive, the last order to run or to stop that was sent. At most as many entries as drives.
     ordered: HashMap<String, RunOrdered>,
     refusals: RefusalLimit<AuditRecord>,
 }
@@ -215,7 +215,7 @@ impl Audit {
         self.records.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Records from now on go to `file` too, or to none.
+    /// Also writes the records to `file` from now on; with `None` to no file.
     pub fn write_to(&self, file: Option<Arc<AuditFile>>) {
         self.file.store(file);
     }
@@ -230,8 +230,8 @@ impl Audit {
         self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
 
-    /// Takes the record of a command that is finished at `now`. Refusals of one client are counted after the first of a
-    /// kind; their records follow within a second or so ([`Audit::record_due`]).
+    /// Adds the record of a command that ended at `now`. After the first refusal of a kind, further refusals of one
+    /// client are counted, and reported within about a second ([`Audit::record_due`]).
     pub(super) fn record(&self, record: AuditRecord, reach: Reach, now: Instant) {
         let mut records = self.records();
         if reach != Reach::Refused {
@@ -302,7 +302,7 @@ impl Audit {
             ring.push(record.share.clone(), number, line.into());
         }
         if let Some(sender) = self.sender.get() {
-            // The last listener may have gone.
+            // The last listener may have disconnected, so an error is ignored.
             let _ = sender.send(record.clone());
         }
         if let Some(file) = &*self.file.load() {
@@ -310,7 +310,7 @@ impl Audit {
         }
     }
 
-    /// Notes a command that was sent to a drive, before it is known whether it shows its effect.
+    /// Notes a command that was sent to a drive, before it is known whether the drive carries it out.
     pub(super) fn ordered(&self, drive: &str, ordered: RunOrdered) {
         self.records().ordered.insert(drive.to_string(), ordered);
     }
@@ -320,19 +320,20 @@ impl Audit {
         self.records().ordered.get(drive).cloned()
     }
 
-    /// The last command to that drive that concerns its run command or was sent to reset its fault, and when it ended.
+    /// The last command to this drive that concerns its run command or was sent to reset its fault, and when it ended.
     pub(crate) fn last_run(&self, drive: &str) -> Option<(Arc<AuditRecord>, Instant)> {
         self.records().runs.get(drive).cloned()
     }
 
-    /// Forgets the last orders of all names for which `is_same` does not hold: a reload gave these names to other drives.
+    /// Forgets the last orders of all names for which `is_same` does not hold: after a reload these names belong to
+    /// other drives.
     pub fn keep_orders_of(&self, is_same: impl Fn(&str) -> bool) {
         let records = &mut *self.records();
         records.runs.retain(|drive, _| is_same(drive));
         records.ordered.retain(|drive, _| is_same(drive));
     }
 
-    /// All that are kept, oldest first, each as JSON; with `drive` those to that drive.
+    /// All kept records, oldest first, each as JSON; with `drive` only those of that drive.
     pub fn recent(&self, drive: Option<&str>) -> Vec<Arc<str>> {
         #[derive(Deserialize)]
         struct Addressed<'l> {

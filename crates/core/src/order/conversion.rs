@@ -1,10 +1,10 @@
-//! The value that a point takes once the register of another one is written. Pure.
+//! The value that a point takes when the register of another point is written. Pure.
 
 use crate::drive::model::Kind;
 use crate::drive::{Point, PointIndex, Source, Value};
 use crate::process_image::Reading;
 
-/// The value that a point takes once the register of another one is written.
+/// The value that a point takes when the register of another point is written.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Becomes {
     /// The two have nothing to do with each other.
@@ -14,8 +14,8 @@ pub(crate) enum Becomes {
     Known(Value),
 }
 
-/// Calculates the value that a point takes once the register of another one is written: the point itself, the point
-/// that takes its commands, or a conversion.
+/// Calculates the value that a point takes when the register of another point is written: the same point, the point
+/// that takes its commands, or a converted one.
 pub(crate) fn becomes(drive: &Reading<'_>, point: PointIndex, written: (PointIndex, Value)) -> Becomes {
     let (index, value) = written;
     if point == index {
@@ -44,7 +44,7 @@ pub(crate) fn becomes(drive: &Reading<'_>, point: PointIndex, written: (PointInd
     }
 }
 
-/// The value of a raw point as its register holds it: a value that is rounded to 0 has no sign.
+/// The value of a raw point as its register stores it; a value rounded to 0 has no sign.
 pub(crate) fn as_held(drive: &Reading<'_>, (index, value): (PointIndex, Value)) -> Value {
     let raw = drive.spec.profile.points.get(index).and_then(Point::raw);
     let held = raw.and_then(|raw| raw.decode(&raw.encode(value, 0).ok()?, Kind::Number));

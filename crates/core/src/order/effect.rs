@@ -1,4 +1,5 @@
-//! Effects of a command on the drives that it reaches, by their profiles: decided once, when it is accepted. Pure.
+//! Effects of a command on each drive that it reaches, from the profiles of the drives; determined once, when the
+//! command is accepted. Pure.
 
 use super::{Order, Touched, Urgency, written};
 use crate::codec::Table;
@@ -13,9 +14,10 @@ pub enum Asks {
     Steer,
     /// A fault reset, a parameter, any other raw write: passes if the drive is free, and takes no hold.
     Other,
-    /// The write takes the run command away, so it always passes.
+    /// The write takes the run command away, so every rule lets it pass.
     Stop,
-    /// Asks for nothing: a read, or a write of a restore that has started and must not be left half done.
+    /// The order needs no right to the drive: a read, or a write of a restore that has started and must not be left
+    /// half done.
     Nothing,
 }
 
@@ -48,7 +50,7 @@ pub struct Effect {
     pub reverse: Option<bool>,
     /// A reference.
     pub reference: bool,
-    /// Whether a raw word is written at the place of the run command that is not a stop.
+    /// Whether the order writes a raw word to the register of the run command that is not a stop.
     pub word: bool,
 }
 
@@ -75,7 +77,7 @@ impl Effect {
         !self.stops && self.run == Some(true)
     }
 
-    /// Whether the effect writes a run command, or a word at its place that is not a stop.
+    /// Whether the order writes a run command, or a word to its register that is not a stop.
     pub fn may_run(self) -> bool {
         self.run == Some(true) || self.word
     }
@@ -85,7 +87,7 @@ impl Effect {
         self.reverse.is_some() || self.reference
     }
 
-    /// The effect of an order on a drive of that profile, whatever its rank.
+    /// The effect of an order on a drive with this profile, independent of its rank.
     pub fn of(order: &Order, profile: &Profile) -> Effect {
         match order {
             Order::Points(values) => {
@@ -164,7 +166,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Effects {
     on: Vec<(DriveIndex, Effect)>,
-    /// The registers that the command sets, and those on which it depends.
+    /// The registers that the command sets, and the registers on which it depends.
     pub touches: Touched,
 }
 
@@ -187,13 +189,13 @@ impl Effects {
         self.on.iter().map(|(drive, _)| *drive)
     }
 
-    /// Effect on this drive; none on a drive that the command does not reach.
+    /// Effect on this drive; no effect if the command does not reach it.
     pub fn on(&self, drive: DriveIndex) -> Effect {
         let on = self.on.iter().find(|(of, _)| *of == drive);
         on.map(|(_, effect)| *effect).unwrap_or_default()
     }
 
-    /// Every drive that the command reaches, with the effect there.
+    /// Every drive that the command reaches, with the effect on it.
     pub fn iter(&self) -> impl Iterator<Item = (DriveIndex, Effect)> + '_ {
         self.on.iter().copied()
     }

@@ -1,5 +1,5 @@
-//! The frequency range of a drive on which a command rests: that by which its Hz became percent, or by which a limit in one
-//! of them held for the other. Pure.
+//! The frequency range of a drive on which a command depends: the range that converted Hz to percent, or that
+//! applied a limit in one unit to the other. Pure.
 
 use std::time::Instant;
 
@@ -18,7 +18,7 @@ pub struct FrequencyRange {
 }
 
 impl FrequencyRange {
-    /// Whether the range is unchanged; a command may have changed the drive's own range at `written`, and a range read
+    /// Whether the range is unchanged. A command may have changed the drive's own range at `written`; a range read
     /// before that is not valid.
     pub fn holds(&self, drive: &Reading<'_>, written: Option<Instant>) -> bool {
         let read_before = |end: PointIndex| {
@@ -37,8 +37,8 @@ impl FrequencyRange {
     }
 }
 
-/// The frequency ranges that decide whether a command to `asked` sets the register to this point and value, and keeps the
-/// limits.
+/// The frequency ranges by which a command to `asked` sets the register to this point and value, and by which it
+/// keeps the limits.
 pub(crate) fn rests_on(drive: &Reading<'_>, asked: PointIndex, written: (PointIndex, Value)) -> Vec<FrequencyRange> {
     let mut ranges = Vec::new();
     for (index, point) in drive.spec.profile.points.enumerate() {
@@ -60,7 +60,7 @@ pub(crate) fn rests_on(drive: &Reading<'_>, asked: PointIndex, written: (PointIn
     ranges
 }
 
-/// Whether the register is an end of a frequency range on which commands may rest.
+/// Whether the register is an end of a frequency range on which commands may depend.
 pub fn is_range_end(profile: &Profile, table: Table, address: u16) -> bool {
     let bands = profile.points.indexes().filter_map(|point| band(profile, point));
     let mut raws = bands.flat_map(ends).filter_map(|end| profile.points.get(end)?.raw());

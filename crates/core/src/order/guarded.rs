@@ -9,7 +9,7 @@ pub enum Reason {
     StartsPerHour,
     /// The motor has not been stopped for long enough.
     MinOff,
-    /// Another drive of the group was started just now.
+    /// Another drive of the group was started shortly before.
     Stagger,
     /// An interlock does not hold.
     Interlock,
@@ -18,7 +18,7 @@ pub enum Reason {
 }
 
 impl Reason {
-    /// All reasons.
+    /// All reasons why a start must wait.
     pub const ALL: [Reason; 5] = [
         Reason::StartsPerHour,
         Reason::MinOff,

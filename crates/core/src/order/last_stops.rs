@@ -1,4 +1,4 @@
-//! The last stops of a machine, as far as they decide on orders that were given before. Pure.
+//! The last stops of a machine, as far as they invalidate orders that were given earlier. Pure.
 
 use std::time::Instant;
 
@@ -27,7 +27,7 @@ impl LastStops {
         self.last.as_ref().map(|(_, at)| *at)
     }
 
-    /// When the last one was taken in that came over another connection than this one.
+    /// When the last stop was accepted that came over a connection other than this one.
     pub fn of_others(&self, than: &Connection) -> Option<Instant> {
         let of = |stop: &&(Connection, Instant)| stop.0 != *than;
         let stop = self.last.as_ref().filter(of).or(self.of_another.as_ref().filter(of));
@@ -41,7 +41,7 @@ mod tests {
 
     use super::*;
 
-    /// Two are enough: compared with all stops, in every order of four stops of three connections.
+    /// Keeping two stops is enough: compared with all stops, in every order of four stops from three connections.
     #[test]
     fn the_last_stop_of_the_others_is_known_for_each_connection() {
         let now = Instant::now();

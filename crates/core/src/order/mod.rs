@@ -1,9 +1,9 @@
-//! An order: its content, its effect on each drive that it reaches, when it came and until when it may be sent, its
-//! origin, and the ticket by which it gets exactly one result.
+//! An order: its content, its effect on each drive that it reaches, when it arrived and until when it may be sent,
+//! its origin, and the ticket by which it gets exactly one result.
 //!
-//! A way in gives an [`Order`]; [`crate::permit::admit`] checks and converts it; the [`Command`] made of it waits in the
-//! [`crate::queue`] of its bus. The [`Ticket`] inside a command yields its result when it is used or dropped, so a
-//! command can neither get two results nor be forgotten.
+//! A server creates an [`Order`]; [`crate::permit::admit`] checks and converts it; the resulting [`Command`] waits
+//! in the [`crate::queue`] of its bus. The [`Ticket`] inside a command yields its result when it is used or
+//! dropped, so a command can neither get two results nor be forgotten.
 //!
 //! [`Outcome`] has the code, the text and the Modbus exception of every result; the texts of refusals are where the
 //! refusal is decided, in [`crate::permit`].
@@ -66,7 +66,7 @@ pub const CONFIRMED: &str = "confirmed";
 pub enum Order {
     /// Points set as one command: index in the profile, value in engineering units.
     Points(Vec<(PointIndex, Value)>),
-    /// A raw write, passed on as it is (except bits of a control word).
+    /// A raw write that is passed on unchanged (except bits of a control word).
     Write(RequestPdu),
     /// A raw read outside the plan.
     Read(RequestPdu),
@@ -77,15 +77,15 @@ pub enum Order {
 /// Rank of a command on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Urgency {
-    /// Takes a run command away.
+    /// The order takes a run command away.
     Stop,
-    /// Any command that is not a stop.
+    /// The order is a command other than a stop.
     Command,
     /// Forwarded read.
     Read,
 }
 
-/// A command that was checked and converted, and may wait for its turn.
+/// A command that was checked and converted, and may now wait in the queue.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Admitted {
     /// The order, with derived points replaced by their sources.
@@ -98,7 +98,7 @@ pub struct Admitted {
     pub ranges: Vec<FrequencyRange>,
 }
 
-/// Whether `min_run` of its drive may delay a stop.
+/// Whether `min_run` of the drive may delay a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Haste {
     /// No delay: the stop of a person, of the gateway itself, or a second one.
@@ -139,7 +139,7 @@ impl Stop {
 pub struct Set {
     /// Whether the command sets references only: a newer one of the same points replaces it.
     pub reference_only: bool,
-    /// Result of the stop that goes first, where this command is its rest; the rest is not sent if the stop fails.
+    /// Result of the stop that was split off from this command; if that stop fails, this rest is not sent.
     pub behind: Option<StopEnd>,
 }
 
@@ -152,22 +152,22 @@ pub enum Work {
     Set(Set),
     /// The command reads outside the plan.
     Read,
-    /// A tool's write, or a broadcast, which goes to all drives that hear it.
+    /// A tool's write, or a broadcast, which reaches every drive that listens to its address.
     PassedOn(PassedOn),
 }
 
-/// When a command came, and until when it may be sent.
+/// When a command arrived, and until when it may be sent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Window {
     /// When the first byte of the command came.
     pub arrival: Arrival,
     /// The command is not sent after this time.
     pub expires: Instant,
-    /// Whether a start may wait until the command expires; else it is refused.
+    /// Whether a start may wait until the command expires; otherwise it is refused.
     pub waits: bool,
 }
 
-/// The part of a command that the rules judge: its identity, its effect on each drive, and when it came.
+/// The part of a command that the rules judge: its identity, its effect on each drive, and when it arrived.
 #[derive(Debug, Clone)]
 pub struct Intent {
     /// Names the command: no other one of the process has the same number.
@@ -180,13 +180,13 @@ pub struct Intent {
     pub effects: Effects,
     /// Frequency ranges on which the values depend.
     pub ranges: Vec<FrequencyRange>,
-    /// When the order came, and until when it may be sent.
+    /// When the order arrived, and until when it may be sent.
     pub window: Window,
     /// The write to a BACnet slot that caused the order.
     pub slot: Option<SlotWrite>,
 }
 
-/// A command on its way to the bus.
+/// A command on its way from a client to the bus.
 #[derive(Debug)]
 pub struct Command {
     /// Content, effects and time of the command.
@@ -199,7 +199,7 @@ pub struct Command {
     pub(crate) overtaken: usize,
 }
 
-/// A number that no other command of the process has, so that data kept for one command never fits another one.
+/// A new number that no other command of the process has, so that data kept for one command never matches another one.
 fn next_number() -> u64 {
     static LAST: AtomicU64 = AtomicU64::new(0);
     LAST.fetch_add(1, Ordering::Relaxed) + 1
@@ -226,7 +226,7 @@ impl Intent {
 }
 
 impl Command {
-    /// A command to the drive of that profile at that place of its bus.
+    /// A command to the drive with this profile at this index of its bus.
     pub fn new(drive: DriveIndex, admitted: Admitted, profile: &Profile, window: Window, ticket: Ticket) -> Command {
         let Admitted {
             order,
@@ -255,7 +255,7 @@ impl Command {
         }
     }
 
-    /// A tool's write, or a broadcast, which has its place among the commands of all drives that it reaches.
+    /// A tool's write, or a broadcast, which is ordered among the commands of every drive that it reaches.
     pub fn passed_on(intent: Intent, passed_on: PassedOn, ticket: Ticket) -> Command {
         Command {
             intent,
@@ -265,7 +265,7 @@ impl Command {
         }
     }
 
-    /// A stop that a bus had started, for the bus that takes its place.
+    /// A stop that a bus had started when it ended, for the bus that replaces it.
     pub fn begun_stop(intent: Intent, was_begun: bool, ticket: Ticket, joined: Vec<(Ticket, Instant)>) -> Command {
         Command {
             intent,
@@ -280,7 +280,7 @@ impl Command {
         }
     }
 
-    /// Rank of the command on the bus. A request passed on for a tool has the rank of a command, whatever it does.
+    /// Rank of the command on the bus. A request passed on for a tool always has the rank of a command.
     pub fn urgency(&self) -> Urgency {
         match self.work {
             Work::Stop(_) => Urgency::Stop,
@@ -304,17 +304,17 @@ impl Command {
         self.intent.effects.on(drive)
     }
 
-    /// Whether the command takes the run command of this drive away.
+    /// Whether the command takes away the run command of this drive.
     pub fn stops(&self, drive: DriveIndex) -> bool {
         self.effect(drive).stops
     }
 
-    /// Whether the command is a stop, which goes before everything else to its drive.
+    /// Whether the command is a stop, which goes ahead of everything else for its drive.
     pub fn is_stop(&self) -> bool {
         matches!(self.work, Work::Stop(_))
     }
 
-    /// Whether another bus accepted the command before a reload and noted its consequences there.
+    /// Whether the bus before a reload accepted the command and already noted its consequences.
     pub(crate) fn is_inherited(&self) -> bool {
         matches!(&self.work, Work::Stop(stop) if stop.is_inherited)
     }
@@ -354,7 +354,7 @@ impl Command {
         self.is_stop() || (is_shutdown && self.as_passed_on().is_some())
     }
 
-    /// The clients of the command: the one whose order it is, then those that joined.
+    /// The clients of the command: the one that gave the order, then those that joined it.
     pub fn origins(&self) -> impl Iterator<Item = &Origin> {
         let joined = match &self.work {
             Work::Stop(stop) => stop.joined.as_slice(),
@@ -364,7 +364,7 @@ impl Command {
         std::iter::once(&self.ticket).chain(joined).map(Ticket::origin)
     }
 
-    /// Until when a client waits for the command; none for the gateway's own.
+    /// Until when a client waits for the command; `None` for the gateway's own commands.
     pub(crate) fn client_waits_until(&self) -> Option<Instant> {
         let joined = match &self.work {
             Work::Stop(stop) => stop.joined.as_slice(),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::Right;
 
-/// Where a command comes from.
+/// The kind of client or interface that a command comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum SourceKind {
     /// Modbus TCP client.
@@ -73,7 +73,7 @@ impl SourceKind {
         }
     }
 
-    /// Whether `min_run` may delay a stop that comes this way: those of people are never delayed.
+    /// Whether `min_run` may delay a stop from this kind of source; stops by people are never delayed.
     pub fn stops_may_be_delayed(self) -> bool {
         matches!(
             self,
@@ -81,7 +81,7 @@ impl SourceKind {
         )
     }
 
-    /// Whether a client commands; the gateway itself is none.
+    /// Whether a client is the source; the gateway itself is not a client.
     pub fn is_client(self) -> bool {
         !matches!(
             self,
@@ -93,16 +93,16 @@ impl SourceKind {
 /// The authority of a client; the drive may allow less.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Authority {
-    /// Read and write.
+    /// The client may read and write.
     Write,
-    /// Read; every write is refused.
+    /// The client may only read; every write is refused.
     ReadOnly,
 }
 
-/// Facts that a client's connection proves about it.
+/// What a client's connection proves about its identity.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Proof {
-    /// The connection proves nothing.
+    /// The connection proves no identity.
     #[default]
     Nothing,
     /// The address of a Modbus TCP client, or of a tool at a TCP slot.
@@ -123,13 +123,13 @@ pub enum Proof {
     Pty(Arc<str>),
 }
 
-/// In which part a client acts.
+/// The role in which a client acts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Acting {
     /// The client acts as itself.
     #[default]
     Usual,
-    /// Each stop of this client is a new one, even if the client repeats its command word continuously.
+    /// Each stop of this client counts as a new one, even if the client repeats its command word continuously.
     Insisting,
     /// The drill that the client armed gives the order.
     Drill,
@@ -152,7 +152,7 @@ pub struct Origin {
 impl Origin {
     /// Name of the origin when a lease expires.
     pub const LEASE: &str = "supervision";
-    /// The client name for a stop that is written again because an earlier write may still be on its way.
+    /// Name of the client for a stop that is repeated because an earlier write may still be on its way.
     pub const REPEATED_STOP: &str = "repeated stop";
     /// The client name for the stop of a drive that was switched to local control with its run command set.
     pub const LOCAL: &str = "local control place";
@@ -164,9 +164,8 @@ impl Origin {
         Origin::of(client, kind, who)
     }
 
-    /// An origin that counts as `client` wherever clients share something: turns and places in the queue, records of
-    /// the audit. A client gains nothing there by more connections or topics, as long as they all name the same
-    /// `client`.
+    /// An origin that counts as `client` wherever clients share a resource: turns and places in the queue, records
+    /// of the audit. More connections or topics give a client no advantage, as long as all name the same `client`.
     pub fn of(client: Arc<str>, kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
         Origin {
@@ -186,7 +185,7 @@ impl Origin {
         self
     }
 
-    /// The drill that this client armed, which appears under that name in audit and events.
+    /// The origin of a drill that this client armed, shown under that name in the audit and in events.
     #[must_use]
     pub fn of_drill(mut self, who: String) -> Origin {
         (self.who, self.acting) = (who, Acting::Drill);
@@ -215,7 +214,7 @@ impl Origin {
         self
     }
 
-    /// Gives a right that no reload takes away, for an action that has started and must be completed.
+    /// Gives a right that no reload removes, for an action that has started and must be completed.
     pub fn lasting(self) -> Origin {
         self.with_right(Right::lasting())
     }
@@ -230,7 +229,7 @@ impl Origin {
         &self.proof
     }
 
-    /// Sets a login, which may renew the lease of the drive until another client commands it.
+    /// Adds the login of the client, by which it may renew the lease of the drive until another client commands the drive.
     pub fn with_login(mut self, login: Arc<str>) -> Origin {
         self.login = Some(login);
         self

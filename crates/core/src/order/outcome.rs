@@ -14,13 +14,13 @@ pub enum Interruption {
     Stop,
     /// The time of the command expired.
     Expired,
-    /// The port was lost.
+    /// The port was lost during the transaction.
     BusDown,
     /// The drive no longer replies.
     Offline,
     /// The gateway stops, or its bus restarts.
     ShuttingDown,
-    /// Another client took hold of the drive.
+    /// Another client took the exclusive right to the drive.
     Taken,
     /// A reload took the right of the client away.
     RightLost,
@@ -41,7 +41,7 @@ pub enum Outcome {
     TimedOut,
     /// The drive's reply was invalid: wrong check code or length.
     Garbled,
-    /// The command expired before its turn; not sent.
+    /// The command expired while it waited, and was not sent.
     Expired,
     /// A newer reference replaced the command; not sent.
     Replaced,
@@ -51,13 +51,13 @@ pub enum Outcome {
     Withdrawn,
     /// The drive acknowledged the value and shows another one.
     NotTaken(String),
-    /// The command was started and interrupted: whether the drive took it, or a part of it, is not known.
+    /// The command was started and then interrupted: it is unknown whether the drive received it, or a part of it.
     Interrupted(Interruption),
     /// The rest of the command was not sent, because its stop failed.
     NotStopped,
     /// The drive acknowledged the stop of a command that also does more; the result of the rest.
     StopOnly(Box<Outcome>),
-    /// The stop of such a command failed, in that way, and the rest was not sent.
+    /// The stop of such a command failed with this outcome, and the rest was not sent.
     StopFailed(Box<Outcome>),
     /// The port is not open.
     BusDown,
@@ -144,7 +144,7 @@ impl Outcome {
             Outcome::TimedOut | Outcome::Offline | Outcome::Expired | Outcome::NotStopped => {
                 Some(Exception::GATEWAY_TARGET)
             }
-            // The client must know what was not done; never success, which would mean both parts.
+            // The client must learn which part was not carried out; success would mean both parts.
             Outcome::StopOnly(part) | Outcome::StopFailed(part) => {
                 Some(part.exception().unwrap_or(Exception::DEVICE_FAILURE))
             }
@@ -221,8 +221,8 @@ pub enum Refusal {
     /// The point or address cannot be written, or does not exist.
     #[error("{0}")]
     NotWritable(String),
-    /// The command depends on a value that was not read from the drive yet; for a silent drive, its absence is the
-    /// reason instead.
+    /// The command depends on a value that has not been read from the drive yet. If the drive is silent, its
+    /// absence is the reason instead.
     #[error("{0}")]
     NotKnown(String),
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
@@ -231,7 +231,7 @@ pub enum Refusal {
     /// Someone else has a right to the drive that goes before that of the client.
     #[error("{0}")]
     HeldByOther(Box<Holder>),
-    /// The motor may not be started yet.
+    /// A guard does not let the motor start yet.
     #[error("{0}; it was not sent")]
     Guarded(Box<Guarded>),
     /// An interlock is not satisfied.
@@ -260,7 +260,7 @@ pub struct Holder {
     pub rank: String,
     /// The point that is held, and how the hold ends.
     pub keeps: String,
-    /// Seconds until the hold ends by itself, if it does.
+    /// Seconds until the hold expires, if it does.
     pub left_s: Option<u64>,
 }
 

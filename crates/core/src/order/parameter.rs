@@ -12,8 +12,8 @@ pub struct ParameterOrder {
     pub id: String,
     /// PDU address of the parameter's (first) holding register.
     pub address: u16,
-    /// The value that the drive must have before, unless it has `to`; `None` for a write-only register, which is
-    /// written once and not read back.
+    /// The value that the drive must have before the write, unless it already has `to`; `None` for a write-only
+    /// register, which is written once and not read back.
     pub from: Option<RawValue>,
     /// The value to write.
     pub to: RawValue,

@@ -7,12 +7,12 @@ use super::{Order, Outcome, written};
 use crate::codec::{RequestPdu, Table};
 use crate::drive::{ModelPoint, PointIndex, Profile, Value};
 
-/// A command, split into its stop and the rest.
+/// A command split into its stop and its rest.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Parts {
-    /// The order stops nothing, or does nothing else.
+    /// The order has no stop, or consists only of a stop.
     One(Order),
-    /// The stop of the order, and the rest.
+    /// The stop part of the order, and the rest.
     Two(Order, Order),
 }
 
@@ -23,7 +23,8 @@ enum Role {
     Stop,
     /// The point sets the run command.
     Run,
-    /// The point takes another command away (direction, reset), as the word of a stop does; alone it is not a stop.
+    /// The point takes another command away (direction, reset), as the control word of a stop does; such a write
+    /// alone is not a stop.
     Clears,
     Other,
 }
@@ -42,8 +43,8 @@ impl Parts {
     }
 }
 
-/// The stop part of a command: the values that are executed even if the rest is refused. `None` if the command does not
-/// stop, or is contradictory.
+/// The stop part of a command: the values that are written even if the rest is refused. `None` if the command does
+/// not stop, or contradicts itself.
 pub fn stop_of(values: &[(PointIndex, Value)], profile: &Profile) -> Option<Vec<(PointIndex, Value)>> {
     let role = |(index, value): &(PointIndex, Value)| role(profile, *index, *value);
     let stops = values.iter().any(|value| role(value) == Role::Stop);
@@ -88,7 +89,7 @@ fn role(profile: &Profile, index: PointIndex, value: Value) -> Role {
     }
 }
 
-/// The write of the control word alone, or of its coil, out of a write of several items that clears the run command.
+/// The write of only the control word, or its coil, taken from a write of several items that clears the run command.
 fn stop_in(pdu: &RequestPdu, profile: &Profile) -> Option<RequestPdu> {
     let (table, items) = written(pdu)?;
     let stops = |(address, value): &&(u16, u16)| profile.is_stop(table, *address, *value);
@@ -102,13 +103,13 @@ fn stop_in(pdu: &RequestPdu, profile: &Profile) -> Option<RequestPdu> {
     })
 }
 
-/// How the stop of a compound command ended, for its rest: after a failed stop nothing is sent.
+/// Result of the stop of a compound command, shared with its rest: after a failed stop the rest is not sent.
 #[derive(Debug, Clone, Default)]
 pub struct StopEnd(Arc<OnceLock<bool>>);
 
 impl StopEnd {
     pub(super) fn note(&self, outcome: &Outcome) {
-        // Answered once only.
+        // Only the first result counts.
         let _ = self.0.set(outcome.is_ok());
     }
 
@@ -118,7 +119,7 @@ impl StopEnd {
     }
 }
 
-/// The one outcome of a command in two parts; `None` while it is not known.
+/// The outcome of a command in two parts; `None` while a part has no outcome.
 pub fn joined(stop: Option<Outcome>, rest: Option<Outcome>) -> Option<Outcome> {
     match (stop?, rest) {
         (stop, None) if stop.is_ok() => None,

@@ -8,8 +8,8 @@ use super::{Outcome, SourceKind, Ticket};
 use crate::codec::RequestPdu;
 use crate::drive::DriveIndex;
 
-/// How much of a busy line background transactions take, as shares of the wire time of process data; where the line
-/// rests they may have all of the rest. All of both kinds together take no more than a fifth of a busy line.
+/// How much of a busy line background transactions may take, as shares of the wire time of process data; an idle
+/// line is theirs. All of them together take at most a fifth of a busy line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Pace {
     /// 18 %: someone waits for the reply.
@@ -19,7 +19,7 @@ pub enum Pace {
 }
 
 impl Pace {
-    /// All paces, in the order in which they have their turn.
+    /// All paces, in the order in which they take turns.
     pub const ALL: [Pace; 2] = [Pace::Brisk, Pace::Slow];
 
     /// The share of a busy line.
@@ -39,7 +39,7 @@ pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
 pub struct PassedOn {
     /// The address on the line; 0 is the broadcast, except on N2.
     pub address: u8,
-    /// Whether the request may change any value of every drive that receives it.
+    /// Whether the request may change a value of any drive that receives it.
     pub may_write: bool,
     /// Whether the request stops all drives that receive it, and precedes all waiting commands.
     pub first: bool,
@@ -47,7 +47,7 @@ pub struct PassedOn {
     pub frame: oneshot::Sender<Vec<u8>>,
 }
 
-/// A request of the lowest rank: one transaction with one drive, which is not a command to it.
+/// A request of the lowest rank: one transaction with one drive that is not a command.
 #[derive(Debug)]
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
@@ -60,12 +60,12 @@ pub struct BackgroundRequest {
     pub expires: Instant,
     /// Ticket of the request.
     pub ticket: Ticket,
-    /// Receiver of the reply's frame, for a tool; none for a request of the gateway itself.
+    /// Receiver of the reply's frame, for a tool; `None` for a request of the gateway itself.
     pub passed_on: Option<PassedOn>,
 }
 
 impl BackgroundRequest {
-    /// Whether the gateway itself reads something from time to time, so that no command or fault is the reason.
+    /// Whether the gateway itself reads at intervals, so that neither a command nor a fault is the reason.
     pub fn is_of_gateway(&self) -> bool {
         self.ticket.origin().kind == SourceKind::Schedule
     }

@@ -1,24 +1,24 @@
-//! The right of a client to write, as the way by which its commands came gives it.
+//! The right of a client to write, granted by the interface through which its commands arrive.
 
 use std::fmt::Debug;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// The permissions of a client, as the gateway is configured now: what a reload changes is seen at once.
+/// The permissions of a client by the present configuration: a change by a reload takes effect at once.
 pub trait Grants: Debug + Send + Sync {
-    /// Whether the client may write to drives of that bus.
+    /// Whether the client may write to drives of this bus.
     fn may_write(&self, bus: &str) -> bool;
 }
 
-/// For a way in whose client may write to every bus, until that is set otherwise.
+/// Grants for an interface whose client may write to every bus, switched by one flag.
 impl Grants for AtomicBool {
     fn may_write(&self, _: &str) -> bool {
         self.load(Ordering::Acquire)
     }
 }
 
-/// The right of a client to write. Commands that wait, sequences that have started and slots of priority arrays carry
-/// the right of their client, so that a reload which takes it away ends them.
+/// The right of a client to write. Waiting commands, sequences in progress and slots of priority arrays carry the
+/// right of their client, so that a reload that revokes it ends them.
 #[derive(Debug, Clone, Default)]
 pub struct Right(Option<Arc<dyn Grants>>);
 
@@ -28,8 +28,7 @@ impl Right {
         Right(Some(grants))
     }
 
-    /// A right that no reload takes away: for the gateway itself, and for an action that has started and must be
-    /// completed.
+    /// A right that no reload removes: for the gateway itself, and for an action that has started and must be completed.
     pub const fn lasting() -> Right {
         Right(None)
     }

@@ -80,7 +80,7 @@ fn number() -> u64 {
     LAST.fetch_add(1, Ordering::Relaxed)
 }
 
-/// A write to a slot; the order that follows from it carries it, so that both are accepted at once.
+/// A write to a slot of a priority array. The resulting order carries it, so that both are accepted together.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SlotWrite {
     /// Number that identifies the write.
@@ -91,7 +91,7 @@ pub struct SlotWrite {
     pub priority: u8,
     /// The new entry; `None` releases the slot.
     pub entry: Option<Entry>,
-    /// Slots released with it: their owners' commands were refused when they were to govern.
+    /// Slots that this write also releases: the commands of their owners were refused when they became effective.
     pub also: Vec<(Commanded, u8)>,
     /// The entry that is planned to govern as a result.
     pub(crate) heir: Option<u64>,

@@ -44,8 +44,8 @@ impl WriteStats {
     }
 }
 
-/// Gives a command exactly one result: with [`Ticket::answer`] or [`Ticket::acknowledge`], or "shutting down" when
-/// dropped. The audit line follows once everything about the command is known.
+/// Gives a command exactly one result: by [`Ticket::answer`] or [`Ticket::acknowledge`], or "shutting down" when
+/// dropped. The audit record follows once the whole outcome of the command is known.
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
@@ -61,11 +61,11 @@ pub struct Ticket {
     confirmation: Option<oneshot::Sender<Result<Duration, String>>>,
     answered: Option<(Outcome, Duration)>,
     confirmed: Option<Duration>,
-    /// Why no read can show the effect.
+    /// Why no read can show the effect of the command.
     unseen: Option<String>,
-    /// Whether nothing of the command was written yet.
+    /// Whether no part of the command was written yet.
     waits: bool,
-    /// Reports the end of this stop to the rest of its order.
+    /// Reports the result of this stop to the rest of its order.
     stop: Option<StopEnd>,
 }
 
@@ -113,14 +113,15 @@ impl Ticket {
         self
     }
 
-    /// Sets where a stop reports its end, for the rest that depends on it.
+    /// Sets where the result of a stop is reported to the rest of its order.
     pub(crate) fn with_rest(mut self, end: StopEnd) -> Ticket {
         self.stop = Some(end);
         self
     }
 
-    /// Where the time arrives from acceptance to the read that showed the effect, or why no read can show it. Closed without
-    /// either when no read showed it, always within the time of the profile after the acknowledgement.
+    /// Receiver of the time from acceptance to the read that showed the effect, or of the reason why no read can
+    /// show it. It closes without a value if no read showed the effect within the profile's time after the
+    /// acknowledgement.
     pub fn confirmation(&mut self) -> oneshot::Receiver<Result<Duration, String>> {
         let (sender, receiver) = oneshot::channel();
         self.confirmation = Some(sender);
@@ -169,7 +170,7 @@ impl Ticket {
         let _ = sender.send(answer);
     }
 
-    /// Records who started or stopped a motor: the next read that shows the change asks for it.
+    /// Records who started or stopped a motor: the next read that shows the change looks this up.
     fn note_run(&self, outcome: &Outcome, now: Instant) {
         let run = self.changes.iter().rev().find_map(|change| change.run);
         let may_be_done = outcome.reach() == Reach::Sent && !matches!(outcome, Outcome::Exception(_));
@@ -222,7 +223,7 @@ impl Drop for Ticket {
     }
 }
 
-/// An acknowledged command that may still be confirmed. If dropped, it stays "acknowledged".
+/// An acknowledged command that may still be confirmed. If dropped, its result stays "acknowledged".
 #[derive(Debug)]
 pub struct Receipt(Ticket);
 
@@ -232,7 +233,7 @@ impl Receipt {
         let time = now.saturating_duration_since(self.0.accepted);
         self.0.confirmed = Some(time);
         if let Some(sender) = self.0.confirmation.take() {
-            // The client may be gone, or may not have requested the confirmation.
+            // The client may have disconnected, or may not have requested the confirmation.
             let _ = sender.send(Ok(time));
         }
     }
@@ -245,7 +246,7 @@ impl Receipt {
         }
     }
 
-    /// Nothing was written yet: the write takes effect later, for the reason `why`.
+    /// The command is accepted but not written yet; `why` is the reason why it takes effect later.
     pub fn waits(mut self, why: &str) {
         self.0.waits = true;
         self.cannot_be_seen(why);

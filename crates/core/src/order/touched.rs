@@ -1,4 +1,5 @@
-//! Which registers of a drive a command sets, and on which it rests: whether two commands may change places. Pure.
+//! Which registers of a drive a command sets, and on which it depends: this decides whether two commands may be
+//! reordered. Pure.
 
 use super::{FrequencyRange, Order, written};
 use crate::codec::Table;
@@ -13,7 +14,7 @@ pub enum Touched {
     /// The registers are not known.
     #[default]
     Anything,
-    /// The known registers.
+    /// Only these registers are set or used.
     These {
         /// Registers that the command sets.
         sets: Vec<Item>,
@@ -23,7 +24,7 @@ pub enum Touched {
 }
 
 impl Touched {
-    /// The registers of a command to a drive of that profile, which rests on these frequency ranges.
+    /// The registers that an order to a drive of this profile sets and depends on, with these frequency ranges.
     pub fn of(order: &Order, ranges: &[FrequencyRange], profile: &Profile) -> Touched {
         let raw = |index: PointIndex| profile.points.get(index).and_then(|point| point.raw());
         let items = |raw: &Raw| {

@@ -1,6 +1,5 @@
 //! Assigns the journals of interrupted restores to the configured drives. A journal belongs to a machine; if that
-//! machine is no longer configured, it is unknown whether a drive in its place, or with its name, is the half-restored
-//! one. Pure.
+//! machine is no longer configured, a drive at its address or with its name may be the half-restored one. Pure.
 
 use super::journal::{JournalFile, Owner};
 use crate::process_image::Machine;
@@ -10,9 +9,9 @@ use crate::process_image::Machine;
 pub enum Claim {
     /// The journal belongs to this machine.
     Own,
-    /// The journal's machine is no longer configured. At its address is this one, of another profile.
+    /// The journal's machine is no longer configured; this drive has its address but another profile.
     Place,
-    /// The journal's machine is no longer configured. This one has its name.
+    /// The journal's machine is no longer configured; this drive has its name.
     Name,
 }
 
@@ -25,7 +24,7 @@ pub struct Claims {
     pub orphans: Vec<usize>,
 }
 
-/// Which of the `journals`, each with its owner, belong to which of the `drives`, each with its name.
+/// Assigns the `journals`, each with its owner, to the `drives`, each with its name.
 pub fn claims(journals: &[(JournalFile, Result<Owner, String>)], drives: &[(Machine, &str)]) -> Claims {
     let mut claims = Claims {
         drives: vec![None; drives.len()],

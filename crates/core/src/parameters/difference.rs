@@ -8,9 +8,9 @@ use crate::drive::parameters::RawValue;
 pub struct Difference {
     /// Id of the parameter.
     pub id: Id,
-    /// Value before; none where it is missing or was not read.
+    /// Value before; `None` if the parameter was missing or not read.
     pub before: Option<RawValue>,
-    /// Value after; none where it is missing or was not read.
+    /// Value after; `None` if the parameter was missing or not read.
     pub after: Option<RawValue>,
     /// The value before with its unit, for people.
     pub note_before: String,
@@ -19,11 +19,11 @@ pub struct Difference {
 }
 
 impl Difference {
-    /// In one line: `102: 5000 → 10000 (50.00 Hz, Maximum frequency → 100.00 Hz, Maximum frequency)`.
+    /// The difference as one line: `102: 5000 → 10000 (50.00 Hz, Maximum frequency → 100.00 Hz, Maximum frequency)`.
     pub fn line(&self) -> String {
         let value = |value: Option<RawValue>, note: &str| match value {
             None => "not there".to_string(),
-            // The note begins with the value in its unit, where that is known.
+            // The note begins with the value in its unit, if the unit is known.
             Some(value) => match note.split(", ").next().filter(|shown| begins_with_number(shown)) {
                 Some(shown) => shown.to_string(),
                 None => match value {

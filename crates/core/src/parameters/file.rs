@@ -1,4 +1,4 @@
-//! A file of parameters: text that people read and version control compares, and that loses nothing.
+//! A file of parameters: text that people can read and version control can compare, without any loss of data.
 //!
 //! ```text
 //! # drivegate parameters 1
@@ -14,7 +14,8 @@
 //! 117 = ?      # not read: the drive refused it with exception 03
 //! ```
 //!
-//! Text behind `#` is kept as text. A value without a decimal point is a register, one with it an analog output of N2.
+//! Text after `#` is kept as text. A value without a decimal point is a register, one with a decimal point an N2
+//! analog output.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
@@ -87,7 +88,7 @@ impl fmt::Display for Id {
 pub struct Entry {
     /// Value of the parameter, or why it was not read.
     pub value: Result<RawValue, String>,
-    /// Value in its unit, and name, as text.
+    /// Text with the value in its unit and the name of the parameter.
     pub note: String,
 }
 
@@ -102,7 +103,7 @@ pub struct ParameterFile {
     pub identification: String,
     /// When the parameters were read, RFC 3339.
     pub time: String,
-    /// The drive's own counters of the line; empty if its family has none.
+    /// The counters of the line that the drive itself keeps; empty if its family has none.
     pub counters: String,
     /// Values by parameter.
     pub values: BTreeMap<Id, Entry>,
@@ -130,7 +131,7 @@ impl ParameterFile {
         format!("{} parameters, {mark}", self.values.len())
     }
 
-    /// The checksum of names and values; the texts are not part of it.
+    /// The checksum of names and values; the notes are not part of it.
     pub fn checksum(&self) -> String {
         let mut text = format!("{}\n", self.family);
         for (id, entry) in &self.values {
@@ -185,7 +186,7 @@ impl ParameterFile {
                 Err(why) => format!("not read: {why}; {}", entry.note),
             };
             let line = format!("{id:width$} = {value:<6} # {}", one_line(&note));
-            // Without a note the line ends behind the value.
+            // Without a note the line ends after the value.
             let _ = writeln!(text, "{}", line.trim_end_matches(" # ").trim_end());
         }
         text

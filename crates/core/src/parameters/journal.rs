@@ -1,5 +1,5 @@
-//! The journal of a restore: the former values, the new ones and how far it is, on disk before the first parameter is
-//! written, so that a restore that was cut off can be resumed or taken back.
+//! The journal of a restore: the former values, the new ones and the progress. The journal is on disk before the
+//! first parameter is written, so that an interrupted restore can be resumed or undone.
 //!
 //! ```text
 //! # drivegate restore 2
@@ -36,7 +36,7 @@ use crate::process_image::Machine;
 
 /// The first line.
 const HEAD: &str = "# drivegate restore 2";
-/// First line of journals that contain only the name of the drive, not its place.
+/// First line of journals that contain the name of the drive but not its bus and address.
 const HEAD_WITHOUT_PLACE: &str = "# drivegate restore 1";
 /// Name of the file, in the directory of the drive's readings.
 const NAME: &str = "restore.journal";
@@ -48,11 +48,11 @@ const RELEASED: &str = "restore.released";
 pub enum Phase {
     /// The restore writes the new values.
     Writing,
-    /// All new values are written; the drive is being made to save them.
+    /// All new values are written; the drive is being ordered to save them.
     Saving,
     /// The restore writes the former values.
     TakingBack,
-    /// All former values are written; the drive is being made to save them.
+    /// All former values are written; the drive is being ordered to save them.
     SavingBack,
 }
 
@@ -73,7 +73,7 @@ impl Phase {
     }
 }
 
-/// To which machine a journal belongs. The names are those of the time when the restore began, and as text.
+/// The machine to which a journal belongs. The names are those from the start of the restore, as text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Owner {
     /// Name of the drive.
@@ -89,7 +89,7 @@ pub struct Owner {
 }
 
 impl Owner {
-    /// The head of a journal, whether or not the rest of it is understood.
+    /// Parses the head of a journal, even if the rest cannot be parsed.
     ///
     /// # Errors
     /// The text is not a journal: the reason.
@@ -175,7 +175,7 @@ pub struct Journal {
     pub phase: Phase,
     /// Parameters of this phase that were done when the journal was written; perhaps more were.
     pub done: usize,
-    /// The drive may have been made to save values of this restore.
+    /// The drive may have been ordered to save values of this restore.
     pub saved: bool,
     /// The plan of the first phase.
     pub plan: Plan,

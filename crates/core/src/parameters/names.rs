@@ -13,8 +13,8 @@ const MOST_ROWS: usize = 10_000;
 pub struct Names(BTreeMap<Id, Label>);
 
 impl Names {
-    /// Reads a list: comma or semicolon between fields, double quotes around fields that have one in them, the first row
-    /// may be the names of the columns. `scale` is the value of one count; unit and scale may be empty.
+    /// Reads a list: comma or semicolon between fields, double quotes around fields that contain one; the first row
+    /// may have the names of the columns. `scale` is the value of one count; unit and scale may be empty.
     ///
     /// # Errors The fault, with its line.
     pub fn parse(text: &str) -> Result<Names, String> {
@@ -62,8 +62,7 @@ impl Names {
     }
 }
 
-/// Cells of a line of CSV, and whether all quotes are closed; a cell in quotes may have separators, and duplicate quotes in
-/// it.
+/// Cells of a CSV line, and whether all quotes are closed; a quoted cell may contain separators and doubled quotes.
 pub fn cells(line: &str, is_separator: impl Fn(char) -> bool) -> (Vec<String>, bool) {
     let (mut cells, mut cell) = (Vec::new(), String::new());
     let (mut quoted, mut chars) = (false, line.chars().peekable());

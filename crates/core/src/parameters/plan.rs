@@ -22,7 +22,8 @@ pub struct ParameterWrite {
     pub from: RawValue,
     /// The value to write.
     pub to: RawValue,
-    /// For people, with the counts on the bus: `102 Maximum frequency: 50.00 Hz → 100.00 Hz (5000 → 10000)`.
+    /// The change as text for people, with the counts on the bus: `102 Maximum frequency: 50.00 Hz → 100.00 Hz
+    /// (5000 → 10000)`.
     pub line: String,
     /// Whether the drive loses the value without power.
     pub volatile: bool,
@@ -35,8 +36,8 @@ pub struct Need {
     pub point: PointIndex,
     /// The required reading of the point. Even then the drive may still refuse.
     pub value: bool,
-    /// Exception code with which the drive refuses a write otherwise, N2 codes with 0x80 added; none where no manual
-    /// gives it.
+    /// Exception code with which the drive refuses a write under other conditions, N2 codes with 0x80 added; `None`
+    /// if no manual states it.
     pub exception: Option<u8>,
     /// The remedy: `switch the operator to PRGM`.
     pub remedy: String,
@@ -47,8 +48,8 @@ pub struct Need {
 pub struct Handling {
     /// The condition for the first write; `None` if no write needs one.
     pub needs: Option<Need>,
-    /// Register that is written once at the end, so that the drive keeps the values: (PDU address, value). `None` if every
-    /// write is kept at once, or if no value can be kept.
+    /// Register that is written once at the end so that the drive saves the values: (PDU address, value). `None` if
+    /// every write is saved at once, or if values cannot be saved.
     pub save: Option<(u16, u16)>,
 }
 
@@ -59,16 +60,16 @@ pub struct Plan {
     pub writes: Vec<ParameterWrite>,
     /// How the drive takes and keeps the parameters.
     pub handling: Handling,
-    /// Parameters that differ and are left out; how they differ and why they are left out, as text.
+    /// Parameters that differ and are not written: how they differ and why they are left out, as text.
     pub left_out: Vec<(Id, String)>,
-    /// Notes: parameters that only one side has, were not read, are not kept.
+    /// Notes about parameters that only one side has, that were not read, or that are not saved.
     pub notes: Vec<String>,
 }
 
 /// The parameters the user named, and whether the risks are accepted.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Wishes {
-    /// Only these parameters, including those that are never restored otherwise. Empty: all.
+    /// Only these parameters, including those that are not restored by default. Empty: all.
     pub only: Vec<Id>,
     /// Treat refusals that can be forced as risks.
     pub force: bool,
@@ -80,7 +81,7 @@ pub struct Risk(pub String);
 
 /// Plans the writes that change the drive from `present` to `wanted`.
 ///
-/// The notes of both files go into [`ParameterWrite::line`]; [`ParameterFile::named`] makes them again.
+/// The notes of both files become part of [`ParameterWrite::line`]; [`ParameterFile::named`] renews them.
 ///
 /// # Errors Every reason against it, each with the difference and the remedy.
 pub fn plan(

@@ -1,8 +1,8 @@
 //! A reading of all parameters of a drive: decides the next request and applies replies. Pure.
 //!
-//! A family lists its parameters or their address ranges; in a range each address is read, and an address refused with
-//! 02 does not exist. Later readings read only the addresses found before, until one of them is refused: then the drive
-//! has another application, and everything is read.
+//! A family lists its parameters or their address ranges. In a range every address is read, and an address refused
+//! with 02 does not exist. Later readings read only the addresses found before, until one of them is refused: then
+//! the drive has another application, and everything is read again.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -30,7 +30,7 @@ const AWAY_PAUSE: Duration = Duration::from_secs(1);
 pub enum Next {
     /// The next request.
     Go,
-    /// The next request after that time, for the reason given.
+    /// The next request follows after this time, for the reason given.
     Pause(Duration, String),
     /// The reading cannot continue.
     Failed(String),
@@ -56,7 +56,7 @@ pub struct Reading {
     counters: Counters,
 }
 
-/// The counters that the drive keeps of its line, read behind the parameters where its family has them (function 08).
+/// The line counters that the drive itself keeps, read after the parameters if its family has them (function 08).
 #[derive(Debug)]
 enum Counters {
     /// The family has no counters, or the drive does not report them.
@@ -67,7 +67,7 @@ enum Counters {
 }
 
 impl Reading {
-    /// Starts a reading of a drive of this family; `known` are the addresses that an earlier reading found.
+    /// Starts a reading of a drive of this family; `known` are the addresses found by an earlier reading.
     pub fn new(profile: Arc<Profile>, known: BTreeSet<u16>) -> Reading {
         let mut reading = Reading {
             profile,
@@ -94,7 +94,7 @@ impl Reading {
         ids.filter_map(|id| profile.parameters.address(id.name())).collect()
     }
 
-    /// Every address that may have a parameter.
+    /// All addresses that may have a parameter.
     fn everywhere(&self) -> BTreeSet<u16> {
         let list = &self.profile.parameters;
         let spans = list.spans.iter().flat_map(|span| {
@@ -188,7 +188,7 @@ impl Reading {
         (self.total.saturating_sub(open), self.total)
     }
 
-    /// The request that [`Reading::request`] gave ended so.
+    /// Takes the outcome of the request that [`Reading::request`] gave; returns what to do next.
     pub fn answered(&mut self, outcome: &Outcome) -> Next {
         let Some(mut block) = self.todo.pop_front() else {
             return self.counted(outcome);
@@ -252,7 +252,7 @@ impl Reading {
         }
     }
 
-    /// The drive answered for a counter. The parameters do not wait for counters that it does not give.
+    /// Takes the drive's answer for a counter. The parameters do not wait for counters that the drive does not report.
     fn counted(&mut self, outcome: &Outcome) -> Next {
         if let Counters::Reading(so_far, tries) = &mut self.counters {
             match outcome {
@@ -273,7 +273,7 @@ impl Reading {
     }
 
     fn take(&mut self, address: u16, words: &[u16]) {
-        // Words in the hole of a block are not parameters.
+        // Words in an unused gap of a block are not parameters.
         if self.profile.parameters.id(address).is_none() {
             return;
         }
@@ -287,7 +287,7 @@ impl Reading {
         self.found.insert(address, value);
     }
 
-    /// Requests each address of a refused block alone, to find the one that is refused; what the profile does not name last.
+    /// Requests each address of a refused block separately, to find the refused one.
     fn split(&mut self, block: Block) {
         let alone = |start| Block {
             start,
@@ -311,7 +311,7 @@ impl Reading {
         Next::Go
     }
 
-    /// The result as a file; `names` take precedence over those of the family.
+    /// The result as a file; `names` take precedence over the names of the family.
     pub fn file(&self, drive: &str, identification: &str, time: &str, names: &Names) -> ParameterFile {
         let list = &self.profile.parameters;
         let values = self.found.iter().filter_map(|(address, value)| {

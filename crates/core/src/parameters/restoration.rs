@@ -1,9 +1,10 @@
 //! A restore in progress: decides the next step and applies replies. Pure: time is an argument; the caller does the
 //! I/O.
 //!
-//! Every parameter is a command of its own, which the bus carries out only when the drive has the former value or the
-//! new one, and only while its motor stands; a drive that has the new value is not written. So a restore that was cut
-//! off anywhere is resumed or taken back by going through all of its parameters again, whatever had reached the drive.
+//! Every parameter is a separate command, which the bus carries out only if the drive has the former value or the
+//! new one, and only while the motor stands; a drive that already has the new value is not written. So an
+//! interrupted restore can be resumed or undone by going through all of its parameters again, whatever had reached
+//! the drive.
 
 use std::time::{Duration, Instant};
 
@@ -17,11 +18,11 @@ use crate::order::{Outcome, ParameterOrder, Refusal};
 const MOST_WAIT: Duration = Duration::from_secs(3600);
 /// Pause before a request to a busy drive is repeated.
 const BUSY_PAUSE: Duration = Duration::from_millis(200);
-/// Pause before the next try where someone has to do something: the motor runs, the drive is away.
+/// Pause before the next attempt if someone has to act first: the motor runs, or the drive is offline.
 const PAUSE: Duration = Duration::from_secs(1);
 /// How often progress is noted in the journal.
 const NOTED: Duration = Duration::from_secs(1);
-/// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved again.
+/// Most saves of one restore: a drive that loses unsaved values is written and saved again.
 const MOST_SAVES: u32 = 3;
 
 /// The next step.
@@ -33,7 +34,7 @@ pub enum Wanted {
     Set(ParameterOrder),
     /// The journal is removed.
     Remove,
-    /// Nothing is wanted, as the restore has ended.
+    /// Nothing is to be done, as the restore has ended.
     Nothing,
 }
 
@@ -42,7 +43,7 @@ pub enum Wanted {
 pub enum Then {
     /// The next step.
     Go,
-    /// The step again after this time, for the reason given.
+    /// The step is repeated after this time, for the reason given.
     Pause(Duration, String),
 }
 
@@ -61,9 +62,9 @@ pub enum End {
 
 #[derive(Debug, Clone, PartialEq)]
 enum State {
-    /// The journal must be written, before the parameter at that place has its turn.
+    /// The journal must be written before the parameter at this index can be set.
     Recording(usize),
-    /// The parameter at that place has its turn; behind the last one the save.
+    /// The parameter at this index is being set; after the last one, the values are saved.
     Setting(usize),
     /// The restore has ended; only its journal still has to be removed.
     Removing(End),
@@ -77,12 +78,12 @@ pub struct Restoration {
     /// The writes of the present direction, in their order.
     writes: Vec<ParameterWrite>,
     state: State,
-    /// Whether something may have been written.
+    /// Whether a value on the drive may have been changed.
     touched: bool,
-    /// Whether something was written that is not saved yet.
+    /// Whether a value was written that is not saved yet.
     wrote: bool,
     saves: u32,
-    /// Since when the restore cannot continue.
+    /// Since when the restore has been unable to continue.
     waits_since: Option<Instant>,
     noted: Instant,
 }
@@ -166,7 +167,8 @@ impl Restoration {
         }
     }
 
-    /// Notes that the journal is on disk, or that it could not be written: the drive is then no longer written to.
+    /// Notes that the journal is on disk, or that it could not be written; in that case nothing more is written to
+    /// the drive.
     pub fn recorded(&mut self, result: Result<(), String>, now: Instant) {
         self.noted = now;
         match result {
@@ -192,7 +194,7 @@ impl Restoration {
         }
     }
 
-    /// The order that [`Restoration::wanted`] gave ended so.
+    /// Takes the outcome of the order that [`Restoration::wanted`] gave; returns what to do next.
     pub fn answered(&mut self, outcome: &Outcome, now: Instant) -> Then {
         let clean = matches!(outcome, Outcome::Refused(_) | Outcome::Exception(_));
         let not_sent = matches!(
@@ -232,12 +234,12 @@ impl Restoration {
         }
     }
 
-    /// The present order is not given to the bus yet, for a reason that may pass.
+    /// The present order could not be given to the bus, for a reason that may pass.
     pub fn put_off(&mut self, why: &str, now: Instant) -> Then {
         self.pause(PAUSE, why, now)
     }
 
-    /// Ends the restore from outside, as it cannot continue.
+    /// Ends the restore from outside because it cannot continue.
     pub fn give_up(&mut self, why: String) {
         self.state = match self.touched {
             true => State::Over(End::Unfinished(why)),
@@ -281,7 +283,7 @@ impl Restoration {
         Then::Go
     }
 
-    /// The drive was made to save the values. If it lost power before that, some are lost: all are checked again.
+    /// The drive has saved the values. If it lost power before, some may be lost, so all are checked again.
     fn saved(&mut self) -> Then {
         self.saves += 1;
         self.wrote = false;
@@ -319,8 +321,8 @@ impl Restoration {
         }
     }
 
-    /// Once something is written, the restore waits for conditions that someone at the drive can fix; before that it
-    /// need not.
+    /// Once a value was written, the restore waits for conditions that someone at the drive can fix; before the
+    /// first write it gives up instead.
     fn wait_for_people(&mut self, waits: String, why: &str, now: Instant) -> Then {
         match self.touched {
             true => self.pause(PAUSE, &waits, now),
@@ -361,7 +363,7 @@ mod tests {
         Restoration::begin(journal, now)
     }
 
-    /// The orders of a restore until it has ended; with `forgets` the drive loses unsaved values at its first save.
+    /// The orders of a restore until its end; with `forgets` the drive loses unsaved values at its first save.
     fn wanted_ids(restoration: &mut Restoration, mut forgets: bool, now: Instant) -> Vec<String> {
         let (mut all, mut has) = (Vec::new(), std::collections::BTreeSet::new());
         let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));

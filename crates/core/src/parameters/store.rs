@@ -20,7 +20,7 @@ pub struct Store {
     dir: PathBuf,
 }
 
-/// A reading on disk.
+/// A parameter reading on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Kept {
     /// Name of the drive.
@@ -85,7 +85,7 @@ impl Store {
     /// The last reading of a drive.
     ///
     /// # Errors
-    /// If the file cannot be read: which file, and why.
+    /// If the file cannot be read; names the file and the reason.
     pub fn latest(&self, drive: &str) -> Result<Option<ParameterFile>, String> {
         let all = self
             .of(drive)
@@ -93,7 +93,7 @@ impl Store {
         all.last().map(|path| read(path)).transpose()
     }
 
-    /// All readings, drive by drive, the oldest first.
+    /// All readings, sorted by drive and then by age, oldest first.
     ///
     /// # Errors
     /// If the directory cannot be read.
@@ -122,8 +122,8 @@ impl Store {
     }
 }
 
-/// The name of a reading made after the one named `newest`: its `own` name if that is in order, otherwise the number after
-/// `newest`.
+/// The name of a reading made after the one named `newest`: `own` if that sorts after it, otherwise the number
+/// after `newest`.
 fn name_after(newest: &str, own: String) -> String {
     if own.as_str() > newest {
         return own;

@@ -25,7 +25,7 @@ pub struct Status {
     pub now: Option<String>,
     /// Why the reading waits.
     pub waits: Option<String>,
-    /// Result of the reading; none while it is in progress.
+    /// Result of the reading; `None` while it is in progress.
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 
@@ -36,7 +36,7 @@ pub enum RestoreStage {
     Reading,
     /// The plan is ready; the requester decides.
     Prepared,
-    /// The restore may not be carried out: the reasons.
+    /// The restore must not be carried out, for these reasons.
     Refused(Vec<String>),
     /// Parameters are written.
     Working,
@@ -64,9 +64,9 @@ pub struct RestoreStatus {
     pub stage: RestoreStage,
     /// Addresses that were read, or parameters that were written, and all.
     pub progress: (usize, usize),
-    /// Why the restore waits.
+    /// Why the restore has to wait at present.
     pub waits: Option<String>,
-    /// Plan of the restore, once known.
+    /// Plan of the restore, once it is known.
     pub prepared: Arc<Prepared>,
     /// Whether someone wants the restore to end before the next parameter.
     pub is_unwanted: bool,
@@ -94,7 +94,7 @@ struct State {
     changed: BTreeMap<(String, String), u64>,
     names: BTreeMap<String, Arc<Names>>,
     store: Option<Store>,
-    /// Drives of the configuration that this process does not serve, with their names: a journal may belong to one of them.
+    /// Configured drives that this process does not serve, with their names: a journal may belong to one of them.
     others: Vec<(Machine, String)>,
 }
 
@@ -107,18 +107,19 @@ impl Vault {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Where readings are kept from now on (none: nowhere), and the names that go before those of the profiles, by profile.
+    /// Sets where readings are stored from now on (`None`: nowhere), and for each profile the parameter names that
+    /// precede those of the profile.
     pub fn configure(&self, store: Option<Store>, names: BTreeMap<String, Arc<Names>>) {
         let mut state = self.lock();
         (state.store, state.names) = (store, names);
     }
 
-    /// Sets the drives of the configuration that this process does not serve; a gateway has no such drives.
+    /// Sets the configured drives that this process does not serve; a gateway process serves all of its drives.
     pub fn set_others(&self, others: Vec<(Machine, String)>) {
         self.lock().others = others;
     }
 
-    /// The drives of the configuration that this process does not serve, with their names.
+    /// The configured drives that this process does not serve, with their names.
     pub fn others(&self) -> Vec<(Machine, String)> {
         self.lock().others.clone()
     }
@@ -147,7 +148,7 @@ impl Vault {
             .or_default() += count;
     }
 
-    /// How far the last reading of that drive is, if there was one since the gateway started.
+    /// Progress of the last reading of this drive, if there was one since the gateway started.
     pub fn status(&self, drive: &Machine) -> Option<Status> {
         self.lock().readings.get(drive).cloned()
     }
@@ -200,7 +201,7 @@ impl Vault {
         }
     }
 
-    /// Notes news about the reading of this drive.
+    /// Updates the status of the reading of this drive.
     pub fn update(&self, drive: &Machine, change: impl FnOnce(&mut Status)) {
         if let Some(reading) = self.lock().readings.get_mut(drive) {
             change(reading);
@@ -218,7 +219,7 @@ impl Vault {
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
     }
 
-    /// Whether a journal of that machine has not been searched for yet; marks it as searched.
+    /// Whether no journal of this machine was searched for yet; marks the machine as searched.
     pub fn is_new(&self, drive: &Machine) -> bool {
         self.lock().looked_for.insert(drive.clone())
     }
@@ -229,12 +230,12 @@ impl Vault {
         orphans.difference(&before).cloned().collect()
     }
 
-    /// How far the last restore of that drive is, if there was one since the gateway started.
+    /// Progress of the last restore of this drive, if there was one since the gateway started.
     pub fn restore(&self, drive: &Machine) -> Option<RestoreStatus> {
         self.lock().restores.get(drive).cloned()
     }
 
-    /// Starts a restore of the drive, at this stage; returns its number.
+    /// Starts a restore of the drive at this stage; returns the number of the restore.
     ///
     /// # Errors Another one is in progress.
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
@@ -256,7 +257,7 @@ impl Vault {
         Ok(number)
     }
 
-    /// Lets the prepared restore with this number begin to write; returns the prepared restore.
+    /// Lets the prepared restore with this number start writing; returns the prepared restore.
     ///
     /// # Errors
     /// The restore is not the last one, or not prepared.
@@ -270,7 +271,7 @@ impl Vault {
         Ok(restore.prepared.clone())
     }
 
-    /// Notes news about the restore of this drive.
+    /// Updates the status of the restore of this drive.
     pub fn update_restore(&self, drive: &Machine, change: impl FnOnce(&mut RestoreStatus)) {
         if let Some(restore) = self.lock().restores.get_mut(drive) {
             change(restore);

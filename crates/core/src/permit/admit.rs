@@ -1,5 +1,5 @@
-//! Which orders are let through by configuration, profile and limits: authority first, then address, then value; and why the
-//! others are not, in words. Pure.
+//! Checks an order by configuration, profile and limits: first the right to write, then the address, then the
+//! value. Gives the reason for a refusal in words. Pure.
 
 mod raw_write;
 
@@ -115,7 +115,7 @@ pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
     Ok(())
 }
 
-/// Why nothing is sent on a line that another master owns.
+/// Reason why nothing is sent on a line that another master owns.
 fn listens(drive: &Reading<'_>) -> String {
     format!(
         "bus `{}` only listens (mode = \"listen\"), another master owns its line; nothing is sent to `{}`",
@@ -198,7 +198,7 @@ fn points(drive: &Reading<'_>, values: Vec<(PointIndex, Value)>) -> Result<Admit
     })
 }
 
-/// The refusal of a command that sets `point` twice, by its name or by that of a point that rests on it.
+/// The refusal of a command that sets `point` twice, under its own name or under the name of a point that depends on it.
 pub fn sets_twice(point: &str) -> Refusal {
     Refusal::BadValue(format!(
         "the command sets `{point}` twice; set each point once, and only one reference"
@@ -247,7 +247,7 @@ fn checked(drive: &Reading<'_>, index: PointIndex, point: &Point, value: Value) 
     })
 }
 
-/// An enumeration accepts the values that its profile lists, unless the profile allows others.
+/// Checks the value of an enumeration: the profile lists the accepted values, unless it allows others.
 fn listed(point: &Point, value: Value) -> Result<(), Refusal> {
     let number = value.as_f64();
     let is_known = || point.texts.keys().any(|code| *code as f64 == number);
@@ -298,7 +298,7 @@ fn related_limits(drive: &Reading<'_>, asked: PointIndex, index: PointIndex, val
     Ok(())
 }
 
-/// A reference converted to the unit of another point, once a command sets it.
+/// A reference converted to the unit of another point that a command sets.
 pub fn converted(drive: &Reading<'_>, (index, value): (PointIndex, Value), to: PointIndex) -> Option<Value> {
     let point = drive.spec.profile.points.get(index)?;
     let written = resolve(drive, index, point, value).ok()?;
@@ -308,7 +308,7 @@ pub fn converted(drive: &Reading<'_>, (index, value): (PointIndex, Value), to: P
     }
 }
 
-/// A derived point becomes the point it rests on; the value must fit the register.
+/// Replaces a derived point by the point that it depends on; the value must fit the register.
 fn resolve(
     drive: &Reading<'_>,
     index: PointIndex,
@@ -357,10 +357,10 @@ fn resolve(
             let figure = derived
                 .inverse(value.as_f64(), band)
                 .ok_or_else(|| below_minimum(point, value, band.0))?;
-            // The limits of the point itself were checked; those of the one after it hold as well.
+            // The limits of the derived point were checked before; those of the point behind it apply as well.
             let rounded = Value::Number((figure * 100.0).round() / 100.0);
             let order = resolve(drive, of, base, checked(drive, of, base, rounded)?)?;
-            // At the minimum frequency the percentage is 0, which has no sign.
+            // At the minimum frequency the percentage is 0; the calculation must not give it a sign.
             let back = derived.value([as_held(drive, order)], Some(band)).map(Value::as_f64);
             if band.0 > 0.0 && value.as_f64() < 0.0 && back.is_some_and(|back| back > 0.0) {
                 return Err(no_sign(point, value));

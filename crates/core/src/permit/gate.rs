@@ -1,7 +1,7 @@
 //! The state of the drives of a bus that decides about orders: stops, holders, priorities, drills, starts. Pure: time is an
 //! argument.
 //!
-//! The gate is part of the queue of the bus, so that orders and what they change here have one order of acceptance.
+//! The gate is part of the queue of the bus, so that orders and the changes they make here have one order of acceptance.
 
 mod holds;
 
@@ -22,12 +22,12 @@ use crate::start_guard::{BusGuards, Clearance};
 /// Most clients of a drive that are remembered.
 const MOST_CLIENTS: usize = 64;
 
-/// A drill under way at a drive: no other order to it runs.
+/// A drill in progress on a drive: no other order to the drive is sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DrillLock {
     /// The drill, as text.
     pub who: String,
-    /// Time before which only stops are sent, so that the drive's own supervision of the fieldbus acts.
+    /// Until this time only stops are sent, so that the drive's own supervision of the fieldbus acts.
     pub quiet_until: Option<Instant>,
 }
 
@@ -36,18 +36,18 @@ pub struct DrillLock {
 pub(super) struct DriveGate {
     /// Number of stops accepted so far.
     stops: u64,
-    /// The last ones, as far as they decide on orders that were given before.
+    /// The last stops, as far as they invalidate orders that were given earlier.
     pub(super) last_stops: LastStops,
     /// Origin of the last stop.
     stopped_by: Option<Origin>,
     /// The number of the last accepted command that may start the drive; 0 before the first one.
     last_starter: u64,
-    /// The login of the last client command; `None` before the first command, or if its client has no login.
+    /// The login of the client that commanded last; `None` before the first command, or if that client has no login.
     commander: Option<Arc<str>>,
     /// The clients that commanded the drive, the last one last.
     clients: Vec<Arc<str>>,
-    /// Clients that commanded another machine under the name or unit that this one has since a reload: their standing run command
-    /// does not start its motor.
+    /// Clients that commanded another machine under the name or unit that this machine has had since a reload: they
+    /// must send a stop, or take the drive, before their run command starts this motor.
     pub(super) must_stop_first: Vec<Arc<str>>,
     pub(super) priorities: Priorities,
     pub(super) holding: Holding,
@@ -59,14 +59,14 @@ pub(super) struct DriveGate {
 /// State of the drives of a bus that decides about their orders.
 #[derive(Debug, Default)]
 pub struct Gate {
-    /// Rules of `[authority]`, where it is on.
+    /// Rules of `[authority]`; `None` if it is off.
     pub(super) rules: Option<Arc<Rules>>,
     drives: BTreeMap<DriveIndex, DriveGate>,
     /// The last pause of the bus.
     pub(super) paused: Option<Stall>,
     /// The start guards.
     pub(super) starts: Option<Arc<BusGuards>>,
-    /// Commands whose start was cleared and that are not over, with the drives that they start.
+    /// Commands in progress whose starts were cleared, with the drives that they start.
     cleared: Vec<(u64, Vec<DriveIndex>)>,
     hold_news: HoldNews,
 }
@@ -100,7 +100,7 @@ impl Gate {
         self.drives.entry(drive).or_default()
     }
 
-    /// Judges a command as far as every drive is concerned that it reaches. A refusal is noted where it counts.
+    /// Judges a command for every drive that it reaches. A refusal is noted by the drive that refused it.
     pub fn judge(&mut self, stage: Stage, command: &Command, facts: &dyn Facts, now: Instant) -> Verdict {
         let (intent, origin) = (&command.intent, command.ticket.origin());
         let drives: Vec<DriveIndex> = command.reach().collect();
@@ -147,7 +147,7 @@ impl Gate {
         verdict
     }
 
-    /// Counts the starts that a command causes whose turn came, and looks whether they are on disk.
+    /// Counts the starts of a command that is about to be sent, and checks whether they are on disk.
     fn clear(&mut self, intent: &Intent, now: Instant) -> Verdict {
         let Some(starts) = self.starts.clone() else {
             return Verdict::Go;
@@ -171,7 +171,7 @@ impl Gate {
         }
     }
 
-    /// Starts that were cleared for commands that have ended count as made, whatever they wrote.
+    /// Counts cleared starts as made once their commands have ended, whatever those wrote.
     pub fn settle(&mut self, is_alive: impl Fn(u64) -> bool) {
         let Some(starts) = &self.starts else { return };
         self.cleared.retain(|(number, drives)| {
@@ -188,12 +188,12 @@ impl Gate {
         !self.cleared.is_empty()
     }
 
-    /// A command was accepted: who gave it, what it withdraws, whose hold it takes or ends.
+    /// Notes an accepted command: its client, the slots it overrules, and the hold it takes or ends.
     pub(crate) fn accepted(&mut self, command: &Command, now: Instant) {
         if command.urgency() == Urgency::Read {
             return;
         }
-        // Before the hold takes note of its word, which may repeat the last one.
+        // This happens before the hold records the command word, which may repeat the last one.
         if !command.is_inherited() {
             self.note_stops(command, now);
         }
@@ -232,7 +232,7 @@ impl Gate {
         }
     }
 
-    /// A stop joins one that was accepted before, and nothing is written for it.
+    /// A stop joined an accepted one, so nothing is written for it.
     pub(crate) fn stop_joined(&mut self, drive: DriveIndex, origin: &Origin, now: Instant) {
         self.hold_stopped(drive, origin, now);
         let effect = Effect {
@@ -264,12 +264,12 @@ impl Gate {
         starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
     }
 
-    /// Until when an ordinary stop of the drive waits.
+    /// Until when `min_run` delays an ordinary stop of the drive.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         self.starts.as_ref()?.stop_waits(drive, now)
     }
 
-    /// Stops of that drive that were accepted so far, also by the bus before a reload.
+    /// Number of stops accepted for this drive, including those accepted by the bus before a reload.
     pub fn stops(&self, drive: DriveIndex) -> u64 {
         self.drives.get(&drive).map_or(0, |drive| drive.stops)
     }
@@ -294,7 +294,7 @@ impl Gate {
         &mut self.drive(drive).priorities
     }
 
-    /// A drill begins, goes silent, or ends at that drive.
+    /// A drill starts, goes silent, or ends on this drive.
     pub(crate) fn set_drill(&mut self, drive: DriveIndex, lock: Option<DrillLock>) {
         self.drive(drive).drill = lock;
     }
@@ -332,7 +332,7 @@ impl Gate {
         }
     }
 
-    /// Takes over what the bus before a reload knew of a machine.
+    /// Takes over the state of a machine from the bus before a reload.
     pub(crate) fn inherit(&mut self, drive: DriveIndex, from: Inheritance) {
         let Inheritance {
             stops,
@@ -360,7 +360,8 @@ impl Gate {
             .map_or_else(Vec::new, |drive| drive.clients.clone())
     }
 
-    /// Since a reload a drive has a name or unit under which these clients commanded another one.
+    /// After a reload a drive has a name or unit under which these clients commanded another machine: they must
+    /// send a stop, or take the drive, before they start it.
     pub(crate) fn stop_first(&mut self, drive: DriveIndex, clients: Vec<Arc<str>>) {
         let of_drive = self.drive(drive);
         for client in clients {

@@ -1,4 +1,4 @@
-//! The list of rules, and the judgement of an order by it. Pure: time is an argument.
+//! The list of rules, and how an order is judged by them. Pure: time is an argument.
 
 use std::time::Instant;
 
@@ -12,7 +12,7 @@ use crate::process_image::Reading;
 /// A moment at which an order is judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
-    /// The order is complete and takes its place in the queue.
+    /// The order is complete and is about to enter the queue.
     Accept,
     /// The line is free for the order.
     Turn,
@@ -23,7 +23,7 @@ pub enum Stage {
 /// Result of judging an order.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
-    /// The order goes on.
+    /// The order may proceed.
     Go,
     /// The order is judged again at this time.
     Wait(Instant),
@@ -39,7 +39,7 @@ impl Verdict {
         Verdict::Refuse(Outcome::Refused(refusal))
     }
 
-    /// The order goes on unless there is a refusal.
+    /// Refuses the order if there is a refusal; otherwise the order may proceed.
     pub(super) fn unless(refusal: Option<Refusal>) -> Verdict {
         refusal.map_or(Verdict::Go, Verdict::refuse)
     }
@@ -50,13 +50,13 @@ impl Verdict {
 pub struct Seen<'a> {
     /// Process image of the drive.
     pub reading: Reading<'a>,
-    /// When its reference and its frequency range were written last, if the order has its turn.
+    /// When reference and frequency range of the drive were last written; set only if the order is about to be sent.
     pub written: Option<LastWritten>,
 }
 
 /// Access to the state of the drives of a bus.
 pub trait Facts {
-    /// State of the drive; none where the place has no drive.
+    /// State of the drive with this index; `None` if the bus has no such drive.
     fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>>;
 }
 
@@ -67,14 +67,14 @@ impl Facts for () {
     }
 }
 
-/// The input of a rule: an order, one drive that it reaches, and the moment.
+/// The input of a rule: an order, one drive that it reaches, and the stage and time of the judgement.
 #[derive(Debug)]
 pub struct Ask<'a> {
     /// The moment.
     pub stage: Stage,
-    /// Now.
+    /// Time of the judgement.
     pub now: Instant,
-    /// The drive that the rule looks at, one of those that the order reaches.
+    /// The drive that the rule judges, one of those that the order reaches.
     pub drive: DriveIndex,
     /// The order.
     pub intent: &'a Intent,
@@ -101,7 +101,7 @@ impl Ask<'_> {
     }
 }
 
-/// A rule with the moments at which it applies.
+/// A rule with the stages at which it applies.
 pub(super) struct Rule {
     /// The moments at which the rule is evaluated; the rule's file explains why not at others.
     pub(super) stages: &'static [Stage],
@@ -111,7 +111,7 @@ pub(super) struct Rule {
     pub(super) judge: fn(&Ask<'_>, &DriveGate, &Gate) -> Verdict,
 }
 
-/// All rules, in the order in which they are evaluated.
+/// All rules in their order of evaluation.
 const RULES: [Rule; 9] = [
     rules::access::RULE,
     rules::age::RULE,
@@ -124,7 +124,7 @@ const RULES: [Rule; 9] = [
     rules::limits::RULE,
 ];
 
-/// Judges an order by every rule of its moment. The first refusal ends it; of several waits the longest counts.
+/// Judges an order by every rule of its stage. The first refusal ends the evaluation; of several waits the longest counts.
 pub(super) fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     let stops = ask.effect().stops;
     let mut verdict = Verdict::Go;

@@ -1,10 +1,11 @@
 //! When an order may move a motor: one gate, used at every moment that counts, with the state of that moment.
 //!
-//! An order passes three moments ([`Stage`]): it is accepted into the queue of its bus, its turn comes on the line, and each of its
-//! frames is about to be sent. Between two of them the state may change: another client, a stop, a reload, a pause of the process,
-//! a drive that restarts, an operator at the panel. So there is one list of rules (`judge`), each in a file of its own below
-//! `rules`, and one state for all of them ([`Gate`]). The callers do not know the rules, and a rule does not know its caller.
-//! Before an order is judged it is checked and converted by profile and limits ([`admit`]).
+//! An order is judged at three stages ([`Stage`]): it is accepted into the queue of its bus, its turn comes on the
+//! line, and each of its frames is about to be sent. In between the state may change: by another client, a stop, a
+//! reload, a pause of the process, a drive that restarts, an operator at the panel. So there is one list of rules
+//! (`judge`), each in a separate file below `rules`, and one state for all of them ([`Gate`]). The callers do not
+//! know the rules, and a rule does not know its caller. Before an order is judged it is checked and converted by
+//! profile and limits ([`admit`]).
 //!
 //! - `admit`: what the profile, the configuration and the limits let through. `reference_limits`: the present reference
 //!   under a changed frequency range.

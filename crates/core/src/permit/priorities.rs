@@ -1,9 +1,10 @@
-//! The priority arrays of a drive, for clients that command by priorities: only what they wrote and is still in force.
-//! Pure.
+//! The priority arrays of a drive, for clients that command by priorities: only what they wrote and is still in
+//! force. Pure.
 //!
-//! The slots order these clients among themselves: the lowest occupied one governs. A command of any other side enters
-//! no slot; when it is accepted it withdraws what it overrules, so that nothing starts later by itself. The arrays are
-//! part of the gate of the bus, so that they and the commands have one order of acceptance.
+//! The slots order these clients among themselves: the occupied slot with the lowest number governs. A command from
+//! any other interface has no slot; when it is accepted it withdraws the entries that it overrules, so that nothing
+//! starts later by itself. The arrays are part of the gate of the bus, so that they and the commands have one order
+//! of acceptance.
 
 mod void;
 
@@ -23,9 +24,9 @@ pub const PROTECTING: u8 = 5;
 /// The consequence of a write to a slot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Follows {
-    /// No command follows: the write does not govern, or the drive stays as it is.
+    /// No command follows: the entry does not govern, or the drive does not change.
     Nothing,
-    /// The value of this point becomes an order of the client that wrote it.
+    /// The value for this point becomes an order of the client that wrote it.
     Order(Commanded, Box<Entry>),
     /// The last value of `run` is given back: a stop.
     Stop,
@@ -38,7 +39,7 @@ pub enum Settled {
     Done,
     /// The write was not carried out: the slot is unchanged.
     Failed,
-    /// The result is not known: the next reading shows it.
+    /// The effect on the drive is unknown until the next reading.
     Unknown,
 }
 
@@ -177,7 +178,7 @@ impl Priorities {
         (of == what).then_some((priority, entry))
     }
 
-    /// The slot that governs what is one thing to the drive, by what stands.
+    /// The governing slot for this point, among all points that mean one thing to the drive, by the entries in force.
     pub fn governing(&self, what: Commanded) -> Option<(Commanded, u8, &Entry)> {
         self.lowest(what, |slot| slot.stands.as_ref())
     }
@@ -224,7 +225,7 @@ impl Priorities {
         }
     }
 
-    /// Whether the order that was planned still follows from a write: other sides may have withdrawn its slot since.
+    /// Whether the planned order still follows from a write: another interface may have withdrawn its slot since.
     pub(crate) fn still_follows(&self, write: &SlotWrite) -> bool {
         match self.plan(write) {
             Follows::Order(_, entry) => write.heir.is_none_or(|heir| heir == entry.number),
@@ -245,7 +246,7 @@ impl Priorities {
         }
     }
 
-    /// The slot that governs after a write, where another one than its own does.
+    /// The slot that governs after a write, if it is not the written one.
     pub fn successor(&self, write: &SlotWrite) -> Option<(Commanded, u8)> {
         let mut after = self.clone();
         after.ask(write);
@@ -289,7 +290,7 @@ impl Priorities {
         self.tidy();
     }
 
-    /// Settles uncertain entries by readings: `reads` gives a value read since then, if there is one.
+    /// Settles uncertain entries by readings: `reads` gives a value read since the given time, if there is one.
     pub fn resolve(&mut self, reads: impl Fn(Commanded, Instant) -> Option<Value>) {
         for (what, _, slot) in self.slots_mut() {
             let Some((entry, since)) = &slot.uncertain else {
@@ -343,7 +344,8 @@ impl Priorities {
         })
     }
 
-    /// Notes an accepted command, which withdraws the entries that it overrules, unless it follows from a slot itself.
+    /// Notes an accepted command, which withdraws the entries that it overrules, unless the command itself follows
+    /// from a slot.
     pub fn accepted(&mut self, origin: &Origin, effect: Effect, write: Option<&SlotWrite>, now: Instant) {
         self.orders += 1;
         self.last = Some((origin.clone(), now));
@@ -358,8 +360,8 @@ impl Priorities {
             self.silenced();
         }
         for (what, priority, slot) in self.slots_mut() {
-            // A start and a reference leave the entries that protect people, even if another slot governs. A stop ends
-            // every active entry, so that nothing starts later by itself.
+            // A start or a reference keeps the entries that protect people, even if another slot governs. A stop
+            // removes every active entry, so that nothing starts later by itself.
             let protects = priority <= PROTECTING;
             match what {
                 Commanded::Run => match effect.run {
@@ -382,7 +384,7 @@ impl Priorities {
         self.tidy();
     }
 
-    /// The lease of the client that governs ended: all its slots are given back.
+    /// The lease of the governing client expired: all of its slots are released.
     pub fn silenced(&mut self) {
         let governs = Commanded::ALL.into_iter().find_map(|what| self.counting(what));
         let Some(client) = governs.map(|(.., entry)| entry.origin.client().clone()) else {

@@ -22,21 +22,21 @@ pub struct LastWritten {
 /// The relevant state of a drive.
 struct Standing<'a> {
     drive: &'a Reading<'a>,
-    /// The points with their own address that the command sets.
+    /// The points with a register of their own that the command sets.
     sets: &'a [(PointIndex, Value)],
-    /// `None` if the command has not started yet: readings that are too old are then ignored.
+    /// When a started command last wrote; readings older than that are ignored. `None` if the command has not started yet.
     begun: Option<LastWritten>,
 }
 
 /// Checks whether the present reference keeps the limits once the command is executed.
 ///
 /// # Errors
-/// The refusal: a limit would be passed, or it is not known whether.
+/// If a limit would be exceeded, or it is unknown whether it would be.
 pub(super) fn keeps_limits(drive: &Reading<'_>, order: &Order) -> Result<(), Refusal> {
     judge(drive, &set_by(drive, order), None)
 }
 
-/// As at the admission, when the order has started: another one may have been carried out since.
+/// Repeats the check of the admission for an order that has started: another order may have been carried out since.
 ///
 /// # Errors
 /// The refusal.
@@ -44,8 +44,8 @@ pub(super) fn still_keeps_limits(drive: &Reading<'_>, order: &Order, last: LastW
     judge(drive, &set_by(drive, order), Some(last))
 }
 
-/// The limits that writing these parameters exceeds, as text: those of the parameters themselves, and those of the
-/// present reference.
+/// The limits that writing these parameters would violate, as text: those of the parameters themselves, and those
+/// of the present reference.
 pub fn limits_passed(drive: &Reading<'_>, parameters: impl Iterator<Item = (u16, RawValue)>) -> Vec<String> {
     let profile = &drive.spec.profile;
     let items: Vec<(u16, u16)> = parameters
@@ -84,7 +84,7 @@ pub fn is_reference(profile: &Profile, table: Table, address: u16) -> bool {
     raws.any(|raw| raw.covers(table, address))
 }
 
-/// The points with an address of their own that a command sets.
+/// The points with a register of their own that a command sets.
 fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(PointIndex, Value)> {
     let profile = &drive.spec.profile;
     match order {
@@ -146,7 +146,8 @@ fn judge(drive: &Reading<'_>, sets: &[(PointIndex, Value)], begun: Option<LastWr
 }
 
 impl<'a> Standing<'a> {
-    /// How a point follows from the reference, with an end of its band that the order sets; `None` if the order sets none.
+    /// The conversion of a point from the reference, and the end of its band that the order sets; `None` if the
+    /// order sets neither end.
     fn changed(&self, point: PointIndex) -> Option<(&'a Derived, PointIndex)> {
         let point = self.drive.spec.profile.points.get(point)?;
         match (&point.source, point.write_to) {

@@ -35,9 +35,9 @@ pub struct Question {
     pub target: Target,
     /// The request.
     pub pdu: RequestPdu,
-    /// Whether the request may change anything: then it is counted and audited as a command.
+    /// Whether the request may change a value: then it is counted and audited as a command.
     pub may_write: bool,
-    /// How the request came.
+    /// When and over which connection the request arrived.
     pub arrival: Arrival,
     /// The request is not sent after this time.
     pub expires: Instant,
@@ -46,7 +46,7 @@ pub struct Question {
 }
 
 impl Question {
-    /// A broadcast by the gateway itself at `now`, for itself or a client; no drive replies to it.
+    /// A broadcast that the gateway sends at `now` for itself or for a client; no drive replies to it.
     pub fn broadcast(pdu: RequestPdu, origin: Origin, now: Instant, within: Duration) -> Question {
         Question {
             target: Target::Address(0),
@@ -59,7 +59,7 @@ impl Question {
     }
 }
 
-/// A requested transaction. Dropping it withdraws it if it was not sent yet.
+/// A requested transaction. Dropping it withdraws the request if it was not sent yet.
 #[derive(Debug)]
 pub struct Exchange {
     answer: oneshot::Receiver<Answer>,
@@ -69,7 +69,7 @@ pub struct Exchange {
 impl Exchange {
     /// How the transaction ended, and the frame of the reply where there was one.
     pub fn poll(&mut self, cx: &mut Context<'_>) -> Poll<(Outcome, Option<Vec<u8>>)> {
-        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        // A dropped ticket answers too, so a closed channel can only mean that the process ends.
         let answer = ready!(Pin::new(&mut self.answer).poll(cx));
         let outcome = answer.map_or(Outcome::ShuttingDown, |answer| answer.outcome);
         let frame = self.frame.try_recv().ok().filter(|frame| !frame.is_empty());
@@ -78,14 +78,14 @@ impl Exchange {
 }
 
 impl BusHandle {
-    /// Passes a request on to the line, in the share of background transactions. When this returns it is in the queue
-    /// of the bus, or answered. A request that may write is a command to every drive that receives it, with its place
-    /// among their other commands.
+    /// Passes a request on to the line within the share of background transactions. When this returns the request
+    /// is in the queue of the bus, or answered. A request that may write counts as a command to every drive that
+    /// receives it, and is ordered among their other commands.
     pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, false, writes, now)
     }
 
-    /// Sends a broadcast that stops every drive of the bus: it goes before all that waits, stops included.
+    /// Sends a broadcast that stops every drive of the bus, ahead of all waiting commands, stops included.
     pub(crate) fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         self.pass_on(question, true, writes, now)
     }
@@ -151,8 +151,7 @@ impl BusHandle {
             };
             (index, effect)
         };
-        // A request that is not decoded may write anything. The registers are the same for every drive that receives
-        // it.
+        // A request that cannot be decoded may write anything. Its registers are the same for every drive that receives it.
         let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
             Touched::of(&order, &[], &drive.spec.profile)
         });

@@ -1,4 +1,4 @@
-//! The hold of a drive, as the north sides ask for it.
+//! The hold of a drive, as the servers use it.
 
 use std::time::{Instant, SystemTime};
 
@@ -51,7 +51,7 @@ impl BusHandle {
         }
     }
 
-    /// After a reload: ends the holds of machines that are on none of these buses, and reports that.
+    /// After a reload: ends the holds of machines that are on none of these buses, and publishes the ends.
     pub fn end_holds(&self, after: &[&BusHandle], events: &Events, now: Instant, time: SystemTime) {
         if !self.queue.has_authority() {
             return;
@@ -70,7 +70,7 @@ impl BusHandle {
         self.publish_holds(events, now, time);
     }
 
-    /// Whether a command whose turn came renews the lease of its drive.
+    /// Whether a command that is about to be sent renews the lease of its drive.
     pub fn renews_by(&self, command: &Command) -> bool {
         if !self.queue.has_authority() {
             return true;
@@ -130,7 +130,7 @@ impl DriveHandle {
         });
         let view = queue.gate.hold_view(self.index, None, now);
         drop(queue);
-        // An order of the former holder may have to end, so the bus is woken.
+        // The waiting order of a former holder may have to end, so the bus is woken.
         self.bus.queue.wake();
         acted?;
         if verb != Verb::Release {
@@ -140,7 +140,7 @@ impl DriveHandle {
             .ok_or_else(|| Refusal::NotAllowed("[authority] was turned off".to_string()))
     }
 
-    /// The published state of the hold, and whether this client has it; `None` while `[authority]` is off.
+    /// The published state of the hold, and whether this client has the hold; `None` while `[authority]` is off.
     pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
         match self.bus.queue.has_authority() {
             true => self.bus.queue.lock().gate.hold_view(self.index, origin, now),
@@ -148,7 +148,7 @@ impl DriveHandle {
         }
     }
 
-    /// The name of the client among the principals, and the ranks below its own; `None` if it is no principal.
+    /// The client's name as a principal, and the ranks below its own; `None` if the client is not a principal.
     pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
         let rules = match self.bus.queue.has_authority() {
             true => self.bus.queue.lock().gate.rules().cloned()?,
@@ -159,8 +159,8 @@ impl DriveHandle {
         Some((claim.name.to_string(), below.collect()))
     }
 
-    /// The heartbeat of a client that may command: the lease of the drive runs again, unless another client's silence
-    /// counts, and so does its hold.
+    /// Processes the heartbeat of a client that may command: renews the lease of the drive, unless another client's
+    /// silence counts, and the client's hold.
     pub fn heartbeat(&self, origin: &Origin, now: Instant) {
         if !self.bus.queue.has_authority() {
             return self.image.renew_lease(now);
@@ -199,15 +199,15 @@ impl DriveHandle {
         why
     }
 
-    /// A client withdrew its request, and nothing is sent for it.
+    /// Notes that a client withdrew its run command although nothing is sent for it.
     pub fn said_stop(&self, origin: &Origin) {
         if self.bus.queue.has_authority() {
             self.bus.queue.lock().gate.hold_said_stop(self.index, origin);
         }
     }
 
-    /// Whether a restore of parameters may begin for this client; this is judged once, so that no restore is left half
-    /// done.
+    /// Whether this client may start a restore of parameters; judged once at the start, so that no restore is left
+    /// half done.
     ///
     /// # Errors
     /// The refusal.
@@ -218,7 +218,8 @@ impl DriveHandle {
 }
 
 impl Plant {
-    /// The reservations in force, with their ends, to be kept for the next start. `now` is `time` on the calendar.
+    /// The reservations in force with their ends, to be saved for the next start of the gateway. `now` is `time` on
+    /// the calendar.
     pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
         let of_bus = |bus: &BusHandle| bus.reservations(now, time);
         let guarded = self.buses.iter().filter(|bus| bus.queue.has_authority());

@@ -1,5 +1,5 @@
-//! Earlier meanings of the name or the unit of a drive: an order belongs to the machine that it named when its first byte came.
-//! Pure: time is an argument.
+//! Earlier meanings of the name or the unit id of a drive: an order belongs to the machine that it named when its
+//! first byte arrived. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -11,7 +11,8 @@ use crate::order::{Arrival, Order, Parts, SourceKind};
 use crate::process_image::BusImage;
 use crate::queue::CommandQueue;
 
-/// For so long after a reload the first bytes of an order may be from before it: connections that are silent for longer are closed.
+/// Time after a reload during which the first bytes of an order may be from before the reload: connections that are
+/// silent for longer are closed.
 const REMEMBERED: Duration = Duration::from_secs(3600);
 /// Changes of meaning that are remembered of one drive.
 const MOST: usize = 8;
@@ -21,12 +22,12 @@ const MOST: usize = 8;
 enum By {
     /// The order uses the name of the drive.
     Name,
-    /// By the unit id, or by the BACnet device that follows from the unit id.
+    /// By the unit id, or by the BACnet device number derived from it.
     Unit,
 }
 
 impl By {
-    /// How orders of this kind name their drive; `None` if they name the address on the line.
+    /// How orders of this kind name their drive; `None` if they use the address on the line.
     fn of(kind: SourceKind) -> Option<By> {
         match kind {
             SourceKind::ModbusTcp | SourceKind::Bacnet => Some(By::Unit),
@@ -51,21 +52,21 @@ struct Served {
     place: DriveIndex,
 }
 
-/// An earlier meaning: until `until` the name or unit stood for another machine, or for none.
+/// An earlier meaning: until `until` the name or unit id meant another machine, or none.
 #[derive(Debug, Clone)]
 struct Former {
     by: By,
     until: Instant,
-    /// The machine that was meant, where it is served now.
+    /// The machine that was meant, if a bus still serves it.
     machine: Option<Served>,
 }
 
-/// The machine that an order named, where its name means another one by now.
+/// The machine that an order meant, if its name means another machine now.
 #[derive(Debug)]
 pub(super) enum Meant {
     /// The machine is served under another name.
     There(Box<DriveHandle>),
-    /// The machine is no longer served, or there was none.
+    /// No bus serves that machine any more, or there was none.
     Gone,
 }
 
@@ -78,7 +79,7 @@ impl Formerly {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The meaning at `asked` of the name or unit of the drive; the first change after that time has it.
+    /// What the name or unit id of the drive meant at `asked`: the record of the first change after that time.
     fn meaning_at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
         let all = self.lock();
         let mut of_drive = all.get(&drive)?.iter();
@@ -87,7 +88,7 @@ impl Formerly {
             .cloned()
     }
 
-    /// Keeps the changes that may still matter at `now`, and this one.
+    /// Adds this change, and removes those that no longer matter at `now`.
     fn add(&self, drive: DriveIndex, former: Former, now: Instant) {
         let mut all = self.lock();
         let of_drive = all.entry(drive).or_default();
@@ -98,7 +99,7 @@ impl Formerly {
         of_drive.push(former);
     }
 
-    /// Takes over what the previous bus remembers of a machine.
+    /// Takes over the earlier meanings of a machine from the previous bus.
     pub(super) fn take_over(&self, drive: DriveIndex, before: &Formerly, place: DriveIndex) {
         if let Some(of_drive) = before.lock().get(&place) {
             self.lock().insert(drive, of_drive.clone());
@@ -106,8 +107,9 @@ impl Formerly {
     }
 }
 
-/// After a reload: keeps what the names and units of drives meant until now, and makes clients that commanded under them take the
-/// drive before they start its motor. `before` are all buses before it, `after` all of now, those that run on among both.
+/// After a reload: records what the names and units of drives meant until now, and makes clients that commanded
+/// under them take the drive before they start its motor. `before` are all buses before the reload, `after` all
+/// buses now; buses that continue are in both.
 pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
     for bus in after {
         for (index, drive) in bus.image.drives.enumerate() {
@@ -152,7 +154,7 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
 }
 
 impl DriveHandle {
-    /// The machine that an order of this kind meant when it arrived, if its name means another machine by now.
+    /// The machine that an order of this kind meant when it arrived, if its name means another machine now.
     pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
         let former = self.bus.formerly.meaning_at(self.index, By::of(kind)?, arrival.asked)?;
         let there = former.machine.and_then(|served| {
@@ -173,7 +175,8 @@ impl DriveHandle {
         Some(there.map_or(Meant::Gone, |there| Meant::There(Box::new(there))))
     }
 
-    /// The stop for this machine in an order that was read for the drive that has its name by now; `None` if the order does not stop.
+    /// The stop for this machine in an order that was parsed for the drive that has its name now; `None` if the
+    /// order does not stop.
     pub(super) fn stop_meant(&self, order: &Order, read_for: &DriveHandle) -> Option<Order> {
         let stops = match order {
             Order::Points(_) => is_stop(order.clone(), read_for),
@@ -185,7 +188,7 @@ impl DriveHandle {
     }
 }
 
-/// Whether an order takes the run command of that drive away, whatever else it does.
+/// Whether an order takes away the run command of this drive, whatever else it does.
 fn is_stop(order: Order, drive: &DriveHandle) -> bool {
     let profile = &drive.image.spec.profile;
     match Parts::of(order, profile) {

@@ -22,11 +22,11 @@ use crate::process_image::{BusImage, Reading};
 #[derive(Debug, Clone)]
 pub struct OrderRequest {
     order: Order,
-    /// The part of the request that is refused, where only its stop was understood: as text, and why.
+    /// The refused part of the request, if only its stop was understood: its text, and the refusal.
     rest: Option<(String, Refusal)>,
     origin: Origin,
     authority: Authority,
-    /// When the request came; now where it is not set.
+    /// When and over which connection the request arrived; `None` means now.
     arrival: Option<Arrival>,
     expiry: Duration,
     slot: Option<SlotWrite>,
@@ -35,8 +35,7 @@ pub struct OrderRequest {
 }
 
 impl OrderRequest {
-    /// The order of this client, with what the client may do at all. The order is not sent later than 2 s after it
-    /// came.
+    /// The order of this client with the rights of the client. The order is not sent later than 2 s after it arrived.
     pub fn new(order: Order, origin: Origin, authority: Authority) -> OrderRequest {
         OrderRequest {
             order,
@@ -84,7 +83,7 @@ impl OrderRequest {
         }
     }
 
-    /// Sets whether a start that must wait does wait, up to its expiry; otherwise it is refused.
+    /// Sets whether a start that a guard delays waits up to its expiry; otherwise it is refused.
     #[must_use]
     pub fn waiting(self, waits: bool) -> OrderRequest {
         OrderRequest { waits, ..self }
@@ -97,7 +96,7 @@ impl OrderRequest {
     }
 }
 
-/// A part of an order on its way into the queue.
+/// The stop or the rest of an order, on its way into the queue.
 struct Part {
     ticket: Ticket,
     window: Window,
@@ -198,11 +197,12 @@ impl BusHandle {
         }
     }
 
-    /// Gives the drive of `reading`, at place `drive` on this bus, a command of the gateway itself: a point of the
-    /// model and its value. No client gives it, so it renews no lease, and no newer reference of a client replaces it.
+    /// Gives the drive of `reading`, at index `drive` on this bus, a command of the gateway itself: a point of the
+    /// model and its value. No client gives it, so it renews no lease, and no newer reference of a client replaces
+    /// it.
     ///
     /// # Errors
-    /// The refusal; it is neither audited nor counted.
+    /// If the command is refused; the refusal is neither audited nor counted.
     pub fn own_order(
         &self,
         drive: DriveIndex,
@@ -237,14 +237,14 @@ impl BusHandle {
 }
 
 impl DriveHandle {
-    /// Gives an order to the drive, at `now`: the one door for all ways in. When this returns it is in the queue of the bus, behind
-    /// all that was placed before, or answered: refused when it is not admitted, not sent when the bus is down or the drive
-    /// offline. Refused writes are audited and published as an event.
+    /// Gives the drive an order at `now`; all interfaces use this function. When it returns the order is in the
+    /// queue of the bus, behind all earlier ones, or answered: refused if it is not admitted, not sent if the bus
+    /// is down or the drive offline. Refused writes are audited and published as an event.
     ///
-    /// The stop of an order that also does more is carried out whatever happens to the rest; it is audited as two.
+    /// An order that stops and also does more is audited as two: its stop is carried out whatever happens to the rest.
     ///
-    /// An order whose first byte came when a reload had not given its name to this machine yet belongs to the machine that it named
-    /// then: a stop in it is carried out there, and nothing else of it anywhere.
+    /// An order whose first byte arrived before a reload gave its name to this machine belongs to the machine that
+    /// it named then: a stop in it is carried out there, and the rest is carried out nowhere.
     pub fn place(&self, request: OrderRequest, now: Instant) -> Placed {
         let arrival = request.arrival.clone().unwrap_or_else(|| Arrival::now(now));
         let Some(meant) = self.meant(request.origin.kind, &arrival) else {
@@ -265,7 +265,7 @@ impl DriveHandle {
         placed
     }
 
-    /// As [`DriveHandle::place`], for an order that means this machine.
+    /// Places an order that means this machine; otherwise like [`DriveHandle::place`].
     fn place_here(&self, request: OrderRequest, now: Instant) -> Placed {
         let reading = self.reading(now);
         let OrderRequest { order, rest, .. } = request.clone();
@@ -326,7 +326,7 @@ impl DriveHandle {
         placed
     }
 
-    /// The stop of an order goes to the bus, and its rest after it unless it is refused.
+    /// Gives the bus the stop of an order, and then its rest unless that is refused.
     fn place_parts(
         &self,
         stop: Order,
@@ -341,7 +341,7 @@ impl DriveHandle {
         let (ticket, answer) = self.ticket(&of_stop, sets, request.origin.clone(), true, now);
         let mut ticket = ticket.with_rest(end.clone());
         let placed = Placed::new(now, answer, ticket.confirmation());
-        // The stop belongs to the other part, even where a block repeats it.
+        // The stop is counted with the other part, even if a block repeats it.
         let mut sets = rest
             .as_ref()
             .map_or_else(|_| Vec::new(), |order| changes(reading, order));
@@ -441,7 +441,7 @@ impl DriveHandle {
         Ok(command)
     }
 
-    /// Why a command to a drive that cannot be reached would be refused if it could.
+    /// Why a command to an unreachable drive would be refused even if the drive could be reached.
     fn gate_refuses(&self, command: &Command, now: Instant) -> Option<Outcome> {
         let facts = self.bus.at_accept(self.stale_after, now);
         match self.bus.queue.lock().gate.judge(Stage::Accept, command, &facts, now) {
@@ -450,7 +450,7 @@ impl DriveHandle {
         }
     }
 
-    /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.
+    /// Answers an order that is not sent. Reads without an answer are not commands and cause no event.
     fn turn_away(&self, ticket: Ticket, what: &str, outcome: Outcome, write: bool, now: Instant) {
         if let Outcome::Refused(refusal) = &outcome
             && write
@@ -467,8 +467,8 @@ impl DriveHandle {
         }
     }
 
-    /// Sends the drive a request of the lowest rank, at `now`; it is not sent later than `expiry` from now. Returns its
-    /// result; a read on a line that another master owns is refused.
+    /// Sends the drive a request of the lowest rank at `now`, at the latest `expiry` later. Returns its result; on
+    /// a line that another master owns, the read is refused.
     pub async fn read_in_background(
         &self,
         pdu: RequestPdu,
@@ -502,18 +502,18 @@ impl DriveHandle {
             passed_on: None,
         };
         self.bus.queue.submit_background(request, now);
-        // A ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        // A dropped ticket answers too, so a closed channel can only mean that the process ends.
         answer.await.map_or(Outcome::ShuttingDown, |answer| answer.outcome)
     }
 
-    /// Refuses an order before it became a command; audited, counted and published like any other refusal.
+    /// Refuses an order before it became a command; the refusal is audited, counted and published like any other.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
     }
 
-    /// Publishes that a command was refused; a flood of them is counted.
+    /// Publishes that a command was refused; many refusals are published as a count.
     fn publish_refusal(&self, what: &str, refusal: &Refusal, origin: &Origin, now: Instant) {
         let what = if what.is_empty() { "an empty command" } else { what };
         let spec = &self.image.spec;

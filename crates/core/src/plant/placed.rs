@@ -1,4 +1,4 @@
-//! A command that was given: where its answer and its confirmation arrive.
+//! A command that was given to the bus, with the receivers of its answer and its confirmation.
 
 use std::future::poll_fn;
 use std::pin::Pin;
@@ -14,7 +14,7 @@ use crate::order::{Answer, Outcome, joined};
 pub struct Shown {
     /// Time from acceptance to the read that showed the effect.
     pub after: Option<Duration>,
-    /// Why no read can show the effect.
+    /// Why no read can show the effect of the command.
     pub unseen: Option<String>,
 }
 
@@ -23,7 +23,7 @@ pub struct Shown {
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
-    /// Answer to the command, or to its stop where it also does more.
+    /// Answer to the command, or to its stop if it also does more.
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
     rest: Option<Box<Rest>>,
@@ -50,7 +50,7 @@ impl Placed {
         }
     }
 
-    /// Adds the rest of a command that was split into stop and rest: the one result covers both parts.
+    /// Adds the rest of a command that was split into stop and rest: one result covers both parts.
     pub(super) fn with_rest(
         mut self,
         answer: oneshot::Receiver<Answer>,
@@ -98,8 +98,8 @@ impl Placed {
         }
     }
 
-    /// Waits further for the read that shows the effect: the time from acceptance to it, or `None` when the order was
-    /// refused, or no read showed it within the time that the profile gives.
+    /// Waits for the read that shows the effect: returns the time from acceptance to that read, or `None` if the
+    /// order was refused or no read showed the effect within the profile's time.
     pub async fn confirmed(&mut self) -> Option<Duration> {
         match self.answered().await.outcome.is_ok() {
             true => poll_fn(|cx| self.poll_confirmation(cx)).await,
@@ -107,7 +107,7 @@ impl Placed {
         }
     }
 
-    /// The effect known so far.
+    /// What is known of the effect so far.
     pub fn shown(&mut self) -> Shown {
         let stop = now(|cx| self.confirmation.poll(cx)).flatten();
         let seen = match &mut self.rest {
@@ -144,7 +144,7 @@ impl Placed {
 
 fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answer> {
     arriving.poll(cx).map(|answer| {
-        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        // A dropped ticket answers too, so a closed channel can only mean that the process ends.
         answer.unwrap_or(Answer {
             outcome: Outcome::ShuttingDown,
             latency: Duration::ZERO,
@@ -156,7 +156,7 @@ fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answ
 #[derive(Debug)]
 enum Arriving<T> {
     Awaited(oneshot::Receiver<T>),
-    /// The result; `None`: it will never arrive.
+    /// The result has arrived; `None` means that there will never be one.
     Known(Option<T>),
 }
 

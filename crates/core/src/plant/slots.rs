@@ -1,4 +1,4 @@
-//! Slots of BACnet's arrays whose client has lost its right to write, by a reload or before a start: they are void.
+//! Voids slots of BACnet priority arrays whose client has lost its right to write, by a reload or before a start.
 
 use std::time::SystemTime;
 
@@ -9,9 +9,9 @@ use crate::permit::{Mode, Rules, VoidSlot};
 use crate::process_image::{Access, DriveImage};
 
 impl BusHandle {
-    /// Empties the slots of its drives whose client may no longer write, and publishes an event for each: such a slot could
-    /// not be released any more. Without `events` nothing is published: another bus has the drives now. Nothing is written to
-    /// a drive.
+    /// Empties the slots of its drives whose client may no longer write, and publishes an event for each: no client
+    /// could release such a slot any more. Without `events` nothing is published, because another bus has the
+    /// drives now. Nothing is written to a drive.
     pub fn void_slots(&self, events: Option<&Events>, time: SystemTime) {
         for (index, image) in self.image.drives.enumerate() {
             let mut queue = self.queue.lock();
@@ -21,7 +21,7 @@ impl BusHandle {
                 .filter(|rules| rules.mode == Mode::Exclusive)
                 .cloned();
             let stays = |what: Commanded, entry: &Entry| {
-                // A client that is not a principal may still stop, and so release an inactive.
+                // A client that is not a principal may still stop, and therefore release an entry `inactive`.
                 let is_stop = what == Commanded::Run && !entry.value.as_bool();
                 let is_known = |rules: &Rules| rules.claim_of(&entry.origin).is_some();
                 image.spec.access == Access::Control
@@ -120,7 +120,7 @@ mod tests {
             (false, true, None, vec![]),
             (true, false, None, vec![]),
             (true, true, Some(rules(Mode::Exclusive, "plc")), all.clone()),
-            // A client that is no longer a principal may only stop, and so release an inactive.
+            // A client that is no longer a principal may only stop, and therefore release an entry `inactive`.
             (true, true, Some(rules(Mode::Exclusive, "")), vec![(Commanded::Run, 3)]),
             (true, true, Some(rules(Mode::Advisory, "")), all.clone()),
         ];

@@ -1,4 +1,4 @@
-//! Collects the state of a drive except its points, for the causes why it does not run.
+//! Collects the state of a drive apart from its points, to explain why it does not run.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder
 use crate::order::{AuditRecord, CONFIRMED, Guarded, Origin, Reason, SourceKind, WriteStats};
 use crate::process_image::{Access, BusImage, Link, Reading, RestoreLock};
 
-/// Whether the drive of `reading`, on that bus, runs, and why not.
+/// Whether the drive of `reading`, on this bus, runs, and if not, why.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
     let spec = reading.spec;
     let order = || {
@@ -27,7 +27,7 @@ pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Ex
     why::explain(&spec.profile, &|point| reading.sample(point), &situation)
 }
 
-/// Why the motor may not be started, as a cause.
+/// Converts a guard's reason against a start into a cause.
 pub(super) fn guarded(hindrance: &Guarded) -> Cause {
     let (cause, remedy) = match hindrance.reason {
         Reason::Interlock => ("interlocked", "satisfy the interlock, then send run again"),

@@ -1,12 +1,12 @@
-//! Speeds that a newer sample contradicts: points are read at different times, so the speed of a motor that stands by now
-//! can still be good, for as long as its class allows. Pure.
+//! Speeds that a newer sample contradicts. Points are read at different times, so a speed from before the motor
+//! stopped can still be good for as long as its poll class allows. Pure.
 
 use std::time::Instant;
 
 use super::Reading;
 use crate::drive::{ModelPoint, PointIndex, Value};
 
-/// The speeds, each with the figure in its unit (%, Hz, rpm) above which the motor turns for certain.
+/// The speed points, each with the value in its unit (%, Hz, rpm) above which the motor certainly turns.
 const SPEEDS: [(ModelPoint, f64); 3] = [
     (ModelPoint::ActualSpeed, 0.5),
     (ModelPoint::OutputFrequency, 0.5),
@@ -14,9 +14,9 @@ const SPEEDS: [(ModelPoint, f64); 3] = [
 ];
 
 impl Reading<'_> {
-    /// Whether the point is a good speed that is not zero although a newer sample shows that the motor stands, or zero
-    /// although a newer one shows that it turns. Other points are not judged: current, torque and power can be anything
-    /// at any speed.
+    /// Whether the point is a good speed that is not zero although a newer sample shows that the motor stands, or
+    /// zero although a newer one shows that it turns. Other points are not checked: current, torque and power can
+    /// have any value at any speed.
     pub fn is_contradicted(&self, point: PointIndex) -> bool {
         let model = self.spec.profile.points.get(point).and_then(|point| point.model);
         let Some((_, certain)) = SPEEDS.iter().find(|(speed, _)| Some(*speed) == model) else {
@@ -32,16 +32,16 @@ impl Reading<'_> {
             .max_by_key(|(seen, _)| *seen);
         match (newest, speed_of(value, *certain)) {
             (Some((_, turns)), Some(turned)) => turns != turned,
-            // The speed is so low that the motor may turn or stand.
+            // At such a low speed the motor may turn or stand.
             (Some((_, turns)), None) => !turns,
             (None, _) => false,
         }
     }
 
-    /// Whether the motor turns, by each good sample, with its time.
+    /// Whether the motor turns according to each good sample, with the time of the sample.
     fn motion(&self) -> impl Iterator<Item = (Instant, bool)> + '_ {
         let bits = [(ModelPoint::Running, false), (ModelPoint::ZeroSpeed, true)];
-        // A motor that runs may run at zero speed, and one that is not at zero speed may be near it.
+        // A running drive may be at zero speed, and a motor that is not at zero speed may be close to it.
         let stands = bits.into_iter().filter_map(|(bit, standing)| {
             let sample = self.model(bit);
             let says = sample.good()?.as_bool() == standing;
@@ -55,7 +55,7 @@ impl Reading<'_> {
     }
 }
 
-/// Whether a motor of that speed turns; `None` where it is too slow to say.
+/// Whether a motor of this speed turns; `None` if the speed is too low to decide.
 fn speed_of(value: Value, certain: f64) -> Option<bool> {
     let speed = value.as_f64().abs();
     if speed == 0.0 {

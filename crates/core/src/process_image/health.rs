@@ -51,7 +51,7 @@ pub struct BusHealth {
     pub tried: bool,
     /// When `up` last changed.
     pub since: Option<SystemTime>,
-    /// Why the port is not open, and the bus's next action.
+    /// Why the port is not open, and what the bus does next.
     pub reason: Option<String>,
     /// Share of the last second that the line was in use (frames, turnaround, silence), 0..=1; `None` until the port was
     /// open for a second.
@@ -64,9 +64,9 @@ pub struct BusHealth {
     pub foreign: u64,
     /// Times the port was opened.
     pub opened: u64,
-    /// Times that a device server closed its connection after it had answered by it, and was connected to again at once.
+    /// How often a device server closed its connection after it had answered over it, and was connected again at once.
     pub reconnects: u64,
-    /// On a line that another master owns: addresses that answer it and have no entry in the configuration; `None` where the
+    /// On a line that another master owns: addresses that answer that master and are not configured; `None` if the
     /// gateway is the master.
     pub unknown: Option<Vec<u8>>,
 }

@@ -43,17 +43,17 @@ pub struct DriveImage {
     pub spec: DriveSpec,
     /// The requests that read the drive.
     pub plan: Plan,
-    /// Why the drive accepts only stops, if so.
+    /// Why the drive accepts only stops; empty if it accepts all commands.
     pub restore_lock: Arc<RestoreLock>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
-    /// Process data of a line that cannot be faster is not stale before that age, ns; a reload may change it.
+    /// Minimum age in ns at which process data becomes stale, for a line that cannot be faster; a reload may change it.
     stale_floor: AtomicU64,
     snapshot: ArcSwap<Snapshot>,
     /// Woken by every update.
     listeners: ArcSwap<Vec<Weak<Notify>>>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
-    /// Turnaround measured, ns; 0 is none yet.
+    /// Turnaround measured, ns; 0 if there is no measurement yet.
     turnaround: AtomicU64,
     /// Turnarounds measured.
     turnarounds: Histogram,
@@ -101,7 +101,7 @@ impl DriveImage {
         DriveImage { restore_lock, ..self }
     }
 
-    /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
+    /// Notes the values that the drive accepted for holding registers: parameters among them did not change by themselves.
     pub fn note_written(&self, items: &[(u16, u16)], now: Instant) {
         let parameters = &self.spec.profile.parameters;
         let is_parameter = |address: u16| parameters.id(address).is_some();
@@ -110,7 +110,7 @@ impl DriveImage {
         written.extend(parameters.map(|(address, value)| (*address, (*value, now))));
     }
 
-    /// Takes over from the image of the same drive before a reload what was written since the parameters were last read.
+    /// Takes over from the image before a reload which registers were written since the parameters were last read.
     pub(crate) fn take_over(&self, before: &DriveImage) {
         let before = before.written.lock().unwrap_or_else(PoisonError::into_inner).clone();
         *self.written.lock().unwrap_or_else(PoisonError::into_inner) = before;
@@ -122,7 +122,7 @@ impl DriveImage {
         written.get(&address).copied()
     }
 
-    /// The parameters were read, from `begun` on: values written before that are contained in the reading.
+    /// Notes that the parameters were read, starting at `begun`: the reading contains values written before that.
     pub fn forget_written(&self, begun: Instant) {
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         written.retain(|_, (_, at)| *at >= begun);
@@ -134,18 +134,19 @@ impl DriveImage {
         self
     }
 
-    /// As [`DriveImage::with_stale_floor`], for a drive that is being read already.
+    /// Sets the minimum age at which data becomes stale for a drive that is already being read; see
+    /// [`DriveImage::with_stale_floor`].
     pub fn set_stale_floor(&self, stale_floor: Duration) {
         let nanos = u64::try_from(stale_floor.as_nanos()).unwrap_or(u64::MAX);
         self.stale_floor.store(nanos, Ordering::Relaxed);
     }
 
-    /// The present snapshot; it does not change while the caller holds it.
+    /// The present snapshot; the returned one never changes.
     pub fn snapshot(&self) -> Arc<Snapshot> {
         self.snapshot.load_full()
     }
 
-    /// Changes the image as one step. Only the bus that owns the drive may call this.
+    /// Changes the image in one step. Only the bus that owns the drive may call this.
     pub fn update(&self, change: impl FnOnce(&mut Snapshot)) {
         let mut next = Snapshot::clone(&self.snapshot.load());
         change(&mut next);
@@ -160,7 +161,7 @@ impl DriveImage {
         !Arc::ptr_eq(&self.snapshot.load(), seen)
     }
 
-    /// Wakes `listener` at every update from now on, as long as it exists.
+    /// Wakes `listener` at every update from now on, until it is dropped.
     pub fn notify(&self, listener: &Arc<Notify>) {
         let listener = Arc::downgrade(listener);
         self.listeners.rcu(|listeners| {
@@ -192,7 +193,8 @@ impl DriveImage {
             .map_or(0, |c| c.load(Ordering::Relaxed))
     }
 
-    /// Notes a time from the end of a request to the beginning of its answer; single late wake-ups are smoothed out.
+    /// Takes into account a time from the end of a request to the start of its reply; single late wake-ups are
+    /// smoothed out.
     pub fn set_turnaround(&self, time: Duration) {
         self.turnarounds.observe(time);
         let last = self.turnaround.load(Ordering::Relaxed);
@@ -221,7 +223,7 @@ impl DriveImage {
         }
     }
 
-    /// The last heartbeat since the last call. Only the bus itself may call this.
+    /// The last heartbeat since the previous call. Only the bus itself may call this.
     pub fn take_heartbeat(&self) -> Option<Instant> {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
@@ -231,22 +233,22 @@ impl DriveImage {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
-    /// Notes whether the drive runs without a lease, since no client is known to have commanded it.
+    /// Notes whether the drive runs without a lease because no client is known to have commanded it.
     pub fn set_unsupervised(&self, unsupervised: bool) {
         self.unsupervised.store(unsupervised, Ordering::Relaxed);
     }
 
-    /// Whether the drive has supervision, but runs without a lease: no client is known to have commanded it.
+    /// Whether the drive has supervision but runs without a lease, because no client is known to have commanded it.
     pub fn is_unsupervised(&self) -> bool {
         self.unsupervised.load(Ordering::Relaxed)
     }
 
-    /// Notes whether what was ordered last is being written again for the drive's own timeout.
+    /// Notes whether the last order is being written repeatedly because of the drive's own timeout.
     pub fn set_refreshing(&self, refreshing: bool) {
         self.refreshing.store(refreshing, Ordering::Relaxed);
     }
 
-    /// Whether what was ordered last is being written again for the drive's own timeout.
+    /// Whether the last order is being written repeatedly because of the drive's own timeout.
     pub fn is_refreshing(&self) -> bool {
         self.refreshing.load(Ordering::Relaxed)
     }
@@ -271,12 +273,12 @@ impl DriveImage {
         self.supervision_failures.load(Ordering::Relaxed)
     }
 
-    /// Counts a lease that expired while the drive ran, or had its run command.
+    /// Counts a lease that expired while the drive ran or had its run command.
     pub fn count_supervision(&self) {
         self.supervisions.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Leases that expired so, so far.
+    /// Number of leases that expired while the drive ran or had its run command.
     pub fn supervisions(&self) -> u64 {
         self.supervisions.load(Ordering::Relaxed)
     }
@@ -335,7 +337,7 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).tried
     }
 
-    /// Changes state and figures. Only the bus itself may call this.
+    /// Changes state and figures of the bus. Only the bus itself may call this.
     pub fn update_health(&self, change: impl FnOnce(&mut BusHealth)) {
         change(&mut self.health.lock().unwrap_or_else(PoisonError::into_inner));
     }
@@ -360,7 +362,7 @@ impl BusImage {
     }
 }
 
-/// Serves as the public shape of a drive in JSON: name to value, `null` where nothing good is known.
+/// A point's value in the public JSON of a drive: `null` if no good value is known.
 pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
     value.map_or(serde_json::Value::Null, |v| match v {
         Value::Bool(b) => b.into(),
@@ -371,8 +373,8 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
     })
 }
 
-/// The model points and profile points of a drive with their names, in their public order; not those that are never
-/// read, of which there is nothing to show, nor hidden ones.
+/// The model points and profile points of a drive with their names, in their public order; without hidden points,
+/// and without points that are never read.
 pub fn public_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
     let is_read = |point: &Point| !point.hidden && point.is_read();
     let model = ModelPoint::ALL

@@ -1,4 +1,5 @@
-//! A drive as a reader sees it at one time: its points in units, with their age and quality. Pure: time is an argument.
+//! The state of a drive for a reader at one time: its points in units, with their age and quality. Pure: time is an
+//! argument.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,15 +11,15 @@ use crate::drive::model::Kind;
 use crate::drive::profile::MOST_REGISTERS;
 use crate::drive::{Bound, ModelPoint, Point, PointIndex, PollClass, Quality, Raw, Sample, Source, State, Value};
 
-/// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
+/// Maximum age of a drive parameter on which a command may depend, if the line can read the parameter faster.
 const PARAMETER_AGE: Duration = Duration::from_secs(5);
 
-/// A drive as a reader sees it at one time.
+/// The state of a drive for a reader at one time.
 #[derive(Debug, Clone)]
 pub struct Reading<'d> {
     /// Configuration of the drive.
     pub spec: &'d DriveSpec,
-    /// Why the drive accepts only stops, if so; none for a past state.
+    /// Why the drive accepts only stops; `None` if it accepts all commands, and for past states.
     pub restore_lock: Option<&'d RestoreLock>,
     /// The snapshot.
     pub snapshot: Arc<Snapshot>,
@@ -32,8 +33,8 @@ pub struct Reading<'d> {
     fresh_from: [Fresh; 2],
 }
 
-/// The earliest time of a sample that is not stale yet; with `None` no sample is stale, because the clock has not run
-/// long enough.
+/// The earliest time of a sample that is not stale yet. With `None` no sample is stale, because the clock has not
+/// run long enough.
 type Fresh = Option<Instant>;
 
 impl<'d> Reading<'d> {
@@ -68,8 +69,8 @@ impl<'d> Reading<'d> {
 }
 
 impl Reading<'_> {
-    /// Age from which a sample of that class is stale: slow points get two of their cycles on top, points
-    /// read once stay good while the drive is online.
+    /// Age at which a sample of this class becomes stale: slow points get two of their cycles in addition, and
+    /// points read once stay good while the drive is online.
     fn age_limit(&self, class: PollClass) -> Option<Duration> {
         match class {
             PollClass::Fast => Some(self.stale_after),
@@ -78,8 +79,8 @@ impl Reading<'_> {
         }
     }
 
-    /// For how long a value of that point is good once it was read, as long as the drive answers: that of its registers that
-    /// age first.
+    /// How long a value of this point is good after it was read, while the drive answers: as long as the value of
+    /// its register that becomes stale first.
     pub fn good_for(&self, point: PointIndex) -> Duration {
         let Some(point) = self.selected(point) else {
             return Duration::ZERO;
@@ -132,21 +133,21 @@ impl Reading<'_> {
         }
     }
 
-    /// The words of an address span, if every one of them is good.
+    /// The words of an address span, if all of them are good.
     ///
     /// # Errors
-    /// Why not: an address that is not polled first, then one refused, then one stale.
+    /// If the words cannot be served: an address that is not polled counts first, then one refused, then one stale.
     pub fn words(&self, table: Table, start: u16, count: u16) -> Result<Vec<u16>, Unavailable> {
         let table = self.spec.profile.canonical(table);
         let mut words = Vec::with_capacity(usize::from(count));
         let mut worst = None;
-        // Cells of one poll are of one quality, which is worked out once.
+        // Cells of one poll have one quality, which is calculated once.
         let mut last: Option<(PollClass, &Cell, Quality)> = None;
         for offset in 0..count {
             let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
             let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
             if class == PollClass::Monitor {
-                // A monitor value is read only now and then, so its present value must be read from the drive.
+                // A monitor value is read only occasionally, so its present value must be read from the drive.
                 return Err(Unavailable::NotPolled);
             }
             let quality = match last {
@@ -166,7 +167,7 @@ impl Reading<'_> {
         worst.map_or(Ok(words), Err)
     }
 
-    /// The point that a value is taken from: the point itself, or its monitoring register.
+    /// The point whose register gives the value: the point itself, or its monitoring register.
     fn selected(&self, point: PointIndex) -> Option<&Point> {
         let points = &self.spec.profile.points;
         match self.snapshot.monitored.contains(&point) {
@@ -179,7 +180,7 @@ impl Reading<'_> {
         self.selected(point).map_or(Sample::NONE, |point| self.sample_of(point))
     }
 
-    /// The sample of a point's own register, whatever a selector of the drive puts there.
+    /// The sample of a point's own register, even if a selector of the drive assigns other content to it.
     pub fn own_sample(&self, point: PointIndex) -> Sample {
         let point = self.spec.profile.points.get(point);
         point.map_or(Sample::NONE, |point| self.sample_of(point))
@@ -196,8 +197,8 @@ impl Reading<'_> {
                 if let Some(band) = self.band(low, high) {
                     return derived.sample(sources(), Some(band));
                 }
-                // The last known ends of the band convert the last value of the source; the result is as good as they
-                // are.
+                // The last known ends of the band convert the last value of the source; the result has no better
+                // quality than they have.
                 let Some((band, quality)) = self.last_band(low, high) else {
                     return Sample::NONE;
                 };
@@ -210,7 +211,7 @@ impl Reading<'_> {
         }
     }
 
-    /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. A register content
+    /// A value of the drive's own registers, with the worst quality and the oldest age among them. Register content
     /// that is not a value (a float that is NaN) is bad.
     fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
         let (mut words, mut quality) = ([0; MOST_REGISTERS], Quality::Good);
@@ -247,7 +248,7 @@ impl Reading<'_> {
         }
     }
 
-    /// The value multiplied by those of other points; the quality becomes that of the worst of them.
+    /// The value multiplied by those of other points; the quality becomes the worst of all.
     fn multiplied(&self, value: Value, raw: &Raw, quality: &mut Quality) -> Option<Value> {
         let factors = raw.factor_from.iter().map(|factor| {
             let factor = self.sample(*factor);
@@ -264,7 +265,7 @@ impl Reading<'_> {
         self.band_of(minimum, maximum, |sample| sample.good())
     }
 
-    /// As [`Reading::band`], for limits and conversions of commands: a bound that was read longer than
+    /// Like [`Reading::band`], for limits and conversions of commands: a bound that was read longer than
     /// [`Reading::parameter_age`] ago counts as unknown.
     pub(crate) fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
         self.band_of(minimum, maximum, |sample| {
@@ -273,8 +274,8 @@ impl Reading<'_> {
         })
     }
 
-    /// Oldest age of a parameter of the drive on which a limit or a conversion of a command may rest: 5 s or, where the
-    /// line is slower, one slow cycle of it, with an eighth for what comes between.
+    /// Maximum age of a drive parameter on which a limit or a conversion of a command may depend: 5 s or, if the
+    /// line is slower, one slow cycle and an eighth for traffic in between.
     pub fn parameter_age(&self) -> Duration {
         PARAMETER_AGE.max(self.slow_cycle + self.slow_cycle / 8)
     }
@@ -302,7 +303,8 @@ impl Reading<'_> {
         }
     }
 
-    /// The ends of a band as the drive reported them last, and the worse quality of the two. No command is made of them.
+    /// The ends of a band as the drive last reported them, and the worse quality of the two. Commands must not
+    /// depend on this.
     fn last_band(&self, minimum: Bound, maximum: Bound) -> Option<((f64, f64), Quality)> {
         let end = |bound: Bound| match bound {
             Bound::Point(point) => {
@@ -339,7 +341,7 @@ impl Reading<'_> {
         }
     }
 
-    /// Age of the process data; `None` if it was never read.
+    /// Age of the process data; `None` if the data was never read.
     pub fn age(&self) -> Option<Duration> {
         self.snapshot.fast_at.map(|at| self.now.saturating_duration_since(at))
     }
@@ -351,7 +353,7 @@ impl Reading<'_> {
         !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > limit)
     }
 
-    /// The drive in one word; `None` while it answers and a point that decides is not good.
+    /// The state of the drive in one word; `None` if the drive answers but a point that decides the state is not good.
     pub fn state(&self) -> Option<State> {
         if self.is_stale() {
             return Some(State::Offline);
@@ -385,8 +387,8 @@ impl Reading<'_> {
         }
     }
 
-    /// Quality of the drive as a whole: that of its process data or, while its state is unknown, that of the deciding
-    /// point.
+    /// Quality of the drive as a whole: that of its process data or, while its state is unknown, that of the point
+    /// that decides the state.
     pub fn overall(&self) -> Quality {
         if self.snapshot.fast_at.is_none() {
             Quality::Bad

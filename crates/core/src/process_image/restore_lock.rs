@@ -1,4 +1,4 @@
-//! Why a drive accepts only stops.
+//! The lock that makes a drive accept only stops, with its reason.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use arc_swap::ArcSwapOption;
 pub struct RestoreLock(ArcSwapOption<String>);
 
 impl RestoreLock {
-    /// From now on the drive takes no commands but stops, for the reason given; or all again.
+    /// Lets the drive accept only stops from now on, for this reason; with `None` all commands again.
     pub fn set(&self, why: Option<String>) {
         self.0.store(why.map(Arc::new));
     }

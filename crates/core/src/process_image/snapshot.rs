@@ -1,4 +1,4 @@
-//! The state of a drive at one time: raw words with their times, and their conversion to points.
+//! The state of a drive at one time: raw words with their times, and how they become points.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -29,8 +29,8 @@ impl Link {
     }
 }
 
-/// How often something is received on a line that another master owns, learned from the times between; tenths of a
-/// second, 0 is not known.
+/// How often a register is received on a line that another master owns, learned from the intervals, in tenths of a
+/// second; 0 is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Cadence(u16);
 
@@ -38,8 +38,9 @@ impl Cadence {
     /// Longest interval between two reads that counts as a cadence.
     pub const LONGEST: Duration = Duration::from_secs(600);
 
-    /// Records that a value was seen again after `interval`. A longer interval than so far is learned at four times the last
-    /// at most, so that a pause of the other master makes no slow cadence; a shorter one by a quarter each time.
+    /// Learns from a value that was received again after `interval`. A longer interval counts as at most four times
+    /// the present one, so that a pause of the other master does not appear as a slow cadence; a shorter one
+    /// reduces the cadence by a quarter at most.
     #[must_use]
     pub fn after(self, interval: Duration) -> Cadence {
         let tenths = |time: Duration| u16::try_from(time.as_millis().div_ceil(100)).unwrap_or(u16::MAX);
@@ -48,7 +49,7 @@ impl Cadence {
         Cadence(interval.max(self.0 - self.0.div_ceil(4)).min(most))
     }
 
-    /// Three intervals: a value not read again within this time is no longer good.
+    /// Three intervals: a value not received again within this time is no longer good.
     pub fn good_for(self) -> Duration {
         Duration::from_millis(300) * u32::from(self.0)
     }
@@ -60,7 +61,7 @@ pub(super) struct Cell {
     pub(super) word: u16,
     pub(super) at: Option<Instant>,
     pub(super) refused: Option<Exception>,
-    /// Read before the drive went away, and not since.
+    /// The value was read before the drive went offline, and not again since.
     pub(super) outlived: bool,
     /// Cadence at which another master reads the register, where one does.
     pub(super) cadence: Cadence,
@@ -74,7 +75,7 @@ impl Cell {
     }
 }
 
-/// Cells that lie together and are polled alike.
+/// Cells at adjacent addresses that are polled in the same class.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Span {
     table: Table,
@@ -99,26 +100,26 @@ pub struct Snapshot {
     pub fast_at: Option<Instant>,
     /// How often another master reads process data, where its traffic fills the snapshot.
     pub heard: Option<Cadence>,
-    /// Points whose value is that of their monitoring register, because a selector of the drive gives them another content
-    /// than the profile states: see [`crate::drive::Point::monitor`].
+    /// Points that take their value from their monitoring register because a selector of the drive has assigned
+    /// other content than the profile states; see [`crate::drive::Point::monitor`].
     pub monitored: Vec<PointIndex>,
-    /// Spans of registers, shared with earlier snapshots as far as nothing in them changed.
+    /// Spans of registers, shared with earlier snapshots if nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
 
-/// Why words cannot be served.
+/// Why words of a drive cannot be served from the image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unavailable {
-    /// The register is not part of the plan, so its value must be read from the drive.
+    /// The register is not polled, so its value must be read from the drive.
     NotPolled,
-    /// Too old, never read, or the drive is offline.
+    /// The value is too old or was never read, or the drive is offline.
     Stale,
     /// The drive refuses the address with this exception.
     Refused(Exception),
 }
 
 impl Snapshot {
-    /// A snapshot in which no address of the plan has a value yet.
+    /// A snapshot in which no polled address has a value yet.
     pub fn empty(plan: &Plan) -> Snapshot {
         let spans = plan.reads.iter().chain(&plan.monitors).map(|read| {
             Arc::new(Span {
@@ -137,7 +138,7 @@ impl Snapshot {
         }
     }
 
-    /// Words that the drive answered.
+    /// Stores words from a reply of the drive.
     pub fn store(&mut self, table: Table, start: u16, words: &[u16], now: Instant) {
         self.each(table, start, words.len(), |cell, offset| {
             let word = words.get(offset).copied().unwrap_or_default();
@@ -151,7 +152,7 @@ impl Snapshot {
         });
     }
 
-    /// Stores words that the drive answered to another master. Returns whether process data was among them.
+    /// Stores words from the drive's reply to another master. Returns whether process data was among them.
     pub fn hear(&mut self, table: Table, start: u16, words: &[u16], now: Instant) -> bool {
         let (mut fast, mut before) = (false, None::<Instant>);
         for span in self.spans.iter().filter(|span| span.class == PollClass::Fast) {
@@ -173,8 +174,8 @@ impl Snapshot {
             };
         });
         if fast {
-            // Between two reads of the same registers: where each takes a read of its own, those of one round follow each
-            // other closely, and the pause until the next round is what counts.
+            // Measures the time between two reads of the same registers. Reads of one round may follow each other
+            // closely, so the pause until the next round is what counts.
             let interval = before.map(|before| now.saturating_duration_since(before));
             let cadence = self.heard.unwrap_or_default();
             self.heard = Some(interval.map_or(cadence, |interval| cadence.after(interval)));
@@ -183,7 +184,7 @@ impl Snapshot {
         fast
     }
 
-    /// The machine was suspended for this time, during which its clock did not advance: all times move back by it.
+    /// Corrects all times after the machine was suspended for this time, during which its clock did not advance.
     pub fn slept(&mut self, time: Duration) {
         let earlier = |at: &mut Option<Instant>| *at = at.map(|at| at.checked_sub(time).unwrap_or(at));
         earlier(&mut self.fast_at);

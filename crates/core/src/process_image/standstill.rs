@@ -1,11 +1,11 @@
-//! Whether a motor stands, as far as reads show it. Pure.
+//! Whether a motor stands, as far as readings show. Pure.
 
 use std::time::Instant;
 
 use super::{Reading, Unavailable};
 use crate::drive::{ModelPoint, Point};
 
-/// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
+/// Causes (`blocks` of a point in the profile) for which a motor may turn whatever its drive does.
 const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
 
 /// Output frequency in Hz up to which a motor that does not run stands.
@@ -69,8 +69,8 @@ impl Reading<'_> {
         reads(ModelPoint::ZeroSpeed) || (reads(ModelPoint::Running) && reads(ModelPoint::OutputFrequency))
     }
 
-    /// Reason why a motor may turn though the drive stands: the point that shows another supply, or does not exclude one yet.
-    /// A point that the drive refuses, or that is not polled, does not count.
+    /// Reason why a motor may turn although its drive has stopped: the point that shows another supply, or does not
+    /// exclude one yet. A point that the drive refuses, or that is not polled, does not count.
     pub fn may_turn(&self) -> Option<String> {
         let points = self.spec.profile.points.enumerate();
         let reasons = points.filter_map(|(index, point)| {

@@ -1,7 +1,7 @@
-//! Readings and frames of a bus, on the way to recorder, trends and counters; costs nothing while unused.
+//! Readings and frames of a bus for recorder, trends and counters; costs nothing while unused.
 //!
-//! The bus only appends and the recorder takes all there is at once, so the bus never waits longer than for the swap of two
-//! lists.
+//! The bus only appends and the recorder takes all entries at once, so the bus never waits longer than for the swap
+//! of two lists.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,10 +10,10 @@ use std::time::Instant;
 use crate::codec::Table;
 use crate::drive::DriveIndex;
 
-/// Most bytes that wait for the recorder; further entries are counted and dropped.
+/// Most bytes of entries that wait for the recorder; further entries are counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;
 
-/// How a transaction looked on the line.
+/// How a transaction ended on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
@@ -48,7 +48,7 @@ impl Verdict {
     }
 }
 
-/// Words that a drive answered to a read of its plan.
+/// Words from a drive's reply to a planned read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TapedRead {
     /// When the words were read.
@@ -60,15 +60,15 @@ pub struct TapedRead {
     pub words: Arc<[u16]>,
 }
 
-/// Bytes on the line: a request, or all that came until its transaction was over.
+/// Bytes on the line: a request, or all bytes received until its transaction ended.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TapedFrame {
-    /// For a request, the time when it was given to the port; otherwise the time of the last byte, or when the
-    /// transaction was given up.
+    /// Time of a request: when the port accepted it. Otherwise the time of the last byte, or when the transaction
+    /// was given up.
     pub at: Instant,
-    /// Place of the drive of the transaction; none for bytes between two transactions.
+    /// Index of the drive of the transaction; `None` for bytes between two transactions.
     pub drive: Option<DriveIndex>,
-    /// Verdict on the frame.
+    /// How the transaction of the frame ended.
     pub verdict: Verdict,
     /// The bytes; empty if nothing arrived.
     pub bytes: Arc<[u8]>,
@@ -138,7 +138,7 @@ pub struct Tape {
 }
 
 impl Tape {
-    /// Sets what is recorded from now on; if nothing, the tape is cleared.
+    /// Sets what is recorded from now on; with nothing to record, the tape is cleared.
     pub fn switch(&self, taping: Taping) {
         self.taping.store(taping as u8, Ordering::Relaxed);
         if taping == Taping::Off {
@@ -151,7 +151,7 @@ impl Tape {
         self.taping.load(Ordering::Relaxed) >= taping as u8
     }
 
-    /// Records a read of the drive with this index. `read` is only called while someone takes the entries. Only the bus
+    /// Records a read of the drive with this index. `read` is called only while the tape is recording. Only the bus
     /// itself may call this.
     pub fn read(&self, drive: DriveIndex, read: impl FnOnce() -> TapedRead) {
         if self.records(Taping::Reads) {
@@ -177,11 +177,11 @@ impl Tape {
         }
     }
 
-    /// All entries since the last call, oldest first, and the number of dropped ones.
+    /// All entries since the previous call, oldest first, and the number of dropped ones.
     pub fn take(&self) -> (Vec<Taped>, u64) {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         let next = Waiting {
-            // Until the next call, about as many entries are expected.
+            // About as many entries are expected until the next call.
             entries: Vec::with_capacity(waiting.entries.len()),
             ..Waiting::default()
         };

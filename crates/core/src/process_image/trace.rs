@@ -1,4 +1,4 @@
-//! The frames on a line, for subscribers; costs nothing without any.
+//! The frames on a line, for subscribers; costs nothing without subscribers.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -21,15 +21,15 @@ pub enum Direction {
 /// A frame, or bytes that are not a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrameRecord {
-    /// A request: when it was given to the port. A reply: when its last byte arrived. Silence instead of a reply: when
-    /// it was given up.
+    /// Time of a request: when the port accepted it. Time of a reply: when its last byte arrived. Time of a
+    /// timeout: when the reply was given up.
     pub time: SystemTime,
-    /// From the end of the frame before (the opening of the port, if there is none) to the beginning of this one; none
-    /// where nothing came. Ends of requests and beginnings of replies are calculated from the time on the wire.
+    /// Time from the end of the previous frame (for the first one: the opening of the port) to the start of this
+    /// one; `None` if nothing arrived. Ends of requests and starts of replies are calculated from the wire time.
     pub gap: Option<Duration>,
     /// Sender of the frame.
     pub direction: Direction,
-    /// The drive of the transaction; none for bytes that came between two transactions.
+    /// The drive of the transaction; `None` for bytes between two transactions.
     pub drive: Option<String>,
     /// The bytes on the wire; empty if nothing arrived.
     pub bytes: Vec<u8>,
@@ -58,12 +58,12 @@ impl Trace {
     /// Publishes a frame to the listeners; the record is only built when there are any.
     pub fn publish(&self, record: impl FnOnce() -> FrameRecord) {
         if self.has_listener() {
-            // The last subscriber may be gone meanwhile, which is not an error.
+            // The last subscriber may have left meanwhile, which is not an error.
             let _ = self.0.send(Arc::new(record()));
         }
     }
 
-    /// Hears all frames from now on.
+    /// Receives all frames from now on.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<FrameRecord>> {
         self.0.subscribe()
     }

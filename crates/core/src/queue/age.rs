@@ -1,4 +1,5 @@
-//! Orders that are no longer wanted: too old, of a client that has gone, or behind a stop. Pure: time is an argument.
+//! Orders that are no longer valid: too old, from a disconnected client, or superseded by a stop. Pure: time is an
+//! argument.
 
 use std::time::{Duration, Instant};
 
@@ -36,14 +37,13 @@ impl Pending {
         command.answer(outcome, now);
     }
 
-    /// Whether an order that a pause kept from that drive renews its lease, once.
+    /// Whether an order that a pause kept from this drive renews its lease, once.
     pub fn take_renewed(&mut self, drive: DriveIndex) -> bool {
         let place = self.renewed.iter().position(|renewed| *renewed == drive);
         place.is_some_and(|place| self.renewed.swap_remove(place) == drive)
     }
 
-    /// The machine was suspended for this time, during which its clock did not advance: waiting commands are older by
-    /// it.
+    /// Ages all waiting commands after the machine was suspended for this time, during which its clock did not advance.
     pub fn slept(&mut self, time: Duration) {
         let earlier = |at: Instant| at.checked_sub(time).unwrap_or(at);
         for command in &mut self.waiting {

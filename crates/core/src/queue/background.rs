@@ -2,8 +2,8 @@
 //! drive. Pure: time is an argument.
 //!
 //! Each request is one transaction, answered exactly once: with the drive's reply, or with the reason why there is
-//! none. The bus sends one where the line rests long enough for it, and else within a small share of the line
-//! ([`Pace`]); longer work sends its requests one behind the other, and so can be interrupted between any two.
+//! none. The bus sends one if the line is idle long enough for it, otherwise within a small share of the line
+//! ([`Pace`]). Longer work sends its requests one after the other, and can be interrupted between any two.
 
 use std::collections::VecDeque;
 use std::time::Instant;
@@ -24,7 +24,7 @@ pub struct Background {
 }
 
 impl Background {
-    /// Takes a request in, unless 32 wait, 8 of the same client, or the bus takes none.
+    /// Adds a request, unless 32 wait, 8 of the same client wait, or the bus accepts none.
     pub fn push(&mut self, request: BackgroundRequest, now: Instant) {
         if let Some(outcome) = &self.closed {
             request.answer(outcome.clone(), now);
@@ -39,7 +39,7 @@ impl Background {
         self.waiting.push_back(request);
     }
 
-    /// The number of the oldest request of that pace that `may` go.
+    /// The number of the oldest request of this pace that `may` allows.
     pub fn next(&self, pace: Pace, mut may: impl FnMut(&BackgroundRequest) -> bool) -> Option<usize> {
         self.waiting.iter().position(|r| r.pace == pace && may(r))
     }
@@ -94,7 +94,7 @@ impl Background {
         self.waiting.iter()
     }
 
-    /// Whether none waits.
+    /// Whether no request waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }

@@ -1,4 +1,4 @@
-//! A reload: another bus takes the place of the one that serves a queue, and the stops that wait in it are handed over.
+//! Handover in a reload: another bus replaces the one that serves a queue, and takes over the waiting stops.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -8,8 +8,8 @@ use super::{CommandQueue, Pending};
 use crate::drive::DriveIndex;
 use crate::order::{Command, Effects, Outcome, Touched, Work};
 
-/// The queue that serves a drive now, and its place there, for all queues before it: after any number of reloads the first one finds
-/// the last one, and those between are gone.
+/// The queue that serves a drive now, and the index of the drive there, for all queues that served it before: after
+/// any number of reloads the first queue finds the present one, even if those in between no longer exist.
 #[derive(Debug, Clone)]
 pub(super) struct Heir(Arc<Mutex<(Weak<CommandQueue>, DriveIndex)>>);
 
@@ -22,7 +22,7 @@ impl Heir {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (Arc::downgrade(queue), place);
     }
 
-    /// The queue that serves the drive now; `None` if no bus serves it any more.
+    /// The queue that serves the drive now; `None` if no bus serves the drive any more.
     pub(super) fn served_by(&self) -> Option<(Arc<CommandQueue>, DriveIndex)> {
         let served_by = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         Some((served_by.0.upgrade()?, served_by.1))
@@ -30,12 +30,12 @@ impl Heir {
 }
 
 impl Pending {
-    /// Whether another bus takes the place of this one.
+    /// Whether another bus is replacing the one of this queue.
     pub fn is_ending(&self) -> bool {
         self.ending
     }
 
-    /// Whether a stop of a drive is under way or waits that no bus sends after this one.
+    /// Whether a stop waits or is in progress for a drive that no bus serves after this one.
     fn has_last_stops(&self) -> bool {
         let begun = |drive: &DriveIndex| self.begun_stops.contains(drive);
         self.last.iter().any(begun) || self.waiting.iter().any(|c| c.is_stop() && self.is_last(c))
@@ -46,10 +46,10 @@ impl Pending {
         self.last.contains(&command.intent.drive)
     }
 
-    /// A stop that the bus had started when it ended: the bus that takes its place sends it.
+    /// Passes on a stop that the bus had started when it ended: the bus that replaces it sends the stop.
     ///
     /// # Errors
-    /// None takes its place.
+    /// If no bus replaces this one.
     pub fn give_back(&mut self, stop: Command) -> Result<(), Box<Command>> {
         match self.ending {
             true => {
@@ -60,7 +60,7 @@ impl Pending {
         }
     }
 
-    /// Takes over a stop that was given to another bus, where it was counted.
+    /// Takes over a stop that another bus had accepted and counted.
     fn inherit(&mut self, mut stop: Command, now: Instant) {
         if let Work::Stop(work) = &mut stop.work {
             work.is_inherited = true;
@@ -73,7 +73,7 @@ impl Pending {
 }
 
 impl Command {
-    /// Changes the place of its drive to the one on the bus that serves it now.
+    /// Changes the index of its drive to the one on the bus that serves the drive now.
     pub(super) fn move_to(&mut self, place: DriveIndex) {
         let effect = self.effect(self.intent.drive);
         self.intent.drive = place;
@@ -82,8 +82,8 @@ impl Command {
 }
 
 impl CommandQueue {
-    /// The bus is about to be replaced: stops wait for the next bus, those of the drives of `last`, which have none, for nothing;
-    /// everything else ends.
+    /// Prepares for the replacement of the bus: stops wait for the next bus, except those of the drives of `last`,
+    /// which have none and are sent now; all other commands end.
     pub fn begin_handover(&self, last: Vec<DriveIndex>, now: Instant) {
         let outcome = Outcome::ShuttingDown;
         self.background().close(&outcome, now);
@@ -103,8 +103,8 @@ impl CommandQueue {
         self.lock().has_last_stops()
     }
 
-    /// Hands the stops of the drive to another queue, in which it has this place: the stops that wait, and those still given
-    /// to this queue later. The other queue also takes over the gate's state of the drive.
+    /// Hands the stops of the drive to another queue, where the drive has this index: the waiting stops, and those
+    /// given to this queue later. The other queue also takes over the gate's state of the drive.
     pub(crate) fn hand_over(&self, drive: DriveIndex, heir: &Arc<CommandQueue>, place: DriveIndex, now: Instant) {
         let mut pending = self.lock();
         let mut of_heir = heir.lock();

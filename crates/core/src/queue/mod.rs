@@ -1,5 +1,6 @@
-//! The command queue of a bus: bounded, ordered, with replacing, purging and expiry. The gate ([`crate::permit`]), which is
-//! part of the queue, decides whether a command may go.
+//! The command queue of a bus: bounded and ordered; newer commands replace older ones, stops remove commands, and
+//! commands expire. The gate ([`crate::permit`]), which is part of the queue, decides whether a command may be
+//! sent.
 
 mod age;
 mod background;
@@ -20,16 +21,17 @@ use crate::drive::DriveIndex;
 use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Urgency};
 use crate::permit::{Facts, Gate, Stage, Verdict};
 
-/// Most clients and drives whose turns are remembered.
+/// Most clients and drives for which the queue remembers when they were last served.
 const SERVED_KEPT: usize = 4 * CAPACITY;
-/// Most refusals at a turn that wait to be reported, which happens before the next transaction; the oldest is dropped.
+/// Most commands refused when their turn came that wait to be reported, which happens before the next transaction;
+/// the oldest is dropped.
 const MOST_DENIED: usize = 256;
 
 /// The waiting commands: pure, time is an argument.
 ///
-/// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. What is
-/// passed on to several drives has its place among the commands of each of them. Between drives the clients take turns,
-/// and within a client its drives.
+/// Commands to one drive are sent in the order in which they were accepted, from whatever client; only a stop goes
+/// ahead. A request passed on to several drives is ordered among the commands of each of them. Between drives the
+/// clients take turns, and for each client its drives.
 #[derive(Debug, Default)]
 pub struct Pending {
     waiting: VecDeque<Command>,
@@ -39,32 +41,32 @@ pub struct Pending {
     closed: Option<Outcome>,
     /// The gateway is about to stop: only stops get in.
     stops_only: bool,
-    /// Clients and their drives in the order in which they were served, the last one last.
+    /// Clients and their drives in the order in which they were served, the latest one last.
     served: VecDeque<(String, DriveIndex)>,
     /// Drives for which a stop arrived since the bus last checked, each once.
     stopped: Vec<DriveIndex>,
-    /// The bus ends and another one takes its place: stops wait for that one.
+    /// The bus is ending and another one replaces it: stops wait for that bus.
     ending: bool,
-    /// Drives that no bus sends a stop to after this one: their stops are sent before it ends.
+    /// Drives that no bus serves after this one: their stops are sent before this bus ends.
     last: Vec<DriveIndex>,
-    /// Drives with a stop that was taken, until the bus reports that it is over.
+    /// Drives whose stop was taken for sending, until the bus reports its end.
     begun_stops: Vec<DriveIndex>,
     /// The drives whose stops another queue took over.
     heirs: BTreeMap<DriveIndex, Heir>,
-    /// Where the queues before this one find the drives that it took over from them.
+    /// For each drive that was taken over from an earlier queue: how that queue finds the drive.
     found_by: BTreeMap<DriveIndex, Heir>,
-    /// The stops that the gateway needs before it ends, until the bus takes note of it.
+    /// The stops that the gateway requires before it ends, until the bus takes them.
     stopping: Option<Stopping>,
-    /// Commands that were refused at their turn, to be reported.
+    /// Commands that were refused when their turn came, and are not reported yet.
     denied: VecDeque<Denied>,
-    /// Drives whose leases are renewed by orders that a pause kept from them, each once.
+    /// Drives whose leases are renewed by orders that a pause kept from them, once each.
     renewed: Vec<DriveIndex>,
 }
 
-/// The command that has its turn.
+/// The command that is next to be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen {
-    /// Rank with which it competes for the line: a redundant stop has that of a command.
+    /// Rank by which the command competes for the line: a redundant stop has the rank of an ordinary command.
     pub rank: Urgency,
     number: u64,
 }
@@ -93,7 +95,7 @@ pub enum Ready {
     At(Instant),
 }
 
-/// The commands that may go, and when to look again.
+/// The commands that may be sent, and when to check again.
 #[derive(Debug, Default)]
 pub struct Choice {
     /// The next command.
@@ -109,12 +111,12 @@ impl Choice {
 }
 
 impl Pending {
-    /// Takes a command in. A stop removes the queued run and reference commands of its drive, or joins the stop that
-    /// waits; a newer reference takes the place of an older one. Stops always find room. When 64 other commands and
-    /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would
-    /// have, or of a drive that its client has more waiting for.
+    /// Adds a command. A stop removes the queued run and reference commands of its drive, or joins a waiting stop;
+    /// a newer reference replaces an older one. There is always room for a stop. If 64 other commands and reads
+    /// wait, a command displaces the newest of a client that has more waiting than its own client would have, or of
+    /// a drive for which its client has more waiting.
     ///
-    /// Returns the refusal where the gate refused it; it is answered then.
+    /// If the gate refuses the command, its refusal; the command is answered by then.
     pub fn push(&mut self, mut command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
         let is_stop = command.is_stop();
         if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive).and_then(Heir::served_by) {
@@ -166,13 +168,13 @@ impl Pending {
         self.accept(command, None, now);
     }
 
-    /// A command waits from now on: at the place of the one that it replaces, or behind all others.
+    /// Adds a command to the waiting ones: at the place of the one that it replaces, or behind all others.
     fn accept(&mut self, command: Command, place: Option<usize>, now: Instant) {
         self.gate.accepted(&command, now);
         self.waiting.insert(place.unwrap_or(self.waiting.len()), command);
     }
 
-    /// Whether a command must make room for another one. Stops need none.
+    /// Whether a command must displace another one. Stops never do.
     fn is_full(&self) -> bool {
         self.waiting.iter().filter(|c| !c.is_stop()).count() >= CAPACITY
     }
@@ -182,13 +184,13 @@ impl Pending {
         self.waiting.iter().map(|c| c.intent.number)
     }
 
-    /// The commands that were refused at their turn since the last call.
+    /// The commands refused since the previous call when their turn came.
     pub fn take_denied(&mut self) -> VecDeque<Denied> {
         std::mem::take(&mut self.denied)
     }
 
-    /// The queued reference that a newer one replaces: the last of the same points, unless a later command conflicts
-    /// with it.
+    /// The queued reference that a newer one replaces: the last one of the same points, unless a later command
+    /// conflicts with it.
     fn replaced_by(&self, command: &Command) -> Option<usize> {
         let to_drive = |c: &Command| c.urgency() != Urgency::Read && c.reaches(command.intent.drive);
         let same = |c: &Command| c.is_reference_only() && same_points(&c.intent.order, &command.intent.order);
@@ -199,8 +201,9 @@ impl Pending {
         self.waiting.get(index).is_some_and(same).then_some(index)
     }
 
-    /// The command displaced in a full queue: the newest of the client with the most entries, or else, within its own
-    /// client, of the drive with the most; neither may have fewer than the new command's client or drive would have.
+    /// The command that is displaced in a full queue: the newest of the client with the most entries or, within the
+    /// client of the new command, of the drive with the most; neither may have fewer than the new command's client
+    /// or drive would have.
     fn victim(&self, command: &Command) -> Option<usize> {
         let (client, drive) = (command.ticket.client(), command.intent.drive);
         let of_client = |c: &Command| (c.ticket.client() == client).then_some(c.intent.drive);
@@ -208,7 +211,8 @@ impl Pending {
             .or_else(|| self.youngest_of_most(of_client, drive))
     }
 
-    /// The youngest of those with the most of one kind, if they are more than the `own` ones would be with one more.
+    /// The newest command of the group with the most commands, if that group has more than the `own` group would
+    /// have with one more.
     fn youngest_of_most<'p, K: PartialEq>(&'p self, kind: impl Fn(&'p Command) -> Option<K>, own: K) -> Option<usize> {
         let others = || self.waiting.iter().enumerate().filter(|(_, c)| !c.is_stop());
         let held = |wanted: &K| others().filter(|(_, c)| kind(c).as_ref() == Some(wanted)).count();
@@ -217,9 +221,10 @@ impl Pending {
         (most > held(&own) + 1).then_some(index)
     }
 
-    /// The next command of this rank at `now`; expired and refused ones are removed. `ready` returns whether the drive of a
-    /// command is ready for it: while the oldest for a drive cannot go, later ones for that drive wait. `redundant` decides
-    /// whether a stop has no effect on its drive, which gives it the rank of a command.
+    /// The next command of this rank at `now`; expired and refused ones are removed. `ready` returns whether the
+    /// drive of a command is ready for it: if the oldest command for a drive cannot be sent, later ones for that
+    /// drive wait. `redundant` decides whether a stop has no effect on its drive, which gives it the rank of an
+    /// ordinary command.
     pub fn next(
         &mut self,
         rank: Urgency,
@@ -242,14 +247,14 @@ impl Pending {
                     passed_over.push(number);
                 }
                 Verdict::LookFirst => passed_over.push(number),
-                // Another command may go in place of the refused one.
+                // Another command may be sent instead of the refused one.
                 Verdict::Refuse(_) => choice.wait(now),
             }
         }
         choice
     }
 
-    /// The command that goes first of that rank as far as order and fairness say, those `passed_over` apart.
+    /// The command of this rank that is next by order and fairness, without those `passed_over`.
     fn best(
         &self,
         rank: Urgency,
@@ -278,7 +283,7 @@ impl Pending {
         for (index, command) in self.waiting.iter().enumerate() {
             let (drive, urgency) = (command.intent.drive, command.urgency());
             if urgency == Urgency::Stop {
-                // The oldest stop of a drive goes first, regardless of what else its client commands.
+                // The oldest stop of a drive is sent first, regardless of what else its client commands.
                 if stopped.contains(&drive) {
                     continue;
                 }
@@ -297,8 +302,8 @@ impl Pending {
                 continue;
             }
             let (client, of_client) = self.served(command);
-            // `None`, which was never served, sorts before any place. A command that was overtaken often enough goes
-            // before all.
+            // A client that was never served sorts first (`None`). A command that was overtaken often enough goes
+            // before all others.
             let key = (command.overtaken < CAPACITY, client, of_client, index);
             if best.is_none_or(|(best, _)| key < best) {
                 best = Some((key, number));
@@ -307,7 +312,7 @@ impl Pending {
         best.map(|(_, number)| number)
     }
 
-    /// Judges a waiting command whose turn came. A refused command is answered and reported.
+    /// Judges a waiting command that is about to be sent. A refused command is answered and reported.
     fn judge_turn(&mut self, number: u64, facts: &dyn Facts, now: Instant) -> Verdict {
         let Some(index) = self.waiting.iter().position(|c| c.intent.number == number) else {
             return Verdict::Go;
@@ -350,7 +355,7 @@ impl Pending {
         self.end_unwanted(command, outcome, now);
     }
 
-    /// Takes the command that was chosen, unless it was removed since.
+    /// Removes the chosen command from the queue and returns it, unless it was removed meanwhile.
     pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
         let index = self.waiting.iter().position(|c| c.intent.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
@@ -372,7 +377,8 @@ impl Pending {
         Some(command)
     }
 
-    /// When the client of that command was served last, and when its drive for it: places in order.
+    /// When the client of this command was last served, and when its drive was served for that client, as places in
+    /// the order.
     fn served(&self, command: &Command) -> (Option<usize>, Option<usize>) {
         let client = command.ticket.client();
         let last = self.served.iter().rposition(|(of, _)| of == client);
@@ -394,7 +400,7 @@ impl Pending {
         self.waiting.iter().any(starts)
     }
 
-    /// The latest expiry of a client's waiting command or stop for this drive; `None` if none waits.
+    /// The latest expiry of a client's waiting command or stop for this drive; `None` if no client waits.
     pub fn client_waits_until(&self, drive: DriveIndex) -> Option<Instant> {
         let commands = self
             .waiting
@@ -433,13 +439,13 @@ impl Pending {
         self.waiting.iter().filter(|c| c.urgency() < Urgency::Read).count()
     }
 
-    /// Whether none waits.
+    /// Whether no command waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }
 }
 
-/// Later commands to the drives that a command reaches wait behind it.
+/// Makes later commands to the drives of this command wait behind it.
 fn keep_order(command: &Command, behind: &mut Vec<DriveIndex>) {
     if command.is_command() {
         behind.extend(command.reach());

@@ -1,4 +1,5 @@
-//! Requests passed on for a tool to several drives, or unchecked to one: their place among the other commands of each.
+//! Requests that are passed on for a tool to several drives, or unchecked to one drive: how they are ordered among
+//! the other commands of each drive.
 
 use std::time::Instant;
 
@@ -9,7 +10,7 @@ use crate::permit::{Facts, Verdict};
 
 impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
-    /// that cannot be sent because its drive is offline does not hold up requests that also reach other drives.
+    /// that cannot be sent because its drive is offline does not delay requests that also reach other drives.
     pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
         if self.waiting.iter().all(|c| c.as_passed_on().is_none()) {
             return Vec::new();
@@ -27,7 +28,7 @@ impl Pending {
         all
     }
 
-    /// Passed-on requests that are sent as commands because a command waits for them.
+    /// Passed-on requests that must be sent like commands because a command waits for them.
     pub(super) fn pressed(&self) -> Vec<u64> {
         let mut waits: Vec<DriveIndex> = Vec::new();
         let mut pressed = Vec::new();
@@ -44,7 +45,7 @@ impl Pending {
         pressed
     }
 
-    /// The request that is passed on next to several drives, or to one unchecked, where nothing is in a hurry.
+    /// The next request to pass on to several drives, or unchecked to one, if no command waits for one.
     pub fn next_passed_on(
         &mut self,
         now: Instant,
@@ -89,8 +90,8 @@ impl Pending {
         self.waiting.iter().find(|c| c.intent.number == chosen.number)
     }
 
-    /// A command that was taken but not sent waits again, ahead of all others, unless a stop arrived for a drive that
-    /// it reaches.
+    /// Returns a command that was taken but not sent to the front of the queue, unless a stop arrived for a drive
+    /// that it reaches.
     pub fn put_back(&mut self, command: Command, now: Instant) {
         let outcome = match &self.closed {
             Some(outcome) => Some(outcome.clone()),

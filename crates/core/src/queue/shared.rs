@@ -33,7 +33,7 @@ impl CommandQueue {
     /// An empty queue.
     ///
     /// # Errors
-    /// If the system gives no event descriptor.
+    /// If the system provides no event descriptor.
     pub fn new() -> io::Result<CommandQueue> {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(CommandQueue {
@@ -66,7 +66,8 @@ impl CommandQueue {
         refusal
     }
 
-    /// Takes the stop of a command and its rest in, with nothing between them, and wakes the bus. Returns the refusals of both.
+    /// Adds the stop of a command and its rest without anything in between, and wakes the bus. Returns the refusals
+    /// of both.
     pub(crate) fn submit_parts(
         &self,
         stop: Command,
@@ -110,8 +111,8 @@ impl CommandQueue {
         pending.closed = Some(outcome);
     }
 
-    /// The gateway is shutting down: from now on only stops are accepted. Waiting commands end, except stops. The bus
-    /// stops its drives until `deadline`, and reports those that were not stopped.
+    /// Prepares for the end of the gateway: from now on only stops are accepted, and all other waiting commands
+    /// end. The bus stops its drives until `deadline`, and reports those that were not stopped.
     pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
         let (report, missing) = oneshot::channel();
         self.background().close(&Outcome::ShuttingDown, now);
@@ -151,11 +152,11 @@ impl CommandQueue {
     /// Clears the wake-up.
     pub fn clear_wake(&self) {
         let mut count = [0u8; 8];
-        // If there is nothing to read, the bus was not woken.
+        // A read without data only means that the bus was not woken.
         let _ = rustix::io::read(&self.wake, &mut count);
     }
 
-    /// Applies these rules to the drives of the bus from now on; with `None`, `[authority]` is off.
+    /// Applies these rules to the drives of the bus from now on; `None` means that `[authority]` is off.
     pub fn set_authority(&self, rules: Option<Arc<Rules>>) {
         let mut pending = self.lock();
         self.has_authority.store(rules.is_some(), Ordering::Release);
@@ -167,7 +168,7 @@ impl CommandQueue {
         self.has_authority.load(Ordering::Acquire)
     }
 
-    /// A drill begins at that drive, goes silent, or ends.
+    /// Notes that a drill starts, goes silent, or ends on this drive.
     pub fn set_drill(&self, drive: DriveIndex, lock: Option<DrillLock>) {
         let mut pending = self.lock();
         let is_quiet = lock.as_ref().is_some_and(|lock| lock.quiet_until.is_some());
@@ -184,7 +185,7 @@ impl CommandQueue {
         }
         let pending = self.lock();
         let quiet = pending.gate.quiet(now);
-        // The flag is set under the lock, so that a drill that starts now is not lost.
+        // The flag is set under the lock, so that a drill that starts at this moment is not missed.
         self.has_quiet.store(quiet.is_some(), Ordering::Release);
         quiet
     }

@@ -1,5 +1,5 @@
-//! Stops in the queue of a bus: ahead of everything, one that does nothing else and one that does for each drive, and what they
-//! end. Pure: time is an argument.
+//! Stops in the queue of a bus: they go ahead of everything, at most two wait for each drive (one bare, one with
+//! more values), and they end other commands. Pure: time is an argument.
 
 use std::time::Instant;
 
@@ -16,12 +16,12 @@ pub struct Stopping {
     pub(super) report: oneshot::Sender<Vec<NotStopped>>,
 }
 
-/// A drive that did not get, or did not acknowledge, the stop that the gateway wanted before it ends.
+/// A drive that did not get, or did not acknowledge, the stop that the gateway required before it ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotStopped {
     /// Name of the drive.
     pub drive: String,
-    /// The result of the stop, in words.
+    /// The result of the stop, as text.
     pub why: String,
 }
 
@@ -39,7 +39,7 @@ impl Stopping {
 
     /// The bus has finished; `missing` are the drives that were not stopped.
     pub fn report(self, missing: Vec<NotStopped>) {
-        // The gateway may have given up waiting.
+        // The gateway may have stopped waiting, so an error is ignored.
         let _ = self.report.send(missing);
     }
 }
@@ -74,13 +74,13 @@ impl Pending {
             .then(|| self.gate.stop_waits(drive, now))?
     }
 
-    /// The stops that were taken are over, but those of the drives that are still `stopping`.
+    /// Notes that the stops taken for sending have ended, except those of the drives that are still `stopping`.
     pub fn settle_stops(&mut self, stopping: impl Fn(DriveIndex) -> bool) {
         self.begun_stops.retain(|drive| stopping(*drive));
     }
 
-    /// At most one bare stop and one stop that also does more wait for each drive. Later ones join an equal one and are
-    /// answered with it; if they differ, the newer one is sent.
+    /// At most one bare stop and one stop that also does more wait for each drive. Later ones join an equal one and
+    /// are answered with it; if they differ, the newer one is sent.
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.intent.drive;
         self.gate.accepted(&stop, now);
@@ -115,8 +115,9 @@ impl Pending {
         }
     }
 
-    /// Lets a stop join one that was accepted at this `last_starter`: the stop is noted like any other, but nothing is written
-    /// for it. Returns whether it may join, which needs that no command was accepted since that may start the drive.
+    /// Lets a stop join one that was accepted at this `last_starter`: the stop is noted like any other, but nothing
+    /// is written for it. Returns whether it may join, which requires that no command accepted since may start the
+    /// drive.
     pub(crate) fn joins_stop(&mut self, drive: DriveIndex, last_starter: u64, by: &Origin, now: Instant) -> bool {
         let is_served = self.closed.is_none() && !self.heirs.contains_key(&drive);
         if !is_served || self.gate.last_starter(drive) != last_starter {
@@ -127,8 +128,8 @@ impl Pending {
         true
     }
 
-    /// Drives for which a stop arrived since the last call: their started commands end, whatever the result of the
-    /// stop.
+    /// Drives for which a stop arrived since the previous call: their commands in progress end, whatever the result
+    /// of the stop.
     pub fn take_stopped(&mut self) -> Vec<DriveIndex> {
         std::mem::take(&mut self.stopped)
     }
@@ -140,7 +141,7 @@ impl Pending {
         });
     }
 
-    /// Takes the stops that the gateway needs before it ends, once.
+    /// Takes the stops that the gateway requires before it ends; returns them only once.
     pub fn take_stopping(&mut self) -> Option<Stopping> {
         self.stopping.take()
     }
@@ -152,7 +153,7 @@ fn is_purged(command: &Command, drive: DriveIndex) -> bool {
 }
 
 impl Command {
-    /// A stop that does nothing but take the run command away.
+    /// Whether the stop only takes the run command away.
     pub(super) fn is_bare_stop(&self) -> bool {
         match &self.intent.order {
             Order::Points(values) => values.len() == 1,

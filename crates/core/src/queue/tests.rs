@@ -46,7 +46,7 @@ fn touched(order: &Order) -> Touched {
     }
 }
 
-/// A command that came at `now`, over a connection of its own.
+/// A command that arrived at `now` over a separate connection.
 fn command(drive: usize, admitted: Admitted, now: Instant, ticket: Ticket) -> Command {
     let window = Window {
         arrival: Arrival::now(now),
@@ -96,7 +96,7 @@ impl Clients {
         self.give((SourceKind::Mqtt, who), drive, Urgency::Command, points(of), false)
     }
 
-    /// When a waiting command may go.
+    /// When another waiting command may be sent.
     fn wakes(&mut self) -> Option<Instant> {
         let now = self.now;
         self.pending
@@ -112,7 +112,7 @@ impl Clients {
         self.take().map(|c| (c.intent.drive.place(), c.urgency()))
     }
 
-    /// All that waits, in the order in which it has its turn: client, drive and first point.
+    /// All waiting commands in the order in which they would be sent: client, drive and first point.
     fn drain(&mut self) -> Vec<(String, usize, usize)> {
         let mut all = Vec::new();
         while let Some(command) = self.take() {
@@ -208,7 +208,7 @@ fn a_newer_reference_takes_the_place_of_the_older_one() {
 #[test]
 fn to_one_drive_it_is_the_order_of_acceptance_whoever_the_client_is() {
     let mut rig = Clients::new();
-    // The first client was served last, so that the others would have their turn.
+    // The first client was served last, so the others would be next.
     let _served = rig.push_from("a", 9, &[0]);
     assert!(rig.take().is_some());
     let _all = [("a", 1), ("b", 2), ("a", 3), ("c", 4)].map(|(who, point)| rig.push_from(who, 1, &[point]));
@@ -337,7 +337,7 @@ fn nobody_is_overtaken_without_a_bound() {
     let _served = rig.push_from("old", 1, &[0]);
     assert!(rig.take().is_some());
     let _old = rig.push_from("old", 1, &[1]);
-    // New clients go before this order, one after the other, up to the limit.
+    // Commands of new clients are sent before this order, one after the other, up to the limit.
     let mut turns = 0;
     loop {
         let _new = rig.push_from(&format!("new {turns}"), 2, &[2]);
@@ -486,7 +486,7 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
     push(&mut rig, Supervision, None, Stop, false);
     push(&mut rig, Shutdown, None, Stop, false);
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("alice#1"));
-    // A command counts whether it waits, replaces an older one, or joins another one.
+    // A command is recorded whether it waits, replaces an older one, or joins another one.
     push(&mut rig, Http, Some("bob#2"), order, true);
     push(&mut rig, Http, Some("carol#3"), order, true);
     assert_eq!(commander(&rig, DriveIndex::new(1)).as_deref(), Some("carol#3"));

@@ -1,4 +1,4 @@
-//! Drives and buses as configured: what they are, and what may be done with them. Pure.
+//! Drives and buses as configured, with the rights to read and write them. Pure.
 
 mod guard;
 
@@ -53,7 +53,7 @@ pub struct Supervision {
     pub timeout: Duration,
     /// Action when the lease expires.
     pub action: LeaseAction,
-    /// A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.
+    /// A drive that is running when the gateway starts gets its lease: only the clock starts, nothing is written.
     pub adopt: bool,
 }
 
@@ -84,9 +84,9 @@ pub struct DriveSpec {
     pub group: Option<String>,
     /// Limits of the drive's starts.
     pub guard: Option<Guard>,
-    /// The interlocks of its starts.
+    /// The interlocks for starts of this drive.
     pub interlocks: Vec<Interlock>,
-    /// A drive of its group starts at a distance from the others, so that its own starts count.
+    /// Another drive of the group is guarded by `stagger`, so the starts of this one count.
     pub staggers: bool,
     /// Whether the drive may be commanded.
     pub access: Access,
@@ -106,18 +106,18 @@ pub struct DriveSpec {
     pub raw_writes: RawWrites,
     /// The permitted access to the drive's parameters.
     pub params: ParamsAccess,
-    /// How often the last order is written again because of the drive's own timeout; `None` if it is not repeated.
+    /// Interval at which the last order is written again because of the drive's own timeout; `None` if it is not repeated.
     pub refresh: Option<Duration>,
-    /// Times of this drive on the line, where they are not those of its bus.
+    /// Times of this drive on the line, if they differ from those of its bus.
     pub timing: Timing,
 }
 
-/// The times of one drive, where they are not those of its bus.
+/// The times of one drive on the line, if they differ from those of its bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Timing {
     /// Time limit for the first byte of a reply; wire time is added.
     pub response_timeout: Option<Duration>,
-    /// Silence before each request to it, and after its reply before a request to any other drive.
+    /// Silence before each request to this drive, and after its reply before a request to any other drive.
     pub silence: Option<Duration>,
     /// Tries after the first.
     pub retries: Option<u32>,
@@ -132,7 +132,7 @@ impl Timing {
     }
 }
 
-/// A value that makes a recording when it holds for a time.
+/// A limit of a value that starts a recording when it was exceeded for some time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PointTrigger {
     /// Index of the point in the profile.
@@ -142,7 +142,7 @@ pub struct PointTrigger {
     pub lasts: Duration,
 }
 
-/// The side of a limit that triggers.
+/// Which side of a limit starts the recording.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum TriggerLimit {
     /// The trigger is a value above this one.
@@ -168,8 +168,8 @@ pub struct BusSpec {
     pub slow_cycle: Duration,
 }
 
-/// Identity of a machine, as far as the configuration defines it: leases, holds and journals belong to it. The name of a
-/// drive, and that of its bus, may come to mean another machine.
+/// Identity of a machine, as far as the configuration defines one: leases, holds and journals belong to it. The
+/// name of a drive, and that of its bus, may later mean another machine.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Machine {
     /// The port of the bus.
@@ -188,14 +188,14 @@ impl std::fmt::Display for Machine {
 }
 
 impl BusSpec {
-    /// Whether the port is a Modbus TCP device on the network: there is no serial line that the gateway knows of, no
-    /// baud rate and no broadcast.
+    /// Whether the port is a Modbus TCP device on the network: without a serial line known to the gateway, baud
+    /// rate or broadcast.
     pub fn is_modbus_tcp(&self) -> bool {
         is_modbus_tcp(&self.port)
     }
 
-    /// Whether no late or doubled reply can be taken for the reply to another request: transaction ids or sockets tell
-    /// them apart. On the way there, the network may hold a request up and let a later one pass.
+    /// Whether a late or duplicate reply cannot be mistaken for the reply to another request, because transaction
+    /// ids or sockets distinguish them. Requests may still overtake each other in the network.
     pub fn tells_replies_apart(&self) -> bool {
         self.is_modbus_tcp() || self.port.starts_with("udp://")
     }
@@ -216,7 +216,7 @@ pub fn is_modbus_tcp(port: &str) -> bool {
 }
 
 impl DriveSpec {
-    /// A drive with only place and profile configured: monitored, its unit is its address.
+    /// A drive with only address and profile configured: it is monitored, and its unit id is its address.
     pub fn new(name: &str, bus: &str, address: u8, profile: Arc<Profile>) -> DriveSpec {
         DriveSpec {
             name: name.to_string(),
@@ -242,12 +242,12 @@ impl DriveSpec {
         }
     }
 
-    /// Whether starts of the drive count: for itself or for others.
+    /// Whether starts of the drive are counted, for its own guard or for those of others.
     pub fn counts_starts(&self) -> bool {
         self.guard.is_some() || self.staggers || !self.interlocks.is_empty()
     }
 
-    /// The drives with which it shares `stagger`, as text: those of its group, else those of its bus.
+    /// The name under which drives share `stagger`: the group of the drive, otherwise its bus.
     pub fn starts_with(&self) -> Arc<str> {
         match &self.group {
             Some(group) => format!("group `{group}`").into(),

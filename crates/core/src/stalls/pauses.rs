@@ -1,5 +1,5 @@
-//! The pauses of the process: each counted once, whichever of its threads notices it; and whether a thread that reads
-//! orders stands still now.
+//! The pauses of the process, each counted once even if several threads notice it; and whether a thread that reads
+//! orders is stalled now.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
@@ -66,8 +66,8 @@ impl Pauses {
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Notes an accepted stop. Each thread that reads orders then shows that it runs: what it reads after a stall that begins
-    /// now came after the stop, so that no healthy client's order is purged by it.
+    /// Notes an accepted stop. Each thread that reads orders then records that it runs: bytes read after a later
+    /// stall arrived after the stop, so that the stop does not remove the order of a healthy client.
     pub fn note_stop(&self) {
         self.0.stops.notify_waiters();
     }
@@ -77,7 +77,7 @@ impl Pauses {
         self.0.stops.notified().await;
     }
 
-    /// Adds a pause of a thread. Returns whether it is a new one: it does not overlap a pause of another thread.
+    /// Adds a pause of a thread. Returns whether it is new, that is, does not overlap a pause of another thread.
     pub fn note(&self, pause: Stall) -> bool {
         let mut state = self.state();
         let last = state
@@ -110,7 +110,7 @@ impl Pauses {
         Heartbeat(beat)
     }
 
-    /// Whether a thread that reads orders does not run now: no orders or heartbeats are received over its connections.
+    /// Whether a thread that reads orders is stalled now: no orders or heartbeats are received over its connections.
     pub fn is_deaf(&self, now: Instant) -> bool {
         let state = self.state();
         let mut readers = state.readers.iter().filter_map(Weak::upgrade);

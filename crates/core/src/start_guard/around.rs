@@ -1,4 +1,4 @@
-//! The drives that interlocks look at, over reloads too. Pure: time is an argument.
+//! The drives that interlocks depend on, also across reloads. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::process_image::{DriveImage, Machine};
 
-/// Time for which a drive that was not read since its bus was started anew keeps its earlier state here.
+/// Time for which a drive keeps its earlier state here after its bus was restarted, until it is read for the first time.
 const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The drives of all buses, by name.
@@ -29,7 +29,7 @@ pub(super) struct Watched {
 pub(super) struct Anew {
     /// When the previous bus had ended.
     pub(super) since: Instant,
-    /// The machine as it was until then; none if it was not there.
+    /// The previous state of the machine; `None` if it was not configured before.
     pub(super) before: Option<Arc<Watched>>,
 }
 
@@ -75,7 +75,7 @@ impl Around {
 }
 
 impl Watched {
-    /// The state that is left to the bus that replaces its own.
+    /// The state that a bus leaves to the bus that replaces it.
     fn left(&self, now: Instant) -> Anew {
         let anew = self.anew.clone().filter(|anew| anew.is_recent(now));
         let before = Watched { anew, ..self.clone() };
@@ -85,7 +85,7 @@ impl Watched {
         }
     }
 
-    /// The announced end of the drive's bus, where another one will replace it.
+    /// The announced end of the drive's bus, if another bus will replace it.
     fn expected(&self) -> Option<&Anew> {
         let is_same = |before: &Arc<Watched>| Arc::ptr_eq(&before.image, &self.image);
         self.anew
@@ -98,7 +98,7 @@ impl Watched {
         self.expected().is_some()
     }
 
-    /// The last beginning of its bus, while a first reading may still be awaited.
+    /// The last restart of its bus, while the first reading after it may still be expected.
     pub(super) fn anew(&self, now: Instant) -> Option<&Anew> {
         self.anew.as_ref().filter(|anew| anew.is_recent(now))
     }

@@ -25,14 +25,14 @@ impl fmt::Display for Unmet {
 }
 
 impl Interlock {
-    /// Returns the interlock if it forbids a start. Only a good sample satisfies it.
+    /// The interlock if it forbids a start. Only a good sample satisfies an interlock.
     pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| self.differs(watched, index, around, now))
     }
 
-    /// Returns the interlock if a running motor is to be stopped. A drive whose bus was restarted counts as it counted before
-    /// until it is read. `stood` is the end of the last pause of the bus: a value that was met and is only too old then waits for
-    /// a first reading.
+    /// The interlock if it requires a running motor to stop. A drive whose bus was restarted keeps its earlier
+    /// state until it is read. `stood` is the end of the last pause of the bus: a value that was satisfied and has
+    /// only become too old then waits for a first reading.
     pub(super) fn trips(&self, around: &Around, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| {
             let is_only_old = stood.is_some_and(|until| self.met_before(watched, index, around, (until, now)));
@@ -88,7 +88,7 @@ impl Interlock {
         if !watched.is_leaving() && read.is_some_and(|read| read > anew.since) {
             return self.differs(watched, index, around, at);
         }
-        // A drive that was not there before stops no motor until it is read.
+        // A drive that was not configured before stops no motor until it is read.
         let before = anew.before.as_ref()?;
         self.differed(before, index, around, (anew.since, now))
     }

@@ -1,4 +1,4 @@
-//! The thread that keeps starts in the state directory. Starts wait for it, stops never.
+//! The thread that saves starts in the state directory. A start waits for it, a stop never does.
 
 use std::io;
 use std::path::Path;
@@ -17,8 +17,8 @@ const BEAT: Duration = Duration::from_millis(100);
 /// Largest file that is read, bytes.
 const LONGEST: u64 = 64 << 20;
 
-/// Keeps starts in this directory from now on; those of earlier runs are read from there. Until that is done, which the end
-/// of the channel signals, guarded drives are not started.
+/// Saves starts in this directory from now on; those of earlier runs are read from it. Until the channel signals
+/// that they were read, guarded drives are not started.
 ///
 /// # Errors
 /// The system gives no thread.
@@ -28,7 +28,7 @@ pub fn keep(dir: &Path, guards: Arc<Guards>) -> io::Result<(Keeper, oneshot::Rec
     guards.await_file(&path);
     let keeper = Keeper::start("starts", dir, move |end| {
         let saved = load(&path);
-        // A thread that the disk held up until another one has its place counts nothing.
+        // A thread that the disk delayed until another one replaced it must not restore its starts.
         if end.try_recv() == Err(TryRecvError::Empty) {
             guards.keep(&saved, Instant::now(), SystemTime::now());
             drop(reading);

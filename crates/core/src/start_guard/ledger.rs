@@ -1,4 +1,4 @@
-//! The motors of all buses, their groups, and what is saved of them. Pure: time is an argument.
+//! The motors of all buses, their groups, and which of their data is saved. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use crate::process_image::{DriveImage, Machine};
 /// Longest wait of a start for the disk.
 pub(super) const DISK: Duration = Duration::from_secs(1);
 
-/// The starts of the whole gateway: shared by its buses, whatever a reload does to them.
+/// The starts of the whole gateway, shared by its buses and kept over every reload.
 #[derive(Debug, Default)]
 pub struct Guards {
     ledger: Mutex<Ledger>,
@@ -32,7 +32,7 @@ pub(super) struct Ledger {
     disk: Disk,
 }
 
-/// A motor in its group.
+/// A motor with the group that it belongs to.
 #[derive(Debug)]
 pub(super) struct Entry {
     pub(super) motor: Motor,
@@ -92,19 +92,19 @@ impl Guards {
         self.around.store(Arc::new(next));
     }
 
-    /// Notes that something changed that must be written to disk.
+    /// Notes a change that must be written to disk.
     pub(super) fn notify_change(&self) {
         self.changed.notify_one();
     }
 
-    /// Starts are about to be kept in that file; until [`Guards::keep`] has what is in it, none is allowed.
+    /// Announces that starts will be saved in this file; until [`Guards::keep`] has its content, no start is allowed.
     pub fn await_file(&self, path: &Path) {
         self.lock().disk = Disk::Unread(path.to_path_buf());
     }
 
-    /// Keeps starts in a file from now on: no start is written to a drive before [`Guards::wrote`] reports that it is on
-    /// disk. `saved` has the starts of earlier runs; after a clock was set back they are not taken to be older than they
-    /// can be.
+    /// Saves starts in a file from now on: no start is written to a drive before [`Guards::wrote`] reports that it
+    /// is on disk. `saved` has the starts of earlier runs; if the clock was set back, none counts as older than
+    /// possible.
     pub fn keep(&self, saved: &Saved, now: Instant, time: SystemTime) {
         let mut ledger = self.lock();
         for (machine, starts) in saved.motors() {
@@ -123,12 +123,12 @@ impl Guards {
         self.notify_change();
     }
 
-    /// The state to save, with its generation; `None` if it is saved already, or failed.
+    /// The state to save, with its generation; `None` if it is already saved, or if saving failed.
     pub fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
         self.lock().to_write(now, time)
     }
 
-    /// Waits for a state to save, no longer than `most`; returns `None` if there is none.
+    /// Waits for a state to save, for at most `most`; returns `None` if there is none.
     pub(super) fn wait_to_write(&self, most: Duration) -> Option<(u64, Saved)> {
         let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind();
         let waited = self.changed.wait_timeout_while(self.lock(), most, is_up_to_date);
@@ -149,7 +149,7 @@ impl Guards {
 }
 
 impl Ledger {
-    /// Counts the starts of a drive from now on, in this group.
+    /// Counts the starts of a drive from now on, as part of this group.
     pub(super) fn register(&mut self, machine: &Machine, group: &Arc<str>) {
         self.entry(machine.clone()).group = group.clone();
     }
@@ -176,7 +176,7 @@ impl Ledger {
         self.motors.get_mut(machine).map(|entry| act(&mut entry.motor))
     }
 
-    /// Why a motor may not be started now.
+    /// Why a motor must not be started now.
     pub(super) fn hindered(&self, machine: &Machine, guard: &Guard, now: Instant) -> Option<Guarded> {
         let entry = self.motors.get(machine)?;
         let stagger = self.too_close(&entry.group, guard, now);
@@ -192,7 +192,7 @@ impl Ledger {
         self.motors.values().filter(move |entry| entry.group == *group)
     }
 
-    /// Whether a start in that group is decided whose word was not sent yet.
+    /// Whether a cleared start in this group has not been sent yet.
     fn awaits_word(&self, group: &Arc<str>) -> bool {
         self.members(group).any(|entry| entry.motor.reserved.is_some())
     }
@@ -202,7 +202,7 @@ impl Ledger {
             return None;
         }
         let retry_after = match self.awaits_word(name) {
-            // The awaited word may be written at any time, so the full distance counts.
+            // The cleared start may be sent at any time, so the full interval applies.
             true => guard.stagger,
             false => {
                 let last = self
@@ -223,7 +223,7 @@ impl Ledger {
         })
     }
 
-    /// Reserves a start that is decided: it counts from now on, and must be on disk before it is written to the drive.
+    /// Reserves a cleared start: it counts from now on, and must be on disk before it is written to the drive.
     pub(super) fn reserve(&mut self, machine: &Machine, number: u64, until: Instant, now: Instant) {
         self.settle(machine, None);
         self.generation += 1;
@@ -275,7 +275,7 @@ impl Ledger {
         }
     }
 
-    /// A word of a command that would start a standing motor is sent.
+    /// Notes that a word of a command that would start a standing motor is being sent.
     pub(super) fn start_written(&mut self, machine: &Machine, number: u64, client: &Arc<str>, now: Instant) {
         if self.with(machine, |motor| motor.start_written(number, client, now)) == Some(true) {
             self.generation += 1;

@@ -1,15 +1,16 @@
 //! Start guards: how often, how soon and how close together motors may be started, and under which conditions.
 //!
-//! A start is a passage of a motor from standing to running, by any cause. One [`Guards`] for the whole gateway counts
-//! them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`]. The rules
-//! of [`crate::permit`] decide whether an order may start a motor. A start that is cleared ([`BusGuards::clear`]) counts
-//! from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except those that
-//! `min_run` delays.
+//! A start is a change of a motor from standing to running, by any cause. One [`Guards`] for the whole gateway
+//! counts them, since drives of several buses can belong to one group; every bus has its view of it, [`BusGuards`].
+//! The rules of [`crate::permit`] decide whether an order may start a motor. A cleared start ([`BusGuards::clear`])
+//! counts from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except
+//! those that `min_run` delays.
 //!
-//! - `motor`: what is known of one motor. `passage`: its last start by an order. `ledger`: all motors, and what is to be written.
-//! - `interlock`: whether the points hold that a start needs. `around`: the drives that have these points. `view`: what the
-//!   guards of one bus say.
-//! - `file`: the form of the file. `keeper`: the thread that writes it; the only place here with I/O and a clock.
+//! - `motor`: the state of one motor. `passage`: its last start by an order. `ledger`: all motors, and the data to
+//!   save.
+//! - `interlock`: whether the points that a start needs have the required values. `around`: the drives that have
+//!   these points. `view`: the results of the guards of one bus.
+//! - `file`: the file format. `keeper`: the thread that writes the file; the only part with I/O and a clock.
 
 mod around;
 mod file;

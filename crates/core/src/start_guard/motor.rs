@@ -1,7 +1,7 @@
-//! The state of one motor, and when it may be started. Pure: time is an argument.
+//! The state of one motor, and when the motor may be started. Pure: time is an argument.
 //!
-//! A start is one passage of the motor from standing to running. The start of an order counts from before its word is
-//! written, once, however often the order is repeated until the motor was seen to stand again.
+//! A start is one change of the motor from standing to running. The start of an order counts from before its word
+//! is written, and only once, however often the order is repeated until the motor was seen to stand again.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use super::{Guard, Guarded, MOST_STARTS, Reason, Unable, shown};
 
 /// The window of `starts_per_hour`.
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
-/// Time after its start for which a motor counts as running although it was not read since.
+/// Time after its start for which a motor counts as running without a reading.
 const UNREAD: Duration = Duration::from_secs(2);
 
 /// The motor's state in a reading.
@@ -42,7 +42,7 @@ pub(super) struct Reserved {
     pub(super) generation: u64,
 }
 
-/// The last start of the motor, until it is seen to stand.
+/// The last start of the motor, kept until the motor is seen to stand.
 #[derive(Debug, Clone)]
 struct Started {
     at: Instant,
@@ -58,9 +58,9 @@ pub(super) struct Motor {
     pub(super) reserved: Option<Reserved>,
     /// The last start by an order.
     passage: Option<Passage>,
-    /// Whether the motor runs, and when that was read; none while it is not known.
+    /// Whether the motor runs, and when that was read; `None` if unknown.
     running: Option<(bool, Instant)>,
-    /// Whether the motor ran when that was known last.
+    /// Whether the motor ran when its state was last known.
     ran: Option<bool>,
     /// Run command as the drive had it last, and when that was read.
     commanded: Option<(bool, Instant)>,
@@ -78,7 +78,7 @@ impl Motor {
         self.starts.iter().copied().chain(reserved)
     }
 
-    /// The starts for the file: a reserved one with the latest time at which it may be written.
+    /// The starts to save; a reserved one with the latest time at which it may be written.
     pub(super) fn starts_to_keep(&self) -> impl Iterator<Item = Instant> + '_ {
         let reserved = self.reserved.map(|reserved| reserved.until);
         self.starts.iter().copied().chain(reserved)
@@ -105,8 +105,8 @@ impl Motor {
         self.passage.as_ref().map(|passage| passage.written)
     }
 
-    /// Whether the motor runs and goes on running. A motor that slows down after a stop may stand by the time that an
-    /// order reaches it.
+    /// Whether the motor runs and will continue to run. A motor that slows down after a stop may stand by the time
+    /// an order reaches it.
     fn runs_for_certain(&self) -> bool {
         let since_stop = |at: Instant| self.stop_written.is_none_or(|stop| at > stop);
         let written = self.written();
@@ -127,7 +127,7 @@ impl Motor {
         reserved || self.passage.as_ref().is_some_and(|passage| passage.number == number)
     }
 
-    /// Why the motor may not be started now, apart from its group.
+    /// Why the motor must not be started now, apart from the interval within its group.
     pub(super) fn hindered(&self, guard: &Guard, now: Instant) -> Option<Guarded> {
         self.too_often(guard, now)
             .into_iter()
@@ -190,19 +190,19 @@ impl Motor {
         self.reserved = Some(reserved);
     }
 
-    /// Counts decided starts as made, whatever their result.
+    /// Counts cleared starts as made, whatever their result.
     pub(super) fn settle(&mut self) {
         if let Some(reserved) = self.reserved.take() {
             self.count(reserved.at);
         }
     }
 
-    /// A word of a command that would start a standing motor is sent. Whether it makes a start.
+    /// Notes that a word of a command that would start a standing motor is being sent. Returns whether this is a start.
     pub(super) fn start_written(&mut self, number: u64, client: &Arc<str>, now: Instant) -> bool {
         let is_next = self.reserved.take_if(|reserved| reserved.number == number).is_some();
         match &mut self.passage {
             _ if is_next => {}
-            // A further word of a start, or a repetition of its last word, moves the start to now.
+            // Another word of the same start, or a repetition of its last word, moves the start to now.
             Some(passage) if passage.number == number && passage.progress != Progress::Vain => {
                 let counted = passage.counted;
                 self.discount(counted);
@@ -236,7 +236,8 @@ impl Motor {
         true
     }
 
-    /// The drive acknowledged a start; of one that does not say whether it runs that is all that shows it.
+    /// Notes that the drive acknowledged a start; for a drive that does not report whether it runs, this is the
+    /// only sign of it.
     pub(super) fn start_acknowledged(&mut self, now: Instant) {
         (self.running, self.ran, self.stands_since) = (Some((true, now)), Some(true), None);
         self.progresses(Progress::Ran);
@@ -260,7 +261,7 @@ impl Motor {
         }
     }
 
-    /// Takes a reading of the motor. Returns whether it changed which starts count, or from when.
+    /// Processes a reading of the motor. Returns whether it changed which starts count, or from when.
     pub(super) fn seen(&mut self, seen: Seen) -> bool {
         let Seen {
             running, stands, at, ..
@@ -340,7 +341,7 @@ impl Motor {
         (self.running, self.unable) = (None, false);
     }
 
-    /// The drive is away: the motor may run and stand again unseen.
+    /// Notes that the drive is offline: its motor may run and stop again unseen.
     pub(super) fn away(&mut self) {
         (self.running, self.unable, self.stands_since) = (None, false, None);
         if let Some(passage) = &mut self.passage {
@@ -348,14 +349,14 @@ impl Motor {
         }
     }
 
-    /// No reading shows whether the motor runs; it is taken to stand from now on.
+    /// Notes that no reading shows whether the motor runs; from now on the motor counts as standing.
     pub(super) fn begin_unreported(&mut self, now: Instant) {
         if self.running.is_none() {
             self.stands_since.get_or_insert(now);
         }
     }
 
-    /// Whether a stop of that client is an ordinary one: the first since its own order started the motor.
+    /// Whether a stop of this client is an ordinary one: the first since its own order started the motor.
     pub(super) fn is_ordinary_stop(&self, client: &str, last_stop: Option<Instant>) -> bool {
         let own = |started: &Started| started.by.as_deref() == Some(client);
         let first = |started: &Started| last_stop.is_none_or(|stop| stop < started.at);

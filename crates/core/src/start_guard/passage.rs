@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 
 use super::Seen;
 
-/// A motor that is seen to start later than that after its word started then, and not when the word was written.
+/// If a motor is seen to start later than this after its word, the start counts from then, not from the word.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
-/// Time after a word that starts it for which a motor may still read as standing.
+/// Time after the word that starts a motor for which the motor may still be read as standing.
 pub(super) const SETTLES: Duration = Duration::from_secs(1);
 
 /// Why a drive cannot start its motor.
@@ -16,7 +16,7 @@ pub(super) const SETTLES: Duration = Duration::from_secs(1);
 pub enum Unable {
     /// The drive has a fault.
     Fault,
-    /// The drive reports that it is not ready. The words of a start make some families ready.
+    /// The drive reports that it is not ready. Some families become ready by the words of a start.
     NotReady,
 }
 
@@ -39,17 +39,17 @@ pub enum ByRun {
 pub(super) enum Progress {
     /// No reading shows the start yet.
     Awaited,
-    /// The motor turns, and does not count as running yet.
+    /// The motor turns but does not count as running yet.
     Turns,
     /// The motor was seen to run.
     Ran,
-    /// The passage has ended: the motor stands again, or the drive did not take the command.
+    /// The start is over: the motor stands again, or the drive did not accept the command.
     Over,
     /// The drive could not start, and did not.
     Vain,
 }
 
-/// A start by an order, from its last word on.
+/// A start by an order, counted from the last word of the order.
 #[derive(Debug, Clone)]
 pub(super) struct Passage {
     /// Number of the start's command.
@@ -58,7 +58,7 @@ pub(super) struct Passage {
     pub(super) progress: Progress,
     /// When the word of the start was written.
     pub(super) written: Instant,
-    /// When a run command was last written: the start's own word or a repetition.
+    /// When a run command was last written: the word of the start or a repetition.
     pub(super) last: Instant,
     /// Date under which the start counts.
     pub(super) counted: Instant,
@@ -66,7 +66,7 @@ pub(super) struct Passage {
     pub(super) unable: bool,
     /// The drive was away since.
     pub(super) away: bool,
-    /// Since when the motor had stood before the start.
+    /// Since when the motor had been standing before the start.
     pub(super) stood: Option<Instant>,
 }
 
@@ -77,13 +77,13 @@ pub(super) enum Shown {
     Nothing,
     /// The awaited start was made.
     Started,
-    /// The awaited start was made, so late that it counts from now on.
+    /// The expected start happened so late that it counts from now on.
     StartedLate,
-    /// A start that does not count yet, and its client, where known.
+    /// A start that does not count yet, and the client that caused it, if known.
     Another(Option<Arc<str>>),
 }
 
-/// Other events of the motor: the last stop, and the run command as the drive had it last.
+/// Other facts about the motor: its last stop, and the run command as the drive last reported it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Besides {
     pub(super) stop: Option<Instant>,
@@ -95,9 +95,9 @@ impl Passage {
         besides.stop.is_some_and(|stop| stop > self.last)
     }
 
-    /// Effect of a run command on a motor that may not be running.
+    /// Effect of a run command on a motor that may be standing.
     pub(super) fn by_run(&self, besides: Besides) -> ByRun {
-        // The run command was taken away since, at the drive itself or from elsewhere.
+        // The run command was taken away since, at the drive itself or by another source.
         let is_off = besides.commanded.is_some_and(|(on, at)| !on && at > self.last);
         match self.progress {
             _ if self.is_stopped(besides) || self.away => ByRun::Starts,
@@ -108,7 +108,7 @@ impl Passage {
         }
     }
 
-    /// Notes that the motor is seen to run; with `came`, it did not run in the previous reading.
+    /// Notes that the motor is seen to run; with `came`, the previous reading showed it not running.
     pub(super) fn is_seen_running(&mut self, came: bool, besides: Besides, at: Instant) -> Shown {
         if self.progress == Progress::Over {
             return if came { Shown::Another(None) } else { Shown::Nothing };
@@ -123,14 +123,14 @@ impl Passage {
         if may_be_of_others && at > self.last + STARTS_WITHIN {
             return Shown::Another(None);
         }
-        // The run command stayed on all the time, so the awaited start was made.
+        // The run command was on all the time, so the expected start happened.
         match at > self.counted + STARTS_WITHIN {
             true => Shown::StartedLate,
             false => Shown::Started,
         }
     }
 
-    /// The motor does not run. Whether this start was in vain from the reading on.
+    /// Notes that the motor does not run. Returns whether this start failed, from this reading on.
     pub(super) fn is_seen_not_running(&mut self, seen: &Seen, besides: Besides) -> bool {
         let before = self.progress;
         self.unable &= seen.unable.is_some();
@@ -152,11 +152,11 @@ impl Passage {
         match seen.unable {
             Some((Unable::Fault, at)) if self.unable => shown(at > self.written),
             Some((Unable::NotReady, at)) if self.unable && seen.stands => shown(at >= self.written + SETTLES),
-            // The motor may have started, and the drive have tripped at once.
+            // The motor may have started and the drive tripped at once.
             Some((Unable::Fault, at)) if at > self.written => Progress::Over,
             _ if !seen.stands => Progress::Turns,
             _ if self.is_stopped(besides) => Progress::Over,
-            // At a reference of zero, asleep, or held back by a terminal.
+            // The motor waits at a reference of zero, in sleep mode, or is blocked by a terminal.
             _ if is_on => Progress::Awaited,
             _ if seen.at >= self.last + SETTLES => Progress::Over,
             _ => Progress::Awaited,

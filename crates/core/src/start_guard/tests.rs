@@ -71,7 +71,7 @@ impl GuardedDrives {
     /// Reads the drive: the motor runs, or stands.
     fn read(&self, drive: usize, running: bool, seconds: f64) {
         let (image, at) = (&self.images[drive], self.at(seconds));
-        // Words of the image: the status word (running, or at zero speed), and the output frequency.
+        // Words of the image: the status word (running, or at zero speed) and the output frequency.
         let words = if running { [0x03, 0, 0, 2500] } else { [0x41, 0, 0, 0] };
         read(image, 2100, &words, at);
         self.guards.update(DriveIndex::new(drive), &image.reading(at, SECOND));
@@ -96,7 +96,7 @@ impl GuardedDrives {
         self.asked(Stage::Write, &[drive], (number, None), seconds) == Verdict::Go
     }
 
-    /// The verdict on a command that starts these drives, at its turn.
+    /// The verdict on a command that starts these drives, when the command is about to be sent.
     fn clear(&self, drives: &[usize], number: u64, seconds: f64) -> Verdict {
         self.asked(Stage::Turn, drives, (number, None), seconds)
     }
@@ -229,7 +229,7 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
         Some("starts_per_hour"),
         "what was read before the stop says nothing"
     );
-    // The motor coasts down: it may stand by the time that the order reaches it.
+    // The motor coasts to a stop: it may stand by the time the order reaches it.
     rig.read(0, true, 2.1);
     assert_eq!(rig.refused(0, 2.2), Some("starts_per_hour"));
     // The drive did not take the stop, or was started again from elsewhere.
@@ -238,7 +238,7 @@ fn a_run_to_a_running_motor_is_no_start_and_one_behind_a_stop_is() {
     assert_eq!(rig.refused(0, 2.5), None);
     rig.read(0, false, 3.0);
     assert_eq!(rig.refused(0, 3.1), Some("starts_per_hour"));
-    // A run that was cleared while the motor ran does not start it when it has stopped since.
+    // A run command that was cleared while the motor ran must not start the motor if it has stopped since.
     assert!(!rig.may_write(0, 2, 3.1));
     assert!(rig.may_write(0, 1, 3.1));
 }
@@ -252,7 +252,7 @@ fn starts_at_the_panel_count_and_those_of_orders_count_once() {
     rig.read(0, true, 6.0);
     rig.read(0, false, 7.0);
     assert_eq!(rig.refused(0, 8.0), Some("starts_per_hour"), "the panel started it");
-    // A motor that runs at its first reading was not seen to start.
+    // A motor that already runs at its first reading was not seen to start.
     rig.read(1, true, 0.0);
     rig.read(1, false, 1.0);
     rig.start_and_stop(1, 2, 2.0);
@@ -272,7 +272,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     assert_eq!((rig.refused(0, 30.9), rig.refused(0, 31.0)), (Some("min_off"), None));
     rig.start_and_stop(0, 1, 40.0);
     assert_eq!((rig.refused(0, 70.9), rig.refused(0, 71.0)), (Some("min_off"), None));
-    // Start and stop come between two reads, so the motor must be seen standing again.
+    // Start and stop happened between two reads, so the motor must be seen standing again.
     assert_eq!(rig.clear(&[0], 2, 71.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(0), 2, &Arc::from("c"), rig.at(71.0));
@@ -281,18 +281,18 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     rig.read(0, false, 71.2);
     rig.read(0, false, 72.5);
     assert_eq!((rig.refused(0, 102.4), rig.refused(0, 102.5)), (Some("min_off"), None));
-    // Stops to a motor that stands change nothing.
+    // Stops to a standing motor change nothing.
     rig.guards.stop_written(DriveIndex::new(0), rig.at(102.6));
     rig.read(0, false, 102.7);
     assert_eq!(rig.refused(0, 102.8), None);
-    // While the drive was away, its motor may have run.
+    // While the drive was offline, its motor may have run.
     rig.images[0].update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
     rig.guards
         .update(DriveIndex::new(0), &rig.images[0].reading(rig.at(180.0), SECOND));
     assert_eq!(rig.refused(0, 180.0), Some("min_off"));
     rig.read(0, false, 190.0);
     assert_eq!((rig.refused(0, 219.0), rig.refused(0, 220.0)), (Some("min_off"), None));
-    // A start that may wait is accepted if it can go in time.
+    // A start that may wait is accepted if its time comes before it expires.
     rig.read(1, false, 200.0);
     let accepted = |until: f64| reason(rig.asked(Stage::Accept, &[1], (0, Some(until)), 220.0));
     assert_eq!((accepted(229.0), accepted(231.0)), ("min_off", "wait"));
@@ -324,7 +324,7 @@ fn drives_of_a_group_start_one_after_the_other() {
     // A start that was cleared but not written counts from its clearance.
     rig.guards.settle(DriveIndex::new(1), 3);
     assert_eq!((rig.refused(0, 17.9), rig.refused(0, 18.0)), (Some("stagger"), None));
-    // A drive without a guard is not held back, and its starts count for the others.
+    // A drive without a guard is not delayed, but its starts count for the others.
     assert_eq!(rig.clear(&[2], 4, 18.0), Verdict::Go);
     rig.guards
         .start_written(DriveIndex::new(2), 4, &Arc::from("c"), rig.at(18.0));
@@ -357,7 +357,7 @@ fn only_a_good_point_holds_an_interlock() {
     assert!(text(3.5).contains("is stale: read 1.5 s ago"), "{}", text(3.5));
     rig.read(2, true, 4.0);
     assert_eq!(rig.clear(&[0], 1, 4.5), Verdict::Go);
-    // The interlock no longer holds when the word is to be written.
+    // The interlock no longer holds when the word is about to be written.
     assert!(rig.may_write(0, 1, 4.9));
     assert!(!rig.may_write(0, 1, 5.5));
     assert_eq!(
@@ -387,7 +387,7 @@ fn a_start_waits_until_it_is_on_disk() {
     rig.shared.wrote(generation, Ok(()));
     assert_eq!(rig.clear(&[0], 1, 1.2), Verdict::Go);
     assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
-    // If the gateway is killed before writing anything, the next run knows of the start.
+    // If the gateway is killed before it has written the word, the next run knows of the start.
     let next = GuardedDrives::of(per_hour(1), Vec::new());
     let saved = Saved::from_json(&saved.to_json()).unwrap();
     next.shared.keep(&saved, next.start, time + 60 * SECOND);
@@ -475,7 +475,7 @@ fn counters_belong_to_the_machine_over_a_reload() {
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
     assert_eq!(starts(&after, 2), "starts_per_hour");
     assert_eq!(starts(&after, 1), "go");
-    // Another machine at that address has no starts.
+    // Another machine at that address has no starts counted.
     specs[2].profile = profile("vacon-cx");
     let after = BusGuards::of(&rig.shared, &rig.bus, &specs).unwrap();
     assert_eq!(starts(&after, 2), "go");
@@ -514,7 +514,7 @@ fn min_run_delays_the_first_stop_of_the_client_that_started_the_motor() {
     );
     assert!(!rig.guards.is_ordinary_stop(DriveIndex::new(0), "another", None));
     assert_eq!((waits(10.0), waits(21.0)), (Some(rig.at(21.0)), None));
-    // The motor is seen to stand, or not seen at all: the stop does not wait.
+    // The motor is seen to stand, or is not seen at all: the stop is not delayed.
     rig.read(0, false, 12.0);
     assert_eq!(waits(12.1), None);
     rig.read(1, false, 0.0);

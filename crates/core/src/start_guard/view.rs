@@ -1,4 +1,4 @@
-//! The guards of one bus: what they say of its drives. The rules that ask them are in `permit`. Pure: time is an argument.
+//! The guards of one bus: their results for its drives. The rules that use them are in `permit`. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,7 +19,7 @@ const LOOK: Duration = Duration::from_millis(2);
 #[derive(Debug)]
 pub struct BusGuards {
     shared: Arc<Guards>,
-    /// Guards by place on the bus; none for a drive without guards.
+    /// Guards by index of the drive on the bus; `None` for a drive without guards.
     drives: PerDrive<Option<Guarding>>,
 }
 
@@ -41,12 +41,12 @@ pub enum Clearance {
     Go,
     /// The start is not cleared before this time.
     Wait(Instant),
-    /// The start is refused, as it cannot be counted.
+    /// The start is refused because it cannot be counted.
     Refused(Guarded),
 }
 
 impl BusGuards {
-    /// The guards of a bus; none where none of its drives is guarded. They take effect with [`BusGuards::begin`].
+    /// The guards of a bus; `None` if none of its drives is guarded. They take effect with [`BusGuards::begin`].
     pub fn of<'d>(
         shared: &Arc<Guards>,
         bus: &BusSpec,
@@ -76,8 +76,8 @@ impl BusGuards {
         })
     }
 
-    /// The bus is about to begin: from now on the starts of its drives count so. Until then, and after a reload that is
-    /// refused, the drives of the bus before it are guarded as they were.
+    /// Puts these guards into effect, when the bus is about to start. Until then, and if the reload is refused, the
+    /// drives keep the guards of the previous bus.
     pub fn begin(&self) {
         let mut ledger = self.shared.lock();
         for of in self.drives.iter().flatten() {
@@ -110,7 +110,8 @@ impl BusGuards {
         self.shared.lock().motor(&of.machine).map_or(ByRun::Runs, Motor::by_run)
     }
 
-    /// Whether the start of an order was cleared for the drive and is not written: that one starts it, if it does.
+    /// Whether a cleared start of an order has not been written to the drive yet: that order starts the motor, if
+    /// anything does.
     pub fn has_cleared(&self, drive: DriveIndex) -> bool {
         let Some(of) = self.of_drive(drive) else { return false };
         let ledger = self.shared.lock();
@@ -124,18 +125,19 @@ impl BusGuards {
         ledger.motor(&of.machine).is_some_and(|motor| motor.is_cleared(number))
     }
 
-    /// Why the guard of the drive lets its motor not start now, and when it may.
+    /// Why the guard of the drive does not permit a start now, and when it will.
     pub fn hindered(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         self.shared.lock().hindered(&of.machine, &of.guard, now)
     }
 
-    /// Why interlocks keep the motor of the drive from starting now.
+    /// Why interlocks prevent a start of the drive now.
     pub fn interlocked(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         self.interlocked_of(self.of_drive(drive)?, now)
     }
 
-    /// The motor ran, or could not start, when the order was judged, and that has changed since: a start that nothing cleared.
+    /// A refusal if the motor ran or could not start when the order was judged, and that has changed since: the
+    /// order would be a start that was never cleared.
     pub fn changed_since(&self, drive: DriveIndex) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         Some(Guarded {
@@ -147,7 +149,7 @@ impl BusGuards {
         })
     }
 
-    /// Why that drive is not started by one order together with the others that it starts.
+    /// A refusal if this drive must not be started together with the other drives of the same order.
     pub fn too_close_together(&self, drive: DriveIndex, effects: &Effects) -> Option<Guarded> {
         let of = self.of_drive(drive).filter(|of| !of.guard.stagger.is_zero())?;
         let others = self
@@ -166,7 +168,7 @@ impl BusGuards {
         })
     }
 
-    /// Why the motor may not be started now, as text; not counted.
+    /// Why the motor must not be started now, as text for people; nothing is counted.
     pub(crate) fn hindrance(&self, drive: DriveIndex, now: Instant) -> Option<Guarded> {
         let of = self.of_drive(drive)?;
         let interlocked = self.interlocked_of(of, now);
@@ -179,7 +181,8 @@ impl BusGuards {
         })
     }
 
-    /// The interlocks that do not hold and stop the running motor of the drive; `stood`: until when its bus last did not run.
+    /// The interlocks that no longer hold and require the running motor of the drive to stop; `stood` is the end of
+    /// the last pause of its bus.
     pub fn tripped(&self, drive: DriveIndex, stood: Option<Instant>, now: Instant) -> Vec<Unmet> {
         let Some(of) = self.of_drive(drive) else {
             return Vec::new();
@@ -214,8 +217,8 @@ impl BusGuards {
         })
     }
 
-    /// Clears an order whose turn came: its starts of these drives are counted once, and it is sent when they are on disk. The
-    /// order is not written later than `expires`.
+    /// Clears an order that is about to be sent: its starts of these drives are counted once, and it is sent when
+    /// they are on disk. The order is not written later than `expires`.
     pub fn clear(&self, started: &[DriveIndex], number: u64, expires: Instant, now: Instant) -> Clearance {
         let started: Vec<&Guarding> = started.iter().filter_map(|drive| self.of_drive(*drive)).collect();
         let mut ledger = self.shared.lock();
@@ -265,7 +268,7 @@ impl BusGuards {
         }
     }
 
-    /// A word of a command of that client that starts the motor is sent.
+    /// Notes that a word of a command of this client that starts the motor is being sent.
     pub fn start_written(&self, drive: DriveIndex, number: u64, client: &Arc<str>, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().start_written(&of.machine, number, client, now);
@@ -320,8 +323,8 @@ impl BusGuards {
         }
     }
 
-    /// Whether a stop of that client is an ordinary one, which waits for `min_run`: the first since its own order started the
-    /// motor.
+    /// Whether a stop of this client is an ordinary one, which waits for `min_run`: the first since its own order
+    /// started the motor.
     pub(crate) fn is_ordinary_stop(&self, drive: DriveIndex, client: &str, last_stop: Option<Instant>) -> bool {
         let of = self.of_drive(drive).filter(|of| !of.guard.min_run.is_zero());
         of.is_some_and(|of| {
@@ -331,7 +334,7 @@ impl BusGuards {
         })
     }
 
-    /// Until when an ordinary stop of the drive waits.
+    /// Until when `min_run` delays an ordinary stop of the drive.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
         let of = self.of_drive(drive)?;
         self.shared.lock().motor(&of.machine)?.stop_waits(&of.guard, now)
@@ -344,11 +347,11 @@ impl BusGuards {
     }
 }
 
-/// The motor's state in a reading; `None` if the reading does not show whether it runs.
+/// The motor's state from a reading; `None` if the reading does not show whether the motor runs.
 fn seen(reading: &Reading<'_>) -> Option<Seen> {
     let sample = reading.model(ModelPoint::Running);
     let running = sample.good()?.as_bool();
-    // A running bit of a faulted drive may be from before the fault; the motor does not run by its run command then.
+    // The running bit of a faulted drive may be from before the fault; the motor does not run by its run command then.
     let runs = running && !reading.is_set(ModelPoint::Fault);
     let commanded = reading.model(ModelPoint::Run);
     let turns = || matches!(reading.standstill(None), Standstill::Turns(_));

@@ -1,9 +1,8 @@
-//! Stop all: every controlled drive of the gateway, of a bus or of a group, each with a stop of its own that is watched until
-//! the motor stands.
+//! Stop all: stops every controlled drive of the gateway, of a bus or of a group, and watches each until its motor stands.
 //!
-//! One mechanism for all north sides: [`StopAll::order`] places the stops before it returns, a task of the gateway
-//! calls [`StopAll::look`] while a command is in progress, and [`StopAll::begun`] wakes it. Where every drive of a bus
-//! is included and known to obey it, one broadcast goes before their stops. Pure: time is an argument.
+//! All interfaces use one mechanism: [`StopAll::order`] places the stops before it returns, a task of the gateway
+//! calls [`StopAll::look`] while a command is in progress, and [`StopAll::begun`] wakes it. If every drive of a bus
+//! is included and known to obey it, one broadcast is sent before the single stops. Pure: time is an argument.
 
 mod one_stop;
 mod scope;
@@ -30,20 +29,20 @@ pub const WAIT: Duration = Duration::from_secs(10);
 pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
 /// Time between two looks at a command that is in progress.
 pub const LOOK: Duration = Duration::from_millis(20);
-/// Time for the broadcast to go onto the line; the stops of the drives do not wait for it.
+/// Time within which the broadcast is sent; the stops of the single drives do not wait for it.
 const BROADCAST: Duration = Duration::from_millis(500);
-/// Commands that wait for their answers; beyond that the oldest is answered with what is known.
+/// Most commands that wait for their answers; beyond that the oldest is answered with what is known.
 const MOST_ORDERS: usize = 256;
 
 /// The result of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
-    /// The drive acknowledged its stop, and a read since shows that the motor stands.
+    /// The drive acknowledged its stop, and a later read shows that the motor stands.
     Standing,
     /// The drive acknowledged its stop, and the motor still turns.
     Stopping,
-    /// Neither an acknowledgement nor a standstill is known.
+    /// Neither an acknowledgement of the stop nor a standstill is known.
     Unproven,
 }
 
@@ -54,7 +53,7 @@ pub struct StoppedDrive {
     pub drive: String,
     /// The result.
     pub outcome: Stopped,
-    /// Why the drive is not known to stand.
+    /// Why the drive is not known to stand still.
     #[serde(default)]
     pub reason: Option<String>,
 }
@@ -62,7 +61,7 @@ pub struct StoppedDrive {
 /// The one answer to a command.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StopReport {
-    /// Whether every drive stands.
+    /// Whether every motor is known to stand.
     pub ok: bool,
     /// All drives that were to be stopped, in the order of the configuration.
     pub drives: Vec<StoppedDrive>,
@@ -75,12 +74,12 @@ impl StopReport {
     }
 }
 
-/// Where the answers to a command arrive. A sender that is gone means that the process ends.
+/// Receivers of the answers to a command. A closed channel means that the process ends.
 #[derive(Debug)]
 pub struct StopOrder {
-    /// Once every stop was acknowledged, or failed for the first time: whether none failed.
+    /// Resolves when every stop was acknowledged or failed once: whether none failed.
     pub acknowledged: oneshot::Receiver<bool>,
-    /// Once every drive stands, or the time has ended.
+    /// Resolves when every motor stands, or the time limit has passed.
     pub report: oneshot::Receiver<StopReport>,
 }
 
@@ -93,10 +92,10 @@ pub struct StopAll {
 
 #[derive(Debug, Default)]
 struct State {
-    /// The stops in progress; each machine once, for all commands that include it.
+    /// The stops in progress, one for each machine, shared by all commands that include the machine.
     stops: Vec<OneStop>,
     orders: Vec<UnderWay>,
-    /// Broadcasts in progress; dropping one withdraws it if it was not sent.
+    /// Broadcasts in progress; dropping one withdraws it if it was not sent yet.
     broadcasts: Vec<(Exchange, Instant)>,
 }
 
@@ -110,11 +109,12 @@ struct UnderWay {
 }
 
 impl StopAll {
-    /// Stops all drives of `scope` as `origin`, who may write. When this returns every stop is in the queue of its bus. Where an order
-    /// under way has stopped a drive, and nothing may have started it since, this order joins it; any other drive has a new stop.
+    /// Stops all drives of `scope` for `origin`, who may write. When this returns every stop is in the queue of its
+    /// bus. If an order in progress has stopped a drive and nothing may have started it since, this order joins
+    /// that one; any other drive gets a new stop.
     ///
     /// # Errors
-    /// The bus or group does not exist, or none of its drives is controlled.
+    /// If the bus or group does not exist, or none of its drives is controlled.
     pub fn order(
         &self,
         plant: &Plant,
@@ -152,8 +152,8 @@ impl StopAll {
         self.begun.notified().await;
     }
 
-    /// Looks the result of the stops, commands those again that failed, and answers what is done. Whether a command is
-    /// still in progress.
+    /// Checks the results of the stops, repeats those that failed, and answers completed commands. Returns whether
+    /// a command is still in progress.
     pub fn advance(&self, plant: &Plant, now: Instant) -> bool {
         let mut state = self.state();
         state.advance(plant, now);
@@ -210,7 +210,7 @@ impl State {
             let stands = concerned().all(|stop| stop.outcome(plant, now).outcome == Stopped::Standing);
             let over = stands || now >= order.until;
             if let Some(acknowledged) = order.acknowledged.take_if(|_| is_answered || over) {
-                // The client may be gone, so an error is ignored.
+                // The client may have disconnected, so an error is ignored.
                 let _ = acknowledged.send(all);
             }
             match over {
@@ -229,7 +229,7 @@ impl State {
             Some(stop.outcome(plant, now))
         };
         let report = StopReport::new(order.machines.iter().filter_map(of).collect());
-        // The client may be gone, so an error is ignored.
+        // The client may have disconnected, so an error is ignored.
         let _ = order.report.send(report);
     }
 }
@@ -241,7 +241,7 @@ fn note_joined(plant: &Plant, drive: &DriveHandle, origin: &Origin, now: Instant
     plant.writes.audit().note(origin, what, ("acknowledged", text), now);
 }
 
-/// The broadcast that stops every drive of the bus, where they are known to obey it and one of them answers.
+/// The broadcast that stops every drive of the bus, if they are known to obey it and at least one of them answers.
 fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> Option<Exchange> {
     let drives = &bus.image.drives;
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
@@ -251,7 +251,7 @@ fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> O
     Some(bus.ask_first(question, &plant.writes, now))
 }
 
-/// Number of controlled drives among these that are not known to stand.
+/// Number of controlled drives among these that are not known to stand still.
 pub fn not_standing<'d>(drives: impl IntoIterator<Item = &'d DriveHandle>, now: Instant) -> usize {
     let controlled = drives
         .into_iter()

@@ -1,4 +1,4 @@
-//! The stop of one drive: placed, placed again where it failed, acknowledged.
+//! The stop of one drive: placed, repeated if it failed, acknowledged.
 
 use std::time::{Duration, Instant};
 
@@ -24,9 +24,9 @@ pub(crate) struct OneStop {
     failed: Option<String>,
     /// Wait before the next try.
     pause: Duration,
-    /// A read since its acknowledgement showed that the motor stands, and none since that it turns.
+    /// A read after the acknowledgement showed that the motor stands, and no later read shows it turning.
     stood: bool,
-    /// Whether the motor was seen to turn after it had stood.
+    /// Whether the motor was seen to turn again after it had been standing.
     restarted: bool,
     /// Number of the last command before the stop that may start the drive.
     last_starter: u64,
@@ -50,7 +50,7 @@ impl OneStop {
         let mut stop = OneStop {
             machine,
             drive: drive.image.spec.name.clone(),
-            // A stop in progress is completed, whatever right a reload takes away.
+            // A stop in progress is completed even if a reload removes the client's right.
             origin: origin.clone().lasting(),
             step: Step::Refused,
             failed: None,
@@ -81,8 +81,8 @@ impl OneStop {
         };
     }
 
-    /// Whether a stop of this client joins this one, so that nothing is written for it: this one waits for its acknowledgement,
-    /// or has it, and nothing is known to have started the motor since.
+    /// Whether a stop of this client joins this one, so that nothing is written for it: this one waits for its
+    /// acknowledgement or has it, and nothing is known to have started the motor since.
     pub(crate) fn is_joined(&self, drive: &DriveHandle, by: &Origin, now: Instant) -> bool {
         let stands_good = match &self.step {
             Step::Placed(_) => true,
@@ -106,7 +106,7 @@ impl OneStop {
         matches!(self.step, Step::Refused)
     }
 
-    /// Why the stop is not acknowledged.
+    /// Why the stop has not been acknowledged.
     pub(crate) fn why_not(&self) -> String {
         let why = self.failed.as_deref().unwrap_or("it got no reply");
         format!("not acknowledged: {why}")
@@ -122,7 +122,7 @@ impl OneStop {
         self.failed.is_some()
     }
 
-    /// Looks the result, and places it again where it failed. A reload may have put the drive elsewhere.
+    /// Checks the result, and repeats the stop if it failed. A reload may have moved the drive to another bus.
     pub(crate) fn advance(&mut self, plant: &Plant, now: Instant) {
         match &mut self.step {
             Step::Placed(placed) => {
@@ -158,7 +158,7 @@ impl OneStop {
                 match seen {
                     Some(Standstill::Stands) => self.stood = true,
                     Some(Standstill::Turns(_)) => self.restarted |= std::mem::take(&mut self.stood),
-                    // On a slow line a value is old before the next read of it.
+                    // On a slow line a value becomes old before it is read again.
                     Some(Standstill::Unknown(_)) | None => {}
                 }
             }

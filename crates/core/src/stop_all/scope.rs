@@ -1,4 +1,4 @@
-//! Which drives a command stops.
+//! The drives that a command to stop all includes.
 
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::Access;
@@ -16,7 +16,7 @@ pub enum Scope {
     Group(String),
 }
 
-/// Why a command stops nothing.
+/// Why a command to stop all has no drives.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NothingToStop {
     /// No bus or group has this name.
@@ -26,7 +26,7 @@ pub enum NothingToStop {
         kind: &'static str,
         /// The requested name.
         name: String,
-        /// The known names.
+        /// The names that exist, for the message.
         known: Vec<String>,
     },
     /// No drive of the bus or group is controlled.

@@ -5,13 +5,13 @@ use std::time::Duration;
 use crate::codec::{Protocol, RequestPdu};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 
-/// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
+/// Time that drives need to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
 pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 
-/// The write that stops every drive of a line at once when it is sent to all of them: only where all of them are to be
-/// stopped, and it means that to each of them. It gets no reply, so a separate stop must follow for every drive.
+/// The write that stops every drive of a line when it is broadcast: only if all of them are to be stopped, and the
+/// write means a stop to each of them. It gets no reply, so every drive gets a separate stop afterwards.
 pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d DriveSpec>) -> Option<RequestPdu> {
-    // With these protocols address 0 is an ordinary device.
+    // With these protocols, address 0 is an ordinary device.
     if bus.protocol == Protocol::N2 || bus.is_modbus_tcp() {
         return None;
     }
@@ -19,7 +19,7 @@ pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d Driv
         .into_iter()
         .map(|drive| (drive.access == Access::Control).then(|| drive.profile.broadcast_stop())?);
     let first = stops.next()??;
-    // A single drive is stopped just as fast by its own stop.
+    // A single drive is stopped just as fast by its own stop, without a broadcast.
     let mut others = stops.peekable();
     others.peek()?;
     others.all(|stop| stop.as_ref() == Some(&first)).then_some(first)

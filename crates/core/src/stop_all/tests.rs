@@ -114,7 +114,7 @@ fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
         "{audited:?}"
     );
     let (_, placed) = second_order(|plant, all, now| {
-        // The motor stood, and turns.
+        // The motor had been standing and now turns.
         read(plant, after(now, 200), 0x41, 0);
         all.advance(plant, after(now, 250));
         read(plant, after(now, 500), 0x03, 0);

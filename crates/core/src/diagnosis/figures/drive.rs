@@ -12,7 +12,7 @@ pub enum Sign {
     Answered,
     /// Requests without a reply, while the drive is present.
     Silent,
-    /// All requests without a reply, whether the drive is present or not.
+    /// All requests that got no reply, whether the drive is present or not.
     Tried,
     /// Replies that are damaged anywhere.
     Damaged,
@@ -22,9 +22,9 @@ pub enum Sign {
     Led,
     /// Stray bytes before the reply that are zeros.
     LedZero,
-    /// Replies without their beginning.
+    /// Replies whose first bytes are missing.
     StartLost,
-    /// Requests that came back without their end.
+    /// Echoes of requests whose last bytes are missing.
     CutEcho,
     /// Stray bytes after a reply, while the line should be idle.
     Idle,
@@ -34,7 +34,7 @@ pub enum Sign {
     Late,
     /// Replies that used more than half of the time limit.
     Slow,
-    /// Transactions that show whether the adapter receives its own requests.
+    /// Transactions that show whether the adapter receives its own requests or not.
     EchoShown,
     /// Transactions that show that the adapter receives its own requests.
     Echoed,
@@ -51,7 +51,8 @@ pub struct Drive {
     pub(super) slowest: Window<1>,
     /// Time limit for the first byte of a reply of the drive.
     pub response_timeout: Duration,
-    /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
+    /// Requests without a reply in a row; of these, the number that closely followed a reply, and the number that
+    /// followed a pause.
     pub(super) run: u16,
     pub(super) run_paused: [u16; 2],
     pub(super) silent_at: Option<Instant>,
@@ -70,7 +71,7 @@ impl Drive {
         self.window.sum(sign as usize)
     }
 
-    /// Steps of the last minute in which one of these was counted.
+    /// Number of steps in the last minute in which one of these signs was counted.
     pub fn steps(&self, signs: &[Sign]) -> usize {
         let has = |step: &&[u16; SIGNS]| {
             signs

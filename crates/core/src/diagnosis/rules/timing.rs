@@ -10,7 +10,7 @@ use crate::diagnosis::{Cause, Certainty};
 const MOST_PROPOSED: u32 = 5000;
 
 impl Rules<'_> {
-    /// A drive whose replies come after the time limit was seen to do so, whatever the others do.
+    /// Finds a drive whose replies come after the time limit. This is measured directly, so the other drives do not matter.
     pub(super) fn answers_late(&mut self) {
         let late = self.figures.sum(Sign::Late);
         let figures = self.figures;
@@ -198,7 +198,7 @@ impl Rules<'_> {
             return;
         }
         let mut fit = 0;
-        // A few may be late replies, or have come twice.
+        // A few replies that are too early may be late or duplicate replies.
         let place = by_baud.iter().position(|count| {
             fit += count;
             fit * 20 >= early * 19

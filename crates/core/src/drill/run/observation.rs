@@ -1,6 +1,7 @@
-//! The observations of a drill once the motor should stop, and the verdict. A reading is dated as early as it can be, since a reply
-//! may be a late one to an earlier request: it proves that the motor still turned then. Standstill is proven only at the moment at
-//! which the reading is evaluated; a standstill not seen in time is not proven.
+//! The observations of a drill once the motor should stop, and the verdict. Each reading is dated as early as
+//! possible, since a reply may be a late reply to an earlier request: such a reading proves that the motor still
+//! turned at that earlier time. Standstill is proven only at the moment when the reading is evaluated; a standstill
+//! not seen in time is not proven.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -12,7 +13,8 @@ use crate::plant::Placed;
 use crate::process_image::{Reading, Standstill};
 use crate::stop_all::OneStop;
 
-/// For so long after a silence the first reading of the drive shows what was so at its end: a sound line takes that long at most.
+/// Time after a silence within which the first reading of the drive counts as its state at the end of the silence:
+/// on a sound line a reading takes no longer.
 const AT_ONCE: Duration = Duration::from_millis(500);
 
 /// The observation of a test.
@@ -137,7 +139,7 @@ impl Run {
         }
         let limit = self.options.limit.as_secs_f64();
         match reading.standstill(Some(until)) {
-            // Whether the switch to local control stopped the motor is not known, so the drill proves nothing.
+            // The cause of the standstill may be the switch to local control, so the drill proves nothing.
             Standstill::Stands if is_local(reading) => Seen::Ended(DrillState::Aborted, LOCAL.to_string()),
             Standstill::Stands if now <= until + AT_ONCE => Seen::Stood {
                 took: now.saturating_duration_since(cause),

@@ -48,7 +48,7 @@ fn what_is_broken_is_told_of_with_its_place() {
         assert!(what.contains("truncated"), "{what} of {length}");
         assert!(offset <= length);
     }
-    // Any byte may be damaged, at any place.
+    // A damaged byte at any place of the file must be noticed.
     for place in (0..bytes.len()).step_by(997) {
         let mut broken = bytes.clone();
         broken[place] = if broken[place] == b'7' { b'8' } else { b'7' };
@@ -161,7 +161,7 @@ fn the_directory_keeps_its_limits_over_restarts() {
         .map(|f| f.unwrap().file_name())
         .collect();
     assert_eq!(files.len(), 11, "{files:?}");
-    // An id may come twice after the clock was set back.
+    // After the clock was set back, an id may occur twice.
     assert_eq!(
         Store::open(&limits)
             .write(&mut recording, SystemTime::now())
@@ -203,11 +203,11 @@ fn after_the_clock_was_set_back_what_is_yet_to_come_goes_and_what_was_made_stays
         made(&format!("r{hour}"), hour);
     }
     assert_eq!(made("r20", 20), "r18 r19 r20");
-    // Two hours back.
+    // The clock is set back by two hours.
     assert_eq!(made("b1", 18), "b1 r18 r20");
     assert_eq!(made("b2", 19), "b1 r18 b2");
     assert_eq!(made("b3", 20), "r18 b2 b3");
-    // The clock is set back to before all of them.
+    // The clock is set back to a time before all recordings.
     assert_eq!(made("c1", 1), "c1 b2 b3");
     assert_eq!(made("c2", 2), "c1 c2 b3");
 }

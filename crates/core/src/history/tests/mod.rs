@@ -146,7 +146,7 @@ fn an_over_current_ramp_is_found_to_the_value_and_the_poll() {
         (TriggerKind::Fault, -30.0, 10.0)
     );
     let currents = recording.values_of("motor_current");
-    // 30 s before the fault, the poll that shows it, and 10 s after it: no poll is missing.
+    // Expected: 30 s before the fault, the poll that shows the fault, and 10 s after it, without a missing poll.
     assert_eq!(currents.len(), 3000 + 1 + 1000);
     for (place, (t, value)) in currents.iter().enumerate() {
         let poll = place as i64 - 3000;

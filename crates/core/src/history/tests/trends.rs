@@ -84,7 +84,7 @@ fn starts_and_run_time_are_what_the_polls_saw() {
     let totals = rig.history().totals();
     assert_eq!(totals.starts, 2);
     assert!((totals.running_seconds - 30.0).abs() < 0.02, "{totals:?}");
-    // Away for a minute, in which it starts; the poll after shows it running.
+    // The drive is offline for a minute, in which the motor starts; the next poll shows it running.
     rig.link(Link::Offline(SystemTime::UNIX_EPOCH));
     rig.recorder.tick(rig.clock);
     rig.pass(MINUTE);

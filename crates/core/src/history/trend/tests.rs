@@ -18,7 +18,7 @@ fn clock() -> Clock {
 struct Rig {
     trend: DriveTrend,
     clock: Clock,
-    /// Values that were fed in: time, value, time for which it is good.
+    /// The values that were added: time, value, and how long the value is good.
     fed: Vec<(Instant, f32, Duration)>,
 }
 
@@ -49,7 +49,7 @@ impl Rig {
         self.fed.push((self.clock.now, value, good_for));
     }
 
-    /// The part at the end of a range, as a client requests it.
+    /// The last part of a range, as a client requests it.
     fn part(&self, range: Range, clock: Clock) -> Part {
         let from = clock.now - range.span;
         self.trend
@@ -106,7 +106,8 @@ impl Rig {
 }
 
 proptest! {
-    /// Whatever comes whenever: each step of each range shows what was read in it, and nothing else.
+    /// Compares with a naive model: whatever values come at whatever times, each step of each range shows what was
+    /// read in it and nothing else.
     #[test]
     fn every_step_is_that_of_a_naive_model(
         reads in prop::collection::vec((0u32..6, 0u64..4000, -1e6f32..1e6, 0u64..20), 1..300)
@@ -267,7 +268,7 @@ fn many_drives_share_the_memory_and_what_they_keep_is_right() {
     rig.check();
     feed(&mut rig, 700);
     rig.check();
-    // With more room, forgotten values do not come back, but new ones are kept.
+    // When the trend may reach back further again, forgotten values do not return, and new ones are kept.
     rig.trend.set_reach(Reach::FULL);
     let [fine, ..] = RANGES;
     let shown = rig.part(fine, rig.clock).steps.iter().flatten().count();

@@ -1,5 +1,5 @@
-//! The lines of an audit file. Each has the SHA-256 of the line before it, so an edit or a cut inside shows when the lines
-//! are read again; a cut at the end shows against a hash that was noted elsewhere. Pure.
+//! The lines of an audit file. Each line has the SHA-256 of the line before it, so that an edit or a removed line
+//! is noticed on reading; a cut at the end is noticed by comparing with a hash that was noted elsewhere. Pure.
 
 use std::fmt;
 use std::str::FromStr;
@@ -76,7 +76,7 @@ pub enum Entry<'e> {
         /// Records of commands that were not sent.
         not_sent: u64,
     },
-    /// The bytes between the last entry and this one are the rest of a line that a crash cut.
+    /// The bytes between the last entry and this one are the rest of a line that a crash cut off.
     Fragment {
         /// When the bytes were found.
         #[serde(serialize_with = "crate::event::rfc3339")]
@@ -98,7 +98,7 @@ pub struct Chain {
 }
 
 impl Chain {
-    /// The line of an entry, with its line end, and the chain after it.
+    /// The line of an entry, with its line end, and the state of the chain after it.
     ///
     /// # Errors
     /// The entry has no form in JSON, which all have.
@@ -135,7 +135,7 @@ impl Head {
     }
 }
 
-/// The number of a line, if it is an entry.
+/// The sequence number of a line, if the line is an entry.
 pub fn seq(line: &[u8]) -> Option<u64> {
     Head::read(line).map(|head| head.seq)
 }
@@ -151,7 +151,7 @@ pub struct Tail {
     pub ended: bool,
 }
 
-/// The end of a file whose last bytes are `window`; `None` if no entry is in them.
+/// The end of the chain in a file whose last bytes are `window`; `None` if they contain no entry.
 pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
     let of = |line: &[u8], head: &Head| Chain {
         seq: head.seq,
@@ -168,8 +168,8 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
         });
     }
     let mut end = window.len();
-    // Bytes before the first line end may be the end of a longer line, so they count only if the window is the whole
-    // file.
+    // Bytes before the first line end may be the end of a longer line, so they count only if the window covers the
+    // whole file.
     while let Some(line_end) = window.get(..end)?.iter().rposition(|byte| *byte == b'\n') {
         let before = window.get(..line_end)?;
         let begin = before.iter().rposition(|byte| *byte == b'\n').map(|place| place + 1);
@@ -185,7 +185,7 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
     None
 }
 
-/// The fragment left by a crash after the last entry, without its line end, and whether it has one.
+/// The fragment that a crash left after the last entry, without its line end, and whether it has one.
 pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
     let (bytes, ended) = match rest.strip_suffix(b"\n") {
         Some(bytes) => (bytes, true),
@@ -208,7 +208,7 @@ pub struct Fault {
 #[derive(Default)]
 pub struct Verifier {
     chain: Option<Chain>,
-    /// Bytes so far of lines that are not entries, and their hash.
+    /// Number and hash of the bytes read so far that belong to lines which are not entries.
     fragment: Option<(u64, Context)>,
     wanted: Option<Hash>,
 }
@@ -230,7 +230,7 @@ impl Verifier {
         }
     }
 
-    /// The end of the chain so far; `None` before the first entry.
+    /// The end of the chain read so far; `None` before the first entry.
     pub fn chain(&self) -> Option<Chain> {
         self.chain
     }
@@ -275,7 +275,7 @@ impl Verifier {
         before.map_or(Ok(()), |before| follows(&head, before))
     }
 
-    /// All lines were read.
+    /// Checks the end of the file after all lines were read.
     ///
     /// # Errors The fault at the end.
     pub fn finish(&self) -> Result<(), String> {
@@ -291,7 +291,7 @@ impl Verifier {
     }
 }
 
-/// Whether a line continues the chain after the line before it.
+/// Checks whether a line continues the chain of the line before it.
 fn follows(head: &Head, before: Chain) -> Result<(), Fault> {
     if head.prev == before.last && head.seq == before.seq + 1 {
         return Ok(());

@@ -1,7 +1,7 @@
-//! The audit file: a thread that writes records behind two bounded queues, one for commands that were sent. No command
-//! waits for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost. A
-//! reload that configures another file starts another thread behind the same queues, so that no record is lost in
-//! between.
+//! The audit file: a thread writes records from two bounded queues, one of them for commands that were sent. No
+//! command waits for it: while the disk is slow, full or missing, records wait, and those beyond the queues are
+//! counted as lost. A reload that configures another file starts another thread on the same queues, so that no
+//! record is lost in between.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::File;
@@ -16,7 +16,7 @@ use super::AuditRecord;
 use super::chain::{self, Chain, Entry, Hash, Tail};
 use crate::files::Rotated;
 
-/// Most records that wait for the disk: of commands that were sent, and of all others.
+/// Most records that wait for the disk: those of commands that were sent, and all others.
 const WAITING: (usize, usize) = (8192, 1024);
 /// Time after which written records survive a power failure, and after which a disk that failed is tried again.
 const SYNC: Duration = Duration::from_secs(1);
@@ -27,7 +27,7 @@ const FILES: u64 = 8;
 /// Longest end of a file that is searched for its last entry, bytes.
 const LONGEST_TAIL: u64 = 64 << 20;
 
-/// Where the audit is written.
+/// Settings of the audit file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AuditFileOptions {
     /// Path of the current file; older ones have `.1` to `.7` after that name.
@@ -41,7 +41,7 @@ impl AuditFileOptions {
         Rotated::new(self.path.clone(), self.max_bytes, FILES)
     }
 
-    /// All possible files, oldest first.
+    /// Paths of all audit files that may exist, oldest first.
     pub fn files(&self) -> Vec<PathBuf> {
         self.rotated().all()
     }
@@ -102,7 +102,7 @@ impl Shared {
         queue.push_front(record);
     }
 
-    /// Waits until there is something to write, at most until `deadline`; whether that thread is to end.
+    /// Waits until there is something to write, at most until `deadline`; returns whether this thread must end.
     fn wait(&self, thread: u64, deadline: Instant, for_records: bool) -> bool {
         let mut queues = self.queues();
         loop {
@@ -127,8 +127,8 @@ impl AuditFile {
         AuditFile::behind(Arc::default(), options)
     }
 
-    /// Starts the thread that writes in its place from now on, with what waits and what was lost. In a file that an
-    /// earlier one still writes it begins when that one has ended.
+    /// Starts the thread that replaces this writer and takes over the waiting records and the number of lost ones.
+    /// If an earlier thread still writes the same file, the new one waits for its end.
     ///
     /// # Errors The system does not provide a thread. This one continues.
     pub fn succeed(&self, options: AuditFileOptions) -> io::Result<AuditFile> {
@@ -179,13 +179,13 @@ impl AuditFile {
         self.shared.wake.notify_one();
     }
 
-    /// Records that were lost since the start: of commands that were sent, and others.
+    /// Records lost since the start: those of commands that were sent, and all others.
     pub fn lost(&self) -> (u64, u64) {
         self.shared.queues().lost
     }
 
-    /// Writes waiting records, as far as the disk takes them, and ends the thread. A disk that hangs blocks this
-    /// forever: wait with a limit.
+    /// Writes waiting records, as far as the disk accepts them, and ends the thread. A hanging disk blocks this
+    /// call forever, so callers must set a time limit.
     pub async fn stop(&self) {
         self.shared.queues().end = true;
         self.shared.wake.notify_all();
@@ -198,7 +198,7 @@ impl AuditFile {
 struct Writer {
     file: Rotated,
     shared: Arc<Shared>,
-    /// `None` until the file was opened once.
+    /// End of the chain of hashes; `None` until the file was opened for the first time.
     chain: Option<Chain>,
     /// Logged once, until a write succeeds.
     failing: bool,
@@ -273,7 +273,7 @@ impl Writer {
         self.file.sync()
     }
 
-    /// Logs a failure once, its end, and now and then the hash of the last line.
+    /// Logs the start and the end of a failure once each, and at intervals the hash of the last line.
     fn report(&mut self, done: io::Result<()>, end: bool) {
         let path = self.file.path().to_path_buf();
         let path = path.display();
@@ -328,7 +328,8 @@ impl Writer {
         Ok(())
     }
 
-    /// Opens the file and finds the end of the chain: in it, or, if it is empty, in memory or in the file before.
+    /// Opens the file and finds the end of the chain: in the file itself or, if it is empty, in memory or in the
+    /// previous file.
     fn open(&mut self) -> io::Result<()> {
         let opened = self.find_end();
         if opened.is_err() {
@@ -378,7 +379,7 @@ fn last_of(path: &Path) -> io::Result<Option<Chain>> {
     }
 }
 
-/// The end of a file of `bytes` bytes; `None` if it has no entry.
+/// The end of the chain in a file of `bytes` bytes; `None` if the file has no entry.
 fn read_tail(file: &mut File, bytes: u64) -> io::Result<Option<Tail>> {
     let mut length = 64 << 10;
     loop {
@@ -398,7 +399,7 @@ fn read_end(file: &mut File, bytes: u64, length: u64) -> io::Result<Vec<u8>> {
     Ok(window)
 }
 
-/// A file without any entry: the rest of its first line, or not an audit file.
+/// Checks a file without an entry: either only the fragment of its first line, or not an audit file.
 fn only_fragment(file: &mut File, bytes: u64) -> io::Result<(Option<(u64, Hash)>, bool)> {
     let window = read_end(file, bytes, LONGEST_TAIL)?;
     if bytes > LONGEST_TAIL || window.iter().filter(|byte| **byte == b'\n').count() > 1 {

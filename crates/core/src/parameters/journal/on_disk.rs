@@ -1,4 +1,4 @@
-//! Where the journal of a drive is kept.
+//! Where the journal of a drive is kept on disk.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
@@ -15,7 +15,7 @@ pub struct JournalFile {
 }
 
 impl JournalFile {
-    /// Below that directory of readings.
+    /// The journal of this drive below the directory of parameter readings.
     pub fn new(params: &Path, drive: &str) -> JournalFile {
         JournalFile {
             dir: params.join(drive),
@@ -49,8 +49,9 @@ impl JournalFile {
         name.to_string_lossy().into_owned()
     }
 
-    /// The journal that is there must not be that of another machine than `of`. One of an earlier version names no machine: it
-    /// is that of the drive with its name, which takes it up and from then on has its machine in it.
+    /// Checks that an existing journal does not belong to another machine than `of`. A journal of an earlier
+    /// version names no machine: it belongs to the drive with its name, which adds its machine when it resumes the
+    /// restore.
     fn is_free(&self, of: &Owner) -> io::Result<()> {
         let there = self.read()?.and_then(|text| Owner::parse(&text).ok());
         let is_same = |there: &Owner| match &there.machine {
@@ -72,22 +73,22 @@ impl JournalFile {
         self.dir.join(NAME)
     }
 
-    /// Puts a journal on disk: when this returns it is there after a power failure too, and one that was there before is either
-    /// whole or replaced. The journal of another machine is left.
+    /// Writes a journal so that it survives a power failure; an existing one is either kept whole or replaced. The
+    /// journal of another machine is not touched.
     ///
     /// # Errors
     /// The journal is not certain to be on disk.
     pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
         self.is_free(of)?;
         files::replace(&self.path(), text.as_bytes())?;
-        // Syncs the entry of the file, and those of directories that may be new.
+        // Syncs the directory entry of the file, and the entries of directories that may be new.
         self.dir.ancestors().take(3).try_for_each(sync)
     }
 
     /// The journal, if there is one.
     ///
     /// # Errors
-    /// Whether there is one is not known, or it cannot be read.
+    /// If it is unknown whether a journal exists, or it cannot be read.
     pub fn read(&self) -> io::Result<Option<String>> {
         let mut bytes = Vec::new();
         match File::open(self.path()) {
@@ -101,7 +102,7 @@ impl JournalFile {
     /// Removes the journal of a restore that has ended. The journal of another machine is left.
     ///
     /// # Errors
-    /// The journal may still be there.
+    /// If the journal could not be removed; it may still exist.
     pub fn remove(&self, of: &Owner) -> io::Result<()> {
         if self.is_free(of).is_err() {
             return Ok(());
@@ -113,10 +114,10 @@ impl JournalFile {
         }
     }
 
-    /// Sets the journal aside, with the former values in it; returns the new path.
+    /// Renames the journal so that it no longer blocks the drive, and keeps the former values in it; returns the new path.
     ///
     /// # Errors
-    /// The journal is still where it was.
+    /// If the journal could not be renamed; it is unchanged.
     pub fn release(&self) -> io::Result<PathBuf> {
         let aside = self.dir.join(RELEASED);
         fs::rename(self.path(), &aside)?;

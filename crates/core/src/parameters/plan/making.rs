@@ -23,7 +23,7 @@ pub(super) struct Making<'a> {
 /// End of an identification with an unread point.
 pub const NOT_KNOWN: &str = "not known";
 
-/// A parameter once the plan is carried out.
+/// The value of a parameter after the plan is carried out.
 struct End {
     id: Id,
     written: bool,
@@ -294,7 +294,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// Objects to ratings of supply and motor, as those of another drive may not fit.
+    /// Objects to changed ratings of supply and motor, since those of another drive may not fit.
     fn check_ratings(&mut self) {
         let ratings = &self.profile.parameters.rules.ratings;
         let changed = self.plan.writes.iter().filter(|write| has(ratings, write.address));
@@ -314,7 +314,7 @@ impl<'a> Making<'a> {
         }
     }
 
-    /// The final values must not violate limits, unless the other drive violated them, too.
+    /// The final values must not violate limits, unless the values of the other drive violated them, too.
     fn check_limits(&mut self) {
         let profile = self.profile;
         for limit in &profile.parameters.rules.limits {

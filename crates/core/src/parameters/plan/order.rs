@@ -1,8 +1,9 @@
 //! The order of writes in which limits between parameters hold at every step.
 //!
-//! A write is safe when it breaks no limit that holds before it. Of the safe ones the lowest address goes first. There is always one: of
-//! the values that rise, the one whose upper limits have all risen; where none rises any more, of those that fall the one whose
-//! lower limits have all fallen. A limit that does not hold in the end binds nothing.
+//! A write is safe if it breaks no limit that held before it. Of the safe writes, the one with the lowest address
+//! goes first. There always is a safe one: of the rising values, the one whose upper limits have all risen; if none
+//! rises any more, of the falling values the one whose lower limits have all fallen. A limit that does not hold in
+//! the end is ignored.
 
 use std::collections::BTreeMap;
 

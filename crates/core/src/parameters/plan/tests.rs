@@ -66,7 +66,7 @@ fn ids_of(plan: &Plan) -> Vec<&str> {
     plan.writes.iter().map(|write| write.id.name()).collect()
 }
 
-/// Parameters of the family as its drives may have them: the named ones, and some of those without a name.
+/// Addresses of parameters that drives of this family may have: the named ones, and some without a name.
 fn addresses(list: &ParameterList) -> Vec<u16> {
     let unnamed = list.spans.iter().flat_map(|span| {
         let addresses = (span.first..=span.last).step_by(97);
@@ -154,8 +154,9 @@ fn seeds() -> impl Strategy<Value = Vec<u16>> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Property for any two legal drives: only differing values are written, once, every step keeps the limits, and in the end only
-    /// values that were left out differ; going back from any step, and on from any step, likewise.
+    /// Property for any two legal drives: only differing values are written, each once, every step keeps the
+    /// limits, and in the end only values that were left out differ. The same must hold for undoing and resuming
+    /// after any step.
     #[test]
     fn every_step_is_safe_there_and_back(from in seeds(), to in seeds(), share in seeds(), cut in any::<u16>()) {
         for profile in with_parameters() {
@@ -196,15 +197,15 @@ proptest! {
         }
     }
 
-    /// Whatever two drives hold, and whatever their limits: every write is there once, and a limit that holds in the end is never broken
-    /// once it holds.
+    /// Property for any values and limits of two drives: every write occurs once, and a limit that holds in the end
+    /// is never broken once it holds.
     #[test]
     fn no_state_is_too_odd(
         from in prop::collection::vec(0..6u16, 7),
         to in prop::collection::vec(0..6u16, 7),
         pairs in prop::collection::vec((0..7u16, 0..7u16), 0..9),
     ) {
-        // In a circle perhaps; or upper above lower by number, which cannot go in a circle.
+        // Limits may form a circle; if not, the upper value is above the lower one by number, which excludes circles.
         let limit = |(upper, lower)| Limit { upper, lower };
         let any: Vec<_> = pairs.iter().copied().map(limit).collect();
         let apart = pairs.iter().filter(|(a, b)| a != b);
@@ -353,14 +354,14 @@ fn drives_that_are_not_alike() {
         reasons[0].starts_with("whether the drives are of the same kind is unknown"),
         "{reasons:?}"
     );
-    // The file comes from the drive itself, so the motor behind it is the same.
+    // The file comes from the drive itself, so the motor connected to it is unchanged.
     let own = words(&teco, "fan-1", &[("Sn-01", 3), ("Cn-09", 44), ("Bn-01", 30)]);
     let (plan_of_own, risks) = plan(&teco, &own, &here, &ALL).unwrap();
     assert_eq!(
         (ids_of(&plan_of_own), risks.len(), plan_of_own.notes.len()),
         (vec!["Cn-09"], 0, 1)
     );
-    // A parameter that is named singly is restored although it is usually left out.
+    // A parameter that is requested by name is restored although it is left out by default.
     let current = words(&teco, "fan-2", &[("Sn-01", 3), ("Cn-09", 44), ("Bn-01", 30)]);
     assert_eq!(
         ids_of(&plan(&teco, &current, &here, &only(&["Cn-09"])).unwrap().0),

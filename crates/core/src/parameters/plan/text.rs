@@ -9,7 +9,7 @@ use crate::drive::parameters::RawValue;
 /// Parameters that a list names; more are counted.
 const NAMED: usize = 12;
 
-/// The line of a change with the values on the bus behind those in a unit.
+/// The line of a change with the values on the bus after those in a unit.
 pub(super) fn with_counts(line: String, from: RawValue, to: RawValue) -> String {
     let (RawValue::Word(from), RawValue::Word(to)) = (from, to) else {
         return line;

@@ -1,4 +1,4 @@
-//! Which raw writes are let through: addresses first, then the control word, then values. Pure.
+//! Decides which raw writes are allowed: checks the addresses, then the control word, then values. Pure.
 
 use super::{checked, related_limits};
 use crate::codec::n2::Object;
@@ -62,7 +62,7 @@ fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(
     }
 }
 
-/// A control word that is neither a stop nor clearly a run command is not passed on, because its effect is unknown.
+/// Refuses a control word that is neither a stop nor clearly a run command, because its effect is unknown.
 fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
     let Some(control) = &drive.spec.profile.control else {
         return Ok(());
@@ -86,7 +86,7 @@ fn control_words(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Res
     }
 }
 
-/// On N2 a write sets one whole object: an address within an object is refused, and so is another length.
+/// On N2 a write sets one whole object: an address inside an object, or another length, is refused.
 fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
     let object = Object::containing(table, first)
         .ok_or_else(|| Refusal::NotWritable(format!("no object starts at {table} {first}; nothing was written")))?;
@@ -99,8 +99,8 @@ fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// The points that a raw write of `items` sets: each whole, and within its limits; and the frequency ranges on which that
-/// rests.
+/// The points that a raw write of `items` sets, each complete and within its limits, and the frequency ranges on
+/// which the limits depend.
 fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<Vec<FrequencyRange>, Refusal> {
     let mut ranges = Vec::new();
     for (index, point) in drive.spec.profile.points.enumerate() {
@@ -138,8 +138,8 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
     Ok(ranges)
 }
 
-/// Whether a raw write takes the run command away and does nothing else. A write of several items is judged like any
-/// other command: its stop was taken out before ([`crate::order::Parts`]).
+/// Whether a raw write takes the run command away and does nothing else. A write of several items counts like any
+/// other command: its stop was split off before ([`crate::order::Parts`]).
 pub(super) fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
     let profile = &drive.spec.profile;
     written(pdu).is_some_and(|(table, items)| match items.as_slice() {

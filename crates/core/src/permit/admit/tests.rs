@@ -175,8 +175,8 @@ fn limits_in_hertz_hold_for_the_frequency_at_which_the_motor_turns() {
     assert_eq!(asked(-30.0..=-10.0, -0.004), refused);
 }
 
-/// A drive of this profile between 10 and 50 Hz, where its range is known, with one limit; percent is that of the band
-/// between `minimum` and 50 Hz.
+/// A drive of this profile between 10 and 50 Hz, if its range is known, with one limit. Percent are those of the
+/// band between `minimum` and 50 Hz.
 fn limited(profile: &Arc<Profile>, name: &str, most: f64) -> DriveImage {
     let spec = DriveSpec {
         access: Access::Control,
@@ -190,14 +190,14 @@ fn limited(profile: &Arc<Profile>, name: &str, most: f64) -> DriveImage {
     image
 }
 
-/// Whatever a profile calls its reference, in whichever unit, and however it is written: a limit on one name holds for all.
+/// A limit on one name of a reference applies to all its names, in any unit and by any kind of write, in every profile.
 #[test]
 fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
     const NAMES: [&str; 3] = ["speed_reference", "frequency_reference", "frequency_command"];
     for profile in Profiles::built_in().iter() {
         let names = NAMES.iter().filter(|name| profile.point_index(name).is_some());
         let points: Vec<PointIndex> = names.filter_map(|name| profile.point_index(name)).collect();
-        // Unverified families may have a reference in percent only, so there is nothing to compare.
+        // Unverified families may have a reference in percent only, so there are no two names to compare.
         if points.len() < 2 && !profile.verified {
             continue;
         }
@@ -255,7 +255,7 @@ fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
     }
 }
 
-/// No two writable figures of a built-in profile lie in the same register under names that know nothing of each other.
+/// No two writable figures of a built-in profile share a register under names that are not related.
 #[test]
 fn a_register_has_one_figure_to_limit() {
     for profile in Profiles::built_in().iter() {
@@ -329,8 +329,8 @@ fn addresses_and_counts() {
     );
 }
 
-/// Limits in Hz and what 50 Hz are in percent rest on the drive's maximum frequency, which may change at its panel.
-/// A backup made while the motor ran would start it.
+/// Limits in Hz, and the percentage of 50 Hz, depend on the drive's maximum frequency, which may be changed at its
+/// panel. Restoring a control word that was read while the motor ran would start the motor.
 #[test]
 fn a_parameter_where_the_drive_is_commanded_is_not_written() {
     let profile = testkit::nx();
@@ -499,7 +499,7 @@ fn registers_without_a_writable_point_need_the_configuration() {
     );
     assert_eq!(asked(&open, write(101, 6_000)), Ok(Urgency::Command));
     assert!(asked(&open, write(100, 0)).is_err());
-    // A refused part of the block refuses all of it.
+    // One refused item of the block refuses the whole block.
     assert!(asked(&image, block(2001, &[0, 5000])).is_err());
     // Together with the control word, the block is sent, but only within the limits. A stop is the control word alone.
     assert_eq!(asked(&image, block(2000, &[1, 0, 5000])), Ok(Urgency::Command));

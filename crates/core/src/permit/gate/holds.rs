@@ -10,10 +10,10 @@ use crate::order::{Asks, Command, Holder, Origin, Refusal};
 use crate::permit::holder::{Claim, Denial, HoldChange, HoldView, Holding, Mode, Rules, Verb};
 use crate::permit::judge::Ask;
 
-/// Most changes of holds waiting to be published, which happens several times a second; beyond that the oldest is
+/// Most changes of holds that wait to be published, which happens several times a second; beyond that the oldest is
 /// dropped.
 const MOST_TOLD: usize = 256;
-/// A command of a client that does not hold its drive is logged once in this time.
+/// Interval at which commands of a client that does not hold the drive are logged.
 const UNHELD_LOGGED: Duration = Duration::from_secs(60);
 
 /// Changes of holds that are to be published, and commands to be logged.
@@ -30,7 +30,7 @@ pub(super) struct HoldNews {
 pub struct Unheld {
     /// Client that gave the order.
     pub client: Arc<str>,
-    /// Why exclusive mode would have refused the order.
+    /// Reason why exclusive mode would have refused the order.
     pub why: String,
 }
 
@@ -41,7 +41,7 @@ impl HoldNews {
         self.told.drain(..beyond);
     }
 
-    /// Notes a command that exclusive mode would have refused, for the log: once a client and minute.
+    /// Notes a command that exclusive mode would have refused, for the log: once per client and minute.
     fn note_unheld(&mut self, drive: DriveIndex, client: Arc<str>, denial: &Denial, rules: &Rules, now: Instant) {
         self.logged.retain(|_, at| now < *at + UNHELD_LOGGED);
         if self.logged.contains_key(&client) || self.unheld.len() >= MOST_TOLD {
@@ -96,7 +96,7 @@ impl Gate {
         self.with_hold(drive, |holding, _, told| holding.end(why, told));
     }
 
-    /// Remembers a run command that is refused after a stop, so that its client does not start the motor by repeating it.
+    /// Remembers a run command that was refused after a stop, so that its client does not start the motor by repeating it.
     pub(super) fn note_refused_run(&mut self, ask: &Ask<'_>) {
         let Some(rules) = self.rules.clone().filter(|_| ask.origin.kind.is_client()) else {
             return;
@@ -108,7 +108,7 @@ impl Gate {
         }
     }
 
-    /// Whether a client may start an action that requires `asks` of the hold, where no order is judged yet.
+    /// Checks whether a client may start an action that requires `asks` of the hold, before any order is given.
     ///
     /// # Errors
     /// The refusal.
@@ -124,7 +124,7 @@ impl Gate {
         self.judge_hold(drive, origin, asks, now).map_or(Ok(()), Err)
     }
 
-    /// Why an order of that client is refused, in exclusive mode, where the hold of the drive keeps it.
+    /// The refusal of a client's order, in exclusive mode, because of the hold of the drive.
     pub(in crate::permit) fn judge_hold(
         &self,
         drive: &DriveGate,
@@ -143,8 +143,7 @@ impl Gate {
         Some(denial.refusal(rules))
     }
 
-    /// Notes that the turn of an accepted command came and that it passes: the command takes the hold again if that has
-    /// ended since.
+    /// Notes that an accepted command is about to be sent: it takes the hold again if the hold has ended since.
     pub(super) fn hold_turn_came(&mut self, command: &Command, now: Instant) {
         let origin = command.ticket.origin();
         let Some(who) = self.claim(origin).filter(|_| origin.kind.is_client()) else {
@@ -213,16 +212,16 @@ impl Gate {
         self.with_hold(drive, |holding, _, _| holding.stop_acknowledged(&who));
     }
 
-    /// Whether supervision follows this client: it holds the drive, was the last holder, or the drive never had one.
+    /// Whether supervision watches this client: it holds the drive, was the last holder, or the drive never had one.
     pub fn hold_renews(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let known = self.rules.as_ref().and_then(|_| self.drives.get(&drive));
         known.is_none_or(|drive| drive.holding.is_whose_silence_counts(self.claim(origin).as_ref()))
     }
 
-    /// Applies a client's action to a hold. Orders of other clients that wait or have started are refused when they go on.
+    /// Applies a client's action to a hold. Waiting or started orders of other clients are refused at their next check.
     ///
     /// # Errors
-    /// Why the client may not do that; never while `[authority]` is off.
+    /// If the client may not do that; never while `[authority]` is off.
     pub(crate) fn hold_act(
         &mut self,
         drive: DriveIndex,
@@ -248,7 +247,8 @@ impl Gate {
         self.with_hold(drive, |holding, _, _| holding.said_stop(&who));
     }
 
-    /// Records that the client knows which machine it commands, so it need not take the drive first.
+    /// Records that the client knows which machine it commands, so it need not send a stop, or take the drive,
+    /// before a start.
     fn needs_no_stop(&mut self, drive: DriveIndex, origin: &Origin) {
         self.drive(drive)
             .must_stop_first
@@ -279,7 +279,8 @@ impl Gate {
         self.claim(origin).is_some_and(|who| who.cyclic)
     }
 
-    /// Whether a stop of that client is none, since it writes its command word all the time and its last one was a stop.
+    /// Whether a stop of this client does not count as one, because the client repeats its command word cyclically
+    /// and its last word was a stop.
     pub(super) fn repeats_its_word(&self, drive: DriveIndex, origin: &Origin) -> bool {
         let Some(drive) = self.drives.get(&drive) else {
             return false;

@@ -1,11 +1,11 @@
-//! Why a client that does not hold a drive is refused, in words. Pure.
+//! Refusals of a client that does not hold the drive, with their texts. Pure.
 
 use std::time::Duration;
 
 use super::{Claim, Rules};
 use crate::order::{Holder, Refusal};
 
-/// Why a command, or an act upon the hold, is refused.
+/// Why a command, or an action on the hold, is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Denial {
     /// The client is not a principal.
@@ -18,10 +18,10 @@ pub enum Denial {
     NeedsTake(Claim),
     /// The drive is under local control.
     Local,
-    /// The client repeats an acknowledged stop of its own while another client holds the drive, or, with no time left, started
-    /// the motor.
+    /// The client repeats its own acknowledged stop while another client holds the drive or, if the time is zero,
+    /// started the motor.
     Repeats(Claim, Duration),
-    /// The client renews a hold that it does not have.
+    /// The client wants to renew a hold that it does not have.
     NotHeld,
 }
 

@@ -17,13 +17,13 @@ const MOST_STOOD: usize = 256;
 /// An action on the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verb {
-    /// Takes a free drive, or renews a hold.
+    /// Takes a free drive, or renews the client's own hold.
     Take,
     /// Renews the client's hold.
     Renew,
     /// Releases the drive; without effect for a client that does not hold it.
     Release,
-    /// Takes the drive from a lower rank.
+    /// Takes the drive from a client of lower rank.
     Break,
 }
 
@@ -101,7 +101,7 @@ pub enum What {
     Held,
     /// The hold ended, for this reason.
     Released(String),
-    /// Another client broke the hold.
+    /// Another client, named here, broke the hold.
     Broken(Claim),
 }
 
@@ -187,10 +187,10 @@ impl Holding {
         }
     }
 
-    /// Whether a command of this client passes. Being a principal grants nothing: the command was admitted before.
+    /// Whether a command of this client passes. Being a principal grants no right to write: that was checked before.
     ///
     /// # Errors
-    /// Why it does not; in advisory mode, why it would not.
+    /// If the command does not pass, the reason; in advisory mode, why exclusive mode would refuse it.
     pub fn judge(&self, who: Option<&Claim>, asks: Asks, rules: &Rules, now: Instant) -> Result<(), Denial> {
         match (asks, who) {
             (Asks::Nothing, _) | (Asks::Stop, None) => return Ok(()),
@@ -220,8 +220,8 @@ impl Holding {
         }
     }
 
-    /// Why the stop of a cyclic client is not sent: it repeats a stop that the drive acknowledged, and another client holds the
-    /// drive, or started the motor last.
+    /// Why the stop of a cyclic client is not sent: it repeats a stop that the drive acknowledged, and another
+    /// client holds the drive or started the motor last.
     fn repeats_in_vain(&self, who: &Claim, now: Instant) -> Option<Denial> {
         let is_acknowledged = |stood: &LastStop| stood.acknowledged && stood.name == who.name;
         if !who.cyclic || !self.stood.iter().any(is_acknowledged) {
@@ -293,8 +293,8 @@ impl Holding {
         self.state = State::Reserved(who.clone(), now + rules.lease);
     }
 
-    /// Supervision stops the drive with the rank of the client that went silent. Any other stop of the gateway's own
-    /// reserves nothing.
+    /// A stop by supervision reserves the drive with the rank of the client that went silent. Any other stop by the
+    /// gateway itself reserves nothing.
     pub fn stopped_by_gateway(&mut self, supervision: bool, rules: &Rules, now: Instant, told: &mut Vec<HoldChange>) {
         self.settle(rules, now, told);
         self.ends("the gateway stopped the drive", told);
@@ -362,7 +362,7 @@ impl Holding {
         }
     }
 
-    /// A command of that client was executed, or its heartbeat arrived: renews its hold. A lease is never shortened.
+    /// Renews the hold of a client whose command was executed or whose heartbeat arrived. A lease is never shortened.
     pub fn renew(&mut self, who: &Claim, rules: &Rules, now: Instant) {
         if let State::Held(by, until) = &mut self.state
             && by.is(who)
@@ -375,7 +375,7 @@ impl Holding {
     /// Applies a client's action to the hold.
     ///
     /// # Errors
-    /// Why the client may not do that.
+    /// If the client may not do that, the reason.
     pub fn act(
         &mut self,
         who: Option<&Claim>,
@@ -429,7 +429,7 @@ impl Holding {
         self.local
     }
 
-    /// After a reload: principals that are gone hold nothing, those that changed have their new rank.
+    /// After a reload: principals that were removed hold nothing, and changed ones get their new rank.
     pub(crate) fn keep_known(&mut self, rules: &Rules, told: &mut Vec<HoldChange>) {
         if let State::Held(by, _) = &self.state
             && !rules.is_configured(by)
@@ -459,7 +459,7 @@ impl Holding {
         self.ends(why, told);
     }
 
-    /// Whether the silence of this client counts, because it is the holder or was the last one.
+    /// Whether silence of this client must stop the drive, because the client is the holder or was the last one.
     pub(crate) fn is_whose_silence_counts(&self, who: Option<&Claim>) -> bool {
         match &self.last {
             None => true,
@@ -467,7 +467,7 @@ impl Holding {
         }
     }
 
-    /// The holder, as long as its hold is not known to have ended.
+    /// The holder; `None` once its hold is known to have ended.
     pub fn holder(&self) -> Option<&Arc<str>> {
         match &self.state {
             State::Held(by, _) => Some(&by.name),
@@ -475,7 +475,7 @@ impl Holding {
         }
     }
 
-    /// The client whose repeated stops end the holds of others: it should be cyclic.
+    /// The client whose repeated stops end the holds of others: its principal should be configured as `cyclic`.
     pub(crate) fn repeater(&self) -> Option<&Arc<str>> {
         self.repeater.as_ref()
     }
@@ -537,7 +537,7 @@ impl Holding {
         self.stood.iter().any(|stood| stood.name == who.name)
     }
 
-    /// Whether the last word of this cyclic client was a stop, too.
+    /// Whether the previous word of this cyclic client was a stop as well.
     pub(crate) fn repeats(&self, who: &Claim) -> bool {
         who.cyclic && self.has_stopped(who)
     }
@@ -546,7 +546,7 @@ impl Holding {
         let Some(who) = who else { return };
         match asks {
             Asks::Stop if !self.has_stopped(who) => {
-                // The table is bounded: besides the principals there may be any number of users.
+                // Bounds the table: besides the principals there may be any number of users.
                 if self.stood.len() >= MOST_STOOD {
                     self.stood.remove(0);
                 }

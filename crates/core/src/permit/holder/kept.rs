@@ -30,7 +30,7 @@ fn milliseconds(time: SystemTime) -> u64 {
 }
 
 impl KeptReservation {
-    /// A reservation of this machine, for a client of this name and rank.
+    /// A reservation of this machine for a client of this name and rank.
     pub fn new(
         machine: Machine,
         (who, rank): (String, String),
@@ -46,9 +46,9 @@ impl KeptReservation {
         }
     }
 
-    /// The client of the reservation, and until when it continues after a start at `now`, which is `time` on the
-    /// calendar; none if it has ended, or its rank no longer exists. If the clock is earlier than the stop, the full
-    /// time is left.
+    /// The client of the reservation and the time until which it continues after a start at `now`, which is `time`
+    /// on the calendar; `None` if it has ended or its rank no longer exists. If the clock shows a time before the
+    /// stop, the full time is left.
     pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
         let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
         let passed = milliseconds(time).saturating_sub(self.stopped_ms);

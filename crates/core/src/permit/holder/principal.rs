@@ -24,8 +24,8 @@ pub struct Principal {
     pub name: Arc<str>,
     /// Place of the rank; 0 is the highest.
     pub rank: usize,
-    /// Whether the client writes its command word continuously: a word that repeats its last stop is not a new stop. Stops over
-    /// HTTP and the local socket are always new ones.
+    /// Whether the client writes its command word continuously: a word that repeats its last stop is then not a new
+    /// stop. Stops over HTTP and the local socket are always new ones.
     pub cyclic: bool,
     /// Addresses over Modbus TCP and TCP slots.
     pub modbus_tcp: Vec<IpNet>,
@@ -37,14 +37,14 @@ pub struct Principal {
     pub mqtt: Option<String>,
     /// Whether the principal is the Sparkplug host.
     pub sparkplug: bool,
-    /// Addresses over BACnet.
+    /// Addresses from which the principal sends over BACnet.
     pub bacnet: Vec<IpNet>,
     /// User id at the local socket.
     pub socket: Option<u32>,
 }
 
 impl Principal {
-    /// A principal without any proof, so that no connection matches it.
+    /// A principal without any proof, which no connection matches.
     pub fn new(name: impl Into<Arc<str>>, rank: usize) -> Principal {
         Principal {
             name: name.into(),
@@ -70,7 +70,7 @@ pub struct Claim {
     pub rank: usize,
     /// See [`Principal::cyclic`]; never set where the interface excludes repetitions.
     pub cyclic: bool,
-    /// Whether the client uses an interface that programs use cyclically, so that a stop may be a repetition.
+    /// Whether the client uses an interface on which programs write cyclically, so that a stop may be a repetition.
     pub may_repeat: bool,
     /// Whether commands break the hold of a lower rank by themselves: in BACnet the priority is the act.
     pub breaks: bool,
@@ -93,7 +93,7 @@ impl Claim {
         self.name == other.name
     }
 
-    /// Whether this claim ranks below the other.
+    /// Whether this claim has a lower rank than the other.
     pub fn is_below(&self, other: &Claim) -> bool {
         self.rank > other.rank
     }

@@ -24,7 +24,7 @@ fn rules(mode: Mode) -> Rules {
     }
 }
 
-/// A drive, its rules and a clock.
+/// A drive with its rules and a clock.
 struct Drive {
     rules: Rules,
     holding: Holding,
@@ -53,7 +53,7 @@ impl Drive {
         })
     }
 
-    /// The code of the refusal, or nothing.
+    /// Gives an order; returns the code of its refusal, or an empty string.
     fn order(&mut self, name: &str, asks: Asks) -> &'static str {
         let who = self.who(name);
         match self.holding.judge(who.as_ref(), asks, &self.rules, self.now) {
@@ -170,7 +170,7 @@ fn nobody_only_stops() {
 
 #[test]
 fn the_acts_upon_a_hold() {
-    // By verb: of a free drive, of the holder, of a lower, an equal and a higher rank.
+    // Columns for each action: the drive is free, held by the client itself, by a lower, an equal and a higher rank.
     let table = [
         (
             Verb::Take,
@@ -283,7 +283,7 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
         assert_eq!(drive.order("plc", Asks::Run), "held_by_other");
         drive
     };
-    // Time alone does not permit a start, as long as the client repeats its run.
+    // The passage of time does not permit a start while the client repeats its run command.
     let mut drive = stopped();
     for _ in 0..40 {
         drive.wait(29);
@@ -312,8 +312,7 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
     assert_eq!(drive.order("plc", Asks::Run), "needs_take");
     drive.wait(300);
     assert_eq!(drive.order("plc", Asks::Run), "ok");
-    // Only a take helps: neither a reference that takes the drive, nor a renewed hold, a reset, or another client's
-    // stop.
+    // Only taking the drive helps: not a reference that takes it, a renewed hold, a reset, or another client's stop.
     for asks in [Asks::Steer, Asks::Other] {
         let mut drive = stopped();
         drive.wait(31);
@@ -486,7 +485,7 @@ fn a_repeated_stop_is_not_sent_while_the_motor_was_started_by_another() {
     );
 }
 
-/// Stops of programs may be repetitions; stops of persons never are, so a person is never reported as cyclic.
+/// Stops by programs may be repetitions; stops by people never are, so a person is never reported as cyclic.
 #[test]
 fn a_stop_over_http_or_the_socket_is_never_a_repetition() {
     let address = "10.0.0.5".parse().unwrap();

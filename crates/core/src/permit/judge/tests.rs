@@ -1,4 +1,4 @@
-//! Every rule by a drive at which it alone refuses: which orders, at which moments.
+//! Each rule with a drive on which it alone refuses: which orders, and at which stages.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -40,7 +40,7 @@ struct Rig {
     gate: Gate,
     image: Arc<DriveImage>,
     right: Arc<AtomicBool>,
-    /// Times at which the orders come and at which they are judged.
+    /// When the orders arrive, and when they are judged.
     asked: Instant,
     now: Instant,
 }
@@ -212,12 +212,12 @@ impl Rig {
     }
 }
 
-/// The result of each order of Alice at each moment: the code where it is refused.
+/// The result of each order of Alice at each stage: the code if it is refused.
 fn refused(why: Why) -> Vec<String> {
     let stages = [Stage::Accept, Stage::Turn, Stage::Write];
     let row = |what: &&str| {
         let told = stages.map(|stage| {
-            // Each moment gets a new gate that has judged nothing yet.
+            // Each stage gets a new gate that has not judged anything yet.
             let mut rig = Rig::new(why);
             let command = rig.command(what, "alice", rig.asked);
             let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);

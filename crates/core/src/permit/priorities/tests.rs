@@ -15,7 +15,7 @@ fn effect(run: Option<bool>, reference: bool) -> Effect {
     }
 }
 
-/// Accepts and carries out a write; returns the orders that follow from it, as point, value and owner.
+/// Accepts and carries out a write; returns the resulting orders as point, value and owner.
 fn write(all: &mut Priorities, what: Commanded, who: &str, priority: u8, value: Option<f64>) -> String {
     let write = asked(all, what, who, priority, value);
     all.settle(write.1.id, Settled::Done, Instant::now());

@@ -14,8 +14,9 @@ pub struct VoidSlot {
 }
 
 impl Priorities {
-    /// Empties the slots whose entry `stays` rejects, those included whose write is still under way. A right that comes
-    /// back later brings none of them back. Nothing follows for the drive: no reload starts or stops a motor by a slot.
+    /// Empties the slots whose entry `stays` rejects, including those whose write is still in progress. A right
+    /// that is granted again later restores none of them. The drive is not commanded: no reload starts or stops a
+    /// motor by a slot.
     pub fn end_without_right(&mut self, stays: impl Fn(Commanded, &Entry) -> bool) -> Vec<VoidSlot> {
         let mut void = Vec::new();
         for (what, priority, slot) in self.slots_mut() {
@@ -30,7 +31,7 @@ impl Priorities {
 }
 
 impl Slot {
-    /// All entries that the slot has or may get, the latest first.
+    /// All entries that the slot has or may get, latest first.
     fn entries(&self) -> impl Iterator<Item = &Entry> {
         let asked = self.asked.iter().rev().filter_map(|(_, entry)| entry.as_ref());
         let uncertain = self.uncertain.iter().map(|(entry, _)| entry);

@@ -9,7 +9,7 @@ use crate::order::Authority;
 use crate::process_image::{Access, DriveImage, DriveSpec, Link};
 use crate::testkit;
 
-/// A drive with this limit of a point, whose registers were read `ago`.
+/// A drive with this limit on a point, whose registers were read `ago`.
 fn drive(profile: &str, limit: (&str, f64), words: &[(Table, u16, &[u16])], ago: Duration) -> DriveImage {
     let profile = testkit::profile(profile);
     let spec = DriveSpec {

@@ -1,13 +1,13 @@
-//! Whether the client of a command may write at all. The present configuration decides: a right that a reload has taken
-//! away since the first byte of a request no longer counts when the request is complete, and a command that waits, or a
-//! sequence in progress, goes no further.
+//! Whether the client of a command may write at all. The present configuration decides: a right that a reload has
+//! removed since the first byte of a request no longer counts when the request is complete, and a waiting command
+//! or a sequence in progress is not continued.
 //!
-//! A stop needs the right when it is accepted. Once accepted it is sent: without it the motor might go on running
-//! against the client's will.
+//! A stop needs the right when it is accepted. An accepted stop is always sent: otherwise the motor might keep
+//! running against the client's will.
 //!
-//! Refusals by the profile, the access of the drive and that of the point come from [`crate::permit::admit`] before this rule, since
-//! the effects of an order are only known then. They are not checked again: a reload that changes the access of a drive or a point
-//! restarts the bus, and orders that wait there end.
+//! Refusals by the profile, the access of the drive and the access of the point come from [`crate::permit::admit`]
+//! before this rule, since the effects of an order are known only then. They are not checked again: a reload that
+//! changes the access of a drive or a point restarts the bus, which ends the orders waiting there.
 
 use crate::order::{Interruption, Order, Origin, Outcome, Refusal};
 use crate::permit::gate::{DriveGate, Gate};
@@ -46,7 +46,7 @@ pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusa
     Err(Refusal::NotAllowed(format!("{why}; nothing was written")))
 }
 
-/// Judges a command of that client for a drive of that bus.
+/// Judges a command of this client for a drive of this bus.
 ///
 /// # Errors
 /// The refusal.

@@ -1,4 +1,4 @@
-//! Whether an order is still wanted: its age, what stopped its machine since, and whether its client is still there.
+//! Whether an order is still valid: its age, what has stopped its machine since, and whether its client is still connected.
 //!
 //! An order that was buffered while the reading thread did not run is as old as the stall, and its sequence is not
 //! known. Pure: time is an argument.
@@ -16,12 +16,12 @@ pub(in crate::permit) const RULE: Rule = Rule {
     judge,
 };
 
-/// Effect of an order on a machine, as far as its age matters.
+/// Effect of an order on a machine, as far as the age of the order matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Does {
     /// The order takes the run command away.
     Stop,
-    /// The order can make a standing motor turn.
+    /// The order can start a standing motor.
     Start,
     /// Does anything else, such as setting a reference.
     Other,
@@ -32,7 +32,7 @@ enum Does {
 /// The facts that decide about the age of an order.
 #[derive(Debug, Clone, Copy)]
 struct Age<'a> {
-    /// How the order came.
+    /// When and over which connection the order arrived.
     arrival: &'a Arrival,
     /// Effect of the order.
     does: Does,
@@ -55,7 +55,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     let age = Age {
         arrival: &window.arrival,
         does,
-        // An order that has started keeps its own time limit: it still clears a reset bit that it has set.
+        // An order in progress keeps its own time limit, so that it still clears a reset bit that it has set.
         expires: (ask.stage != Stage::Write).then_some(window.expires),
         stops: &drive.last_stops,
         waited: gate.paused,
@@ -87,7 +87,7 @@ fn verdict(age: Age<'_>, now: Instant) -> Verdict {
     if arrival.pause.is_some_and(of_before) || waited.is_some_and(of_before) {
         return Verdict::Refuse(Outcome::Expired);
     }
-    // A stop that came during the same stall may be read after it.
+    // A stop that arrived during the same stall may be read after this order.
     match arrival.stall.map(|stall| stall.read_by()) {
         Some(until) if now < until => Verdict::Wait(until),
         _ => Verdict::Go,
@@ -106,8 +106,9 @@ mod tests {
         start + Duration::from_millis(ms)
     }
 
-    /// Times in ms: order received and expires; the stall during which it came; the last pause of its reader, and of
-    /// the bus; connection opened, and whether it is closed; a stop over this connection, and over another one; now.
+    /// Times in ms: when the order arrived and expires; the stall during which it arrived; the last pause of its
+    /// reader, and of the bus; when its connection was opened, and whether that is closed; a stop over this
+    /// connection, and over another one; the time of the judgement.
     #[derive(Clone, Copy)]
     struct Case {
         asked: u64,
@@ -122,7 +123,7 @@ mod tests {
         now: u64,
     }
 
-    /// A healthy order, judged 100 ms after it came.
+    /// A healthy order, judged 100 ms after it arrived.
     const PLAIN: Case = Case {
         asked: 20_000,
         expires: 22_000,

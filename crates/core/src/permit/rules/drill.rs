@@ -1,5 +1,5 @@
-//! Whether a drill is under way at the drive: no other order runs meanwhile, and a stop ends it. While it keeps the line silent
-//! nothing at all is sent to the drive but stops.
+//! Whether a drill is in progress on the drive: no other order is sent meanwhile, and a stop ends the drill. While
+//! the drill keeps the line silent, nothing but stops is sent to the drive.
 
 use crate::order::{Holder, Refusal};
 use crate::permit::gate::{DriveGate, Gate};

@@ -1,5 +1,5 @@
-//! Whether the guard of the drive permits a start of its motor now: starts per hour, time since it stood, distance to
-//! other starts.
+//! Whether the guard of the drive permits a start of its motor now: starts per hour, time since standstill, time
+//! between starts of a group.
 
 use crate::order::Refusal;
 use crate::permit::gate::{DriveGate, Gate};
@@ -19,7 +19,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
     match (ask.stage, starts.by_run(ask.drive)) {
         // A repeated run command is not a new start until the motor was seen to stand again.
         (_, ByRun::Runs | ByRun::Repeats) => Verdict::Go,
-        // The earlier cleared order starts the motor, if it does start.
+        // Another order that was cleared before starts the motor, if anything does.
         (Stage::Accept, _) if starts.has_cleared(ask.drive) => Verdict::Go,
         (Stage::Accept | Stage::Turn, _) => may_begin(ask, starts),
         (Stage::Write, ByRun::Starts) if !starts.is_cleared(ask.drive, ask.intent.number) => {

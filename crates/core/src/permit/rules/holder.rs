@@ -1,7 +1,8 @@
-//! The holder of the drive, the client for which a stop reserved it, and the clients that must take it before a start.
+//! The holder of the drive, the client for which a stop reserved it, and the clients that must take the drive
+//! before a start.
 //!
-//! A stop is judged only when it is accepted, since a word that a cyclic client repeats is not a stop; an accepted stop is
-//! sent.
+//! A stop is judged only when it is accepted, since a repeated word of a cyclic client is not a stop; an accepted
+//! stop is always sent.
 
 use crate::order::{Asks, Holder, Refusal};
 use crate::permit::gate::{DriveGate, Gate};
@@ -21,7 +22,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     Verdict::unless(refused.or_else(|| stops_first(ask, drive)))
 }
 
-/// Why a client does not start the motor of a machine that has, since a reload, the name under which the client commanded another one.
+/// Refuses the start if, since a reload, the machine has a name under which this client commanded another machine.
 fn stops_first(ask: &Ask<'_>, drive: &DriveGate) -> Option<Refusal> {
     let is_meant = ask.asks() == Asks::Run && drive.must_stop_first.contains(ask.origin.client());
     is_meant.then(|| {

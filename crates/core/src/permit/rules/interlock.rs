@@ -1,4 +1,5 @@
-//! Whether the points hold that a start needs, read and good: also for a reference that turns a motor whose run command stands.
+//! Whether the interlock points of a start are read, good and have the required values; also for a reference that
+//! would turn a motor whose run command is on.
 
 use crate::drive::{ModelPoint, Value};
 use crate::order::Refusal;
@@ -7,7 +8,7 @@ use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 use crate::process_image::Reading;
 use crate::start_guard::ByRun;
 
-/// Output frequency in Hz below which a motor with its run command stands, or sleeps.
+/// Output frequency in Hz below which a motor with its run command on counts as standing or in sleep mode.
 const TURNS: f64 = 0.5;
 
 pub(in crate::permit) const RULE: Rule = Rule {
@@ -28,7 +29,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
     Verdict::unless(unmet.map(|unmet| Refusal::Interlocked(unmet.why)))
 }
 
-/// Whether the run command of the drive stands and the motor does, too: a reference can turn it.
+/// Whether the run command of the drive is on and the motor stands: a reference can then make it turn.
 fn waits_for_a_reference(reading: &Reading<'_>) -> bool {
     let stands = || match reading.model(ModelPoint::OutputFrequency).good().map(Value::as_f64) {
         Some(hertz) => hertz.abs() < TURNS,

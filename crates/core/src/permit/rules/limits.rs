@@ -1,8 +1,8 @@
-//! Whether the values of the order still keep the limits, and what they rest on still holds.
+//! Whether the values of an order still keep the limits, and whether the readings behind those limits are still valid.
 //!
-//! At accept the limits are checked while the order is converted ([`crate::permit::admit`]), since its values come from the range
-//! on which they depend. At write nothing can have changed: between the turn of an order and its last frame no other order to that
-//! drive is sent.
+//! At the stage "accept" the limits are checked while the order is converted ([`crate::permit::admit`]), since its
+//! values come from the range on which they depend. At the stage "write" nothing can have changed: between the
+//! first and the last frame of an order no other order to the drive is sent.
 
 use crate::order::{FrequencyRange, Refusal};
 use crate::permit::gate::{DriveGate, Gate};

@@ -1,8 +1,8 @@
-//! Whether an order still means the machine that it named when its first byte came.
+//! Whether an order still means the machine that it named when its first byte arrived.
 //!
-//! This rule is checked before an order takes its place ([`crate::plant::DriveHandle::place`]), since all other rules look at the
-//! machine that the order reaches. It is not checked again: a bus serves the same machines as long as it runs, and a reload ends
-//! or hands over the waiting orders of a bus that it replaces, by machine.
+//! This rule is checked before an order enters the queue ([`crate::plant::DriveHandle::place`]), since all other
+//! rules judge the machine that the order reaches. It is not checked again: a bus serves the same machines as long
+//! as it runs, and a reload ends the waiting orders of a bus that it replaces, or hands them over by machine.
 
 use crate::order::Refusal;
 

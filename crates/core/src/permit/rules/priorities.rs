@@ -14,7 +14,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, _: &Gate) -> Verdict {
     if matches!(ask.intent.order, Order::Read(_)) {
         return Verdict::Go;
     }
-    // An accepted write stays in its slot; whether it follows from the slots was checked before.
+    // An accepted write keeps its slot; whether the order follows from the slots was checked before.
     let follows = |write| ask.stage != Stage::Accept || drive.priorities.still_follows(write);
     if !ask.intent.slot.as_ref().is_none_or(follows) {
         return Verdict::Refuse(Outcome::Replaced);

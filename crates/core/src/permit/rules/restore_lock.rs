@@ -12,7 +12,7 @@ pub(in crate::permit) const RULE: Rule = Rule {
 };
 
 fn judge(ask: &Ask<'_>, _: &DriveGate, _: &Gate) -> Verdict {
-    // The writes of the restore itself are what the lock is for.
+    // The writes of the restore itself pass the lock.
     if !ask.changes() || matches!(ask.intent.order, Order::Parameter(_)) {
         return Verdict::Go;
     }

@@ -7,7 +7,7 @@ use crate::drive::Profile;
 use crate::process_image::{Cadence, Link};
 use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
 
-/// A value that depends on the drive's frequency range is no worse than the values of that range.
+/// A value that depends on the drive's frequency range is not shown worse than the values of that range.
 #[test]
 fn a_value_within_a_band_is_as_good_as_the_band() {
     let profile = nx();
@@ -34,7 +34,7 @@ fn a_value_within_a_band_is_as_good_as_the_band() {
     assert_eq!(sample(), Sample::NONE, "an empty range");
 }
 
-/// The state rests on fault, running and ready, in that order, as far as it needs them.
+/// The state depends on fault, running and ready in this order, and only on those that are needed.
 #[test]
 fn a_state_is_known_only_when_what_decides_it_is() {
     let cx = profile("vacon-cx");
@@ -78,7 +78,7 @@ fn a_state_is_known_only_when_what_decides_it_is() {
     );
 }
 
-/// Parameters may have been changed while the drive was away.
+/// Parameters may have changed while the drive was offline.
 #[test]
 fn parameters_from_before_a_drive_went_away_are_not_believed() {
     let cx = profile("vacon-cx");
@@ -121,7 +121,7 @@ fn what_a_family_lacks_decides_nothing() {
     }
 }
 
-/// Another master polls register after register, then other drives for six seconds.
+/// Another master polls one register after the other, then other drives for six seconds.
 #[test]
 fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     let nx = nx();
@@ -148,7 +148,8 @@ fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
     assert!(!is_stale(now + Duration::from_secs(10)) && is_stale(now + Duration::from_secs(16)));
 }
 
-/// A scale in another register: no value without it, none with an invalid power, and never a better quality.
+/// A scale in another register: without it there is no value, an invalid power gives none, and the quality never
+/// improves by it.
 #[test]
 fn a_scale_in_another_register() {
     let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\
@@ -226,7 +227,7 @@ fn a_value_of_several_registers_is_as_good_as_all_of_them() {
     image.update(|s| s.refuse(Table::Holding, 4, 1, Exception::ADDRESS));
     assert_eq!(seen("current").1, Quality::Bad);
     assert_eq!(seen("total"), (Some(Value::Number(7999.0)), Quality::Good));
-    // The counter rolls over between two readings of its parts.
+    // The counter rolls over between the reads of its two parts.
     store(1, &[0], now + Duration::from_millis(10));
     assert_eq!(seen("total"), (None, Quality::Bad), "it would go back by 999");
     store(1, &[0, 8], now + Duration::from_millis(20));

@@ -37,7 +37,7 @@ impl Bench {
         }
     }
 
-    /// The reader reads an order that came during the stall over this connection.
+    /// The reader reads an order that arrived during the stall over this connection.
     fn reads(&mut self, connection: usize, gives: Gives) -> Receiver<Answer> {
         let arrival = Arrival {
             asked: self.began,
@@ -80,8 +80,8 @@ impl Bench {
     }
 }
 
-/// Two orders that came during a stall, in the sequence in which they are read, with the connection of each; what became
-/// of them, and what is sent of them 300 ms after the stall.
+/// Two orders that arrived during a stall, in the sequence in which they are read, with the connection of each;
+/// their results, and what is sent 300 ms after the stall.
 #[test]
 fn a_stop_wins_over_what_came_with_it_over_other_connections() {
     let (sent, purged, expired) = ("", "purged", "expired");
@@ -106,7 +106,7 @@ fn a_stop_wins_over_what_came_with_it_over_other_connections() {
         let what = format!("{stood:?}: {first:?}, {second:?}");
         assert_eq!(bench.sent(300 * MS), is_sent, "{what}");
         let codes_of = answers.each_mut().map(|answer| match outcome(answer) {
-            // Taken from the queue.
+            // The command was taken from the queue for sending.
             None | Some(Outcome::ShuttingDown) => "",
             Some(outcome) => outcome.code(),
         });

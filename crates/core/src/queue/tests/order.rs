@@ -1,4 +1,5 @@
-//! One order for each drive: requests passed on to several drives among the others, and orders given before a stop.
+//! One order of commands for each drive: requests passed on to several drives among the others, and orders given
+//! before a stop.
 
 use super::*;
 use crate::codec::{Reply, RequestPdu};
@@ -80,7 +81,7 @@ fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
     let _both = give(&mut rig, both.clone(), false);
     let mut second = give(&mut rig, reference(30.0), true);
     assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));
-    // Behind the other order the newest reference replaces the previous one.
+    // Behind the other order, the newest reference replaces the previous one.
     let _third = give(&mut rig, reference(40.0), true);
     assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
     // An order for other points changes nothing.
@@ -197,7 +198,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     old.begin_handover(Vec::new(), now);
     assert_eq!(outcome(&mut run), Some(Outcome::ShuttingDown));
     let (mut late, mut gone) = (give(&old, 2, Urgency::Stop), give(&old, 4, Urgency::Stop));
-    // The port may be lost and opened again in the last moments of the bus.
+    // The port may be lost and opened again shortly before the bus ends.
     old.close(Outcome::BusDown, now);
     old.open();
     old.hand_over(DriveIndex::new(3), &new, DriveIndex::new(0), now);

@@ -1,4 +1,4 @@
-//! Stops: two of a drive wait at most, none is refused, and a redundant one has no precedence.
+//! Stops: at most two of a drive wait, none is refused, and a redundant one has no precedence.
 
 use super::*;
 use crate::codec::{Reply, RequestPdu};
@@ -126,7 +126,7 @@ fn a_stop_that_tells_nothing_new_has_the_rank_of_a_command() {
     );
     assert_eq!(rig.next(Urgency::Stop, &[1]), None);
     assert_eq!(rig.next(Urgency::Command, &[1]), Some((1, Urgency::Stop)));
-    // A run that waits behind it may start the motor; a reference does not.
+    // A run command that waits behind the stop may start the motor; a reference does not.
     for (reference_only, rank) in [(false, Urgency::Stop), (true, Urgency::Command)] {
         let _stop = rig.stop(1, points(&[1]));
         let _behind = rig.push(1, Urgency::Command, &[7], reference_only);

@@ -20,7 +20,7 @@ impl Play {
         self.began + Duration::from_secs_f64(seconds)
     }
 
-    /// Gives an order to run its turn, and writes it; returns its effect.
+    /// Lets a run order pass the guard and writes it; returns its effect.
     fn run(&mut self, now: Instant) -> ByRun {
         let by_run = self.motor.by_run();
         self.number += 1;
@@ -36,7 +36,8 @@ impl Play {
         by_run
     }
 
-    /// A reading: `+` and `-` say that the drive has its run command, or has none; without them it does not tell.
+    /// Processes a reading: `+` and `-` mean that the drive has its run command or not; without them the drive does
+    /// not report it.
     fn read(&mut self, what: &str, at: Instant) {
         let commanded = what.ends_with(['+', '-']).then(|| (what.ends_with('+'), at));
         let state = what.trim_end_matches(['+', '-']);
@@ -58,7 +59,7 @@ impl Play {
         });
     }
 
-    /// Steps of the form `1.5 what`; orders to run say what they are to be.
+    /// Plays steps of the form `1.5 what`; a run order also states its expected effect.
     fn play(&mut self, about: &str, steps: &str) {
         for step in steps.split(", ") {
             let (seconds, what) = step.split_once(' ').unwrap();

@@ -26,7 +26,7 @@ impl GuardedDrives {
         BusGuards::of(&self.shared, &self.bus, &specs).unwrap()
     }
 
-    /// Restarts the bus of these drives: it ends and begins at these times.
+    /// Restarts the bus of these drives: the bus ends and begins at these times.
     fn restart(&mut self, drives: &[usize], ends: f64, begins: f64) {
         let leaving: Vec<Arc<DriveImage>> = drives.iter().map(|drive| self.images[*drive].clone()).collect();
         self.shared.expect(&leaving, self.at(ends));
@@ -46,7 +46,7 @@ impl GuardedDrives {
 fn a_prepared_bus_changes_nothing_until_it_begins() {
     let rig = GuardedDrives::of(STAGGERED, Vec::new());
     (0..3).for_each(|drive| rig.read(drive, false, 0.0));
-    // In the prepared bus each drive is in a group of its own.
+    // In the prepared bus each drive has a separate group.
     let prepared = rig.prepared(|spec| spec.group = Some(spec.name.clone()));
     rig.start_and_stop(0, 1, 1.0);
     assert_eq!(rig.refused(1, 2.0), Some("stagger"), "guarded as before");
@@ -64,12 +64,12 @@ fn a_prepared_bus_changes_nothing_until_it_begins() {
 #[test]
 fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
     let mut rig = GuardedDrives::of(Guard::default(), vec![trip("d3")]);
-    // At the start of the process nothing counts before it is read.
+    // When the process starts, nothing counts before it is read.
     assert_eq!(rig.tripped(0, 9.9), None);
     assert!(rig.tripped(0, 10.0).is_some_and(|why| why.contains("is unknown")));
     rig.read(2, true, 20.0);
     assert_eq!(rig.tripped(0, 20.9), None);
-    // The bus takes longer to end than its values are fresh, and reads once more meanwhile.
+    // The bus needs longer to end than its values stay fresh, and reads once more meanwhile.
     let leaving = vec![rig.images[2].clone()];
     rig.shared.expect(&leaving, rig.at(20.5));
     rig.read(2, true, 20.6);
@@ -97,7 +97,7 @@ fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
 fn a_drive_that_was_not_there_stops_no_motor_before_it_was_read() {
     let mut rig = GuardedDrives::of(Guard::default(), vec![trip("d3")]);
     rig.read(2, true, 0.0);
-    // Another machine has the name of the drive.
+    // Another machine has taken the name of the drive.
     let mut spec = rig.images[2].spec.clone();
     spec.address = 9;
     rig.images[2] = image(spec);

@@ -11,7 +11,7 @@ fn options(dir: &Path) -> AuditFileOptions {
     }
 }
 
-/// A writer without its thread.
+/// A writer without the thread that runs it.
 fn writer(dir: &Path) -> Writer {
     let AuditFileOptions { path, max_bytes } = options(dir);
     Writer::new(Rotated::new(path, max_bytes, FILES), Arc::default(), 0)
@@ -28,7 +28,7 @@ impl Writer {
     }
 }
 
-/// All files, oldest first.
+/// The content of all files, oldest first.
 fn text(dir: &Path) -> Vec<u8> {
     let numbered = |n| dir.join(format!("audit.jsonl.{n}"));
     let mut files: Vec<PathBuf> = (1..10).rev().map(numbered).filter(|path| path.exists()).collect();
@@ -82,7 +82,7 @@ fn records_become_a_chain_that_a_restart_continues() {
 #[tokio::test]
 async fn a_reload_loses_no_record() {
     let (one, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    // Each reload sets another size, then another file as well.
+    // Each reload sets another size, and then another file.
     for dirs in [[&one, &one], [&one, &other]] {
         let at = |round: usize| AuditFileOptions {
             max_bytes: (1 << 20) + round as u64,
