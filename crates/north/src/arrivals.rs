@@ -1,10 +1,10 @@
-//! Arrival times of received bytes that are not processed yet: a request dates from its first byte. Pure.
+//! Arrival times of received bytes that are not processed yet: a request has the time of its first byte. Pure.
 
 use std::collections::VecDeque;
 
 use crate::order::Arrival;
 
-/// Most chunks whose arrival times are kept apart; later chunks count with the last one.
+/// Most chunks whose arrival times are kept separately; later chunks get the time of the last one.
 const MOST_PIECES: usize = 64;
 
 /// How and when the unread bytes arrived, the first bytes first.
@@ -12,7 +12,7 @@ const MOST_PIECES: usize = 64;
 pub(super) struct Arrivals(VecDeque<(usize, Arrival)>);
 
 impl Arrivals {
-    /// Adds this number of bytes with their arrival.
+    /// Adds this number of bytes with their arrival time.
     pub(super) fn came(&mut self, count: usize, arrival: Arrival) {
         if count == 0 {
             return;
@@ -28,8 +28,8 @@ impl Arrivals {
         }
     }
 
-    /// Takes the arrival of the first `count` bytes: dated from the first of them, with the last stall among them. `None` if
-    /// there are none.
+    /// Takes out the arrival time of the next `count` bytes: the time of the first of them, with the last stall
+    /// among them. `None` if there are no bytes.
     pub(super) fn take(&mut self, mut count: usize) -> Option<Arrival> {
         let mut taken: Option<Arrival> = None;
         while count > 0 {

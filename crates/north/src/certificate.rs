@@ -1,6 +1,6 @@
 //! The fields that the gateway itself reads from an X.509 certificate: subject, validity and role.
 //!
-//! Trust is decided by rustls: a client's certificate is read here after its chain and its signature were verified.
+//! Reads certificates of clients. Trust is decided by rustls: chain and signature were verified before.
 
 use x509_cert::certificate::{Certificate, TbsCertificate};
 use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
@@ -30,7 +30,7 @@ pub(super) struct CertificateSummary {
     pub(super) role: Result<Option<String>, RoleError>,
 }
 
-/// Why the role in a certificate is not accepted. It grants write access, so nothing ambiguous passes.
+/// Why the role in a certificate is not accepted. A role can grant write access, so nothing ambiguous is accepted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RoleError {
     /// RFC 5280 allows one extension of each kind.
@@ -92,7 +92,7 @@ pub(super) fn common_name(subject: &Name) -> Option<String> {
     is_text.then(|| String::from_utf8_lossy(value.value()).into_owned())
 }
 
-/// For the log and the audit: without characters that could imitate another line or another field.
+/// Makes a text printable for the log and the audit: without characters that could imitate another line or field.
 pub(super) fn printable(text: &str) -> String {
     let safe = |c: char| {
         if c.is_alphanumeric() || " .-_@:/+".contains(c) {
@@ -207,7 +207,7 @@ mod tests {
             &[UTF8, 9, b'o', b'p'],
             &[&[UTF8, 0x81, 8][..], b"operator"].concat(),
             &[&[UTF8, 0x80][..], b"operator", &[0, 0]].concat(),
-            // After the role follows another byte or a second role.
+            // Another byte, or a second role, follows the role.
             &[&operator[..], &[0]].concat(),
             &[&operator[..], &operator[..]].concat(),
             &sequence(&[operator.clone(), element(UTF8, b"viewer")]),

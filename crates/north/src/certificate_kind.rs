@@ -71,12 +71,12 @@ pub(super) struct KeyKind {
     pub(super) name: String,
     /// Whether the gateway can verify a peer with such a key.
     pub(super) verifies: bool,
-    /// Whether the gateway can use such a key as its own.
+    /// Whether the gateway can use a key of this kind as its own.
     pub(super) signs: bool,
 }
 
 impl Kind {
-    /// Reads a certificate; `None` if the bytes are no certificate.
+    /// Reads a certificate; `None` if the bytes are not a certificate.
     pub(super) fn of(certificate: &[u8]) -> Option<Kind> {
         let certificate = Certificate::from_der(certificate).ok()?;
         let content = certificate.tbs_certificate();
@@ -95,8 +95,8 @@ impl Kind {
         })
     }
 
-    /// Whether the certificate has no names (subjectAltName), and its common name is this host or address, as other programs
-    /// compare it then.
+    /// Whether the certificate has no names (subjectAltName) but its common name is this host or address; other
+    /// programs then compare the common name.
     pub(super) fn is_commonly_named(&self, host: &ServerName<'_>) -> bool {
         let Some(common) = self.common_name.as_deref().filter(|_| self.names.is_empty()) else {
             return false;
@@ -163,7 +163,7 @@ impl KeyKind {
     }
 }
 
-/// An algorithm of a signature or a key in words, by the content of its identifier.
+/// Name of the signature or key algorithm with this identifier.
 pub(super) fn algorithm(identifier: &[u8]) -> String {
     let read = |reader: &mut SliceReader<'_>| {
         let first = ObjectIdentifier::decode(reader)?;

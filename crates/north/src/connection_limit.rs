@@ -18,7 +18,7 @@ const MAX_CLOSING: usize = 32;
 /// How many connections a server may have open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Limits {
-    /// Most connections of all clients together.
+    /// Most connections of all clients in total.
     pub(super) total: usize,
     /// How many of all connections are kept for clients that may write.
     pub(super) reserved: usize,
@@ -35,7 +35,7 @@ impl Limits {
         }
     }
 
-    /// Maximum number of displaced connections that are not closed yet; beyond it newcomers are refused instead.
+    /// Maximum number of displaced connections that are still closing; beyond it, new connections are refused instead.
     fn closing(&self) -> usize {
         self.total.min(MAX_CLOSING)
     }
@@ -52,12 +52,12 @@ impl Limits {
     }
 }
 
-/// An open connection, with what [`decide`] needs to know about it.
+/// An open connection, as [`decide`] needs it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Open {
     address: IpAddr,
     authority: Authority,
-    /// Whether the connection keeps its place against another one of its address. See [`ConnectionPlace::use_at`].
+    /// Whether the connection keeps its place when another one from its address arrives; see [`ConnectionPlace::use_at`].
     in_use: bool,
     /// Time of the connection's last use, ms.
     used: u64,
@@ -67,7 +67,7 @@ struct Open {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Decision {
     Admit,
-    /// Instead of the open connection with this index.
+    /// Accept the connection in place of the open one with this index.
     Replace(usize),
     Refuse(LimitReached),
 }
@@ -83,9 +83,9 @@ pub(super) enum LimitReached {
 
 /// Decides about a new connection from `address`.
 ///
-/// A connection in use is not closed for another one from the same address, except for one that may write if it itself
-/// may not. When no place is left, the address with the most connections gives up its longest idle one to an address
-/// that has fewer. Who may write never yields to someone who may not.
+/// A connection in use is not closed for another one from the same address, unless only the new one may write. If
+/// no place is left, the address with the most connections loses its longest idle one to an address that has fewer.
+/// A client that may write never yields to one that may not.
 fn decide<I>(limits: &Limits, open: I, address: IpAddr, authority: Authority) -> Decision
 where
     I: Iterator<Item = Open> + Clone,
@@ -156,7 +156,7 @@ impl From<Authority> for Rights {
     }
 }
 
-/// Why the gateway closes a working connection.
+/// Why the gateway closes a connection that works.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum CloseReason {
     /// See [`decide`].
@@ -170,7 +170,7 @@ pub(super) enum CloseReason {
     CertificateRefused,
 }
 
-/// The place of one connection under a limit.
+/// The place that one connection has under a limit.
 #[derive(Debug)]
 pub(super) struct ConnectionPlace {
     address: IpAddr,
@@ -196,18 +196,19 @@ impl ConnectionPlace {
         &self.rights
     }
 
-    /// Cancelled when the connection must end: its place is taken, [`ConnectionPlace::close`] was called, or its server stops.
+    /// Token that is cancelled when the connection must end: its place is needed, [`ConnectionPlace::close`] was
+    /// called, or its server stops.
     pub(super) fn closing(&self) -> &CancellationToken {
         &self.closing
     }
 
-    /// Why the connection must end; `None` if its server stops.
+    /// Why the connection must end; `None` if only its server stops.
     pub(super) fn close_reason(&self) -> Option<CloseReason> {
         self.why.get().copied()
     }
 
-    /// Ends the connection; the first reason counts. The client may no longer write, unless the place only goes to
-    /// another client.
+    /// Ends the connection; the first reason is kept. The client loses its right to write, unless its place is
+    /// merely given to another client.
     pub(super) fn close(&self, why: CloseReason) {
         if why != CloseReason::Displaced {
             self.rights.set(Authority::ReadOnly);
@@ -216,7 +217,7 @@ impl ConnectionPlace {
         self.closing.cancel();
     }
 
-    /// Notes that the connection was used at `now`, and whether it is `in_use` from then on.
+    /// Notes that the connection was used at `now`, and whether it counts as `in_use` from then on.
     pub(super) fn use_at(&self, now: Instant, in_use: bool) {
         let used = now.saturating_duration_since(self.start).as_millis();
         self.used
@@ -278,7 +279,7 @@ pub(super) struct Newcomer<'c> {
     pub(super) cancel: &'c CancellationToken,
 }
 
-/// Why a connection gets no place.
+/// Why a connection is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum NoPlace {
     /// The client may not connect at all.
@@ -305,12 +306,12 @@ impl ConnectionLimit {
         self.lock().limits = limits;
     }
 
-    /// A place for a new connection, and the address of the connection that it displaced. `judge` returns the rights of
-    /// the client, or that it may not connect; it is called while no [`ConnectionLimit::review`] runs, so that a reload
-    /// misses no connection.
+    /// A place for a new connection, and the address of the connection that it displaced. `judge` returns the
+    /// rights of the client, or that it may not connect; it is called while no [`ConnectionLimit::review`] runs, so
+    /// that a reload misses no connection.
     ///
     /// # Errors
-    /// Why the connection gets no place.
+    /// If the connection gets no place; contains the reason.
     pub(super) fn acquire(
         self: &Arc<Self>,
         newcomer: Newcomer<'_>,
@@ -349,8 +350,8 @@ impl ConnectionLimit {
         Ok((ConnectionPermit { limit, place }, displaced))
     }
 
-    /// Judges the open connections of one listener again: `judge` returns what they may do from now on, or `None` to
-    /// close them.
+    /// Judges the open connections of one listener again: `judge` returns the rights of each from now on, or `None`
+    /// to close it.
     pub(super) fn review(&self, listener: usize, judge: impl Fn(&ConnectionPlace) -> Option<Authority>) {
         let table = self.lock();
         for place in table.open.iter().filter(|place| place.listener == listener) {

@@ -17,7 +17,7 @@ use super::server_trust::ServerTrust;
 
 /// Time before the end of a certificate or a CRL at which a warning begins.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
-/// Last second of the year 9999, which a certificate without an end states.
+/// Last second of the year 9999, which certificates without an expiry date contain.
 const LAST_DATE: u64 = 253_402_300_799;
 
 /// Certificate chain and key of a server or client, with the content of their files; equal while the content is.
@@ -40,7 +40,7 @@ pub enum TlsFile {
     ClientCrl,
 }
 
-/// A fault in one of the files, or a warning about it, with its remedy.
+/// A fault of a certificate or key file, or a warning about it, with its remedy.
 #[derive(Debug, thiserror::Error)]
 #[error("{problem}")]
 pub struct IdentityFault {
@@ -126,11 +126,12 @@ impl TlsFile {
 }
 
 impl ServerIdentity {
-    /// Reads both files of a server and checks that they fit together. A certificate that has ended or will soon is a warning:
-    /// its clients will refuse it, but the drives must still be polled after a restart. So is one that names no host.
+    /// Reads certificate and key of a server and checks that they match. A certificate that has expired, or soon
+    /// will, is only a warning: clients will refuse it, but the drives must still be polled after a restart. A
+    /// certificate that names no host is a warning as well.
     ///
     /// # Errors
-    /// All faults of the files.
+    /// If certificate or key cannot be used; contains all faults.
     pub fn load(
         certificate: &Path,
         key: &Path,
@@ -145,7 +146,7 @@ impl ServerIdentity {
     /// Loads an identity like [`ServerIdentity::load`], for a client, which needs no names.
     ///
     /// # Errors
-    /// All faults of the files.
+    /// If certificate or key cannot be used; contains all faults.
     pub fn load_of_client(
         certificate: &Path,
         key: &Path,
@@ -194,7 +195,7 @@ impl ServerIdentity {
     }
 }
 
-/// Why a chain and a key cannot be used together, in words of who chose them.
+/// Why a certificate chain and a key cannot be used together, in words for the user.
 pub(super) fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> IdentityFault {
     let own = chain.first().and_then(|own| Kind::of(own));
     let Some(Kind { name, is_old, key, .. }) = own else {
@@ -218,7 +219,7 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
     Arc::new(crypto::ring::default_provider())
 }
 
-/// Why there are no CA certificates to verify a server with, and the remedy.
+/// Why there are no CA certificates for verifying a server, and the remedy.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum RootsError {
     #[error(transparent)]
@@ -231,8 +232,8 @@ pub(super) enum RootsError {
     Protocol(rustls::Error),
 }
 
-/// The servers to trust: those with a certificate of a CA in a file, or with one that is itself in it; or those with one of a
-/// CA of the system.
+/// The servers to trust: those with a certificate issued by a CA in the file, or contained in the file; without a
+/// file, those with a certificate of a CA of the system.
 pub(super) fn trusted_servers(ca: Option<&Path>) -> Result<ServerTrust, RootsError> {
     let mut store = RootCertStore::empty();
     let mut named = Vec::new();
@@ -316,7 +317,7 @@ fn unsupported_key(kind: Kind, file: String) -> FileProblem {
     }
 }
 
-/// Warns of a server's own certificate that has no names.
+/// A warning about a server certificate without names.
 fn nameless(file: &Path, der: &CertificateDer<'_>) -> Option<FileProblem> {
     let kind = Kind::of(der)?;
     kind.names.is_empty().then(|| FileProblem::NoNames {

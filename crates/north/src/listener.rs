@@ -1,6 +1,7 @@
-//! The listeners of a TCP server: binds the sockets, accepts connections and starts a task for each. At a reload new
-//! sockets are bound before old ones are closed, and a listener that stays keeps its socket and its connections. A server that
-//! starts goes on without an address that the machine does not have yet, and listens on it once it has.
+//! The listeners of a TCP server: bind the sockets, accept connections and start a task for each. A reload binds
+//! new sockets before old ones are closed, and an unchanged listener keeps its socket and its connections. A server
+//! that is starting continues without an address that the machine does not have yet, and listens on it as soon as
+//! the address exists.
 
 mod accept;
 mod state;
@@ -26,13 +27,13 @@ pub use self::state::ListenerStates;
 
 /// Handles the connections to one of a server's listeners.
 pub(crate) trait ConnectionHandler: Send + Sync + 'static {
-    /// The place of a connection; dropping it gives the place back.
+    /// The place of a connection; dropping it frees the place.
     type Permit: Send;
 
-    /// A place for a connection of this client. `None` refuses it; the handler counts and logs that.
+    /// A place for a connection of this client. `None` refuses the connection; the handler counts and logs that.
     fn admit(&self, client: IpAddr) -> Option<Self::Permit>;
 
-    /// The configuration has the listener no more: ends the rights of its clients, as far as it does not give them in
+    /// Ends the rights of the clients when the listener is removed from the configuration, unless they have them by
     /// another way.
     fn retire(&self) {}
 
@@ -72,7 +73,7 @@ impl ListenerSpec {
 pub(crate) struct Listeners<H> {
     server: ServerKind,
     stats: Arc<NorthState>,
-    /// Where listeners and connections run.
+    /// Tracker of the tasks for listeners and connections.
     tasks: TaskTracker,
     cancel: CancellationToken,
     open: Vec<OpenListener<H>>,
@@ -92,7 +93,7 @@ struct OpenListener<H> {
     stopped: Option<JoinHandle<()>>,
 }
 
-/// Where a listener of a new configuration gets its socket.
+/// The source of the socket for a listener of a new configuration.
 #[derive(Debug)]
 enum Socket {
     /// The socket of the open listener is kept.
@@ -143,12 +144,12 @@ impl<H: ConnectionHandler> Listeners<H> {
         of_kind.map(|listener| listener.bound).collect()
     }
 
-    /// Binds the sockets that are missing. Open ones go on, with one exception: a socket that is no longer configured is
-    /// closed early if a new one overlaps it, because the system does not allow both at one time.
+    /// Binds the missing sockets. Open ones are kept, with one exception: a socket that is no longer configured is
+    /// closed early if a new one overlaps it, because the system does not allow both at the same time.
     ///
-    /// A server that starts takes an address that the machine does not have yet: it comes with its interface, and
-    /// anyone who reads drives until then is served. In a reload such an address is an error: it would take the place
-    /// of one that works.
+    /// A starting server accepts an address that the machine does not have yet: the address appears with its
+    /// interface, and all other clients are served meanwhile. In a reload such an address is an error, because it
+    /// would replace one that works.
     ///
     /// # Errors
     /// The first address that cannot be bound; everything is open as before.
@@ -212,7 +213,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         any
     }
 
-    /// Closes the new sockets. A listener whose socket was closed for them binds it again, now or as soon as it can.
+    /// Closes the new sockets. A listener whose socket was closed for them binds it again, now or as soon as possible.
     pub(super) fn abort(&mut self, new: NewSockets) {
         for socket in new.wanted.iter().filter_map(|(_, socket)| socket.bound()) {
             stop_listening(socket);
@@ -229,9 +230,9 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
-    /// Lets the new sockets accept and closes those that are no longer wanted, with their connections. `handler` gives
-    /// the handler of a listener and the runtime it runs on: that of the open listener, adapted to the new
-    /// configuration, or a new one whose connections end with the token.
+    /// Lets the new sockets accept connections and closes those that are no longer configured, with their
+    /// connections. `handler` gives the handler of a listener and its runtime: the handler of the open listener,
+    /// adapted to the new configuration, or a new one whose connections end with the token.
     pub(super) fn commit(
         &mut self,
         new: NewSockets,
@@ -287,7 +288,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
-    /// Closes all listeners; requests in progress complete as if a reload closed each of them.
+    /// Closes all listeners; requests in progress are completed, as after a reload that closes them.
     pub(super) async fn close(&mut self) {
         for mut listener in std::mem::take(&mut self.open) {
             tracing::info!(target: "drivegate::north::listener", address = %listener.bound, "{}: no longer listening", self.server.title());
@@ -301,7 +302,7 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
-    /// Starts the accept loop of a listener; without a socket, it binds one as soon as it can.
+    /// Starts the accept loop of a listener; without a socket, the loop binds one as soon as possible.
     fn accept(&self, listener: &mut OpenListener<H>, socket: io::Result<std::net::TcpListener>) {
         let state = self.stats.listeners.add(self.server, listener.bound);
         state.set(socket.as_ref().err().map(io::Error::to_string));
@@ -314,7 +315,7 @@ impl<H: ConnectionHandler> Listeners<H> {
             stop: listener.stop.clone(),
         };
         let run = async move {
-            // A socket belongs to the runtime that this runs on.
+            // A socket belongs to the runtime that this code runs on.
             let first = socket.ok().and_then(|socket| ListeningSocket::new(socket).ok());
             let address = accept.address;
             accept.run(first, move || ListeningSocket::new(bind(address)?)).await;
@@ -323,7 +324,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     }
 }
 
-/// Whether an address that cannot be bound for this reason may come with its interface.
+/// Whether an address that cannot be bound for this reason may appear later with its interface.
 fn may_come(cause: &io::Error) -> bool {
     cause.kind() == io::ErrorKind::AddrNotAvailable || cause.raw_os_error() == Some(Errno::NODEV.raw_os_error())
 }

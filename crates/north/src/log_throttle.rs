@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 /// Minimum time between two log lines of one kind, unless another is given.
 const INTERVAL: Duration = Duration::from_secs(10);
 
-/// Lets one log line of a kind through in each interval and counts the others.
+/// Lets one log line of a kind pass in each interval and counts the others.
 #[derive(Debug)]
 pub(super) struct LogThrottle {
     interval: Duration,

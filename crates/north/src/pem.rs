@@ -36,7 +36,7 @@ pub(super) enum Found {
     Key,
     PublicKey,
     Certificate,
-    /// A certificate with what its owner trusts it for, an own form of OpenSSL.
+    /// A certificate with the purposes for which its owner trusts it, a format of OpenSSL.
     TrustedCertificate,
     Request,
     /// PKCS#7.
@@ -53,7 +53,7 @@ const CRL: &str = "CRL";
 const MOST_BYTES: u64 = 16 << 20;
 
 impl Found {
-    /// By the first lines of the sections, in the order in which they tell most about the mistake.
+    /// The kind of content by the first lines of the sections, in the order in which they explain the mistake best.
     fn of(bytes: &[u8]) -> Found {
         let text = String::from_utf8_lossy(bytes);
         let begins = |label: &str| text.contains(&format!("-----BEGIN {label}-----"));
@@ -128,7 +128,7 @@ fn is_sequence(bytes: &[u8]) -> bool {
     }
 }
 
-/// All certificates of a file, at least one.
+/// All certificates of a file; an error if there is none.
 pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemError> {
     let bytes = content(file)?;
     let read: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
@@ -149,7 +149,7 @@ pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemErro
     })
 }
 
-/// All certificate revocation lists of a file, at least one: PEM, or a single one in DER as CAs publish it.
+/// All certificate revocation lists of a file, at least one: in PEM, or a single one in DER as CAs publish it.
 pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, PemError> {
     let bytes = content(file)?;
     // A DER file begins with the tag of a sequence, which is not a letter of PEM.

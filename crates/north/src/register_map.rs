@@ -1,8 +1,8 @@
 //! The public register map of Modbus TCP: common model, command block, float block and the gateway itself
 //! (`docs/modbus-tcp.md`).
 //!
-//! Addresses below [`FIRST`] are those of the drive. Holding and input registers from there on are the same. A value
-//! that does not fit its register is "not available", never clamped.
+//! Addresses below [`FIRST`] are those of the drive. Holding and input registers from there on are equal. A value
+//! that does not fit its register is shown as "not available", never clamped.
 
 mod command;
 mod gateway;
@@ -29,14 +29,14 @@ const COMMAND_WORD: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
 const FREQUENCY_REFERENCE: u16 = 0x8102;
 pub(crate) const HEARTBEAT: u16 = 0x8103;
-/// Where a client takes, renews, releases or breaks the hold of the drive.
+/// Register by which a client takes, renews, releases or breaks the hold of the drive.
 pub(crate) const HOLD: u16 = 0x8104;
 
 /// "Not available" of a signed register.
 const NO_I16: u16 = 0x8000;
 /// "Not available" of an unsigned register.
 const NO_U16: u16 = 0xFFFF;
-/// Maximum age that its register can show, ms.
+/// Maximum age that the age register can show, ms.
 const MAX_AGE_MS: u128 = 65_534;
 
 const RUN: u16 = 1 << 0;
@@ -120,9 +120,9 @@ pub enum Content {
     Age,
     /// A point of the common model.
     Point(ModelPoint),
-    /// The command bits; they read as the drive has them now.
+    /// The command bits; reading returns the present command of the drive.
     Command,
-    /// Any write renews the supervision; reads 0.
+    /// Any write renews the supervision; reading returns 0.
     Heartbeat,
     /// The holder of the drive.
     Holder,
@@ -211,7 +211,7 @@ const FLOAT: [Entry; 13] = [
 pub const BLOCKS: [&[Entry]; 3] = [&COMMON, &COMMAND, &FLOAT];
 
 impl Entry {
-    /// First address after this entry.
+    /// First address after this register entry.
     fn end(&self) -> u32 {
         u32::from(self.address) + u32::from(self.form.registers())
     }
@@ -251,7 +251,7 @@ pub(crate) struct DriveView<'r> {
     reading: &'r Reading<'r>,
     bus: BusState,
     stale: bool,
-    /// Hold of the drive, and whether it is the client's own; none where `[authority]` is off.
+    /// Hold of the drive, and whether this client has it; `None` if `[authority]` is off.
     hold: Option<(HoldView, bool)>,
 }
 
@@ -267,7 +267,7 @@ impl<'r> DriveView<'r> {
         }
     }
 
-    /// Adds the hold, and whether it is the client's own.
+    /// Adds the hold, and whether this client has it.
     pub(crate) fn with_hold(mut self, hold: Option<(HoldView, bool)>) -> DriveView<'r> {
         self.hold = hold;
         self
@@ -294,7 +294,7 @@ impl<'r> DriveView<'r> {
         Ok(registers)
     }
 
-    /// The value of a point if it is good, which it never is for a stale drive.
+    /// The value of a point if it is good; a stale drive has no good values.
     fn good(&self, point: ModelPoint) -> Option<f64> {
         if self.stale {
             return None;
@@ -325,7 +325,8 @@ impl<'r> DriveView<'r> {
         }
     }
 
-    /// 0 free, 1 this client, 2 another one, 3 the local control place, 4 reserved after a stop.
+    /// Holder of the drive as a register value: 0 free, 1 this client, 2 another client, 3 local control, 4
+    /// reserved after a stop.
     fn holder(&self) -> u16 {
         match &self.hold {
             None => NO_U16,
@@ -349,7 +350,8 @@ impl<'r> DriveView<'r> {
             .map_or(NO_U16, |age| age.as_millis().min(MAX_AGE_MS) as u16)
     }
 
-    /// "Not available" has bits set that are invalid in a command, so that writing it back is refused.
+    /// The command register: "not available" has bits set that are invalid in a command, so that writing it back is
+    /// refused.
     fn command(&self) -> u16 {
         let (Some(run), Some(reverse)) = (self.good(ModelPoint::Run), self.bit(ModelPoint::Reverse)) else {
             return NO_U16;

@@ -32,8 +32,8 @@ pub trait Server: Sized + std::fmt::Debug {
         cancel: CancellationToken,
     ) -> Result<Self, ServerError>;
 
-    /// A reload is about to end it, for one with the options `next` if there is one: rights that its clients do not have
-    /// then end now.
+    /// Notes that a reload is about to replace this server by one with the options `next`, or by none: rights that
+    /// clients would not have under the new options end now.
     fn end_rights(&self, _next: Option<&Self::Options>) {}
 
     /// Waits until the cancelled server has stopped.
@@ -49,7 +49,7 @@ pub trait Reconfigure: Server {
     /// Does all that can fail; changes nothing for any client.
     ///
     /// # Errors
-    /// The server cannot run with these options: it runs as before.
+    /// If the server cannot run with these options; it continues with the old ones.
     async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError>;
 
     /// Applies a prepared change.

@@ -1,8 +1,9 @@
 //! Server trust: certificates signed by a CA, and certificates listed themselves.
 //!
-//! rustls takes a certificate in the list of CAs only as one that signs others. Other programs accept a server that shows such a
-//! certificate, and so does this: who names a certificate trusts exactly it, so neither its version nor what it may sign
-//! matters. What it is valid for does: dates, use and host, and the server must prove in the handshake that it has its key.
+//! rustls accepts a certificate in the list of CAs only as one that signs others. Other programs accept a server
+//! that presents such a certificate itself, and so does this code: a user who names a certificate trusts exactly
+//! that one, so its version and signing rights do not matter. Dates, purpose and host do matter, and the server
+//! must prove in the handshake that it has the key.
 
 use std::sync::Arc;
 
@@ -41,7 +42,7 @@ impl ServerTrust {
     /// Trusts the certificates in `named` and all certificates signed by the CAs in `roots`.
     ///
     /// # Errors
-    /// There is no usable CA.
+    /// If there is no usable CA.
     pub(super) fn new(roots: RootCertStore, named: Vec<CertificateDer<'static>>) -> Result<ServerTrust, Error> {
         let provider = provider();
         let algorithms = provider.signature_verification_algorithms;
@@ -116,7 +117,7 @@ impl ServerCertVerifier for ServerTrust {
     }
 }
 
-/// Whether a certificate that is named itself is valid now, for a server, and for this host.
+/// Whether a certificate that the configuration itself names is valid now, for a server, and for this host.
 fn check_named(certificate: &CertificateDer<'_>, host: &ServerName<'_>, now: UnixTime) -> Result<(), Error> {
     let (Ok(read), Some(kind)) = (certificate::read(certificate), Kind::of(certificate)) else {
         return Err(bad_encoding());
@@ -133,7 +134,7 @@ fn check_named(certificate: &CertificateDer<'_>, host: &ServerName<'_>, now: Uni
     if !kind.serves {
         return Err(CertificateError::InvalidPurpose.into());
     }
-    // In a certificate without other names, other programs compare the common name as well.
+    // If a certificate has no other names, other programs compare the common name as well.
     if kind.is_commonly_named(host) {
         return Ok(());
     }
@@ -159,7 +160,7 @@ fn verify_with_key(
     signed: &DigitallySignedStruct,
     algorithms: &WebPkiSupportedAlgorithms,
 ) -> Result<HandshakeSignatureValid, Error> {
-    // In TLS 1.2 the scheme does not name the curve, so several algorithms may fit; the key shows which.
+    // In TLS 1.2 the scheme does not name the curve, so several algorithms may fit; the key decides.
     let of_scheme = algorithms.mapping.iter().filter(|(scheme, _)| *scheme == signed.scheme);
     let wanted = key.algorithm.to_der().map_err(|_| bad_encoding())?;
     let bytes = key.subject_public_key.as_bytes().ok_or_else(bad_encoding)?;

@@ -46,7 +46,7 @@ pub struct NorthState {
     pub reload: ReloadStats,
     /// Recent commands.
     pub(super) commands: RememberedCommands,
-    /// Whether the slots that BACnet clients had before the start were loaded, or are void: none of them comes back.
+    /// Whether the slots that BACnet clients had before the start were loaded or made void: after that, none is restored.
     pub(super) kept_slots_read: AtomicBool,
     /// State that an MQTT client leaves to the next one.
     pub mqtt_left: Handover,
@@ -54,7 +54,7 @@ pub struct NorthState {
     pub(super) broker_rights: BrokerRights,
 }
 
-/// The recent commands of all ways that recognise a repetition. They outlive the servers that a reload replaces.
+/// The recent commands of all interfaces that recognise repetitions. They outlive the servers that a reload replaces.
 #[derive(Debug, Default)]
 pub(super) struct RememberedCommands {
     /// Commands that came from the broker.

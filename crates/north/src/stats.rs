@@ -81,12 +81,12 @@ impl ServerKind {
     }
 }
 
-/// Why a connection was refused, or closed in favour of another connection.
+/// Why a connection was refused, or closed in favour of another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConnectionRefusal {
     /// The address of the client is not in `allow`.
     NotAllowed,
-    /// The server has the most connections that it may have.
+    /// The server has its maximum number of connections.
     Full,
     /// The address of the client has its maximum number of connections.
     AddressFull,
@@ -97,7 +97,7 @@ pub enum ConnectionRefusal {
 }
 
 impl ConnectionRefusal {
-    /// All reasons.
+    /// All reasons why a connection is refused.
     pub const ALL: [ConnectionRefusal; 5] = [
         ConnectionRefusal::NotAllowed,
         ConnectionRefusal::Full,
@@ -200,7 +200,7 @@ pub struct BacnetStats(Mutex<Option<BacnetFigures>>);
 pub struct BacnetFigures {
     /// Counters since the server was started.
     pub counters: drivegate_bacnet::Counters,
-    /// The configured BBMD, and whether it passes broadcasts on.
+    /// The configured BBMD, and whether it accepted the registration for broadcasts.
     pub bbmd: Option<(String, drivegate_bacnet::Registration)>,
 }
 
@@ -238,7 +238,7 @@ pub enum SlotOutcome {
     Exception,
     /// The gateway refused the request.
     Refused,
-    /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
+    /// There was no reply to pass on: the drive is silent or offline, or the request was not sent.
     NoAnswer,
     /// The tool sent another request before the reply.
     Abandoned,
@@ -317,7 +317,7 @@ pub struct MqttStats {
     lost: [AtomicU64; MqttKind::ALL.len()],
 }
 
-/// A kind of message that the MQTT client keeps until the broker has it; messages that it gives up are counted.
+/// A kind of message that the MQTT client keeps until the broker has received it; dropped messages are counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttKind {
     Event,
@@ -328,7 +328,7 @@ pub enum MqttKind {
 }
 
 impl MqttKind {
-    /// All kinds of messages.
+    /// All kinds of kept messages.
     pub const ALL: [MqttKind; 3] = [MqttKind::Event, MqttKind::Result, MqttKind::History];
 
     /// Name in the metrics.
@@ -342,14 +342,14 @@ impl MqttKind {
 }
 
 impl MqttStats {
-    /// Counts lost messages.
+    /// Adds to the count of lost messages.
     pub(crate) fn lost(&self, kind: MqttKind, count: u64) {
         if let Some(counter) = self.lost.get(kind as usize) {
             counter.fetch_add(count, Ordering::Relaxed);
         }
     }
 
-    /// Messages lost so far, by kind.
+    /// Number of messages lost so far, for each kind.
     pub fn losses(&self) -> impl Iterator<Item = (MqttKind, u64)> {
         let counts = self.lost.iter().map(|c| c.load(Ordering::Relaxed));
         MqttKind::ALL.into_iter().zip(counts)

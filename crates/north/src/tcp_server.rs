@@ -1,5 +1,5 @@
-//! A server whose clients connect over TCP. Its listeners, its tasks and a reload in two steps are the same for Modbus TCP,
-//! HTTP and the tool slots; what its options mean for a connection is the part of each [`TcpService`].
+//! A server whose clients connect over TCP. Its listeners, its tasks and a reload in two steps are common to Modbus
+//! TCP, HTTP and the tool slots; each [`TcpService`] defines what its options mean for a connection.
 
 use std::fmt::Debug;
 use std::net::SocketAddr;
@@ -21,7 +21,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     const KIND: ServerKind;
     /// Handles the connections to a listener.
     type Handler: ConnectionHandler + Debug;
-    /// Prepared parts of a change besides the sockets, such as certificates.
+    /// Prepared parts of a change apart from the sockets, such as certificates.
     type Prepared;
 
     /// A service without listeners; `tasks` end with `cancel`.

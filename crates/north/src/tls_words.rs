@@ -16,7 +16,7 @@ pub enum Peer {
     Server {
         /// Name of the setting with the certificates that verify the server.
         ca: &'static str,
-        /// Name of the setting for a client certificate; empty if there is no such setting.
+        /// Name of the setting for the gateway's own certificate; empty if there is no such setting.
         own: &'static str,
     },
     /// A client of the gateway.
@@ -30,7 +30,7 @@ pub(super) const BROKER: Peer = Peer::Server {
 /// A gateway that a command connects to over HTTPS.
 pub const GATEWAY: Peer = Peer::Server { ca: "--ca", own: "" };
 
-/// Fault and remedy, as `what; what to do`; `None` if it is not a TLS error.
+/// Fault and remedy as `what; what to do`; `None` if the error does not come from TLS.
 pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
     let (what, remedy) = match found(error)? {
         Error::InvalidCertificate(cause) => certificate(cause, peer),
@@ -50,7 +50,7 @@ pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
                 Peer::Client => "give the client a certificate of the CA in client_ca".to_string(),
             },
         ),
-        // Other errors are not caused by a configuration.
+        // The configuration does not cause any other error.
         error => return Some(format!("TLS: {error}")),
     };
     Some(format!("{what}; {remedy}"))

@@ -17,7 +17,7 @@ use crate::permit::Settled;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::{LeaseAction, Machine};
 
-/// Most batches of datagrams whose dates are kept until their writes are taken up.
+/// Most batches of datagrams whose arrival times are kept until their writes are processed.
 const MOST_KEPT: usize = 64;
 /// The name of the vendor without an identifier of one's own.
 const VENDOR: &str = "drivegate";
@@ -124,7 +124,7 @@ impl Desk {
         self.server.receive(from, datagram, &self.view, now);
     }
 
-    /// Notes how the datagrams arrived that are processed at `now`.
+    /// Notes when the datagrams arrived that are processed at `now`.
     pub(super) fn came(&mut self, arrival: Arrival, now: Instant) {
         if self.arrivals.len() >= MOST_KEPT {
             self.arrivals.pop_front();

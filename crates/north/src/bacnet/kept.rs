@@ -54,8 +54,8 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
     all
 }
 
-/// Puts the kept entries into their slots again. An entry is void if its client may no longer write, or its drive is
-/// gone.
+/// Restores the saved entries into their slots. An entry is void if its client may no longer write, or its drive no
+/// longer exists.
 pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], now: Instant, time: SystemTime) {
     for slot in slots.iter().filter(|slot| (1..=PROTECTING).contains(&slot.priority)) {
         let Some(drive) = plant.drive_at(&slot.machine) else {
@@ -118,7 +118,8 @@ fn remove(path: &Path) -> Result<(), String> {
     }
 }
 
-/// At the start of a gateway that keeps no slots: those of an earlier run are void. No later configuration revives them.
+/// Discards the slots of an earlier run, at the start of a gateway that does not save slots. No later configuration
+/// revives them.
 pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
     stats.kept_slots_read.store(true, Ordering::Relaxed);
     let (path, events) = (state_dir.join(FILE), events.clone());
@@ -137,13 +138,13 @@ pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
     let _ = stats.patience.read(discard).await;
 }
 
-/// Kept slots, and the file that holds them.
+/// Path of the file for saved slots, and the slots in it.
 type Kept = (PathBuf, Vec<KeptSlot>);
 
-/// The file as a server keeps it up to date, one write behind the other.
+/// The file of saved slots, kept up to date by a server with one write after the other.
 #[derive(Debug, Default)]
 pub(super) struct KeptFile {
-    /// Slots known to be on disk, and their file.
+    /// Slots known to be on disk, with the path of their file.
     written: Option<Kept>,
     writing: Option<JoinHandle<Result<Option<Kept>, String>>>,
     /// When a failed write is tried again.
@@ -156,7 +157,7 @@ impl KeptFile {
         self.written = Some((path, slots));
     }
 
-    /// Writes these slots to `path` if they are not there; without `path` what was kept is removed.
+    /// Writes these slots to `path` if they are not on disk yet; without `path`, removes the saved ones.
     pub(super) fn keep(&mut self, path: Option<PathBuf>, plant: &Plant, now: Instant) {
         if let Some(done) = self.writing.take_if(|writing| writing.is_finished()) {
             match done.now_or_never() {
@@ -196,7 +197,7 @@ impl KeptFile {
         }
     }
 
-    /// Writes it once more and waits for that, for the time that a disk may take.
+    /// Writes the slots a last time and waits for it, within the time limit for the disk.
     pub(super) async fn finish(&mut self, path: Option<PathBuf>, plant: &Plant) {
         let until = tokio::time::Instant::now() + DISK;
         loop {
@@ -252,7 +253,7 @@ mod tests {
     async fn what_a_full_disk_refused_is_written_when_there_is_room_unasked() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join(FILE);
-        // A folder of this name makes it impossible to create the file.
+        // A folder of this name prevents the file from being created.
         let aside = file.with_extension(files::PARTIAL);
         std::fs::create_dir(&aside).unwrap();
         let plant = Plant::new("test", Duration::from_secs(1), Vec::new());

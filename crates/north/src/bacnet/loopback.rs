@@ -33,13 +33,13 @@ impl Loopback {
         }
     }
 
-    /// Processes a datagram that arrived. The command in it is in the queue of its bus when this returns.
+    /// Processes a received datagram. A command in it is in the queue of its bus when this returns.
     pub fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.desk.receive(from, datagram, now);
         self.take_up(now);
     }
 
-    /// Sends the clients the results of their writes so far.
+    /// Sends the clients the results of their completed writes.
     pub fn collect(&mut self, now: Instant) {
         let mut place = 0;
         while let Some((_, waiting)) = self.waiting.get_mut(place) {

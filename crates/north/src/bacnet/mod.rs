@@ -1,8 +1,8 @@
-//! The BACnet/IP server: each drive is its own device behind a virtual network (`docs/bacnet.md`).
+//! The BACnet/IP server: each drive is a separate device behind a virtual network (`docs/bacnet.md`).
 //!
-//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` lists the objects of a drive, `view` reads their
-//! values from the process image, `writes` converts writes of clients to commands, `desk` brings them together, `task`
-//! moves datagrams, `offline` does so without sockets.
+//! The protocol is in `drivegate_bacnet`, which does no I/O. `objects` lists the objects of a drive, `view` reads
+//! their values from the process image, `writes` converts writes of clients to commands, `desk` combines them,
+//! `task` sends and receives datagrams, `offline` does the same without sockets.
 
 mod desk;
 pub mod ede;
@@ -56,7 +56,7 @@ pub enum WhenOffline {
 pub struct Options {
     /// Address of the server.
     pub listen: SocketAddrV4,
-    /// Device instance of the gateway; the instance of a drive is this one plus its unit.
+    /// Device instance of the gateway; the instance of a drive is this number plus its unit id.
     pub device: u32,
     /// Number of the virtual network of the drives; `None` if all objects belong to the gateway's device (`layout = "flat"`).
     pub network: Option<u16>,
@@ -133,7 +133,8 @@ impl Options {
         4
     }
 
-    /// Whether a server with these options can continue with `other`: its sockets and its identity for clients stay.
+    /// Whether a server with these options can take over the `other` options without a restart: sockets and device
+    /// identity are unchanged.
     fn continues(&self, other: &Options) -> bool {
         let identity = |options: &Options| {
             let Options {
@@ -250,7 +251,7 @@ impl Reconfigure for Server {
             self.address = SocketAddr::V4(sockets.address);
             self._state = self.stats.listeners.add(ServerKind::Bacnet, self.address);
         }
-        // The rights change before the task has the new options: writes in progress are judged by them at once.
+        // The rights change before the task gets the new options, so that writes in progress are judged by them at once.
         self.rights.set(Some(&options));
         self.options = options.clone();
         // A task that has ended ends with the process.

@@ -57,13 +57,13 @@ pub enum Meaning {
 /// A device, with the meaning of each of its objects in the same order.
 #[derive(Debug, Clone)]
 pub struct Shown {
-    /// The device as BACnet clients see it.
+    /// The device as shown to BACnet clients.
     pub device: Arc<Device>,
     /// The meaning of each object.
     pub meanings: Vec<Meaning>,
 }
 
-/// Objects with their meanings.
+/// BACnet objects with their meanings.
 #[derive(Default)]
 struct Objects(Vec<(Object, Meaning)>);
 
@@ -145,19 +145,20 @@ const PER_DRIVE: u32 = 1000;
 /// The objects of one device for all drives, with the unit of each object's drive; `None` for objects of the gateway.
 #[derive(Debug, Clone)]
 pub struct Flat {
-    /// The device as BACnet clients see it.
+    /// The device as shown to BACnet clients.
     pub device: Arc<Device>,
     /// The unit and the meaning of each object.
     pub places: Vec<(Option<u8>, Meaning)>,
 }
 
-/// All objects of these devices, that of the gateway first, as those of one: numbers are unit * 1000 + n, names `drive.point`.
+/// All objects of these devices as objects of one device, those of the gateway first: numbers are unit * 1000 + n,
+/// names `drive.point`.
 pub fn flat((name, instance): (&str, u32), gateway: Shown, drives: impl Iterator<Item = (String, u8, Shown)>) -> Flat {
     let mut objects = gateway.device.objects().to_vec();
     let mut places: Vec<(Option<u8>, Meaning)> = gateway.meanings.iter().map(|meaning| (None, *meaning)).collect();
     for (drive, unit, shown) in drives {
         for (object, meaning) in shown.device.objects().iter().zip(&shown.meanings) {
-            // Instances from there on belong to the next unit.
+            // Instances from this number on belong to the next unit.
             if object.id.instance >= PER_DRIVE {
                 continue;
             }
@@ -176,7 +177,7 @@ pub fn flat((name, instance): (&str, u32), gateway: Shown, drives: impl Iterator
     }
 }
 
-/// The unit of the drive to which an object of the one device belongs, and its number there.
+/// The unit id of the drive to which an object of the single device belongs, and the number of the object in that drive.
 pub fn of_flat(object: ObjectId) -> Option<(u8, u32)> {
     let unit = u8::try_from(object.instance / PER_DRIVE)
         .ok()
@@ -279,14 +280,14 @@ fn commands(spec: &DriveSpec, all: &mut Objects) {
     }
 }
 
-/// The points that only the profile has, in its order, counted over all types.
+/// Adds the points that only the profile has, in its order, numbered across all types.
 fn own(spec: &DriveSpec, all: &mut Objects) {
     let profile = &spec.profile;
     let own = profile.points.enumerate().filter(|(_, point)| point.model.is_none());
     for (number, (index, point)) in (OWN..).zip(own) {
         let writable = point.write && spec.access == Access::Control;
         let unread = point.raw().is_some() && point.class == PollClass::Never;
-        // A point that is left out still keeps its number.
+        // A point that is left out still uses up its number.
         if point.hidden || (unread && !writable) {
             continue;
         }
@@ -327,7 +328,7 @@ fn own(spec: &DriveSpec, all: &mut Objects) {
     }
 }
 
-/// The state of an enumeration, from 1: the place of its code among those with texts.
+/// The state of an enumeration, counted from 1: the position of its code among the codes with texts.
 pub(super) fn state_of(point: &Point, code: i64) -> u32 {
     let place = point
         .texts

@@ -1,5 +1,5 @@
-//! Which hosts may write, as `[bacnet]` is now: a reload counts from the moment at which it is applied, also for requests
-//! under way and for what stands in slots.
+//! Which hosts may write according to the present `[bacnet]`: a reload takes effect at once, also for requests in
+//! progress and for values in slots.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -20,12 +20,12 @@ impl HostRights {
         HostRights(Arc::new(ArcSwapOption::from_pointee(options.clone())))
     }
 
-    /// These options count from now on; none: no client may write.
+    /// Puts these options into effect; with `None` no client may write.
     pub(super) fn set(&self, options: Option<&Options>) {
         self.0.store(options.cloned().map(Arc::new));
     }
 
-    /// Whether the server goes on to serve.
+    /// Whether the server still serves clients.
     pub(super) fn are_there(&self) -> bool {
         self.0.load().is_some()
     }
@@ -38,7 +38,7 @@ impl HostRights {
         }))
     }
 
-    /// The right of a client by its name in the audit; a name that is not an address has no right.
+    /// The right of a client, given by its name in the audit; a name that is not an address has no right.
     pub(super) fn of_name(&self, who: &str) -> Right {
         match who.parse::<Address>() {
             Ok(client) => self.of(&client),

@@ -1,5 +1,5 @@
-//! The sockets: one for what comes to this host, and for broadcasts, which Linux gives to a socket that is bound to their address,
-//! one for those of the network and one for 255.255.255.255, to which many clients send.
+//! The UDP sockets: one for datagrams to this host, one for broadcasts of the network and one for 255.255.255.255,
+//! to which many clients send. Linux delivers a broadcast only to a socket that is bound to the broadcast address.
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -29,7 +29,7 @@ impl Sockets {
         unicast.set_broadcast(true)?;
         let port = unicast.local_addr()?.port();
         let address = SocketAddrV4::new(*listen.ip(), port);
-        // Without the table of routes nothing but the widest broadcast is known.
+        // Without the routing table only 255.255.255.255 is known.
         let routes = std::fs::read_to_string("/proc/net/route").unwrap_or_default();
         let prefix = prefix(*listen.ip(), &routes);
         let to = broadcast_of(*listen.ip(), prefix);
@@ -58,7 +58,7 @@ impl Sockets {
     }
 }
 
-/// A socket for broadcasts, which other programs of this host may receive, too.
+/// A socket for broadcasts that other programs on this host can receive at the same time.
 fn shared(address: SocketAddrV4) -> io::Result<UdpSocket> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = socket_with(AddressFamily::INET, SocketType::DGRAM, flags, None)?;

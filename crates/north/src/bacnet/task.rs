@@ -33,7 +33,7 @@ use crate::process_image::Snapshot;
 use crate::reading::{Reader, is_readable};
 use crate::stats::BacnetFigures;
 
-/// Interval in which the task does what is due.
+/// Interval at which the task checks for due work.
 const TICK: Duration = Duration::from_millis(100);
 /// Shortest interval between reports of changes.
 const LOOK: Duration = Duration::from_millis(5);
@@ -47,9 +47,9 @@ const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 /// A message from the server to its task.
 #[derive(Debug)]
 pub(super) enum ToTask {
-    /// Other options, and other sockets where the address is another one.
+    /// Use other options, and other sockets if the address has changed.
     Apply(Box<Options>, Option<Sockets>),
-    /// Accept no more requests.
+    /// Accept no further requests.
     Retire,
 }
 
@@ -72,7 +72,7 @@ pub(super) struct Task {
     /// Devices with a slot from before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,
-    /// Looks up the BBMD.
+    /// Task that looks up the BBMD.
     lookup: Option<JoinHandle<Option<SocketAddrV4>>>,
     retired: bool,
 }
@@ -178,7 +178,7 @@ impl Task {
         }
     }
 
-    /// Sends pending datagrams. Any that the system does not accept at once are lost, as datagrams may be.
+    /// Sends pending datagrams. Any that the system does not accept at once are dropped, as UDP allows.
     fn flush(&mut self) {
         while let Some((to, datagram)) = self.desk.server.transmit() {
             let to = match to {
@@ -252,14 +252,14 @@ impl Task {
         }
     }
 
-    /// File in which slots are kept; `None` if they are not kept, or if a reload takes the server away and with it
-    /// their purpose.
+    /// File in which slots are saved; `None` if they are not saved, or if a reload removes the server and makes the
+    /// file useless.
     fn keep_file(&self) -> Option<std::path::PathBuf> {
         let keeps = self.options.keep_priorities && self.desk.view.rights.are_there();
         keeps.then(|| self.options.state_dir.join(kept::FILE))
     }
 
-    /// Loads the slots from before the start. A server that a reload starts loads none: they were void before.
+    /// Loads the slots saved before the start. A server that a reload starts loads none: they were void before.
     async fn load(&mut self) {
         let Some(path) = self.keep_file() else { return };
         if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {
@@ -352,7 +352,7 @@ impl Task {
         }
     }
 
-    /// Looks up the address of the BBMD, and repeats this while its name is not found.
+    /// Looks up the address of the BBMD, and repeats this until its name is found.
     fn find_bbmd(&mut self, now: Instant) {
         use drivegate_bacnet::Registration;
         let Some((host, port)) = self.options.bbmd.clone() else {
@@ -397,7 +397,7 @@ async fn ending(token: u64, mut waiting: Waiting) -> Ended {
     Ended::of(token, waiting, outcome)
 }
 
-/// The reader of a new socket, which waits for bytes that come from now on.
+/// The reader of a new socket, for bytes that arrive from now on.
 fn waiting_reader() -> Reader {
     let reader = Reader::here();
     reader.nothing(Instant::now(), || false);
@@ -407,7 +407,7 @@ fn waiting_reader() -> Reader {
 /// Waits for a broadcast; returns the index of the socket that received one.
 async fn broadcast_received(sockets: &[UdpSocket]) -> usize {
     std::future::poll_fn(|cx| {
-        // Any error of the socket shows when the socket is read.
+        // Any error of the socket is reported when the socket is read.
         let ready = sockets.iter().position(|socket| socket.poll_recv_ready(cx).is_ready());
         ready.map_or(Poll::Pending, Poll::Ready)
     })

@@ -74,7 +74,7 @@ impl ControlledDrive {
         self.view.plant.drive("p1").unwrap()
     }
 
-    /// Everything that is planned was read just now, each register that value.
+    /// Stores this value in every polled register, as just read.
     fn read(&self, word: u16) {
         read_all(&self.drive().image, self.now, |_| word);
         self.view.set_time(self.now);
@@ -165,7 +165,7 @@ impl ControlledDrive {
         self.view.sample(DEVICE, self.place(object)).value.unwrap()
     }
 
-    /// Gives the drive an order as an MQTT client would; returns the refusal, if any.
+    /// Gives the drive an order over another interface, as an MQTT client would; returns the refusal, if any.
     fn elsewhere(&self, point: ModelPoint, value: Value) -> Option<Refusal> {
         let drive = self.drive();
         let index = drive.image.spec.profile.model_index(point).unwrap();

@@ -1,4 +1,4 @@
-//! The plant as BACnet sees it at one time: what each object shows, which device answers.
+//! The state of the plant for BACnet at one time: the value of each object, and which device answers.
 
 use std::cell::Cell;
 use std::collections::HashMap;
@@ -32,19 +32,20 @@ pub(super) struct ShownDrive {
     pub(super) shown: Shown,
 }
 
-/// The plant, and how BACnet clients see it.
+/// The plant, and how it appears to BACnet clients.
 #[derive(Debug)]
 pub(super) struct View {
     pub(super) plant: Arc<Plant>,
     pub(super) options: Arc<Options>,
     pub(super) rights: HostRights,
     gateway: Shown,
-    /// All objects of the plant as objects of one device.
+    /// All objects of the plant in a single device.
     flat: Option<Flat>,
-    /// By the instance of the gateway plus the unit, which is that of the drive's device where it has one.
+    /// Drives by the gateway's instance number plus the unit id; this is also the instance of the drive's device,
+    /// if the drive has a device.
     pub(super) drives: HashMap<u32, ShownDrive>,
     buses: Vec<BusHandle>,
-    /// The time of this look, by the monotonic clock and by the wall clock.
+    /// The time of this view, by the monotonic clock and by the wall clock.
     now: Cell<(Instant, SystemTime)>,
 }
 
@@ -387,7 +388,7 @@ impl Application for View {
         };
         let (what, now) = (write.object.to_string(), self.now.get().0);
         let refusal = Refusal::NotAllowed(why.to_string());
-        // The client gets no more detail than this.
+        // The client gets no details beyond this error.
         drive
             .handle
             .refuse(&what, refusal, super::writes::origin(&self.rights, from, None), now);

@@ -49,14 +49,14 @@ pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) 
     origin.proven(proof).with_right(rights.of(from))
 }
 
-/// Begins a write whose request arrived in this way.
+/// Starts a write whose request arrived at this time.
 pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> Begun {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
     let origin = origin(&view.rights, &job.from, job.priority);
     let expiry = expiry(job);
-    // A reload may have come since the request was received, or between two of its writes.
+    // A reload may have happened since the request was received, or between two of its writes.
     if let Err(refusal) = client_access(Stage::Accept, false, &origin, &handle.image.spec.bus) {
         handle.refuse(&described(job), refusal, origin, now);
         return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
@@ -102,8 +102,8 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
     }
 }
 
-/// Time from its request for which a write may be sent: a write that waited for another one of the same request has its
-/// own time.
+/// Time after the request within which a write may be sent. A write that waited for another one of the same request
+/// gets more time.
 fn expiry(job: &Job) -> Duration {
     DEFAULT_EXPIRY + job.since.saturating_duration_since(job.asked)
 }
@@ -134,7 +134,7 @@ fn described(job: &Job) -> String {
     }
 }
 
-/// A write to a slot of the priority array, and the order that follows from it.
+/// Processes a write to a slot of the priority array and the order that results from it.
 fn slot(
     handle: &DriveHandle,
     (what, index): (Commanded, PointIndex),
@@ -176,7 +176,7 @@ fn slot(
                 };
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
-                // The entry that comes to govern was written long ago; its order is given now.
+                // The entry that becomes effective was written long ago, but its order is given now.
                 let mut came = arrival.clone();
                 let mut expires = expiry(job);
                 if !own {
@@ -188,7 +188,7 @@ fn slot(
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {
-                    // The order of its owner is refused, so that slot is released, too.
+                    // The order of the slot's owner is refused, so the slot is released as well.
                     Some(next) if !write.also.contains(&next) => write.also.push(next),
                     _ => return waits(handle, placed, Some(write.id)),
                 }
@@ -227,7 +227,8 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
     Some(Begun::Answered(Ok(())))
 }
 
-/// Whether the drive could be given this value at all; anything unknown yet is judged when the write becomes a command.
+/// Whether the drive can accept this value at all; anything unknown at this time is checked when the write becomes
+/// a command.
 fn possible(handle: &DriveHandle, index: PointIndex, value: Value, now: Instant) -> Result<(), Refusal> {
     let order = Order::Points(vec![(index, value)]);
     match permit::admit(order, &handle.reading(now), Authority::Write) {

@@ -23,8 +23,7 @@ pub(crate) struct HoldReply<'r> {
     own: Option<bool>,
 }
 
-/// The fields of the hold in the JSON of a drive. They compare equal regardless of the time left, which changes by
-/// itself.
+/// The fields of the hold in the JSON of a drive. Comparison ignores the remaining time, which changes by itself.
 #[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
 pub(crate) struct HoldFields {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -65,7 +64,7 @@ impl<'r> HoldReply<'r> {
         }
     }
 
-    /// The result of an action; `seen` is the hold's state if it was refused.
+    /// The result of an action on the hold; `seen` is the state of the hold if the action was refused.
     pub(crate) fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
         let (hold, refusal) = match done {
             Ok(view) => (Some(view), None),

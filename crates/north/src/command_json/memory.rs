@@ -1,4 +1,4 @@
-//! Which commands were taken, so that a repetition is recognised. Time is an argument.
+//! Remembers executed commands so that repetitions are recognised. Time is an argument.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
@@ -17,11 +17,11 @@ const MOST_COMMANDS: usize = 1 << 18;
 /// The parts of a command by which its repetition is recognised.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Taken<'t> {
-    /// Where the command came in: its topic, or the user and the drive.
+    /// Where the command arrived: its topic, or the user and the drive.
     pub(crate) topic: &'t str,
     /// Payload of the command.
     pub(crate) payload: &'t [u8],
-    /// Where the command's result goes: response topic and correlation data.
+    /// Where the command's result is sent: response topic and correlation data.
     pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
     /// Whether the broker marks the command as a repetition.
     pub(crate) dup: bool,
@@ -37,8 +37,9 @@ pub(crate) struct Memory<R> {
     hasher: RandomState,
     /// Oldest first.
     recent: VecDeque<Recent<R>>,
-    /// By topic, `id` and payload. Trees, because entries come and go all day: a hash table doubles when removals have used up
-    /// its free places, and keeps the size that a flood needed.
+    /// Commands by a fingerprint of topic, `id` and payload. Trees are used because entries are added and removed
+    /// all day: a hash table would double when removals have used up its free places, and keep the size that a
+    /// flood required.
     known: BTreeMap<u64, Known>,
     /// The remembered commands by the time until which they are remembered.
     ends: BTreeMap<(Instant, u64), u64>,
@@ -46,12 +47,12 @@ pub(crate) struct Memory<R> {
     last_of: BTreeMap<u64, u64>,
     /// Number of commands taken so far.
     taken: u64,
-    /// Commands up to this number get no result any more if they have none.
+    /// Commands up to this number that have no result yet never get one.
     abandoned: u64,
 }
 
-/// Memory of the clients of one broker, or of the connections of the HTTP server, shared with those that a reload starts
-/// in their place: repeated commands may come over a new connection. Results by way of a broker are payloads.
+/// Memory shared by the clients of one broker, or by the connections of the HTTP server, also across reloads: a
+/// repeated command may arrive over a new connection. Results sent through a broker are payloads.
 #[derive(Debug)]
 pub(crate) struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
 
@@ -130,7 +131,7 @@ pub(crate) enum Repetition<R> {
 }
 
 impl<R: Clone> Memory<R> {
-    /// The fingerprint of a command with this `id`.
+    /// The fingerprint that identifies a command with this `id`.
     pub(crate) fn fingerprint(&self, taken: &Taken<'_>, id: Option<&str>) -> Fingerprint {
         let Taken { topic, payload, .. } = taken;
         let answer_to = self.hasher.hash_one(taken.answer_to);
@@ -235,7 +236,7 @@ impl<R: Clone> Memory<R> {
         number
     }
 
-    /// Notes that nobody waits for the results of the commands so far any longer; these do not come any more.
+    /// Notes that pending results are no longer awaited by anyone and will not come.
     pub(crate) fn abandon(&mut self) {
         self.abandoned = self.taken;
     }

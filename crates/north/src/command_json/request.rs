@@ -72,8 +72,8 @@ pub(crate) fn excerpt(payload: &[u8]) -> String {
     format!("`{short}{dots}`")
 }
 
-/// The `id` of an object, read before the rest, so that a client finds its request in the result whatever else is wrong.
-/// `None` if the payload is not JSON or contains several.
+/// The `id` of an object, read before the rest, so that a client can match the result to its request even if the
+/// rest is invalid. `None` if the payload is not JSON or contains several ids.
 pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
     let OnlyId(id) = serde_json::from_slice(payload).ok()?;
     Id::of(id?)
@@ -84,7 +84,7 @@ pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
 pub(crate) struct Asked {
     pub(crate) points: Points,
     pub(crate) expiry: Duration,
-    /// Why all but a stop is refused; `points` then holds the points of the stop.
+    /// Why everything except a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
     /// Whether a start that must wait does wait.
     pub(crate) wait: bool,
@@ -113,22 +113,22 @@ impl Asked {
         })
     }
 
-    /// Whether the command has a stop, which is executed whatever happens to the rest.
+    /// Whether the command contains a stop, which is executed whatever happens to the rest.
     pub(crate) fn stops(&self, profile: &Profile) -> bool {
         stop_of(&self.points, profile).is_some()
     }
 
-    /// Whether the command does more than stop, so that its repetition is not executed.
+    /// Whether the command contains more than a stop, so that a repetition of it is not executed.
     pub(crate) fn does_more(&self, profile: &Profile) -> bool {
         let whole = || matches!(Parts::of(Order::Points(self.points.clone()), profile), Parts::One(_));
         self.refused.is_none() && !(self.stops(profile) && whole())
     }
 
-    /// Gives the command to the drive at `now`: as a whole, or only its stop if the rest, `what`, is refused. `arrival`
-    /// tells how the command came.
+    /// Gives the command to the drive at `now`: as a whole, or only its stop if the rest, `what`, is refused.
+    /// `arrival` is when and how the command arrived.
     ///
     /// # Errors
-    /// The answer if all of it is refused.
+    /// If the whole command is refused; contains the answer.
     pub(crate) fn place(
         self,
         drive: &DriveHandle,
@@ -154,7 +154,7 @@ impl Asked {
 /// The points and the expiry of a command.
 ///
 /// # Errors
-/// The refusal; nothing of the command may be executed.
+/// If nothing of the command may be executed; contains the refusal.
 pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal> {
     let (fields, refused) = object(payload)?;
     points_of(fields, refused, profile)
@@ -218,7 +218,7 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
     })
 }
 
-/// The point of that name with its value. Limits are checked with the command.
+/// The point with this name, and its value. Limits are checked later with the command.
 pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(PointIndex, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
         let writable = || {
@@ -284,8 +284,7 @@ fn brief(value: &Json) -> String {
     }
 }
 
-/// The fields of an object. If some of its values are not valid in JSON (`NaN`, `1e999`), they are null, and the refusal
-/// reports that.
+/// The fields of an object. Values that are not valid JSON (`NaN`, `1e999`) become null, and the refusal reports them.
 fn object(payload: &[u8]) -> Result<(Fields, Option<Refusal>), Refusal> {
     let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
     let value: Json = match serde_json::from_slice(payload) {
@@ -366,7 +365,7 @@ impl<'de> Visitor<'de> for FieldsVisitor {
     }
 }
 
-/// The `id` of an object, if it has exactly one; other fields are ignored.
+/// Only the `id` of an object, if it has exactly one; other fields are ignored.
 struct OnlyId(Option<Box<RawValue>>);
 
 impl<'de> Deserialize<'de> for OnlyId {
@@ -407,7 +406,7 @@ fn unknown_drive(name: &str, plant: &Plant) -> String {
     format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
 }
 
-/// The answer to a command for a drive that there is not, and its audit.
+/// The answer to a command for an unknown drive, which is also audited.
 pub(crate) fn refuse_unknown(plant: &Plant, name: &str, what: &str, origin: Origin, now: Instant) -> Answer {
     let shown = excerpt(name.as_bytes());
     plant.refuse_unknown(shown.trim_matches('`'), what, unknown_drive(name, plant), origin, now)

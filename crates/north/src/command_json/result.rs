@@ -18,7 +18,7 @@ pub(crate) struct CommandResult<'r> {
     result: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<ErrorObject>,
-    /// Code of the rest of a command, where only its stop was carried out.
+    /// Refusal code for the rest of a command of which only the stop was executed.
     #[serde(skip_serializing_if = "Option::is_none")]
     rest: Option<&'static str>,
     /// Time after which a refused start may be retried.
@@ -76,7 +76,7 @@ fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
 }
 
 impl<'r> CommandResult<'r> {
-    /// The result at `time` of the command with this `id`, after what reads have shown so far.
+    /// The result at `time` of the command with this `id`, as far as reads have confirmed it so far.
     pub(crate) fn new(
         id: Option<&'r Id>,
         drive: &'r str,
@@ -111,7 +111,7 @@ impl<'r> CommandResult<'r> {
         }
     }
 
-    /// The result as JSON, as it is sent to the client.
+    /// The result as the JSON that the client receives.
     pub(crate) fn to_json(&self) -> Vec<u8> {
         // Strings, numbers and previous JSON can always be serialized.
         serde_json::to_vec(self).unwrap_or_default()

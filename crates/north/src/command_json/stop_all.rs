@@ -14,7 +14,7 @@ use crate::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
 const STOP_ALL: &str = "stop all";
 const DRIVES: &str = "all drives";
 
-/// Which drives are to be stopped.
+/// Body of a request to stop all: which drives are to be stopped.
 #[derive(Debug, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StopBody {
@@ -23,7 +23,7 @@ pub struct StopBody {
     pub wait_s: Option<f64>,
 }
 
-/// Which drives are to be stopped, and how long the answer waits for them to stand. An empty body stops all.
+/// Parses which drives are to be stopped, and how long the answer waits for standstill. An empty body stops all drives.
 ///
 /// # Errors
 /// The request does not specify the drives clearly.

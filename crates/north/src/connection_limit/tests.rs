@@ -192,7 +192,7 @@ fn newcomer() -> impl Strategy<Value = (u8, bool, u8)> {
 }
 
 proptest! {
-    /// With any sequence of connections no limit is exceeded, and no connection yields that must not.
+    /// Property for any sequence of connections: no limit is exceeded, and connections that must stay are not displaced.
     #[test]
     fn limits_hold_and_operators_stay(limits in limits(), newcomers in prop::collection::vec(newcomer(), 1..200)) {
         let mut rig = LimitedPlaces::new(limits);

@@ -1,4 +1,4 @@
-//! Whether a request is answered: the host it is meant for, then the token of its sender. Pure.
+//! Decides whether a request is answered: checks the host it is addressed to, then the token of its sender. Pure.
 
 use std::net::IpAddr;
 
@@ -18,7 +18,7 @@ pub(super) struct Access {
     pub(super) tokens: Option<Tokens>,
 }
 
-/// Why a request is not answered.
+/// Why a request is refused before it is processed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum AccessError {
     #[error("the request has no `Host` header, or more than one")]
@@ -46,10 +46,10 @@ impl AccessError {
 }
 
 impl Access {
-    /// Whether a request on a connection to the address `local` of this machine may be answered.
+    /// Whether a request on a connection to this machine's address `local` may be answered.
     ///
     /// # Errors
-    /// Why the request is not answered.
+    /// If the request must not be answered; contains the reason.
     pub(super) fn check(&self, uri: &Uri, headers: &HeaderMap, local: IpAddr) -> Result<(), AccessError> {
         self.check_host(uri, headers, local)?;
         let (Some(tokens), Some(scope)) = (&self.tokens, scope(uri.path())) else {
@@ -68,7 +68,8 @@ impl Access {
             return Err(AccessError::HostCount);
         };
         let host = host.to_str().map_err(|_| AccessError::BadHost)?;
-        // A request to a proxy names the host in its first line too, and that one counts (RFC 9112, 3.2.2).
+        // A request sent to a proxy also names the host in its first line, and that name takes precedence (RFC
+        // 9112, 3.2.2).
         for text in [Some(host), uri.authority().map(|authority| authority.as_str())]
             .into_iter()
             .flatten()

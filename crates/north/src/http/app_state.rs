@@ -23,8 +23,8 @@ pub(super) struct AppState {
     pub(super) cancel: CancellationToken,
     /// Open event streams.
     pub(super) listeners: Arc<ConnectionLimit>,
-    /// Large replies are rendered one at a time: a client that sends such requests continuously shares the turns with
-    /// all others, and `/healthz` does not wait for it.
+    /// Large replies are created one at a time: a client that requests them continuously shares the turns with all
+    /// others, and `/healthz` is not delayed.
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
     files: Semaphore,
@@ -64,7 +64,7 @@ impl AppState {
         Ok(tokio::task::spawn_blocking(read).await.map_err(|_| unavailable)?)
     }
 
-    /// The cookies of this gateway, on a connection that came like that.
+    /// The cookies of this gateway for a connection of this kind (with or without TLS).
     pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
         Cookies::of(&self.plant.load().gateway, reached.tls)
     }

@@ -26,8 +26,8 @@ impl<S: Sync> FromRequest<S> for Payload {
     }
 }
 
-/// Reads the body of at most `most` bytes. Until the body is complete, the connection is not in use: it yields to
-/// others.
+/// Reads a body of at most `most` bytes. While the body is incomplete, the connection does not count as in use and
+/// yields to others.
 ///
 /// # Errors
 /// The reply to a body that is too long, incomplete or too slow.

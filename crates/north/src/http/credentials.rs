@@ -1,19 +1,19 @@
-//! The common part of token and user files: one entry per line, each with its own name.
+//! The common part of token and user files: one entry per line, each with a unique name.
 
 use std::str::FromStr;
 
-/// A token or a user. Its display form is its line of the file.
+/// A token or a user. Its `Display` form is its line in the file.
 pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
     /// `token` or `user`.
     const KIND: &'static str;
-    /// Most of a file: more than any plant needs.
+    /// Most entries of a file, more than any plant needs.
     const MOST_ENTRIES: usize;
 
     /// Unique in the file.
     fn name(&self) -> &str;
 }
 
-/// Why a line is not a token or a user, or none can be made.
+/// Why a line is not a valid token or user, or why none can be created.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CredentialError {
     /// The words do not have the required form.
@@ -31,7 +31,7 @@ pub enum CredentialError {
     /// The hash is not of the kind in the text.
     #[error("the hash is not {0}")]
     Hash(&'static str),
-    /// More lines than any plant needs.
+    /// The file has more lines than any plant needs.
     #[error("there are more than {1} {0}s")]
     Many(&'static str, usize),
     /// A password that is easily guessed, or no text.

@@ -76,7 +76,7 @@ pub(super) struct Shown<'e> {
     shown_in: Option<RecordingMade>,
 }
 
-/// The recordings on disk, by the time that they cover.
+/// The recordings on disk, sorted by the time that they cover.
 struct Recorded {
     before: Duration,
     after: Duration,
@@ -94,7 +94,7 @@ impl Recorded {
         }
     }
 
-    /// The recording of its drive that covers the event; the one with the nearest trigger if several do.
+    /// Adds to an event the recording of its drive that covers the event; of several, the one with the nearest trigger.
     fn show<'e>(&self, event: &'e Event) -> Shown<'e> {
         let covers = |(at, entry): &&(SystemTime, Arc<Entry>)| {
             let of_drive = event.drive.as_ref() == Some(&entry.drive);

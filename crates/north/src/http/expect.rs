@@ -1,4 +1,4 @@
-//! Whether the gateway is the one that a client expects, with the configuration that it expects.
+//! Checks whether this gateway, with its configuration, is the one that the client expects.
 
 use std::path::Path;
 
@@ -10,10 +10,10 @@ use super::reached::Reached;
 use crate::local::absolute;
 use crate::plant::Plant;
 
-/// Why a request is not meant for this gateway, with the status of the reply.
+/// Why a request is meant for another gateway, with the status of the reply.
 type Unmet = (StatusCode, String);
 
-/// Whether the gateway is the one of the header [`EXPECT`], if there is one.
+/// Checks that this gateway is the one named by the header [`EXPECT`], if the header is present.
 ///
 /// # Errors
 /// The gateway is another one, or runs with another configuration.

@@ -3,7 +3,7 @@
 
 use std::net::IpAddr;
 
-/// Names that always mean this machine, in addition to those that end in `.localhost`.
+/// Names that always mean this machine, in addition to names that end in `.localhost`.
 const LOOPBACK: [&str; 4] = ["localhost", "localhost.localdomain", "ip6-localhost", "ip6-loopback"];
 /// Longest name of a host.
 const LONGEST_NAME: usize = 255;
@@ -63,7 +63,7 @@ impl Host {
 pub(super) struct Hosts(Vec<Host>);
 
 impl Hosts {
-    /// The loopback, this machine by its name `own_name`, and the hosts of the configuration.
+    /// The hosts of this gateway: the loopback, its machine's name `own_name`, and the configured hosts.
     pub(super) fn new(own_name: &str, configured: &[String]) -> Hosts {
         let short = own_name.split('.').next().unwrap_or_default();
         let own = [own_name, short].into_iter().filter_map(Host::parse);
@@ -73,7 +73,7 @@ impl Hosts {
         )
     }
 
-    /// Whether a request to `host` on a connection to the address `local` of this machine is meant for it.
+    /// Whether a request to `host` that arrived at this machine's address `local` is meant for this gateway.
     pub(super) fn contain(&self, host: &Host, local: IpAddr) -> bool {
         let own = match host {
             Host::Address(address) => address.is_loopback() || *address == local.to_canonical(),

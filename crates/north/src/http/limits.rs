@@ -14,18 +14,19 @@ pub const MAX_LISTENERS: usize = 32;
 /// Maximum number of open event streams of one address.
 pub const MAX_LISTENERS_PER_ADDRESS: usize = 16;
 
-/// Connections beyond the limits, which are served `/healthz` and `/readyz` only: whatever the others do, these two answer.
+/// Connections beyond the limits, which only serve `/healthz` and `/readyz`: these two answer whatever the other
+/// connections do.
 pub(super) const HEALTH: Limits = Limits {
     total: 8,
     reserved: 0,
     per_address: 4,
 };
 
-/// Time limit for the head of a request on such a connection.
+/// Time limit for the head of a request on a connection reserved for health checks.
 pub(super) const HEALTH_HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Time limit for the head of a request, from the connection or from the previous reply on. It bounds slow senders and
-/// idle connections.
+/// Time limit for the head of a request, counted from the start of the connection or from the previous reply. The
+/// limit bounds slow senders and idle connections.
 pub(super) const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Maximum length of the head of a request, bytes.
@@ -40,5 +41,5 @@ pub(super) const HANDSHAKE: Duration = Duration::from_secs(10);
 /// Time for pending replies when the gateway stops, and for streams when a reload ends their connection.
 pub(super) const GRACE: Duration = Duration::from_millis(500);
 
-/// Time for the replies to commands when a reload ends their connection: longer than any of them waits for the bus.
+/// Time for the replies to commands after a reload has ended their connection: longer than any command waits for the bus.
 pub(super) const ANSWERED_WITHIN: Duration = Duration::from_secs(60);

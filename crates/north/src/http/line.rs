@@ -25,7 +25,7 @@ pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<Strin
     let line = app.north.history.line(&name);
     let hour = match &line {
         Some(line) => line.lock().unwrap_or_else(PoisonError::into_inner).last_hour(clock),
-        // The bus is being started and has no history yet.
+        // The bus is just being started and has no history yet.
         None => LineHistory::new(&handle.image, clock).last_hour(clock),
     };
     Ok(Json(Line::new(handle, hour)).into_response())

@@ -57,7 +57,7 @@ impl Loopback {
         })
     }
 
-    /// The status of the answer to a GET of `target`, path and query; `None` if it is not a valid target.
+    /// The status of the reply to GET `target`, a path with query; `None` if the target is invalid.
     pub fn get(&self, target: &[u8]) -> Option<u16> {
         let uri = Uri::try_from(target).ok().filter(|uri| uri.path().starts_with('/'))?;
         let request = Request::get(uri).header(header::HOST, "127.0.0.1");

@@ -98,7 +98,7 @@ impl ExpectedDrive {
     }
 }
 
-/// The port of a bus, the same from whatever directory and by whatever link it is named.
+/// The port of a bus as one canonical path, whatever directory or link it is named by.
 pub fn port_of(bus: &BusSpec) -> String {
     if bus.port.contains("://") {
         return bus.port.clone();
@@ -392,7 +392,7 @@ pub struct PointValue {
     pub why: Option<String>,
 }
 
-/// The state in one word and the text of the fault. Both are no points of a profile, but are read by these names like
+/// The state of the drive or the text of its fault. Neither is a point of a profile, but both are read by name like
 /// points, as over MQTT and HTTP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Word {
@@ -426,7 +426,7 @@ impl Word {
 }
 
 impl PointValue {
-    /// A word, or the quality of what it comes from, and why it is not good.
+    /// A text value or, if it is not good, the quality of its source and the reason.
     pub(crate) fn word(word: Word, value: Result<String, (Quality, String)>) -> PointValue {
         let (value, quality, why) = match value {
             Ok(text) => (Json::String(text), Quality::Good, None),
@@ -442,7 +442,7 @@ impl PointValue {
         }
     }
 
-    /// The point with its sample; `why` is called only where the sample is not good.
+    /// The point with its sample; `why` is called only if the sample is not good.
     pub(crate) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
         let value = sample.good();
         PointValue {

@@ -1,4 +1,4 @@
-//! HTTP: status page, Prometheus metrics, health and the JSON interface; commands of users, where they are on.
+//! HTTP: status page, Prometheus metrics, health and the JSON interface; with commands by users, if they are enabled.
 //!
 //! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
 //! The cancellation ends everything, including open event streams.
@@ -161,7 +161,8 @@ impl TcpService<Options> for HttpService {
         });
     }
 
-    /// Without the server no client commands over it, including requests that are still coming in.
+    /// Revokes the right to command of all HTTP clients when the server is removed, including requests still being
+    /// received.
     fn retire(&mut self) {
         self.operating.set_users(None);
     }
@@ -182,7 +183,7 @@ pub(crate) struct HttpConnections {
     stopping: CancellationToken,
 }
 
-/// The place of a connection, and which requests the connection may make.
+/// The place of a connection, and which requests it may send.
 pub(crate) struct HttpPermit {
     permit: ConnectionPermit,
     coverage: Coverage,
@@ -237,7 +238,7 @@ impl ConnectionHandler for HttpConnections {
         set_socket_options(stream.stream());
         let reader = stream.reader().clone();
         let terms = self.terms.load_full();
-        // If the own address is unknown, the client is gone.
+        // If the local address is unknown, the client has disconnected.
         let Ok(local) = stream.stream().local_addr() else {
             return;
         };
@@ -261,9 +262,9 @@ impl ConnectionHandler for HttpConnections {
 }
 
 impl HttpConnections {
-    /// Answers the requests of a client that connected to the address `local` of this machine. After the cancellation,
-    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply; that to a command comes first, unless
-    /// the whole server ends.
+    /// Answers the requests of a client that connected to this machine's address `local`. After the cancellation,
+    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply; the reply to a command is
+    /// completed first, unless the whole server ends.
     async fn serve_requests(
         &self,
         (stream, reader): (impl AsyncRead + AsyncWrite + Unpin, Arc<Reader>),
@@ -286,12 +287,12 @@ impl HttpConnections {
             address: peer.ip(),
             coverage,
         };
-        // Each token is a command whose reply is still to come.
+        // Each token stands for a command whose reply is pending.
         let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
-            // Someone may have logged in, or out, since the connection came.
+            // A user may have logged in or out since the connection was opened.
             place
                 .rights()
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));
@@ -304,7 +305,7 @@ impl HttpConnections {
                 matches!(*request.method(), hyper::Method::POST | hyper::Method::DELETE).then(|| commands.token());
             let reply = router.call(request);
             async move {
-                // Gives other clients a turn between two pipelined requests.
+                // Lets other clients run between two pipelined requests.
                 tokio::task::yield_now().await;
                 let reply = reply.await;
                 drop(command);
@@ -327,7 +328,7 @@ impl HttpConnections {
                     commands.close();
                     let last = async {
                         let answered = timeout(ANSWERED_WITHIN, commands.wait());
-                        // This runs for either cause that ended the wait.
+                        // The wait has ended by cancellation or by new terms; both are handled here.
                         let _ = self.stopping.run_until_cancelled(answered).await;
                         tokio::time::sleep(GRACE).await;
                     };

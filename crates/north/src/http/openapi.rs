@@ -1,4 +1,4 @@
-//! The routes and their description, built together: everything served is described.
+//! The routes together with their OpenAPI description: everything that is served is described.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
@@ -24,7 +24,7 @@ pub(super) const PATH: &str = "/api/v1/openapi.json";
 
 const JSON: &str = "application/json";
 
-/// Failures with their description; the last two only for requests that reach a drive.
+/// Failure replies with their description; the last two only for requests that reach a drive.
 const FAILURES: [(&str, &str); 4] = [
     ("4XX", "refused, and why"),
     (
@@ -35,7 +35,7 @@ const FAILURES: [(&str, &str); 4] = [
     ("504", "what became of it is not known, or not all of it is"),
 ];
 
-/// The routes added so far, with their description.
+/// The routes added so far, with their OpenAPI description.
 pub(super) struct Api {
     router: Router<Arc<AppState>>,
     paths: Paths,
@@ -51,7 +51,7 @@ pub(super) struct Doc {
     body: Option<RefOr<Schema>>,
     content_type: &'static str,
     reply: Option<RefOr<Schema>>,
-    /// Body of a failure reply, where it is not an error of the request itself.
+    /// Body of a failure reply, unless the request itself was invalid.
     failure: Option<RefOr<Schema>>,
     schemas: Vec<(String, RefOr<Schema>)>,
 }
@@ -106,7 +106,7 @@ impl Doc {
         self.or_schema(other)
     }
 
-    /// The route may reply with a list of such objects instead.
+    /// Documents that the route may also reply with a list of such objects.
     pub(super) fn or_list<T: ToSchema>(mut self) -> Doc {
         let other = schema_of_list::<T>(&mut self.schemas);
         self.or_schema(other)
@@ -132,7 +132,7 @@ impl Doc {
         doc
     }
 
-    /// A request that was understood, and not carried out, is answered with this object.
+    /// Documents that a valid request which could not be carried out is answered with this object.
     pub(super) fn failing_with<T: ToSchema>(mut self) -> Doc {
         self.failure = Some(schema_of::<T>(&mut self.schemas));
         self
@@ -237,7 +237,7 @@ impl Api {
         self
     }
 
-    /// All routes, with the route of their description.
+    /// All routes, including the one that serves their description.
     pub(super) fn finished(self) -> Router<Arc<AppState>> {
         let document = Arc::new(OnceLock::new());
         let text: Arc<OnceLock<String>> = document.clone();

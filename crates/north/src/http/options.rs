@@ -13,11 +13,11 @@ use crate::connection_limit::Limits;
 pub struct Options {
     /// Address to listen on.
     pub listen: SocketAddr,
-    /// Names and addresses under which it is reached, in addition to its own and those of the loopback.
+    /// Host names and addresses by which the gateway is reached, in addition to its own and those of the loopback.
     pub hosts: Vec<String>,
     /// The tokens for reading; `None`: everything is open.
     pub tokens: Option<Tokens>,
-    /// The users who may command; `None`: commands are off.
+    /// The users who may command; `None` if commands are disabled.
     pub users: Option<Users>,
     /// Certificate and key; `None`: without TLS.
     pub identity: Option<ServerIdentity>,
@@ -43,7 +43,8 @@ impl Options {
         self.limits().files() + HEALTH.files()
     }
 
-    /// Half of the connections can be those of one address. Where commands are on, some are for addresses of users only.
+    /// The limits of connections: half of them may come from one address. If commands are enabled, some are
+    /// reserved for addresses of users.
     pub(super) fn limits(&self) -> Limits {
         let limits = Limits::new(self.max_connections, self.max_connections.div_ceil(2));
         match self.users {

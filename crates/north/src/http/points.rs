@@ -17,7 +17,7 @@ use crate::order::{self, Authority, Order, Origin};
 use crate::plant::{DriveHandle, OrderRequest};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
-/// Most points in one request; a profile has some hundred points.
+/// Most points in one request, more than a profile has.
 const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);
@@ -74,7 +74,7 @@ enum Wanted {
     Word(Word),
 }
 
-/// The word, or the quality of what it comes from, and why it is not good.
+/// The state or fault text of the drive or, if it is not good, the quality of its source and the reason.
 fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<String, (Quality, String)> {
     let profile = &reading.spec.profile;
     let bad = word
@@ -192,7 +192,7 @@ fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: PointIndex) -
         })
 }
 
-/// Why the words of a register are not good; `None` if they are.
+/// Why the words of a register are not good; `None` if they are good.
 fn why_no_words(reading: &Reading<'_>, raw: &Raw) -> Option<String> {
     match reading.words(raw.table, raw.address, raw.form.items()).err()? {
         Unavailable::Refused(code) => Some(format!("the drive refused it with {code}")),

@@ -12,7 +12,7 @@ use super::messages::ErrorReply;
 use super::replies::Refused;
 use crate::document::parse_duration;
 
-/// Why a query is not understood.
+/// Why a query string is not valid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum QueryError {
     #[error("unknown parameter `{0}`")]
@@ -39,10 +39,10 @@ impl From<QueryError> for Refused {
     }
 }
 
-/// The values of the parameters `known`, in their order; an empty value is none.
+/// The values of the parameters `known`, in their order; an empty value counts as absent.
 ///
 /// # Errors
-/// If another parameter is given, or one of them twice.
+/// If an unknown parameter is given, or a known one twice.
 pub(super) fn parameters<const N: usize>(
     query: Option<&str>,
     known: &'static [&'static str; N],
@@ -62,7 +62,7 @@ pub(super) fn parameters<const N: usize>(
     Ok(values)
 }
 
-/// The names in a list such as `points=ready,running`; `None` without that parameter. Others are nothing to it.
+/// The names in a list such as `points=ready,running`; `None` without this parameter. Other parameters are ignored.
 pub(super) fn names(query: Option<&str>, parameter: &str) -> Option<HashSet<String>> {
     let pairs = query.unwrap_or_default().split('&');
     let value = pairs

@@ -1,4 +1,4 @@
-//! How a request arrived: its client, and what its connection covers.
+//! How a request arrived: its client, and the properties of its connection.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -40,10 +40,10 @@ pub(super) struct Client {
     pub(super) coverage: Coverage,
 }
 
-/// A user of the local socket: anyone who may open it may do everything.
+/// A user of the local socket: any user who may open the socket may do everything.
 #[derive(Debug, Clone)]
 pub(crate) struct LocalUser {
-    /// The interface that the user came by, as the audit shows it.
+    /// The interface that the user used, for the audit.
     pub(crate) kind: SourceKind,
     /// Name of the user, as the audit shows it.
     pub(crate) who: Arc<str>,
@@ -66,9 +66,9 @@ pub(super) struct Reached {
     pub(super) refusals: Arc<LogThrottle>,
     /// The connection has TLS.
     pub(super) tls: bool,
-    /// The user of the local socket; `None`: over TCP.
+    /// The user of the local socket; `None` for a connection over TCP.
     pub(super) local: Option<LocalUser>,
-    /// The place of the connection; `None` without a socket.
+    /// The place of the connection under the limit; `None` without a socket.
     pub(super) place: Option<Arc<ConnectionPlace>>,
 }
 
@@ -81,7 +81,8 @@ impl Reached {
         reached.ok_or(StatusCode::INTERNAL_SERVER_ERROR.into())
     }
 
-    /// A request of this machine that came over no network: through the local socket, or from a test of the interface.
+    /// A request from this machine that did not come over a network: through the local socket, or from a test of
+    /// the interface.
     pub(super) fn within(local: Option<LocalUser>, place: Option<Arc<ConnectionPlace>>) -> Reached {
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
         Reached {

@@ -7,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use super::messages::ErrorReply;
 use crate::plant::{BusHandle, Plant};
 
-/// A reply with the reason of a refusal. Boxed: it goes through many results.
+/// A reply that refuses a request. Boxed, because it is part of many results.
 #[derive(Debug)]
 pub(super) struct Refused(Box<Response>);
 

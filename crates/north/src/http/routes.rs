@@ -288,7 +288,7 @@ async fn guard(
     let is_local = reached.local.is_some();
     // The socket has no logins.
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
-    // A command of someone who may give it is served on the last connection too.
+    // A command from an address of a user is also served on the reserved connections.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
     let access = match is_local {
         true => Ok(()),
@@ -331,7 +331,7 @@ async fn guard(
     response
 }
 
-/// The reply to a request that is not answered because of its host or its token; `None` if it is answered all the same.
+/// The reply to a request that is refused because of its host or its token; `None` if the request is to be answered.
 async fn refused(
     app: &AppState,
     reached: &Reached,

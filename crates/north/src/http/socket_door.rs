@@ -1,4 +1,4 @@
-//! The HTTP API at the local socket. Anyone who may open the socket may do everything: no login, no token, any `Host`.
+//! The HTTP API on the local socket. Every user who may open the socket may do everything: no login, no token, any `Host`.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::pin::pin;
@@ -28,7 +28,7 @@ use crate::order::{Authority, Proof, Right, SourceKind};
 use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader};
 
-/// Serves the connections of the local socket that speak HTTP.
+/// Serves the connections of the local socket that use HTTP.
 #[derive(Debug, Clone)]
 pub(crate) struct SocketDoor {
     router: Router,
@@ -42,8 +42,8 @@ impl SocketDoor {
         }
     }
 
-    /// Answers the requests of a client until it leaves, goes silent or yields to another one; a reply that is being
-    /// made is finished.
+    /// Answers the requests of a client until it disconnects, is idle too long or yields to another client; a reply
+    /// in progress is completed.
     pub(crate) async fn serve(
         &self,
         (stream, reader): (impl AsyncRead + AsyncWrite + Unpin, Arc<Reader>),
@@ -55,7 +55,7 @@ impl SocketDoor {
             address: reached.address,
             coverage: Coverage::Everything,
         };
-        // Each token is a command whose reply is still to come.
+        // Each token stands for a command whose reply is pending.
         let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
@@ -84,7 +84,7 @@ impl SocketDoor {
                 connection.as_mut().graceful_shutdown();
                 commands.close();
                 let last = async {
-                    // This runs for either cause that ended the wait.
+                    // This runs for each cause that ends the wait.
                     let _ = timeout(ANSWERED_WITHIN, commands.wait()).await;
                     tokio::time::sleep(GRACE).await;
                 };
@@ -100,7 +100,7 @@ impl SocketDoor {
     }
 }
 
-/// The door for a command of this very process, which has buses of its own and no socket.
+/// Access to the HTTP API for a command in the same process, which serves the buses itself without a socket.
 #[derive(Debug)]
 pub struct InProcess {
     door: SocketDoor,
@@ -109,7 +109,7 @@ pub struct InProcess {
     cancel: CancellationToken,
 }
 
-/// Most connections of a command, and the size of the buffer of each connection.
+/// Most connections of a command, and the buffer size of each.
 const CONNECTIONS: usize = 4;
 const BUFFER: usize = 64 * 1024;
 
@@ -120,7 +120,7 @@ impl InProcess {
         let user = LocalUser {
             kind: SourceKind::CommandLine,
             who: who.into(),
-            // Anyone who may open the port holds it as anyone who opens the socket does.
+            // A user who may open the port has the same identity here as one who opens the socket.
             proof: Proof::Uid(rustix::process::geteuid().as_raw()),
             right: Right::lasting(),
             control: None,
@@ -133,7 +133,7 @@ impl InProcess {
         }
     }
 
-    /// A new connection; `None` while there are too many.
+    /// A new connection; `None` if there are too many.
     pub fn connect(&self) -> Option<DuplexStream> {
         let newcomer = Newcomer {
             address: IpAddr::V4(Ipv4Addr::LOCALHOST),

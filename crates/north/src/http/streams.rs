@@ -1,7 +1,7 @@
 //! Server-sent events: the events of the plant, and the frames on the buses.
 //!
-//! A stream ends when the gateway stops and when a reload removes its source; the client then reconnects. A client that
-//! is too slow loses the oldest items and is sent their number.
+//! A stream ends when the gateway stops and when a reload removes its source; the client then reconnects. A client
+//! that is too slow loses the oldest items and receives their number.
 
 use std::convert::Infallible;
 use std::fmt::Write as _;
@@ -70,7 +70,7 @@ pub(super) async fn events(
         Ok(permit) => permit,
         Err(refused) => return full(&refused),
     };
-    // Each message is made at the time when the client takes it.
+    // Each message is created when the client takes it.
     let kept = stream::iter(kept).map(|(id, line)| Message::default().id(event_id(id)).data(line));
     let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
     respond(kept.chain(live), permit)
@@ -103,8 +103,8 @@ pub(super) async fn trace(
     Ok(respond(stream::select_all(streams), permit))
 }
 
-/// A place for an event stream, or why there is none. The address with the most streams gives one up to an address
-/// that has fewer.
+/// A place for an event stream, or the reply that refuses one. The address with the most streams loses one to an
+/// address that has fewer.
 fn stream_permit(app: &AppState, client: Client) -> Result<ConnectionPermit, String> {
     let newcomer = Newcomer {
         address: client.address,
@@ -131,7 +131,7 @@ fn full(why: &str) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, retry, Json(problem)).into_response()
 }
 
-/// Turns received items into messages; lost items become a message of their own.
+/// Turns received items into messages; lost items are reported by a separate message.
 fn messages_of<T: Clone + Send + 'static>(
     receiver: broadcast::Receiver<T>,
     message: impl Fn(T) -> Option<Message> + Send + 'static,
@@ -146,7 +146,7 @@ fn messages_of<T: Clone + Send + 'static>(
 
 /// The reply; `permit` is released when the stream ends or the client disconnects.
 fn respond(messages: impl Stream<Item = Message> + Send + 'static, permit: ConnectionPermit) -> Response {
-    // Something is sent at once, so that the client sees the stream open before the first event.
+    // A first message is sent at once, so that the client sees the stream open before the first event.
     let hello = Message::default().retry(RETRY).comment("open");
     let messages = stream::iter([hello])
         .chain(messages)
@@ -161,7 +161,7 @@ fn respond(messages: impl Stream<Item = Message> + Send + 'static, permit: Conne
     (unbuffered, Sse::new(messages).keep_alive(keep_alive)).into_response()
 }
 
-/// Distinguishes this run of the program from others, since the numbers of events restart with each run.
+/// Identifies this run of the program, since the numbers of events restart with each run.
 fn instance() -> &'static str {
     static INSTANCE: OnceLock<String> = OnceLock::new();
     INSTANCE.get_or_init(|| {

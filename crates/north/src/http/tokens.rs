@@ -1,7 +1,7 @@
 //! Access tokens of the HTTP server: the token file, and checking tokens.
 //!
-//! A token is 256 random bits, so its SHA-256 can be neither inverted nor guessed, and the file holds nothing secret.
-//! Argon2 and the like are for passwords, which people choose.
+//! A token is 256 random bits, so its SHA-256 can be neither inverted nor guessed, and the file contains no secret.
+//! Argon2 and similar functions are for passwords, which people choose.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,7 +17,7 @@ use crate::hex;
 const BYTES: usize = 32;
 /// Prefix of a hash in the file.
 const ALGORITHM: &str = "sha256:";
-/// The words of a line.
+/// The fields of a line, for error messages.
 const FORM: CredentialError = CredentialError::Form("name scopes hash");
 const NOT_A_HASH: CredentialError = CredentialError::Hash("`sha256:` and 64 hexadecimal digits");
 
@@ -28,7 +28,7 @@ pub enum Scope {
     Read,
     /// `/metrics`.
     Metrics,
-    /// Grants nothing yet: only users, who have names, can give commands.
+    /// Grants nothing at present: only users can give commands, because they have names.
     Control,
 }
 
@@ -129,7 +129,7 @@ impl Credential for Token {
 pub type Tokens = Credentials<Token>;
 
 impl Tokens {
-    /// The token whose secret this is. The time that this takes depends on the number of tokens only.
+    /// The token with this secret. The time of the search depends only on the number of tokens.
     pub(super) fn find(&self, secret: &str) -> Option<&Token> {
         let hash = hash(secret);
         let mut found = None;

@@ -62,7 +62,7 @@ impl Wanted {
         };
         let mut points: Vec<String> = Vec::new();
         for point in point.iter().flat_map(|points| points.split(',')).map(str::trim) {
-            // Once each, so that a reply is bounded for any request.
+            // Each point counts once, so that a reply is bounded for any request.
             if !point.is_empty() && points.iter().all(|known| known != point) {
                 points.push(point.to_string());
             }
@@ -71,7 +71,8 @@ impl Wanted {
     }
 }
 
-/// The trends of one drive: without `point` which there are, with one of them an object, with several a list of these.
+/// The trends of one drive: without `point` the names of the available ones, with one `point` an object, with
+/// several a list of objects.
 pub(super) async fn trend(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
@@ -105,7 +106,7 @@ pub(super) async fn trend(
             let trend = history.trend();
             points.iter().filter_map(|point| part(&trend, point)).collect()
         }
-        // The bus of the drive is being started, so there is no history yet.
+        // The bus of the drive is just being started, so there is no history yet.
         None => {
             let nothing = DriveTrend::new(profile, Reach::FULL, clock);
             points.iter().filter_map(|point| part(&nothing, point)).collect()

@@ -1,6 +1,6 @@
-//! The users who may command over HTTP: the users file, and checking passwords.
+//! The users who may command over HTTP: the users file, and the check of passwords.
 //!
-//! Passwords are chosen by people, so the file holds Argon2id hashes: each guess costs time and memory.
+//! Passwords are chosen by people, so the file contains Argon2id hashes: each guess costs time and memory.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,11 +11,11 @@ use ring::rand::{SecureRandom, SystemRandom};
 
 use super::credentials::{Credential, CredentialError, Credentials, checked_name};
 
-/// Memory of a hash, KiB: 12 MiB are there on a small board too, once at a time.
+/// Memory of a hash, KiB: even a small board has 12 MiB, and one hash is computed at a time.
 const MEMORY: u32 = 12 * 1024;
 /// Passes of Argon2id over its memory. With this memory, three is the least that OWASP recommends.
 const PASSES: u32 = 3;
-/// Most that a hash in the file may cost: memory in KiB, passes and lanes. More would let a file stall the gateway.
+/// Maximum cost of a hash in the file: memory in KiB, passes and lanes. A higher cost would let a file stall the gateway.
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
 /// Bytes of a salt.
 const SALT: usize = 16;
@@ -27,7 +27,7 @@ const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$00000000000000000000000000000000000
 pub const MIN_PASSWORD: usize = 10;
 /// Most bytes of a password.
 pub const MAX_PASSWORD: usize = 256;
-/// The words of a line.
+/// The fields of a line, for error messages.
 const FORM: CredentialError = CredentialError::Form("name hash");
 const NOT_A_HASH: CredentialError = CredentialError::Hash("one of Argon2id with at most 64 MiB, 16 passes and 4 lanes");
 
@@ -36,7 +36,7 @@ const NOT_A_HASH: CredentialError = CredentialError::Hash("one of Argon2id with 
 pub struct User {
     /// Unique in the file.
     pub name: String,
-    /// In the string format of password hashes, with salt and parameters.
+    /// The password hash in PHC string format, with salt and parameters.
     hash: String,
 }
 
@@ -64,25 +64,25 @@ impl User {
         })
     }
 
-    /// The hash, in which name and parameters of the function and the salt stand too.
+    /// The hash string, which also contains function, version, parameters and salt.
     pub(super) fn hash(&self) -> &str {
         &self.hash
     }
 }
 
-/// The memory in which passwords are compared, one after the other. It is allocated once, because the allocator would keep
-/// each block that is freed.
+/// The memory in which passwords are compared one after the other. It is allocated once, because the allocator
+/// would keep each freed block.
 #[derive(Debug, Default)]
 pub(super) struct Workspace(Vec<Block>);
 
 impl Workspace {
-    /// Whether this is the password of that hash. Takes as long for any password.
+    /// Whether the password matches this hash. Takes the same time for any password.
     pub(super) fn is_password(&mut self, hash: &str, password: &str) -> bool {
         let found = PasswordHash::new(hash).and_then(|hash| self.compute(&hash, password).map(|own| hash.hash == own));
         found.unwrap_or(false)
     }
 
-    /// Computes `hash` for this password; none if it is not a complete hash.
+    /// Computes `hash` for this password; `None` if the hash is incomplete.
     fn compute(&mut self, hash: &PasswordHash<'_>, password: &str) -> password_hash::Result<Option<Output>> {
         let (Some(salt), Some(length)) = (hash.salt, hash.hash.map(|own| own.len())) else {
             return Err(password_hash::Error::PhcStringField);
@@ -104,7 +104,7 @@ impl Workspace {
     }
 }
 
-/// The part of a hash that defines its computation: name, version and parameters of the function.
+/// The part of a hash that determines the cost of computing it: name, version and parameters of the function.
 fn cost(hash: &str) -> &str {
     let end = hash.match_indices('$').nth(3).map(|(at, _)| at);
     end.and_then(|end| hash.get(..=end)).unwrap_or_default()
@@ -164,9 +164,9 @@ impl Credential for User {
 pub type Users = Credentials<User>;
 
 impl Users {
-    /// The hash behind which the password of that name has to be, if there is such a user, and hashes of unknown
-    /// passwords: all together there is one of each cost that the file has. So the comparison takes as long for every
-    /// name, known or not, whatever the hashes of the file cost.
+    /// The hash that the password of this user must match, if there is such a user, and hashes of unknown
+    /// passwords: in total one for each cost that occurs in the file. So the comparison takes the same time for
+    /// every name, known or unknown.
     pub(super) fn hashes(&self, name: &str) -> (Option<&str>, Vec<String>) {
         let own = self.named(name).map(User::hash);
         let mut costs: Vec<&str> = self.0.iter().map(|user| cost(user.hash())).collect();

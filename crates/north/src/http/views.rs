@@ -1,4 +1,4 @@
-//! Handlers of the routes without their own file.
+//! Handlers of the routes that have no separate file.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -190,7 +190,8 @@ pub(super) async fn all_params(State(app): State<Arc<AppState>>, RawQuery(query)
     Ok(Json(readings.await?.unwrap_or_default()).into_response())
 }
 
-/// Reads from the store with `read`, away from the tasks of other clients; none where readings are not stored.
+/// Reads from the store with `read` on a blocking thread, so that other clients do not wait; `None` if readings are
+/// not stored.
 async fn from_store<T: Send + 'static>(
     app: &AppState,
     read: impl FnOnce(Store) -> Result<T, String> + Send + 'static,

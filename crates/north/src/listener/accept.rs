@@ -1,4 +1,4 @@
-//! Accepts the connections to one socket, whatever errors the system reports, and binds it again when it is lost.
+//! Accepts the connections to one socket despite any errors that the system reports, and binds it again when it is lost.
 
 use std::future::Future;
 use std::io;
@@ -20,7 +20,7 @@ use crate::ServerKind;
 use crate::log_throttle::LogThrottle;
 use crate::reading::{Dated, Reader, is_readable};
 
-/// Pause after an accept error of the machine: the usual one, too many open files, does not go away at once.
+/// Pause after an accept error of the machine: the usual one, too many open files, does not disappear at once.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// First and longest pause before a lost socket is bound again.
 const REBIND: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
@@ -28,7 +28,7 @@ const REBIND: (Duration, Duration) = (Duration::from_millis(100), Duration::from
 /// Frees the address of a socket that is about to be closed, also while a copy of the socket is open: a process that
 /// was forked has one until it executes its program.
 pub(super) fn stop_listening(socket: &impl AsFd) {
-    // The shutdown fails for a socket that is lost, which no longer listens anyway.
+    // The shutdown fails for a lost socket, which no longer listens anyway.
     let _ = shutdown(socket, Shutdown::Both);
 }
 
@@ -82,7 +82,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
     /// Accepts until the socket is lost; why.
     async fn accept(&self, mut socket: impl Accept) -> io::Error {
         let log = LogThrottle::default();
-        // A client may have connected, and sent bytes, while this runtime did not run.
+        // A client may have connected and sent bytes while this runtime was stalled.
         let reader = Reader::here();
         loop {
             let at_once = socket.accept().now_or_never();
@@ -97,7 +97,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
                 Ok((stream, peer)) => {
                     reader.came(Instant::now(), false, || false);
                     self.admit(Dated::new(stream, Arc::new(reader.accepted())), peer);
-                    // Connections that yielded to this one close before the next comes.
+                    // Connections that yielded to this one are closed before the next one is accepted.
                     tokio::task::yield_now().await;
                 }
                 Err(error) if concerns_one_client(&error) => {}
@@ -114,7 +114,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
     }
 
     fn admit(&self, stream: Dated<TcpStream>, peer: SocketAddr) {
-        // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
+        // A listener on [::] receives IPv4 clients as ::ffff:a.b.c.d.
         let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
         if let Some(permit) = self.handler.admit(peer.ip()) {
             self.tasks.spawn(self.handler.clone().serve(stream, peer, permit));
@@ -156,7 +156,7 @@ impl Accept for ListeningSocket {
     }
 }
 
-/// Whether the error is one of a connection that ended before it was accepted (accept(2)).
+/// Whether the error concerns only a connection that ended before it was accepted (accept(2)).
 fn concerns_one_client(error: &io::Error) -> bool {
     matches!(
         error.kind(),

@@ -1,4 +1,4 @@
-//! Which listeners there are, and why those that do not listen do not: for readiness and metrics.
+//! The configured listeners, and why some of them do not listen: for readiness and metrics.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;

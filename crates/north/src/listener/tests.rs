@@ -207,7 +207,7 @@ async fn an_address_that_comes_is_listened_on() {
     assert_eq!(states.up(), [], "a server that ended has no listener");
 }
 
-/// Listens on these addresses from now on.
+/// Applies these listen addresses, as a reload does.
 async fn reload(
     listeners: &mut Listeners<Recorder>,
     handler: &Arc<Recorder>,
@@ -281,7 +281,7 @@ async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
     rig.stop.cancel();
 }
 
-/// A process that was forked has all sockets until it executes its program, as this test has copies of them.
+/// A forked process has all sockets until it executes its program; this test imitates it with copies of the sockets.
 #[tokio::test]
 async fn an_address_is_free_as_soon_as_its_listener_is_closed() {
     let rig = OnePlaceServer::new();

@@ -17,7 +17,7 @@ pub struct ReloadOrder {
     pub answer: oneshot::Sender<ReloadOutcome>,
 }
 
-/// What the local socket needs to reach its gateway.
+/// The connection from the local socket to its gateway.
 #[derive(Debug, Clone)]
 pub struct Control {
     config: PathBuf,
@@ -31,7 +31,7 @@ impl PartialEq for Control {
 }
 
 impl Control {
-    /// For a gateway that runs with the configuration file `config`, and where its commands arrive.
+    /// Creates the control for a gateway with the configuration file `config`, and the receiver of its commands.
     pub fn new(config: &Path) -> (Control, mpsc::Receiver<ReloadOrder>) {
         let (orders, arrive) = mpsc::channel(WAITING);
         let config = absolute(config);
@@ -44,13 +44,13 @@ impl Control {
     }
 }
 
-/// The path of a configuration file, the same from whatever directory and by whatever link it is named.
+/// The absolute path of a configuration file, whatever directory or link it is named by.
 pub fn absolute(config: &Path) -> PathBuf {
     let found = config.canonicalize().or_else(|_| std::path::absolute(config));
     found.unwrap_or_else(|_| config.to_path_buf())
 }
 
-/// Lets the gateway read its configuration again, and waits for the outcome.
+/// Makes the gateway read its configuration again, and waits for the outcome.
 ///
 /// # Errors
 /// The gateway has no configuration file, or is shutting down.

@@ -1,9 +1,9 @@
 //! The local socket: the HTTP API for commands on the machine of the gateway (`http/socket_door.rs`).
 //!
-//! The permissions of the socket's file decide who may connect, and any client that may connect may command, as far as
-//! the drives allow it. Commands take the route of all others ([`crate::plant::DriveHandle::place`]) and are audited
-//! with the user id of the client's process. Connections and times are bounded; when there are too many connections,
-//! one that waits for no response is closed in favour of the new one.
+//! The permissions of the socket's file decide who may connect, and any client that can connect may command as far
+//! as the drives allow. Commands are placed like all others ([`crate::plant::DriveHandle::place`]) and audited with
+//! the user id of the client's process. Connections and times are bounded; if there are too many connections, an
+//! idle one is closed in favour of the new one.
 
 pub(crate) mod control;
 mod path;
@@ -36,7 +36,7 @@ pub use path::{RuntimeDirectories, SocketPath};
 
 /// Most clients at one time.
 const MAX_CLIENTS: usize = 32;
-/// The address that all local clients count under, so that they share one limit.
+/// The address under which all local clients are counted, so that they share one limit.
 const THIS_MACHINE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// Time for the first byte of a client.
 const FIRST_BYTE: Duration = Duration::from_secs(10);
@@ -52,7 +52,7 @@ pub struct Options {
     pub control: Option<Control>,
 }
 
-/// What local clients reach: the HTTP API and the gateway.
+/// What local clients can reach: the HTTP API and the gateway control.
 #[derive(Debug)]
 struct Door {
     http: SocketDoor,
@@ -76,7 +76,7 @@ impl Local {
         &self.path
     }
 
-    /// The open connections: each ends when the orders that came over it are answered, also once the server is stopped.
+    /// The open connections: each ends when the orders received over it are answered, even if the server has stopped.
     pub fn connections(&self) -> TaskTracker {
         self.connections.clone()
     }
@@ -86,10 +86,10 @@ impl server::Server for Local {
     const NAME: &'static str = "the local socket";
     type Options = Options;
 
-    /// Starts the server at the first path that it can have. It runs until `cancel`, whatever clients do.
+    /// Starts the server at the first available path. It runs until `cancel`, whatever clients do.
     ///
     /// # Errors
-    /// If the socket cannot be bound: what failed and where.
+    /// If the socket cannot be bound; contains what failed and where.
     async fn start(
         options: Options,
         plant: SharedPlant,
@@ -119,13 +119,13 @@ impl server::Server for Local {
         })
     }
 
-    /// The permissions of the file are the right to command, and the file is gone: another one may be open to other
-    /// users.
+    /// The file's permissions are the right to command. After its removal, another socket may be open to other
+    /// users, so the rights end.
     fn end_rights(&self, _: Option<&Options>) {
         self.right.store(false, Ordering::Release);
     }
 
-    /// The file is removed; a request that is being carried out gets its response from the bus.
+    /// The socket file is removed; a request in progress still gets its response from the bus.
     async fn stopped(self) {
         if let Err(error) = self.task.await {
             tracing::error!(target: "drivegate::local", "the local socket ended unexpectedly: {error}; please report \
@@ -141,7 +141,7 @@ async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel:
         listener: 0,
         cancel: &cancel,
     };
-    // A client may have connected, and sent bytes, while this runtime did not run.
+    // A client may have connected and sent bytes while this runtime was stalled.
     let reader = Reader::here();
     loop {
         let accepted = match bound.listener.accept().now_or_never() {
@@ -186,9 +186,9 @@ fn turn_away(stream: &UnixStream) {
 const NOT_HTTP: &str =
     "{\"error\":\"this socket serves HTTP; try curl --unix-socket PATH http://gateway/api/v1/drives\"}\n";
 
-/// Serves one client until it leaves, goes silent or yields to another one.
+/// Serves one client until it disconnects, is idle too long or yields to another one.
 async fn serve(stream: Dated<UnixStream>, door: Arc<Door>, permit: ConnectionPermit) {
-    // Without a user id the command has no owner.
+    // Without a user id the command could not be audited, so the connection is closed.
     let Ok(peer) = stream.stream().peer_cred() else {
         return;
     };

@@ -1,4 +1,4 @@
-//! Where the socket is: the same for a gateway and for its clients, and never taken away from a gateway that runs.
+//! The path of the local socket: chosen alike by the gateway and its clients, and never taken from a running gateway.
 
 use std::fs::{File, Permissions};
 use std::io;
@@ -27,7 +27,7 @@ pub enum SocketPath {
     /// The default name in the runtime directory.
     #[default]
     Default,
-    /// This path.
+    /// Use this path.
     At(PathBuf),
     /// Nowhere.
     Off,
@@ -68,7 +68,7 @@ impl RuntimeDirectories {
 }
 
 impl SocketPath {
-    /// Where a gateway listens: at the first of these that no running gateway has.
+    /// Paths at which a gateway may listen: it uses the first one that no running gateway has.
     pub(super) fn of_gateway(&self, directories: &RuntimeDirectories) -> Vec<PathBuf> {
         match self {
             SocketPath::Default => directories.all().next().map(numbered).unwrap_or_default(),
@@ -77,7 +77,7 @@ impl SocketPath {
         }
     }
 
-    /// Where a client looks for its gateway, which may be a service or run in a session of the same user.
+    /// Paths at which a client looks for its gateway, which may be a service or run in a session of the same user.
     pub fn of_client(&self, directories: &RuntimeDirectories) -> Vec<PathBuf> {
         match self {
             SocketPath::Default => directories.all().flat_map(numbered).collect(),
@@ -86,7 +86,7 @@ impl SocketPath {
     }
 }
 
-/// `drivegate.sock`, `drivegate-2.sock` and so on.
+/// Numbered socket paths: `drivegate.sock`, `drivegate-2.sock` and so on.
 fn numbered(directory: PathBuf) -> Vec<PathBuf> {
     let name = |number| match number {
         1 => "drivegate.sock".to_string(),
@@ -106,7 +106,7 @@ pub(super) struct Bound {
 
 impl Drop for Bound {
     fn drop(&mut self) {
-        // The socket still listens, so no other gateway has put its own file there; another program may have.
+        // The socket still listens, so no other gateway has replaced the file; another program may have.
         if std::fs::symlink_metadata(&self.path).is_ok_and(|file| (file.dev(), file.ino()) == self.id) {
             let _ = std::fs::remove_file(&self.path);
         }
@@ -116,7 +116,7 @@ impl Drop for Bound {
 /// Listens on the first of `paths` that no running gateway has.
 ///
 /// # Errors
-/// Why no socket can be bound.
+/// If no socket can be bound; contains the reason.
 pub(super) async fn bind_first(paths: &[PathBuf]) -> io::Result<Bound> {
     let mut error = io::Error::from(io::ErrorKind::NotFound);
     for path in paths {
@@ -129,13 +129,14 @@ pub(super) async fn bind_first(paths: &[PathBuf]) -> io::Result<Bound> {
     Err(error)
 }
 
-/// Listens on `path`. The file of a gateway that was killed is replaced, that of one that runs is not. Anyone who looks
-/// at it and replaces it holds a lock on the directory, so two gateways that start together do not both replace it.
+/// Listens on `path`. The file of a killed gateway is replaced, the file of a running one is not. The check and the
+/// replacement happen under a lock on the directory, so that two gateways that start together do not both replace
+/// it.
 async fn bind(path: &Path) -> io::Result<Bound> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     let directory = directory.unwrap_or(Path::new("."));
     if directory == Path::new(SYSTEM_DIRECTORY) {
-        // Systemd creates it for a service, but not for a gateway that root starts by hand.
+        // For a service systemd creates the directory, but not for a gateway that root starts by hand.
         let _ = std::fs::create_dir(directory);
     }
     let _lock = lock(directory).await?;
@@ -179,7 +180,7 @@ async fn remove_if_dead(path: &Path) -> io::Result<()> {
     match UnixStream::connect(path).await {
         Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => std::fs::remove_file(path),
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        // As many clients wait at that socket as can wait.
+        // The backlog of the other socket is full, so a gateway is listening there.
         Err(error) if error.kind() == io::ErrorKind::WouldBlock => in_use("another gateway listens there"),
         Err(error) => Err(error),
         Ok(_) => in_use("another gateway listens there"),
@@ -241,7 +242,7 @@ mod tests {
         assert!(!path.exists() && paths[1].exists(), "each removes its own");
         let third = bind_first(&paths).await.unwrap();
         assert_eq!(&third.path, path);
-        // Another program puts a file of its own in the socket's place.
+        // Another program replaces the socket with its own file.
         std::fs::remove_file(path).unwrap();
         std::fs::write(path, "mine").unwrap();
         drop(third);

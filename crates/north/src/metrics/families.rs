@@ -16,7 +16,7 @@ use crate::start_guard::Reason;
 use crate::version::{self, VERSION};
 use crate::{NorthState, ServerKind};
 
-/// All series, with the series of one family next to each other.
+/// All metric series, with the series of one family next to each other.
 pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Families {
     let mut all = Families::default();
     drives(plant, north, now, &mut all);

@@ -1,7 +1,7 @@
 //! Prometheus metrics: the plant at one time as families of series (`docs/http.md`).
 //!
-//! Metrics are added, never renamed or removed. Every drive is read once per scrape, so its series are consistent. A
-//! point that is not good has no series: a graph shows a gap, never an old value.
+//! Metrics are added, never renamed or removed. Every drive is read once per scrape, so its series are consistent.
+//! A point that is not good has no series, so that a graph shows a gap instead of an old value.
 
 mod families;
 mod model;
@@ -45,8 +45,8 @@ const TYPES: [(Format, &str, &str); 3] = [
 ];
 
 impl Format {
-    /// The format for an `Accept` header, and its content type: OpenMetrics if the client names a version that there is, or none,
-    /// and prefers it.
+    /// The format for an `Accept` header, and its content type: OpenMetrics if the client prefers it, with a known
+    /// version or without one.
     pub(crate) fn accepted(accept: &str) -> (Format, &'static str) {
         let weight_of = |format: Format, version: &str| {
             let wanted: &[&str] = match format {
@@ -71,7 +71,7 @@ impl Format {
     }
 }
 
-/// Version and weight of a media range of an `Accept` header if it is one of `wanted`.
+/// Version and weight of a media range in an `Accept` header, if the range is one of `wanted`.
 fn weight<'r>(range: &'r str, wanted: &[&str]) -> Option<(Option<&'r str>, f64)> {
     let mut parts = range.split(';').map(str::trim);
     let media = parts.next()?;
@@ -92,7 +92,7 @@ fn weight<'r>(range: &'r str, wanted: &[&str]) -> Option<(Option<&'r str>, f64)>
 /// All metrics of the gateway as text.
 ///
 /// # Errors
-/// The encoder fails, which it does not when it writes to a string.
+/// If the encoder fails, which does not happen when writing to a string.
 pub fn encode(plant: &Plant, stats: &NorthState, now: Instant, format: Format) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(Scrape {

@@ -11,7 +11,7 @@ use crate::process_image::HistogramSnapshot;
 /// A label of a series: name and value.
 pub(super) type Label = (&'static str, Cow<'static, str>);
 
-/// Labels of a series. A plant has thousands of them, so that those of a drive share what they have in common.
+/// Labels of a metric series. A plant has thousands of series, so the series of one drive share their common labels.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Labels {
     of: Option<Arc<[Label]>>,
@@ -108,11 +108,11 @@ pub(super) struct Family {
     pub(super) kind: Kind,
 }
 
-/// Place of a family.
+/// Index of a metric family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct FamilyId(usize);
 
-/// All series of a scrape, in one list: a list for each family would leave its place in the heap behind, scrape by scrape.
+/// All series of a scrape in one list: a separate list for each family would fragment the heap with every scrape.
 #[derive(Debug, Default)]
 pub(super) struct Families {
     families: Vec<Family>,

@@ -1,4 +1,4 @@
-//! Clients that may connect to a listener, and their rights.
+//! Decides which clients may connect to a listener, and their rights.
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
@@ -35,13 +35,13 @@ const KEEPALIVE_PROBES: u32 = 3;
 /// How the rights of a client are determined.
 #[derive(Debug, Clone)]
 pub(super) enum WriteAccess {
-    /// The address decides: these networks may write.
+    /// Clients may write by their address: from these networks.
     ByAddress(Vec<IpNet>),
     /// Clients may write by the role in their certificate.
     ByCertificate(Arc<TlsAuthenticator>),
 }
 
-/// Clients that may connect to a listener, and their rights. A reload replaces it.
+/// The clients that may connect to a listener, and their rights. A reload replaces this policy.
 #[derive(Debug, Clone)]
 pub(super) struct Policy {
     pub(super) allow: Vec<IpNet>,
@@ -70,7 +70,7 @@ impl Policy {
     }
 
     /// The rights of a TLS client whose role grants `authority`; `None` if it may not connect. The authenticator
-    /// watches its certificate and role.
+    /// checks its certificate and role.
     fn by_certificate(&self, address: IpAddr, authority: Authority) -> Option<Authority> {
         contains(&self.allow, address).then_some(authority)
     }
@@ -89,7 +89,7 @@ pub(crate) struct Admission {
 }
 
 impl ConnectionHandler for Admission {
-    /// With TLS, these are only the places of the handshakes.
+    /// With TLS, these places only count handshakes.
     type Permit = ConnectionPermit;
 
     fn admit(&self, client: IpAddr) -> Option<ConnectionPermit> {
@@ -147,7 +147,7 @@ impl Admission {
         }
     }
 
-    /// Applies a new policy to open connections as well: they get its rights, or are closed.
+    /// Applies a new policy, also to open connections: they get its rights, or are closed.
     pub(super) fn update(&self, policy: Policy, view: View) {
         self.view.show(view, Instant::now());
         self.policy.store(Arc::new(policy.clone()));
@@ -265,7 +265,7 @@ fn handshake_remedy(_: LimitReached) -> String {
     "their TLS handshakes are not complete; they have 10 s for them".to_string()
 }
 
-/// The most that any of the listeners allows that address; `None` if it may connect to none.
+/// The highest authority that any of the listeners grants this address; `None` if it may not connect to any.
 fn authority_of(listeners: &[Listener], address: IpAddr) -> Option<Authority> {
     let mut of = listeners.iter().filter(|listener| contains(&listener.allow, address));
     let first = of.next()?;

@@ -11,7 +11,7 @@ use crate::order::{Authority, Grants, Origin, Proof, Right, SourceKind};
 #[derive(Debug, Clone)]
 pub(super) struct Client {
     pub(super) rights: Rights,
-    /// Name of the client in the audit: its address, after the name in its certificate if it has one.
+    /// Name of the client in the audit: its address, preceded by the name in its certificate if it has one.
     pub(super) who: String,
     /// Name without the port: all connections of a client share it.
     client: Arc<str>,
@@ -19,7 +19,7 @@ pub(super) struct Client {
     right: Right,
 }
 
-/// Drives that a client may write to: as its address or certificate allows, on the buses that its listener shows.
+/// The right of a client to write: by its address or certificate, on the buses that its listener shows.
 #[derive(Debug)]
 struct ClientRight {
     rights: Rights,

@@ -5,8 +5,9 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::process_image::Machine;
 
-/// The word last written at 0x8100 of each unit by any client, and the machine that it was written to: a fault reset is a change of
-/// its bit 2. Behind a reload that puts another machine at a unit, a word that a client repeats changes nothing there.
+/// The word last written at 0x8100 of each unit by any client, and the machine it was written to: a fault reset is
+/// a change of its bit 2. After a reload that puts another machine at a unit, a word that a client repeats changes
+/// nothing there.
 #[derive(Debug, Default)]
 pub(super) struct CommandWords(Mutex<BTreeMap<u8, (Machine, Option<u16>)>>);
 

@@ -21,11 +21,11 @@ use crate::reading::Reader;
 
 /// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time limit for the client to accept a part of its answers.
+/// Time limit for the client to accept a part of its replies.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for pending requests when the gateway stops, and for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
-/// Time for pending requests when a reload ends the connection: longer than any of them waits for the bus.
+/// Time for pending requests after a reload has ended the connection: longer than any request waits for the bus.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(30);
 /// Maximum number of bytes that are read and discarded before a connection is closed.
 const MAX_DISCARDED: usize = 64 * 1024;
@@ -53,8 +53,9 @@ enum End {
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`. Requests that
-/// wait for the bus are answered then, unless the whole server is `stopping`. Returns what it spoke instead of Modbus TCP.
+/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its
+/// `place`. Requests that wait for the bus are answered before the end, unless the whole server is `stopping`.
+/// Returns the protocol that the client used instead of Modbus TCP.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     (stream, reader): (S, Arc<Reader>),
     session: ClientSession,
@@ -80,7 +81,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     if matches!(end, End::Stopping | End::Closed(_)) {
         connection.finish_pending(stopping).await;
     }
-    // With TLS, a close notification distinguishes the end from a truncation.
+    // With TLS, a close notification distinguishes a regular end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
         close(&mut connection.stream).await;
     }
@@ -114,11 +115,10 @@ struct Connection<'p, S> {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     async fn run(&mut self) -> Result<Infallible, End> {
-        // Once this is set, reading stops; the requests that wait for the bus are still answered.
+        // When this is set, reading stops; the requests that wait for the bus are still answered.
         let mut input_end: Option<End> = None;
         let mut half_frame_since: Option<Instant> = None;
-        // A single future for the whole connection, so that it registers with the token once and not with every
-        // request.
+        // One future serves the whole connection, so that it registers with the token once and not for every request.
         let place = self.place;
         let mut closing = std::pin::pin!(place.closing().cancelled());
         loop {
@@ -178,7 +178,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// Processes the input, unless an earlier part of it was not Modbus.
+    /// Processes the input, unless an earlier part was not Modbus.
     fn process(&mut self, input_end: &mut Option<End>) -> Consumed {
         if matches!(input_end, Some(End::NotModbus(_))) {
             return Consumed::default();
@@ -203,7 +203,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         if reads && let Some(count) = self.stream.read(space).now_or_never() {
             return Ok(Event::Input(count?));
         }
-        // A client that waits does not flood the gateway, so it need not yield.
+        // A client that is waiting does not flood the gateway, so its task need not yield.
         self.since_yield = 0;
         tokio::select! {
             biased;
@@ -243,8 +243,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// Pending requests are answered: each was accepted, and its answer comes within its expiry. When the server stops they have
-    /// half a second.
+    /// Answers pending requests: each was accepted, and its answer arrives within its expiry. When the server
+    /// stops, they have half a second.
     async fn finish_pending(&mut self, stopping: &CancellationToken) {
         // A client that reads its answers too slowly is not waited for.
         let within = |flushed: Result<Result<(), End>, _>| flushed.unwrap_or(Err(End::NotReading));
@@ -272,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Reading {
     On,
-    /// No more input is read: the client has finished, or too many of its requests wait.
+    /// Reading is paused: the client has finished, or too many of its requests wait.
     Paused,
 }
 
@@ -316,7 +316,7 @@ impl Idle {
     }
 }
 
-/// Writes the output if the stream accepts all of it at once, as it usually does: no timer, no registration.
+/// Writes the output if the stream accepts all of it at once, as it usually does; this needs no timer and no registration.
 fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<bool, End> {
     let output = &mut dialogue.output;
     while !output.is_empty() {

@@ -1,8 +1,8 @@
 //! Certificate revocation lists of the CAs of clients.
 //!
-//! rustls checks clients against the lists. What is checked here is that it can: each list is signed by its CA, and each
-//! CA has a list; otherwise a wrong file would refuse every client. A list that should have been replaced
-//! stays in force: its revocations hold, and operators can still stop their drives when the CA fails to issue a new one.
+//! rustls checks clients against the lists. This code checks that rustls can do so: each list is signed by its CA,
+//! and each CA has a list; otherwise a wrong file would refuse every client. An outdated list stays in force: its
+//! revocations apply, and operators can still stop their drives if the CA fails to issue a new list.
 
 use std::path::Path;
 use std::time::SystemTime;

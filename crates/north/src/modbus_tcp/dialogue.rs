@@ -78,7 +78,7 @@ impl Dialogue {
             .extend(self.session.finish(answered, now, &mut self.output));
     }
 
-    /// Notes that `count` bytes arrived in this way in the free part of the input buffer.
+    /// Notes that `count` bytes arrived at this time in the free part of the input buffer.
     pub(super) fn received(&mut self, count: usize, arrival: Arrival) {
         self.arrivals.came(count, arrival);
         self.filled = (self.filled + count).min(self.input.len());
@@ -89,8 +89,8 @@ impl Dialogue {
         }
     }
 
-    /// Processes the frames in the input, [`TURN`] at most, while there is room for their results. Input that is not
-    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing after it can be
+    /// Processes the frames in the input, at most [`TURN`], while there is room for their results. Input that is
+    /// not Modbus ends the dialogue: earlier requests are answered or wait for the bus, and nothing after it is
     /// processed.
     pub(super) fn process(&mut self, now: Instant) -> (Consumed, Option<NotModbus>) {
         let mut consumed = Consumed::default();
@@ -147,7 +147,7 @@ impl Dialogue {
         !self.waiting.is_empty()
     }
 
-    /// Appends all answers that have arrived, so that they are sent together.
+    /// Appends all results that have arrived, so that they are sent together.
     pub(super) fn collect(&mut self, now: Instant) {
         while let Some(Some(answered)) = self.waiting.next().now_or_never() {
             self.finish(answered, now);

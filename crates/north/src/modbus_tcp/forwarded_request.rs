@@ -34,7 +34,7 @@ pub(super) struct ForwardedRequest {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct ReadBehind {
     pub(super) at: At,
-    /// First address in the registers of the drive.
+    /// First address, as in the registers of the drive.
     pub(super) start: u16,
     pub(super) count: u16,
 }
@@ -55,7 +55,7 @@ pub(super) enum BusWork {
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum ReadPart {
-    /// Words from the process image.
+    /// Words that are already known from the process image.
     Known(Vec<u16>),
     /// A read of one object: the first `skip` of its items are dropped, the next `take` are used.
     Object { pdu: RequestPdu, skip: usize, take: usize },
@@ -91,8 +91,8 @@ pub(super) enum Progress {
     Stopped(Header, RequestPdu, bool),
 }
 
-/// A request whose command is in the queue and only waits for the result. The content is `None` once the request is
-/// answered.
+/// A request whose command is in the queue and that only waits for the result. The content is `None` once the
+/// request is answered.
 #[derive(Debug)]
 pub(super) enum PendingRequest {
     Forwarded(Option<Box<ForwardedRequest>>, Placed),
@@ -125,7 +125,7 @@ impl Future for PendingRequest {
                 let Poll::Ready(all) = Pin::new(acknowledged).poll(cx) else {
                     return Poll::Pending;
                 };
-                // If no answer comes, the process ends and the result stays unknown.
+                // Without an answer the process is ending, and the result stays unknown.
                 let all = all.unwrap_or(false);
                 request.take().map_or(Poll::Pending, |(header, request)| {
                     Poll::Ready(AnsweredRequest::StopAll(header, request, all))
@@ -188,7 +188,8 @@ impl ForwardedRequest {
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 
-    /// Reads what function 23 reads, after its write: from the process image, and from the drive what is not polled.
+    /// Executes the read part of function 23 after its write: from the process image, and from the drive for words
+    /// that are not polled.
     pub(super) fn read_behind(mut self: Box<Self>, then: ReadBehind, client: &Client, now: Instant) -> Progress {
         let ReadBehind { at, start, count } = then;
         let known = match at {
@@ -248,10 +249,10 @@ impl ForwardedRequest {
     }
 }
 
-/// The registers of the common model from this address on.
+/// Reads registers of the common model from this address on.
 ///
 /// # Errors
-/// Exception 02 if the model has no such registers.
+/// If the model has no such registers; contains exception 02.
 pub(super) fn common(
     drive: &DriveHandle,
     client: &Client,

@@ -38,7 +38,7 @@ pub(crate) enum NotModbus {
     Protocol(u16),
     #[error("length {0} instead of 2 to 254")]
     Length(u16),
-    /// As from a client of a serial line that a device server would pass on.
+    /// The client sends frames of a serial line, as a device server would pass them on.
     #[error(
         "the client speaks Modbus {0} over TCP; set it to Modbus TCP (MBAP), or let it use a tool slot of the bus \
          ([[bus.slot]]), which accepts serial frames"
@@ -60,13 +60,13 @@ pub(crate) fn of_serial_line(bytes: &[u8]) -> Option<NotModbus> {
     (is_rtu && !matches!(decode(bytes), Ok(Some(frame)) if frame.used > SHORTEST)).then_some(NotModbus::Serial("RTU"))
 }
 
-/// A frame with a function code and nothing else: what an RTU request for two registers from 0 passes for.
+/// Length of a frame with only a function code: an RTU request for two registers from 0 looks like one.
 const SHORTEST: usize = HEADER + 1;
 
-/// The frame at the beginning of `bytes`; `None` while it is incomplete.
+/// The frame at the start of `bytes`; `None` while it is incomplete.
 ///
 /// # Errors
-/// An invalid header, as soon as it is recognised.
+/// If the header is invalid; reported as soon as that is recognised.
 pub(crate) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
     if let [_, _, high, low, ..] = bytes
         && (*high, *low) != (0, 0)
@@ -158,7 +158,7 @@ mod tests {
             frame
         };
         for frame in [
-            // From 0, where the beginning is one of Modbus TCP: 10 registers, 2 registers, 1 register.
+            // Requests from address 0 begin like Modbus TCP frames: 10 registers, 2 registers, 1 register.
             rtu(1, &[3, 0, 0, 0, 10]),
             rtu(1, &[3, 0, 0, 0, 2]),
             rtu(1, &[3, 0, 0, 0, 1]),

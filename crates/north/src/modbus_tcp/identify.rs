@@ -2,11 +2,11 @@
 
 use crate::codec::{Exception, Reply};
 
-/// Maximum length of the text of an object: six of them fit into one reply.
+/// Maximum length of the text of an object, so that six objects fit into one reply.
 const MAX_TEXT: usize = 40;
 /// Basic and regular objects, both as single objects and as a stream.
 const CONFORMITY: u8 = 0x82;
-/// Read device id codes.
+/// Codes of "read device id" in function 43.
 const BASIC: u8 = 1;
 const REGULAR: u8 = 2;
 const EXTENDED: u8 = 3;

@@ -23,7 +23,7 @@ pub struct Loopback {
     watch: Arc<Watch>,
     /// The reader, from the opening of the connection on.
     reader: Option<Reader>,
-    /// Input that the dialogue has no room for yet.
+    /// Input for which the dialogue has no room yet.
     backlog: Vec<u8>,
     closed: bool,
 }
@@ -46,7 +46,7 @@ impl Loopback {
         Loopback::of(session, Watch::in_virtual_time())
     }
 
-    /// Another client of the same server, by the `name` in its certificate if it has shown one.
+    /// Another client of the same server, with this `name` in its certificate if it has one.
     pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Loopback {
         let session = self.dialogue.session().beside(Client::new(peer, name, authority));
         Loopback::of(session, self.watch.clone())
@@ -62,20 +62,19 @@ impl Loopback {
         }
     }
 
-    /// Shows whether the thread runs that reads the bytes of all its clients. A watch that was never set to running sees no
-    /// stalls.
+    /// The watch of the thread that reads the bytes of all clients. A watch that never ran sees no stalls.
     pub fn watch(&self) -> &Arc<Watch> {
         &self.watch
     }
 
-    /// Processes `bytes` and returns the answers available so far; requests that wait for the bus are answered by a
-    /// later call, with or without further input. Commands are in the queue of their bus when this returns. The first call
-    /// opens the connection.
+    /// Processes `bytes` and returns the replies available so far; requests that wait for the bus are answered by a
+    /// later call, with or without further input. Commands are in the queue of their bus when this returns. The
+    /// first call opens the connection.
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         self.take(bytes, false, now)
     }
 
-    /// Takes bytes like [`Loopback::receive`], from a client that closed the connection behind `bytes`.
+    /// Processes bytes like [`Offline::receive`], from a client that closed the connection after `bytes`.
     pub fn receive_last(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let answers = self.take(bytes, true, now);
         if let Some(reader) = &self.reader {
@@ -118,8 +117,8 @@ impl Loopback {
         answers
     }
 
-    /// Whether the input was not Modbus: a server reads no more of it, and closes the connection when the requests
-    /// before it are answered.
+    /// Whether the input was not Modbus: a server then reads no more and closes the connection after the earlier
+    /// requests are answered.
     pub fn is_closed(&self) -> bool {
         self.closed
     }

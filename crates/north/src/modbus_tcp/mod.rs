@@ -1,8 +1,8 @@
 //! Modbus TCP server: listeners and connections. What requests mean is decided in `session`; the public register map is
 //! in [`super::register_map`].
 //!
-//! Requests may be pipelined. Answers from the process image are sent in one write. A request that needs the bus does
-//! not delay the ones after it, so replies can overtake one another; each has its transaction id.
+//! Requests may be pipelined. Replies from the process image are sent in one write. A request that needs the bus
+//! does not delay the ones after it, so replies can overtake one another; each carries its transaction id.
 
 mod admission;
 mod client;
@@ -55,12 +55,12 @@ pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
     Some(certificate.role.map_err(|why| why.to_string()))
 }
 
-/// Least time between two log lines about clients that send RTU frames over TCP, which reconnect again and again.
+/// Minimum interval between two log lines about clients that send RTU frames over TCP and reconnect continuously.
 const SERIAL_LOGGED: Duration = Duration::from_secs(600);
 /// Section of the TLS listener.
 const TLS_SECTION: &str = "[modbus_tcp.tls]";
-/// Maximum number of TLS handshakes at one time, and how many of them one address may have. A handshake that takes long
-/// yields to a newer one, so idle connections do not block new ones.
+/// Maximum number of simultaneous TLS handshakes, in total and from one address. A slow handshake yields to a newer
+/// one, so idle connections do not block new ones.
 const HANDSHAKES: Limits = Limits {
     total: 64,
     reserved: 0,
@@ -102,7 +102,7 @@ impl Options {
         }
     }
 
-    /// Limits of connections; some places are kept for clients that may write, if any may.
+    /// Limits of connections; some places are reserved for clients that may write, if there can be any.
     fn limits(&self) -> Limits {
         let limits = Limits::new(self.max_connections, self.max_connections_per_address);
         let by_address = self.listeners.iter().any(|listener| !listener.write.is_empty());
@@ -153,7 +153,7 @@ pub struct ModbusTcp {
     authenticator: Option<Arc<TlsAuthenticator>>,
     state: Arc<ServerState>,
     plant: SharedPlant,
-    /// Where clients without TLS are served.
+    /// Runtime that serves clients without TLS.
     own: Handle,
     /// Number of listeners opened so far.
     opened: usize,
@@ -163,7 +163,8 @@ impl TcpService<Options> for ModbusTcp {
     const NAME: &'static str = "Modbus TCP";
     const KIND: ServerKind = ServerKind::ModbusTcp;
     type Handler = Admission;
-    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
+    /// Prepared requirements for the clients of the TLS listener, if it is new or its certificates, revocations or
+    /// roles have changed.
     type Prepared = Option<Requirements>;
 
     fn new(
@@ -209,9 +210,9 @@ impl TcpService<Options> for ModbusTcp {
         }
     }
 
-    /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
-    /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
-    /// rights are disconnected.
+    /// Applies prepared options. Unchanged listeners keep their connections as far as the options allow, with the
+    /// rights of the new options. TLS clients whose certificate is no longer admitted with the same rights are
+    /// disconnected.
     fn commit(
         &mut self,
         options: Options,
@@ -270,7 +271,7 @@ impl TcpService<Options> for ModbusTcp {
         });
     }
 
-    /// Without the server no client commands over it.
+    /// Without the server no client may command over it.
     fn retire(&mut self) {
         let options = self.state.options.load_full();
         self.state.options.store(Arc::new(Options {
@@ -293,7 +294,7 @@ struct ServerState {
     refusals: Refusals,
     /// Log lines about clients that send RTU frames over TCP.
     serial_clients: LogThrottle,
-    /// Cancelled when the server ends: from then on it does not wait for its clients.
+    /// Token that is cancelled when the server ends; from then on the server does not wait for its clients.
     stopping: CancellationToken,
 }
 
@@ -313,8 +314,9 @@ impl ServerState {
 }
 
 /// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
-/// which take a millisecond of computing, do not delay these clients; and a single thread serves more of them than
-/// several that hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
+/// which need a millisecond of computing, then do not delay these clients. A single thread also serves more clients
+/// than several that pass work to each other: a fifth more on two processors with 16 clients
+/// (`benches/modbus_tcp`).
 fn start_thread(tasks: &TaskTracker, events: Events) -> Result<Handle, ServerError> {
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     let tasks = tasks.clone();

@@ -30,19 +30,19 @@ struct State {
 
 #[derive(Debug)]
 struct OpenClient {
-    /// Certificate chain of the client, its own certificate first.
+    /// Certificate chain of the client, the client's certificate first.
     chain: Vec<CertificateDer<'static>>,
     role_name: Option<String>,
     role: Role,
     /// The client's name in the log.
     who: String,
     refused: CancellationToken,
-    /// Rights of the client, once it has a place.
+    /// Rights of the client; `None` until it has a place.
     rights: Option<Rights>,
 }
 
 impl OpenClient {
-    /// Why the client may not stay; `None` if it may.
+    /// Why the client must be disconnected; `None` if it may stay.
     fn objection(&self, requirements: &Requirements, now: SystemTime) -> Option<String> {
         if let Err(error) = requirements.check(&self.chain, now) {
             return Some(format!("its certificate is no longer accepted: {error}"));
@@ -74,7 +74,7 @@ impl OpenClients {
         self.lock().requirements.clone()
     }
 
-    /// Holds all clients against other requirements at `now`, and disconnects those that do not meet them.
+    /// Checks all clients against new requirements at `now`, and disconnects those that do not meet them.
     pub(super) fn renew(&self, requirements: Requirements, now: SystemTime) {
         let mut state = self.lock();
         for client in state.open.values() {
@@ -129,7 +129,7 @@ impl OpenClients {
     }
 }
 
-/// A connected client; it counts as disconnected when this value is dropped.
+/// A connected TLS client; it counts as disconnected when this value is dropped.
 #[derive(Debug)]
 pub(super) struct CertificateGuard {
     clients: Arc<OpenClients>,
@@ -140,7 +140,7 @@ pub(super) struct CertificateGuard {
 }
 
 impl CertificateGuard {
-    /// Sets the rights of the client: they end with its certificate or its role.
+    /// Sets the rights of the client, which end with its certificate or its role.
     pub(super) fn watch(&self, rights: &Rights) {
         let mut state = self.clients.lock();
         if let Some(client) = state.open.get_mut(&self.id) {
@@ -151,7 +151,8 @@ impl CertificateGuard {
         }
     }
 
-    /// Waits until the client may not stay: a reload no longer admits it, or a certificate of its chain has expired.
+    /// Waits until the client must be disconnected: a reload no longer admits it, or a certificate of its chain has
+    /// expired.
     pub(super) async fn refused(&self) {
         tokio::select! {
             () = self.refused.cancelled() => {}
@@ -191,7 +192,7 @@ impl Drop for CertificateGuard {
     }
 }
 
-/// Time until the next of `ends` has ended, at most [`LOOK`]. A certificate is valid through its last second.
+/// Time until the next of `ends` has passed, at most [`LOOK`]. A certificate is valid through its last second.
 fn time_to_next(ends: &[u64], now: SystemTime) -> Duration {
     let now = seconds(now);
     let left = ends.iter().filter(|end| **end >= now).min().map(|end| end + 1 - now);

@@ -9,41 +9,41 @@ use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 use crate::register_map::{FIRST, GATEWAY_UNIT, STOP_ALL};
 use crate::stop_all::{Scope, StopAll};
 
-/// The part of the plant that the clients of one listener see.
+/// The part of the plant that the clients of one listener can see.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct View {
     /// Names of the visible buses; `None` for all.
     pub buses: Option<Vec<String>>,
-    /// Name of the drive at units 0 and 255, in place of the gateway's own registers.
+    /// Name of the drive at unit ids 0 and 255, in place of the gateway's own registers.
     pub default_drive: Option<String>,
-    /// Where the view's registers are.
+    /// Layout of the view's registers.
     pub registers: Registers,
 }
 
-/// The registers of a drive that clients see.
+/// The layout of a drive's registers for clients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Registers {
     /// The common model from 0x8000 on, and the registers of the drive below.
     #[default]
     Model,
-    /// The common model from 0 on, and those of the drive from 0x0300 on.
+    /// The common model from address 0 on, and the drive's own registers from 0x0300 on.
     ModelAtZero,
     /// Only the drive's own registers, 0 to 0xFFFF.
     Raw,
 }
 
-/// Where a register of a client is.
+/// The meaning of a register address of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum At {
-    /// In the common model, at this address counted from 0x8000.
+    /// A register of the common model, with its address counted from 0x8000.
     Model(u16),
-    /// In the registers of the drive.
+    /// A register of the drive itself.
     Drive,
     /// Nowhere.
     Nowhere,
 }
 
-/// First address of the commands, of the floats and of the drive's own registers where the common model is at 0.
+/// First address of the commands, of the floats and of the drive's own registers in the layout with the common model at 0.
 const COMMANDS_AT: u16 = 0x0110;
 const FLOATS_AT: u16 = 0x0200;
 const DRIVE_AT: u16 = 0x0300;
@@ -58,7 +58,7 @@ impl Registers {
         }
     }
 
-    /// Where clients see a register of the common model, which is given by its address from 0x8000 on.
+    /// The address at which clients see a register of the common model, which is given by its address from 0x8000 on.
     pub fn of_model(self, address: u16) -> Option<u16> {
         let offset = address.checked_sub(FIRST)?;
         let shown = match self {
@@ -75,7 +75,7 @@ impl Registers {
         self.locate(start, count) == At::Drive
     }
 
-    /// Where the registers from `start` on are; a span that reaches from one kind into another is nowhere.
+    /// The meaning of the registers from `start` on; a span that crosses from one kind into another has none.
     pub(super) fn locate(self, start: u16, count: u16) -> At {
         let last = u32::from(start) + u32::from(count.saturating_sub(1));
         let Ok(last) = u16::try_from(last) else {
@@ -91,8 +91,9 @@ impl Registers {
         }
     }
 
-    /// Begin of a write from `start` on that reaches from one kind of registers into another and covers the command word, as
-    /// if all of it were of the common model. A stop in it is carried out, however far the write reaches.
+    /// Start address of a write that crosses from one kind of registers into another and covers the command word,
+    /// as if all of it belonged to the common model. A stop in such a write is carried out, however far the write
+    /// extends.
     pub(super) fn around_the_command_word(self, start: u16, count: u16) -> Option<u16> {
         let word = match self {
             Registers::Model => FIRST + STOP_ALL,
@@ -127,7 +128,7 @@ struct Shown {
     since: Option<Instant>,
 }
 
-/// The part of the plant that the clients of one listener see.
+/// The part of the plant that the clients of one listener can see.
 #[derive(Debug)]
 pub(super) struct PlantView {
     plant: SharedPlant,
@@ -236,7 +237,7 @@ impl Routes {
         self.drives.get(usize::from(index))
     }
 
-    /// Where the registers of drives are.
+    /// The layout of the registers of drives.
     pub(super) fn registers(&self) -> Registers {
         self.shown.view.registers
     }
@@ -246,8 +247,8 @@ impl Routes {
         self.shown.view.default_drive.is_some()
     }
 
-    /// Whether a request of that time may have meant another drive or register: a reload has given the unit or the
-    /// address another meaning since.
+    /// Whether a request from that time may have meant another drive or register, because a reload has since given
+    /// the unit id or the address another meaning.
     pub(super) fn is_older(&self, asked: Instant) -> bool {
         self.shown.since.is_some_and(|since| asked < since)
     }
@@ -256,7 +257,7 @@ impl Routes {
         &self.drives
     }
 
-    /// All visible drives, as the scope of a stop.
+    /// All visible drives, as the scope of stop all.
     pub(super) fn scope(&self) -> Scope {
         match &self.shown.view.buses {
             Some(buses) => Scope::Buses(buses.clone()),

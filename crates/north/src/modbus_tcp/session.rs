@@ -36,11 +36,11 @@ const OWN_FUNCTIONS: [u8; 6] = [3, 4, 6, 16, 23, 43];
 
 /// How a request is handled.
 enum Decision {
-    /// Answered at once.
+    /// Reply to send at once.
     Reply(RequestPdu, Reply),
-    /// Refused at once.
+    /// Exception to send at once.
     Exception(Exception),
-    /// Forwarded to the drive, or refused on the way.
+    /// The request is forwarded to the drive, or was refused on the way.
     Drive(Box<(ForwardedRequest, BusWork)>),
     /// The stops of all drives are in the queues of their buses.
     StopAll(RequestPdu, oneshot::Receiver<bool>),
@@ -103,8 +103,8 @@ impl ClientSession {
         }
     }
 
-    /// Answers a request that arrived in this way into `out`, or returns the pending request. The command is in the
-    /// queue when this returns, so commands reach the bus in the order of their frames.
+    /// Writes the reply to a request that arrived at this time into `out`, or returns the pending request. The
+    /// command is in the queue when this returns, so commands reach the bus in the order of their frames.
     pub(super) fn take(
         &mut self,
         frame: &Frame<'_>,
@@ -134,8 +134,8 @@ impl ClientSession {
         None
     }
 
-    /// Appends the answer to a request that the bus has answered, or returns it if it waits for its next part, whose
-    /// command is in the queue when this returns.
+    /// Appends the reply to a request that the bus has answered, or returns the request if it waits for its next
+    /// part, whose command is in the queue when this returns.
     pub(super) fn finish(
         &mut self,
         answered: AnsweredRequest,
@@ -217,7 +217,7 @@ impl ClientSession {
         };
         let profile = &drive.image.spec.profile;
         let decoded = RequestPdu::decode(frame.pdu);
-        // A reload since the first byte may have given the unit or the address to another drive or register.
+        // A reload since the first byte may have given the unit id or the address to another drive or register.
         if WRITES.contains(&frame.function) && self.routes.is_older(arrival.asked) {
             return Exception::GATEWAY_PATH.into();
         }
@@ -318,8 +318,8 @@ impl ClientSession {
         }
     }
 
-    /// Function 23: the write, and behind its answer the read. Both are judged before anything is written; a stop in the
-    /// write is carried out whatever the rest is.
+    /// Executes function 23: the write and, after its result, the read. Both are checked before anything is
+    /// written; a stop in the write is carried out even if the rest is refused.
     fn write_and_read(
         &self,
         header: Header,
@@ -435,7 +435,7 @@ impl ClientSession {
         let (plant, scope, origin) = (&self.routes.plant, self.routes.scope(), self.client.origin());
         match self.routes.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
             Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
-            // The client may write nothing here.
+            // The client has no right to write here.
             Err(why) => {
                 refuse_stop_all(plant, nothing_to_stop(&why), &origin, now);
                 Err(Exception::FUNCTION)
@@ -473,7 +473,7 @@ impl ClientSession {
         }
     }
 
-    /// A read of the blocks from 0x8000 on.
+    /// Reads from the blocks from 0x8000 on.
     fn common(&self, drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
         common(drive, &self.client, start, count, now).map_or_else(Decision::from, |words| {
             Decision::Reply(request, Reply::Registers(words))
@@ -500,13 +500,13 @@ impl ClientSession {
         }
     }
 
-    /// Calls `update` with the word last written at 0x8100 of that drive.
+    /// Calls `update` with the word last written at 0x8100 of this drive.
     fn last_word<T>(&self, drive: &DriveHandle, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
         let unit = drive.image.spec.unit;
         self.state.command_words.update(unit, drive.machine(), update)
     }
 
-    /// A write to the blocks from 0x8000 on by a client that may write to the drive.
+    /// Executes a write to the blocks from 0x8000 on, by a client that may write to the drive.
     fn command(
         &self,
         header: Header,
@@ -516,7 +516,8 @@ impl ClientSession {
         values: &[u16],
         now: Instant,
     ) -> Decision {
-        // In any other write the register of the hold is refused as one that is not there, behind the stop that the write may contain.
+        // The register of the hold may only be written alone: in any other write it is refused like a missing
+        // register, after a stop in the write was carried out.
         match (start, values) {
             (HOLD, [value]) | (HEARTBEAT, [_, value]) if drive.has_authority() => {
                 return self.hold(drive, request, start, *value, now);
@@ -542,7 +543,7 @@ impl ClientSession {
                 },
                 _,
             )) => BusWork::Stop(Order::Points(points), refusal),
-            // A heartbeat alone is no command, so it is answered at once and not audited.
+            // A heartbeat alone is not a command, so it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.heartbeat(&self.client.origin(), now);
                 return Decision::Reply(request, Reply::Written);
@@ -634,7 +635,7 @@ fn has_function(profile: &Profile, function: u8) -> bool {
     profile.ranges.iter().any(|r| r.table == table)
 }
 
-/// Maximum number of items in one read of this span, by the ranges of the profile that it touches.
+/// Maximum number of items in one read of this span, from the limits of the profile's ranges that it touches.
 fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
     let table = profile.canonical(table);
     let last = start.saturating_add(count.saturating_sub(1));

@@ -43,7 +43,8 @@ pub struct Tls {
 }
 
 impl Tls {
-    /// Whether both require the same of a client's certificate, show it the same and grant it the same.
+    /// Whether both options require the same of a client's certificate, present the same server certificate and
+    /// grant the same rights.
     pub(super) fn admits_like(&self, other: &Tls) -> bool {
         (&self.identity, &self.roles) == (&other.identity, &other.roles)
     }
@@ -52,9 +53,9 @@ impl Tls {
 /// The rights of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
-    /// Read.
+    /// The role may read.
     Monitor,
-    /// Read and write.
+    /// The role may read and write.
     Control,
 }
 
@@ -67,10 +68,10 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Reads the files and checks at `now` that they can be used together; returns warnings with them.
+    /// Reads the certificate files and checks at `now` that they can be used together; also returns warnings.
     ///
     /// # Errors
-    /// All faults of the files.
+    /// If the files cannot be used; contains all faults.
     pub fn load(
         certificate: &Path,
         key: &Path,
@@ -81,7 +82,7 @@ impl Identity {
         let (mut errors, mut warnings) = (Vec::new(), Vec::new());
         let server = ServerIdentity::load(certificate, key, now).map_err(|faults| errors.extend(faults));
         let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
-        // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so no client is refused for it.
+        // An expired CA is still a valid trust anchor (RFC 5280, 6.1.1), so no client is refused for it.
         let anchors = ca.iter().flatten().flat_map(|anchor| {
             let unsupported = unsupported_ca(client_ca, anchor);
             validity(client_ca, anchor, now).into_iter().chain(unsupported)
@@ -108,8 +109,8 @@ impl Identity {
         Err(errors)
     }
 
-    /// Verifies the certificates of clients. Once there are revocation lists, each CA in the chain of a client must
-    /// have one; a list remains in force when it is out of date.
+    /// The verifier for certificates of clients. If there are revocation lists, each CA in the chain of a client
+    /// must have one; an outdated list remains in force.
     fn verifier(&self) -> Result<Arc<dyn ClientCertVerifier>, IdentityFault> {
         let unusable_ca = |why: &str| TlsFile::ClientCa.fault(FileProblem::UnusableCa(why.to_string()));
         let mut roots = RootCertStore::empty();
@@ -126,8 +127,8 @@ impl Identity {
             })
     }
 
-    /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, and a session
-    /// cannot outlive it.
+    /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, so no
+    /// session can outlive it.
     fn server_config(&self, verifier: Arc<dyn ClientCertVerifier>) -> Result<Arc<ServerConfig>, IdentityFault> {
         let mut config = self.server.server_config(Some(verifier))?;
         config.session_storage = Arc::new(NoServerSessionStorage {});
@@ -161,7 +162,7 @@ impl Requirements {
     /// Whether a client's certificates, its own first, are accepted at `now`.
     ///
     /// # Errors
-    /// Why the certificates are not accepted.
+    /// If the certificates are not accepted; contains the reason.
     pub(super) fn check(&self, chain: &[CertificateDer<'_>], now: SystemTime) -> Result<(), rustls::Error> {
         let Some((own, intermediates)) = chain.split_first() else {
             return Err(rustls::Error::NoCertificatesPresented);
@@ -179,7 +180,7 @@ impl Requirements {
     }
 }
 
-/// Authenticates the clients of a listener. Its certificates, revocations and roles can be renewed while it serves.
+/// Authenticates the clients of a listener. Certificates, revocations and roles can be renewed while the listener serves.
 #[derive(Debug)]
 pub(super) struct TlsAuthenticator {
     clients: Arc<OpenClients>,
@@ -227,7 +228,7 @@ impl TlsAuthenticator {
     /// Performs the handshake and reads the role of the client at `peer`.
     ///
     /// # Errors
-    /// Why the client is refused.
+    /// If the client is refused; contains the reason.
     pub(super) async fn authenticate(
         &self,
         stream: Dated<TcpStream>,

@@ -3,7 +3,7 @@
 use std::hash::{BuildHasher, RandomState};
 use std::time::Duration;
 
-/// First and longest wait.
+/// First and longest wait before a connection attempt.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
 /// After a connection that lasted this long, the next attempt follows after the shortest wait.
 const STABLE: Duration = Duration::from_secs(5);
@@ -15,7 +15,7 @@ pub(super) struct Rotation {
     current: usize,
     /// Brokers tried since the last wait that duplicate.
     tried: usize,
-    /// Number of times that the turn came back to the first broker.
+    /// Number of times that the rotation has returned to the first broker.
     round: usize,
     wait: Duration,
 }
@@ -36,7 +36,7 @@ impl Rotation {
         self.current
     }
 
-    /// Number of times that the turn came back to the first broker.
+    /// Number of times that the rotation has returned to the first broker.
     pub(super) fn round(&self) -> usize {
         self.round
     }
@@ -45,8 +45,8 @@ impl Rotation {
         self.count == 1
     }
 
-    /// The turn of the next broker, and the wait before it, after a connection that was `held` for this long. The wait differs by
-    /// chance: gateways that lost their broker at the same time come back one after the other.
+    /// Selects the next broker, and returns the wait before it after a connection that lasted for `held`. The wait
+    /// is random, so that gateways that lost their broker at the same time reconnect one after the other.
     pub(super) fn next(&mut self, held: Duration) -> Duration {
         if held >= STABLE {
             (self.tried, self.wait) = (0, BACK_OFF.0);
@@ -110,7 +110,7 @@ mod tests {
         }
         assert_eq!(turns.get(..6), Some(&[2, 0, 1, 2, 0, 1][..]));
         assert_eq!(rotation.wait, BACK_OFF.1);
-        // A broker that kept the connection: the others come at once again.
+        // If a broker kept the connection, the next attempts to the others follow at once.
         let waits = [STABLE, Duration::ZERO].map(|held| rotation.next(held));
         assert!(waits.iter().all(|wait| *wait <= BACK_OFF.0), "{waits:?}");
     }

@@ -1,4 +1,4 @@
-//! The broker's capabilities, from its CONNACK and its refusals. No I/O.
+//! The broker's capabilities, learned from its CONNACK and its refusals. No I/O.
 
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{ConnAck, LastWill};
@@ -42,7 +42,7 @@ impl BrokerLimits {
         }
     }
 
-    /// Losses with a broker that lacks a feature; each completes a sentence about it.
+    /// Functions that are lost with a broker without some feature; each text completes a sentence about the broker.
     pub(super) fn losses(&self) -> Vec<&'static str> {
         let all = [
             (
@@ -73,8 +73,8 @@ pub(super) enum Lack {
     Retained,
 }
 
-/// The form of the last will that the broker accepts: it is part of the CONNECT, before the broker reports its
-/// capabilities.
+/// The form of the last will that the broker is known to accept. The will is part of the CONNECT, before the broker
+/// reports its capabilities.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct WillForm {
     unacknowledged: bool,

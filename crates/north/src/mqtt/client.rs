@@ -1,4 +1,4 @@
-//! The client of the plain topics: it owns outbox, journal and publisher, and publishes while there is a connection.
+//! The client of the plain topics: owns outbox, journal and publisher, and publishes while it is connected.
 
 mod answers;
 mod buffering;
@@ -51,7 +51,7 @@ const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 /// Minimum time between two log lines about lost messages.
 const LOST_LOGGED: Duration = Duration::from_secs(60);
 
-/// Expiring messages are renewed after their time divided by this number.
+/// Messages with an expiry are renewed after their expiry time divided by this number.
 const RENEWED: u32 = 2;
 
 /// An expiry in whole seconds: 0 would mean at once.
@@ -97,7 +97,7 @@ struct PlainClient {
     refused: LogThrottle,
     /// Number of events lost because they arrived too fast.
     missed: u64,
-    /// Number of lost messages already logged, and the limit for log lines about them.
+    /// Number of lost messages already logged, and the throttle for log lines about them.
     lost_logged: u64,
     lost: LogThrottle,
     repair: Repair,
@@ -178,7 +178,7 @@ impl PlainClient {
         client
     }
 
-    /// Whether another message from the broker may be taken: a result of it finds room.
+    /// Whether another message from the broker may be accepted: there is room for its result.
     fn receives(&self) -> bool {
         self.commands.has_room() && self.outbox.has_room_for_results()
     }
@@ -213,7 +213,7 @@ impl PlainClient {
         }
     }
 
-    /// Someone else published a status in the gateway's name, such as the will of its last connection.
+    /// Notes a status that another client published in the gateway's name, such as the last will of an earlier connection.
     fn on_status(&mut self, payload: &[u8]) {
         if payload != b"online" {
             self.repair.ask();
@@ -221,7 +221,7 @@ impl PlainClient {
         }
     }
 
-    /// Publishes `online` again if someone published another status, or if it would expire.
+    /// Publishes `online` again if another status was published, or if it would expire.
     fn repair_status(&mut self, now: Instant) {
         let renews = self.renew_at.is_some_and(|at| now >= at);
         if self.is_alive() && (self.repair.take(now) || renews) {
@@ -330,8 +330,8 @@ impl session::Client for PlainClient {
         report_refused(&self.subscriptions, refused);
     }
 
-    /// Publishes the status, then everything else. A client that reads `online` may send commands, so the subscriptions came
-    /// first.
+    /// Publishes the status, then everything else. A client that reads `online` may send commands, so the
+    /// subscriptions were made before.
     fn ready(&mut self, limits: BrokerLimits) {
         self.common.stats.mqtt.connected.store(true, Ordering::Relaxed);
         self.common.link.log_ready(limits, "");

@@ -37,7 +37,7 @@ const CONFIRMING: QueueLimit = QueueLimit {
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
-    /// Everything from the connection to the broker counts as one client.
+    /// All messages over the connection to the broker count as one client.
     client: Arc<str>,
     /// Accepted commands without an answer, in the order of acceptance.
     waiting: PendingCommands,
@@ -52,7 +52,7 @@ pub(super) struct Commands {
 /// The configuration of commands.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
-    /// Topics that results may go to.
+    /// Topics to which results may be sent.
     pub(super) responses: ResponseTopics,
     /// Commands without an `id` are refused, except stops.
     pub(super) require_id: bool,
@@ -60,7 +60,7 @@ pub(super) struct Rules {
     pub(super) right: Right,
 }
 
-/// Pending results that a client hands to its successor.
+/// Pending results that a client hands over to its successor at a reload.
 #[derive(Debug, Default)]
 pub(super) struct OrdersLeft {
     waiting: PendingCommands,
@@ -95,8 +95,8 @@ pub(super) enum Finished {
 }
 
 impl Commands {
-    /// `memory` outlives this client, so that a command is recognised after a reload; this client continues with the commands
-    /// that the previous one has `left`.
+    /// `memory` outlives this client, so that a command is recognised after a reload; this client continues with
+    /// the commands in `left` from the previous one.
     pub(super) fn new(
         topics: Topics,
         rules: Rules,
@@ -130,16 +130,17 @@ impl Commands {
         }
     }
 
-    /// Whether another message may be processed. If not, messages stay with the broker, so that no stop is refused for
-    /// lack of room.
+    /// Whether another message may be processed. Otherwise messages stay with the broker, so that no stop is
+    /// refused for lack of room.
     pub(super) fn has_room(&self) -> bool {
         !self.waiting.is_full(WAITING)
     }
 
-    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once; otherwise its command is
-    /// in the queue of the bus. A repeated command is not executed again, but answered with the previous result or refused; a stop is
-    /// always executed, without the rest where the command does more. `crowded` returns whether too many results wait on a topic: a command
-    /// that would be answered there is refused.
+    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if it is known at once;
+    /// otherwise its command is in the queue of the bus. A repeated command is not executed again, but answered
+    /// with the previous result or refused; a stop is always executed, but without the rest of its command.
+    /// `crowded` returns whether too many results wait on a topic: a command that would be answered there is
+    /// refused.
     pub(super) fn take(
         &mut self,
         incoming: Incoming,
@@ -246,7 +247,7 @@ impl Commands {
         Some(reply.with(json(HoldReply::new(name, done, seen))))
     }
 
-    /// Takes a stop of all drives. Returns the answer where no stop is sent.
+    /// Processes a stop of all drives. Returns the answer if no stop is sent.
     fn stop_all(&mut self, incoming: &Incoming, origin: &Origin, plant: &Plant, now: Instant) -> Option<Message> {
         let reply = Reply::to(incoming, self.topics.result(), "", &self.rules.responses);
         let refuse = |refusal| Some(reply.with(refused_stop(&refuse_stop_all(plant, refusal, origin, now))));
@@ -258,7 +259,7 @@ impl Commands {
             Ok(wanted) => wanted,
             Err(refusal) => return refuse(refusal),
         };
-        // A client whose `commands` a reload turned off ends, and still receives what was on its way.
+        // A client whose `commands` a reload disabled is ending, but still receives messages that were on their way.
         if let Err(refusal) = access(Stage::Accept, true, self.rules.right.allows("")) {
             return refuse(refusal);
         }
@@ -332,7 +333,7 @@ impl Commands {
     fn poll_stopped(&mut self, cx: &mut Context<'_>) -> Poll<(Reply, StopReport)> {
         for (index, stop) in self.stopping.iter_mut().enumerate() {
             if let Poll::Ready(report) = Pin::new(&mut stop.report).poll(cx) {
-                // Without a report the process ends, and nothing is proven.
+                // Without a report the process is ending, and no standstill is proven.
                 let report = report.unwrap_or_default();
                 return Poll::Ready((self.stopping.remove(index).reply, report));
             }
@@ -361,7 +362,7 @@ impl Commands {
         finished.map_or(Poll::Pending, Poll::Ready)
     }
 
-    /// The one answer to what is finished, at `time`.
+    /// The answer to a finished command, at `time`.
     pub(super) fn answer(&mut self, finished: Finished, time: SystemTime) -> Message {
         match finished {
             Finished::Command(pending, answer, shown) => self.result(pending, &answer, shown, time),
@@ -396,7 +397,7 @@ fn repeats(why: &str) -> String {
 }
 
 impl PendingCommand {
-    /// Number of bytes whose length the client controls.
+    /// Replaces the client as a reload does; the new client continues with the commands of the old one.
     fn bytes(&self) -> usize {
         self.reply.bytes() + self.id.as_ref().map_or(0, |id| id.text().len())
     }

@@ -1,4 +1,4 @@
-//! A connection to the broker: a rumqttc client, polled by its own task.
+//! A connection to the broker: a rumqttc client, polled by a separate task.
 //!
 //! Client and event loop are discarded after any error: the outbox is better at keeping what rumqttc would keep
 //! (messages in flight). The polling task never publishes, and publishing never waits: what finds no room stays in the
@@ -42,12 +42,12 @@ pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) const INFLIGHT: u16 = 1000;
 /// Number of messages handed to rumqttc and not written to the socket yet.
 const REQUESTS: usize = 128;
-/// Messages written to the socket, or read from it, at a time.
+/// Messages that are written to the socket, or read from it, at once.
 const BATCH: usize = 16;
 /// Number of events that the client has not processed; beyond it, polling pauses.
 const EVENTS: usize = 64;
-/// Maximum size of a packet from the broker; much larger than any valid command, so that one that is too long gets an
-/// answer. Brokers drop larger ones without a word.
+/// Maximum size of a packet from the broker: much larger than any valid command, so that a command that is too long
+/// still gets an answer. Brokers drop larger packets silently.
 const MAX_PACKET: u32 = 2 << 20;
 /// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
@@ -69,7 +69,7 @@ pub(super) enum Step {
     Accepted(BrokerLimits),
     /// The broker takes no wildcards: the client subscribes again.
     Subscribe(BrokerLimits),
-    /// The broker answered the subscriptions: of each, in order, the reason if it refused it.
+    /// The broker answered the subscriptions: for each, in order, the reason if it was refused.
     Subscribed(Vec<Option<String>>),
     /// The oldest published message with an acknowledgement was sent with this packet id.
     Sent(u16),
@@ -83,9 +83,9 @@ pub(super) enum Step {
     Room,
     /// A ping was sent to the broker.
     Pinged,
-    /// Nothing that concerns the client, such as any other packet from the broker.
+    /// An event that does not concern the client, such as any other packet from the broker.
     Nothing,
-    /// The connection is open but can no longer be used, for this reason, and must be given up.
+    /// The connection is open but cannot be used any more, for this reason, and must be closed.
     Stuck(&'static str),
     /// The broker refused the connection because of the last will. The last event.
     Refuses(Lack),
@@ -108,15 +108,15 @@ pub(super) struct Connection {
     /// Number of subscriptions whose answers are awaited, and the answers so far.
     wanted: usize,
     answers: Vec<Option<String>>,
-    /// The task; `None` once it ends by itself.
+    /// The task of the connection; `None` when the task ends by itself.
     task: Option<JoinHandle<()>>,
 }
 
-/// Short names of topics, for telemetry that is published again and again: a topic gets one when it is published for the
-/// second time, as long as the broker has any.
+/// Topic aliases for telemetry that is published repeatedly: a topic gets one when it is published for the second
+/// time, as long as the broker has any left.
 #[derive(Debug, Default)]
 struct Aliases {
-    /// Aliases by topic, each with whether the broker knows it.
+    /// Aliases by topic, and whether the broker knows each.
     named: HashMap<Arc<str>, (u16, bool)>,
     once: HashSet<Arc<str>>,
 }
@@ -151,7 +151,7 @@ struct Backlog {
     messages: AtomicUsize,
     /// Times at which rumqttc wrote its latest messages.
     rate: Mutex<Rate>,
-    /// What it wrote last.
+    /// The packets that the library wrote last.
     trail: Mutex<Trail>,
     /// Whether the client waits for [`Step::Room`].
     room_wanted: AtomicBool,
@@ -175,7 +175,7 @@ impl Backlog {
         self.trail.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Why a connection ended that the broker closed without a reason.
+    /// Why the broker closed a connection, if it gave no reason.
     fn closed(&self) -> String {
         match self.trail().last() {
             Some(packet) => format!("{CLOSED}; the last packet sent before was {packet}"),
@@ -193,8 +193,8 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Starts to connect to `broker` as this client, with this last will; `dial` makes the TCP connection, first to the
-    /// address of number `first`.
+    /// Starts to connect to `broker` as this client, with this last will; `dial` opens the TCP connection,
+    /// beginning with the address of index `first`.
     pub(super) fn open(
         options: &Options,
         (broker, client_id): (&Broker, &str),
@@ -207,7 +207,7 @@ impl Connection {
             let password = password.map(|password| password.0).unwrap_or_default();
             mqtt.set_credentials(user, password);
         }
-        // Behind a proxy, the only name to look up is the name of the proxy.
+        // With a proxy, only the name of the proxy is looked up.
         let dialled = match &options.proxy {
             None => broker.clone(),
             Some((host, port)) => Broker {
@@ -291,8 +291,8 @@ impl Connection {
             })
     }
 
-    /// Whether the broker was silent for so long that the connection is lost. A broker without a reason to send gets a
-    /// repeated subscription: it must answer, and nothing changes.
+    /// Whether the broker was silent for so long that the connection is lost. A silent broker gets a repeated
+    /// subscription, which it must answer and which changes nothing.
     pub(super) fn is_silent(&mut self, limits: Option<BrokerLimits>, now: Instant) -> bool {
         let verdict = self.silence.judge(limits.and_then(|limits| limits.keep_alive), now);
         if verdict == Verdict::Ask
@@ -332,7 +332,7 @@ impl Connection {
         self.backlog
             .trail()
             .publishes(message.topic.clone(), message.payload.len(), retain);
-        // Before the attempt: the event for the last message may come right after it.
+        // The flag is set before the attempt, because the event for the last message may follow immediately.
         self.backlog.room_wanted.store(true, Ordering::SeqCst);
         let attempt = self
             .client
@@ -356,8 +356,8 @@ impl Connection {
         }
     }
 
-    /// Ends the connection without waiting for it, and sends the broker the reason, as far as it reads. The last will is
-    /// published if it is `true_now`: other clients take the gateway for online.
+    /// Ends the connection without waiting, and sends the broker the reason if it still reads. The last will is
+    /// published if it is `true_now`, that is, if other clients still assume that the gateway is online.
     pub(super) fn give_up(mut self, why: &str, true_now: bool) {
         let reason = match true_now {
             true => DisconnectReasonCode::DisconnectWithWillMessage,
@@ -365,7 +365,7 @@ impl Connection {
         };
         let properties = DisconnectProperties {
             session_expiry_interval: None,
-            // Without any property the library sends the code of a normal end, whatever the reason.
+            // Without any property the library sends the code of a normal end, whatever the reason is.
             reason_string: Some(why.to_string()),
             user_properties: Vec::new(),
             server_reference: None,
@@ -385,7 +385,7 @@ impl Connection {
     }
 }
 
-/// Commands on these topics. Retained messages are requested too, and stay marked even if they arrive during the
+/// A subscription to commands. Retained messages are requested too and stay marked, even if they arrive during the
 /// subscription, so that they can be refused.
 pub(super) fn commanding(path: String) -> Filter {
     Filter {
@@ -396,7 +396,7 @@ pub(super) fn commanding(path: String) -> Filter {
     }
 }
 
-/// A filter of these topics, without the gateway's own messages.
+/// A subscription without the gateway's own messages.
 pub(super) fn of_others(path: String) -> Filter {
     Filter {
         path,
@@ -512,7 +512,7 @@ async fn poll(mut eventloop: EventLoop, reader: Arc<Reader>, event: mpsc::Sender
             match (&mut sending).now_or_never() {
                 Some(sent) => sent,
                 None => {
-                    // Nothing is read until the client has room.
+                    // Reading pauses until the client has room.
                     reader.ceased();
                     sending.await
                 }
@@ -549,8 +549,8 @@ fn interpret(event: Event, arrival: Arrival) -> Option<Step> {
     }
 }
 
-/// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is not a packet
-/// of MQTT 5, and closes the connection; some close it at once.
+/// Why the connection was not accepted. A broker without MQTT 5 answers in the format of an older version and
+/// closes the connection; some close it at once.
 fn refusal(error: &ConnectionError) -> String {
     match error {
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io)))
@@ -558,7 +558,7 @@ fn refusal(error: &ConnectionError) -> String {
         {
             format!("{io}: {SCHEME}")
         }
-        // Errors of the network or of TLS have messages of their own.
+        // Errors of the network or of TLS are reported with their own text.
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(_))) => reason(error),
         ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
             "the broker closed the connection without accepting it: it does not support MQTT 5, or expects TLS; {MQTT_5}, or \
@@ -568,7 +568,7 @@ fn refusal(error: &ConnectionError) -> String {
     }
 }
 
-/// Remedy for a broker that closes a connection before it accepts it.
+/// Remedy for a broker that closes a connection before accepting it.
 const SCHEME: &str = "the broker did not accept the connection; check the scheme in mqtt.url: mqtts:// for a port with TLS, \
                       usually 8883, mqtt:// for one without, usually 1883";
 
@@ -578,8 +578,8 @@ const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, o
 /// The broker ended an accepted connection, and did not say why.
 pub(super) const CLOSED: &str = "the broker closed the connection without a reason";
 
-/// The server that a broker names when it sends its clients to another one. The gateway does not follow: it would send its
-/// password to a server that nobody configured.
+/// The server to which a broker redirects its clients. The gateway does not follow: it would send its password to a
+/// server that is not configured.
 fn reference(disconnect: &Disconnect) -> String {
     let named = disconnect
         .properties
@@ -596,7 +596,7 @@ fn reference(disconnect: &Disconnect) -> String {
     }
 }
 
-/// The broker ended the connection before TLS was there, and did not say why.
+/// The broker ended the connection during the TLS handshake without a reason.
 const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: perhaps it does not use TLS \
                              on this port, or refuses the gateway; check the port in mqtt.url, usually 8883, and the \
                              broker's log";
@@ -651,13 +651,13 @@ fn reason(error: &ConnectionError) -> String {
     format!("the broker refuses the connection ({code:?}){advice}")
 }
 
-/// Packets with these filters in their order, each of at most `most` bytes and [`MOST_FILTERS`] filters, unless there are
-/// too many.
+/// Packets with these filters in their order, each of at most `most` bytes and [`MOST_FILTERS`] filters; none if
+/// there are too many.
 fn packets(filters: Vec<Filter>, most: usize) -> Vec<Vec<Filter>> {
     let most_filters = MOST_FILTERS.max(filters.len().div_ceil(MOST_PACKETS));
     let mut packets: Vec<(usize, Vec<Filter>)> = Vec::new();
     for filter in filters {
-        // Each filter needs, besides its path, the path's length and the options; each packet has a head.
+        // Each filter needs its path, the length of the path and the options; each packet has a header.
         let bytes = filter.path.len() + 3;
         let has_room = |(size, packet): &&mut (usize, Vec<Filter>)| size + bytes <= most && packet.len() < most_filters;
         match packets.last_mut().filter(has_room) {

@@ -1,4 +1,4 @@
-//! Connects to a broker by TCP: tries all addresses of its name in turn, at a limited rate.
+//! Connects to a broker over TCP: tries all addresses of its name in turn, at a limited rate.
 
 use std::collections::VecDeque;
 use std::io;
@@ -24,7 +24,7 @@ const WITHIN: Duration = Duration::from_secs(1);
 struct Pace(VecDeque<Instant>);
 
 impl Pace {
-    /// Counts an attempt at `now`, or returns when it may follow.
+    /// Counts an attempt at `now`, or returns when the next one is allowed.
     fn take(&mut self, now: Instant) -> Result<(), Instant> {
         self.0.retain(|at| now.saturating_duration_since(*at) < WITHIN);
         match self.0.front() {

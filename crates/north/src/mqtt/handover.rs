@@ -1,4 +1,4 @@
-//! State that a client leaves to the one that a reload puts in its place.
+//! State that a client leaves to the client that replaces it at a reload.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -53,7 +53,7 @@ impl Handover {
         self.lock().unread = Some(events);
     }
 
-    /// Discards what the last clients left, if no client takes it; the retained topics are still to be cleared.
+    /// Discards the state of the last clients if no client takes it over; the retained topics still have to be cleared.
     pub fn discard(&self) {
         let mut left = self.lock();
         let retained = std::mem::take(&mut left.retained);

@@ -18,7 +18,7 @@ const COMPLETE: Duration = Duration::from_secs(10);
 pub(super) struct Recorder {
     topic: Arc<str>,
     last: Option<(StateContent, Instant)>,
-    /// Entries of the array that is being filled, and when it was started.
+    /// Number of entries in the array being filled, and when the array was started.
     entries: usize,
     array: Vec<u8>,
     begun: Option<Instant>,
@@ -46,8 +46,8 @@ impl Recorder {
         self.max_packet = max_packet;
     }
 
-    /// Records what a drive shows: when it changed, or with [`History::All`] when it is `fresh`; at most once in `min`.
-    /// Returns how long to wait if it is too early.
+    /// Records the values of a drive: when they changed, or with [`History::All`] when they are `fresh`; at most
+    /// once in `min`. Returns how long to wait if it is too early.
     pub(super) fn record(
         &mut self,
         mode: History,

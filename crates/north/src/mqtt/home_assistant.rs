@@ -44,7 +44,7 @@ pub(super) struct Announcer {
     max_packet: usize,
     /// Places of the devices that are still to be announced.
     pending: VecDeque<usize>,
-    /// Topics given out, of which some may still wait.
+    /// Topics of messages given to the outbox, some of which may still wait there.
     under_way: Vec<Arc<str>>,
     /// A device has another number of messages.
     changed: bool,
@@ -56,7 +56,7 @@ pub(super) struct Announcer {
 #[derive(Debug)]
 struct Announced {
     device: Device,
-    /// The topics of its message, more than one where the broker does not take it as a whole.
+    /// The topics of the device's message; more than one if the broker does not accept the message as a whole.
     topics: Vec<Arc<str>>,
 }
 
@@ -77,7 +77,7 @@ impl Announcer {
         }
     }
 
-    /// Announces the devices of this plant from now on, and announces all of them again.
+    /// Announces the devices of this plant from now on; all of them are announced again.
     pub(super) fn adopt(&mut self, plant: &Plant) {
         let gateway = Device::gateway(&self.gateway, plant);
         let drives = plant
@@ -94,7 +94,8 @@ impl Announcer {
         self.begin();
     }
 
-    /// Announces everything again, since the broker may have lost it; `max_packet` is the largest packet that it takes.
+    /// Announces everything again, since the broker may have lost it; `max_packet` is the largest packet that the
+    /// broker accepts.
     pub(super) fn restart(&mut self, max_packet: usize) {
         self.max_packet = max_packet;
         self.under_way.clear();
@@ -106,7 +107,7 @@ impl Announcer {
         self.pending = (0..self.devices.len()).collect();
     }
 
-    /// The topic on which Home Assistant reports that it was started.
+    /// The topic on which Home Assistant reports that it has started.
     pub(super) fn birth_topic(&self) -> String {
         format!("{}/status", self.prefix)
     }
@@ -144,8 +145,8 @@ impl Announcer {
         std::mem::take(&mut self.changed)
     }
 
-    /// The messages of the next device, if there is one and its turn has come; `waits` returns whether a message of a
-    /// topic is still in progress to the broker.
+    /// The messages of the next device, if there is one and it is due; `waits` returns whether a message of a topic
+    /// is still on its way to the broker.
     pub(super) fn next(&mut self, now: Instant, waits: impl Fn(&str) -> bool) -> Vec<Update> {
         if self.again.is_some_and(|at| at <= now) {
             (self.again, self.begun) = (None, Some(now));
@@ -168,7 +169,7 @@ impl Announcer {
             return Vec::new();
         };
         let id = device.id().to_string();
-        // All topics of the device are about as long; the digits of a part are not counted exactly.
+        // All topics of the device have about this length; the digits of a part number are not counted exactly.
         let overhead = topics.first().map_or(0, |topic| topic.len()) + 32;
         let payloads = device.payloads(&self.sources, self.max_packet.saturating_sub(overhead));
         // Topics of an earlier connection, whose packets were smaller, are cleared.
@@ -191,7 +192,7 @@ impl Announcer {
     }
 
     fn topic(&self, device: &str, part: usize) -> Arc<str> {
-        // The topic has the part behind the gateway's own id; `gateway` is the gateway's message.
+        // The topic contains the part after the gateway's own id, or `gateway` for the message of the gateway.
         let name = device.strip_prefix(self.gateway.as_str()).unwrap_or(device);
         let name = name.strip_prefix('_').unwrap_or("gateway");
         match part {

@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 pub(super) const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
 const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
-/// Without a packet from the broker for this long, the connection is considered lost.
+/// Time without a packet from the broker after which the connection is considered lost.
 const LOST: Duration = KEEP_ALIVE.saturating_mul(3);
-/// Part of the interval in which a ping is to be answered.
+/// Fraction of the interval within which a ping must be answered.
 const OF_INTERVAL: f64 = 0.8;
 
 /// The decision about a broker that may be silent.
@@ -18,7 +18,7 @@ pub(super) enum Verdict {
     Fine,
     /// Send the broker a request that it must answer.
     Ask,
-    /// The connection is lost.
+    /// The connection must be considered lost.
     Lost,
 }
 
@@ -29,7 +29,7 @@ pub(super) struct Silence {
     heard: Instant,
     /// Whether a test subscription was sent, and the answer is still to come.
     asked: bool,
-    /// When the library sent a ping; `None` once the broker sent anything since.
+    /// When the library sent a ping; `None` once the broker has sent anything since.
     pinged: Option<Instant>,
 }
 
@@ -88,8 +88,8 @@ impl Silence {
 mod tests {
     use super::*;
 
-    /// Seconds of an hour at which a silent broker gets a test subscription, and when it is lost, if ever. The library pings it
-    /// at the interval `pings`.
+    /// Seconds within an hour at which a silent broker gets a test subscription, and when the connection is
+    /// considered lost, if ever. The library pings the broker at the interval `pings`.
     fn hour(interval: Option<u16>, answers: bool, pings: Option<u64>) -> (Vec<u64>, Option<u64>) {
         let start = Instant::now();
         let (mut silence, mut asked) = (Silence::new(start), Vec::new());

@@ -1,5 +1,6 @@
-//! The link of a client to one of its brokers: which broker is tried next and when, the last will in the form that it takes, the
-//! subscriptions, silence, and the log of outages. What is published and received is up to the client.
+//! The link of a client to one of its brokers: which broker is tried next and when, the last will in a form that
+//! the broker accepts, the subscriptions, silence, and the log of outages. The client decides what is published and
+//! received.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -25,7 +26,7 @@ pub(super) enum Due {
     Nothing,
     /// The next attempt to connect.
     Connect,
-    /// The connection is to be given up, for this reason.
+    /// The connection must be given up, for this reason.
     GiveUp(&'static str),
 }
 
@@ -33,7 +34,7 @@ pub(super) enum Due {
 enum State {
     /// No connection; the next attempt follows at `retry_at`.
     Down { retry_at: Instant },
-    /// A connection that the broker may not have accepted yet.
+    /// An open connection that the broker may not have accepted yet.
     Up(Box<Connection>, Phase),
 }
 
@@ -45,7 +46,7 @@ enum Phase {
 }
 
 impl Phase {
-    /// The broker's capabilities, once known.
+    /// The broker's capabilities; `None` until they are known.
     fn limits(&self) -> Option<&BrokerLimits> {
         match self {
             Phase::Connecting => None,
@@ -70,12 +71,12 @@ pub(super) struct BrokerLink {
     takeovers: Takeovers,
     /// The password of the last attempt.
     password: Option<Secret>,
-    /// A password of a file that the broker refused, and when it may be tried again.
+    /// A password from a file that the broker refused, and when it may be tried again.
     refused: Option<(Secret, Instant)>,
 }
 
 impl BrokerLink {
-    /// A link that begins with the broker `kept`, which worked before a reload, if it is still configured.
+    /// A link that starts with the broker `kept`, which worked before a reload, if that broker is still configured.
     pub(super) fn new(options: Options, client_id: String, prefix: &'static str, kept: Option<&Broker>) -> BrokerLink {
         let brokers = &options.brokers;
         let first = kept.and_then(|kept| brokers.iter().position(|broker| broker == kept));
@@ -110,7 +111,7 @@ impl BrokerLink {
         matches!(self.state, State::Up(..))
     }
 
-    /// Features of the broker, once it accepted the connection.
+    /// Capabilities of the broker; `None` until it has accepted the connection.
     pub(super) fn limits(&self) -> Option<BrokerLimits> {
         match &self.state {
             State::Up(_, phase) => phase.limits().copied(),
@@ -118,7 +119,7 @@ impl BrokerLink {
         }
     }
 
-    /// Features of the broker, once it answered the subscriptions.
+    /// Capabilities of the broker; `None` until it has answered the subscriptions.
     pub(super) fn ready(&self) -> Option<BrokerLimits> {
         match &self.state {
             State::Up(_, Phase::Ready { limits, .. }) => Some(*limits),
@@ -126,7 +127,7 @@ impl BrokerLink {
         }
     }
 
-    /// The next event of the connection; pending while there is none. Cancel safe.
+    /// The next event of the connection; waits until there is one. Cancel safe.
     pub(super) async fn next(&mut self) -> Step {
         let step = match &mut self.state {
             State::Down { .. } => std::future::pending().await,
@@ -153,7 +154,7 @@ impl BrokerLink {
                 limits.wildcards = false;
                 Step::Subscribe(*limits)
             }
-            // Another connection follows at once with a lesser will, if there is one.
+            // Another connection with a simpler last will follows at once, if there is such a will.
             (Step::Refuses(lack), _) if self.will.lessen(lack) => {
                 tracing::debug!(target: "drivegate::north::mqtt", "{}the broker refuses the last will ({lack:?}); trying a lesser one", self.prefix);
                 self.state = State::Down {
@@ -166,8 +167,8 @@ impl BrokerLink {
         }
     }
 
-    /// Notes that the broker answered the subscriptions; returns the broker's limits if that was the first time on this
-    /// connection: the client may publish from now on.
+    /// Notes that the broker answered the subscriptions; returns the broker's limits if that was the first time on
+    /// this connection, since the client may then publish.
     pub(super) fn become_ready(&mut self) -> Option<BrokerLimits> {
         let State::Up(_, phase) = &mut self.state else {
             return None;
@@ -196,13 +197,13 @@ impl BrokerLink {
         }
     }
 
-    /// Starts to connect to the broker whose turn it is, with this last will.
+    /// Starts to connect to the next broker, with this last will.
     ///
     /// # Errors
-    /// Why the link cannot connect.
+    /// If the link cannot connect; contains the reason.
     pub(super) async fn connect(&mut self, will: Will) -> Result<(), String> {
         let options = self.options.clone();
-        // Read for each attempt, so that renewed certificates and tokens are used without a restart.
+        // The files are read for each attempt, so that renewed certificates and tokens are used without a restart.
         let read = move || {
             let config = tls::client_config(&options).map_err(|error| error.to_string())?;
             let password = options.password.as_ref().map(Password::read).transpose()?;
@@ -250,13 +251,14 @@ impl BrokerLink {
         accepted.is_some_and(|(connection, limits)| connection.publish(message, limits))
     }
 
-    /// Disconnects in order, so that the broker does not publish the last will; false without a connection that it accepted.
+    /// Disconnects in an orderly way, so that the broker does not publish the last will; returns false if there is
+    /// no accepted connection.
     pub(super) fn disconnect(&mut self) -> bool {
         let accepted = self.accepted();
         accepted.is_some_and(|(connection, limits)| connection.disconnect(limits))
     }
 
-    /// The client may publish: logged, with what is lost with this broker.
+    /// Logs that the client may publish, with the functions that are lost with this broker.
     pub(super) fn log_ready(&mut self, limits: BrokerLimits, named: &str) {
         let (prefix, broker) = (self.prefix, self.broker());
         tracing::info!(target: "drivegate::north::mqtt", "{prefix}connected to the broker at {broker}{named}");
@@ -275,20 +277,20 @@ impl BrokerLink {
         tracing::warn!(target: "drivegate::north::mqtt", "{}the orderly disconnect timed out; the broker publishes the last will", self.prefix);
     }
 
-    /// Ends the connection for this reason, and sends it to the broker. The last will is published if it is `true_now`.
+    /// Ends the connection and sends the reason to the broker. The last will is published if it is `true_now`.
     pub(super) fn give_up(&mut self, why: &str, true_now: bool) {
         if let Some(connection) = self.lost(why) {
             connection.give_up(why, true_now);
         }
     }
 
-    /// The connection is lost, for this reason; returns the lost one. Dropping it aborts its task and closes the socket.
+    /// Notes that the connection was lost for this reason; returns it. Dropping it aborts its task and closes the socket.
     pub(super) fn lost(&mut self, why: &str) -> Option<Connection> {
         let (now, prefix, broker) = (Instant::now(), self.prefix, self.broker());
         let place = self.rotation.current();
         let before = self.turn_to_next(None, now);
         self.read_password_again(why, now);
-        // Whatever the last packet was: a broker that closes without a reason is one reason.
+        // All connections closed without a reason count as one reason, whatever the last packet was.
         let closed = why.starts_with(CLOSED);
         let kind = if closed { CLOSED } else { why };
         if self
@@ -315,7 +317,8 @@ impl BrokerLink {
         before
     }
 
-    /// A broker that does not accept the password any more may accept the one that the file has now.
+    /// Allows another attempt with the password file: a broker that no longer accepts the old password may accept
+    /// the new content.
     fn read_password_again(&mut self, why: &str, now: Instant) {
         let is_refused = CREDENTIALS.iter().any(|code| why.contains(code));
         if let (true, Some(Password::File(_)), State::Down { retry_at }) =
@@ -338,7 +341,7 @@ impl BrokerLink {
             _ => None,
         };
         if held.is_some() || !self.rotation.is_single() {
-            // The next broker, or this one with another configuration, may take more.
+            // The next broker, or this one with another configuration, may accept a more complete last will.
             self.will = WillForm::first(self.options.retain);
         }
         let usual = self.rotation.next(held.unwrap_or_default());

@@ -33,13 +33,13 @@ impl From<Message> for Published {
     }
 }
 
-/// The commands of an MQTT client without its connection. Time is an argument; the calendar advances with it from
-/// [`Loopback::new`] on.
+/// The command processing of an MQTT client without a connection. Time is an argument; the calendar advances with
+/// it from [`Offline::new`] on.
 #[derive(Debug)]
 pub struct Loopback {
     plant: SharedPlant,
     commands: Commands,
-    /// Messages that stay with the broker because there is no room for more commands.
+    /// Messages that stay with the broker because there is no room for further commands.
     held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
@@ -92,7 +92,7 @@ impl Loopback {
         std::mem::take(&mut self.results)
     }
 
-    /// Whether any command waits for its answer, its confirmation or for room.
+    /// Whether any command waits for its answer, for its confirmation or for room.
     pub fn is_waiting(&self) -> bool {
         !self.commands.is_idle() || !self.held.is_empty()
     }

@@ -1,5 +1,5 @@
-//! Keeps messages on disk until the broker has acknowledged them, across restarts and crashes. Blocking: it runs on the
-//! thread of the [`store`](super::store).
+//! Keeps messages on disk until the broker has acknowledged them, across restarts and crashes. Blocking: runs on
+//! the thread of the [`store`](super::store).
 //!
 //! Segment files `{name}-{number}.log` in one directory, each a sequence of records ([`super::record`]): messages with
 //! ascending numbers, and marks up to which number all messages are acknowledged. Records are only appended. A segment
@@ -7,8 +7,8 @@
 //! oldest segment is deleted. Damaged parts are copied to `{name}-{number}-{offset}.damaged`; reading continues at the
 //! next valid record.
 //!
-//! Messages that cannot be written wait in memory behind those on disk, so the order stays, and are written as soon as
-//! the disk takes them.
+//! Messages that cannot be written wait in memory behind those on disk, so that the order is kept, and are written
+//! as soon as the disk accepts them.
 
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
@@ -26,7 +26,7 @@ const SUFFIX: &str = ".log";
 const DAMAGED: &str = ".damaged";
 /// Largest and smallest size of a segment, bytes; between them a 64th of the buffer.
 const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
-/// Maximum number of messages that wait in memory because the disk does not take them; their size is at most
+/// Maximum number of messages that wait in memory because the disk does not accept them; their size is at most
 /// [`KEPT_BYTES`].
 const UNWRITTEN: usize = crate::event::BURST;
 /// Files with damaged records that are kept.
@@ -60,15 +60,15 @@ pub(super) struct MessageLog {
     pub(super) last: u64,
     /// Up to here messages were loaded, taken or lost.
     passed: u64,
-    /// Up to here all messages are acknowledged; the mark on disk may be older.
+    /// Number up to which all messages are acknowledged; the mark on disk may be older.
     acknowledged: u64,
     marked: u64,
     unsynced: bool,
     lost: u64,
     /// Messages already counted as lost in the gaps that are still to be passed.
     pub(super) counted: u64,
-    /// Number up to which nothing is kept, because the buffer was full. Messages up to there that were taken and are
-    /// not acknowledged are lost.
+    /// Number up to which no messages are kept, because the buffer was full. Messages up to this number that were
+    /// taken and not acknowledged are lost.
     pub(super) gone: u64,
     /// The files were deleted since the last call of [`Journal::take_wiped`].
     wiped: bool,
@@ -77,7 +77,7 @@ pub(super) struct MessageLog {
 #[derive(Debug)]
 struct MessageLogDir {
     dir: PathBuf,
-    /// First part of the names of the files.
+    /// First part of the names of the journal's files.
     name: &'static str,
     max_bytes: u64,
     /// Creates the file of a segment.
@@ -165,12 +165,12 @@ impl MessageLog {
             }
         }
         if end < bytes.len() as u64 {
-            // Nothing valid follows, only what was being written when the process ended or when the disk was full.
+            // No valid record follows, only data that was being written when the process ended or the disk was full.
             if let Err(error) = self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default())
                 && end == 0
                 && !is_full(&error)
             {
-                // The gateway understands nothing in the file and could keep none of it elsewhere.
+                // The gateway can neither read the file nor move it aside.
                 let path = path.display();
                 tracing::warn!(target: "drivegate::north::mqtt", "{path}: nothing in it is valid; it is left as it \
                                                                   is, and nothing from it is published");
@@ -204,12 +204,12 @@ impl MessageLog {
         self.loaded.front().map_or(self.passed, |(number, _)| number - 1)
     }
 
-    /// Number of messages lost since the last call: the buffer was full, or they were damaged.
+    /// Number of messages lost since the previous call because the buffer was full or they were damaged.
     pub(super) fn take_lost(&mut self) -> u64 {
         std::mem::take(&mut self.lost)
     }
 
-    /// Number of messages that are not acknowledged and are on no disk: anyone who ends now loses them.
+    /// Number of messages that are neither acknowledged nor on disk: they are lost if the process ends now.
     pub(super) fn unkept(&self) -> u64 {
         match self.place {
             Some(_) => self
@@ -226,7 +226,7 @@ impl MessageLog {
         std::mem::take(&mut self.wiped)
     }
 
-    /// Appends a message; [`Journal::write`] writes it. A message that is `taken` already is kept only until it is
+    /// Appends a message; [`Journal::write`] writes it. A message that is already `taken` is kept only until it is
     /// acknowledged.
     pub(super) fn append(&mut self, message: Message, taken: bool) {
         self.last += 1;
@@ -256,8 +256,8 @@ impl MessageLog {
         Some(number)
     }
 
-    /// Removes and returns messages in order, with their numbers: at most `most`, and none after [`LOADED_BYTES`]
-    /// bytes.
+    /// Removes and returns messages in order with their numbers: at most `most`, and none after the first
+    /// [`LOADED_BYTES`] bytes.
     pub(super) fn take(&mut self, most: usize) -> Vec<(u64, Message)> {
         let (mut taken, mut bytes) = (Vec::new(), 0);
         let all_of_disk = loop {
@@ -325,7 +325,7 @@ impl MessageLog {
         true
     }
 
-    /// Messages up to this number that were not passed are lost.
+    /// Notes that the messages up to this number are passed; those that were not taken are lost.
     fn pass_all(&mut self, last: u64) {
         if last > self.passed {
             self.pass(last);
@@ -333,7 +333,7 @@ impl MessageLog {
         }
     }
 
-    /// Notes that the next message is this one; the messages in between are lost.
+    /// Notes that the next message has this number; the messages in between are lost.
     fn pass(&mut self, number: u64) {
         if number <= self.passed {
             return;
@@ -353,7 +353,7 @@ impl MessageLog {
     /// Writes appended messages and acknowledgements; returns whether there was anything to write.
     ///
     /// # Errors
-    /// If the disk does not take the data; they stay in memory, and the next call tries again.
+    /// If the disk does not accept the data, which then stay in memory until the next call.
     pub(super) fn write(&mut self) -> io::Result<bool> {
         let mut written = false;
         if self.place.is_none() {
@@ -444,7 +444,7 @@ impl MessageLog {
         Ok(())
     }
 
-    /// Deletes the oldest segment with its messages, which frees its room; returns false if there is none.
+    /// Deletes the oldest segment with its messages to free its room; returns false if there is none.
     fn drop_oldest(&mut self) -> io::Result<bool> {
         if self.segments.front().is_none_or(|oldest| oldest.end == 0) {
             return Ok(false);
@@ -460,7 +460,7 @@ impl MessageLog {
         Ok(true)
     }
 
-    /// Writes the files again if someone deleted them; their content still exists as long as they are open.
+    /// Writes the files again if someone deleted them; their content exists as long as they are open.
     fn restore_wiped(&mut self) -> io::Result<()> {
         let Some(place) = &mut self.place else { return Ok(()) };
         let files = self.segments.iter().map(|s| &s.file).chain([&place.lock]);

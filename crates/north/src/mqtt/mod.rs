@@ -9,13 +9,14 @@
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher`, `rounds`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide
-//! what is published, when, and in which order; `offline` drives `commands` without a broker. `broker_limits`, `keep_alive`,
-//! `retry` and `takeover` judge what the broker does, without I/O as well, `back_off` chooses the broker. `client` owns
-//! them. `sparkplug` is a client of its own, on a link of its own. `session` is the loop of both: it connects, reconnects,
-//! follows reloads and disconnects. `link` is the way to one of the brokers: it owns the `connection`, which wraps rumqttc,
-//! which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are sent again
-//! from the outbox. `handover` keeps what a client leaves to the one after a reload.
+//! `payload`, `publisher`, `rounds`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O:
+//! they decide what is published, when, and in which order; `offline` drives `commands` without a broker.
+//! `broker_limits`, `keep_alive`, `retry` and `takeover` judge the behaviour of the broker, also without I/O;
+//! `back_off` chooses the broker. `client` owns all of these. `sparkplug` is a separate client with a separate
+//! link. `session` is the loop of both clients: it connects, reconnects, follows reloads and disconnects. `link` is
+//! the way to one of the brokers: it owns the `connection`, which wraps rumqttc and keeps no state: every
+//! connection is a new rumqttc client with a clean session, and unacknowledged messages are sent again from the
+//! outbox. `handover` keeps the state that a client leaves for the one after a reload.
 
 mod back_off;
 mod broker_limits;
@@ -111,7 +112,7 @@ pub struct Options {
     pub password: Option<Password>,
     /// Host and port of an HTTP proxy, by whose CONNECT all brokers are reached.
     pub proxy: Option<(String, u16)>,
-    /// Most messages that each connection publishes in any second; 0 sets no limit.
+    /// Most messages per second that each connection publishes; 0 sets no limit.
     pub publish_limit: usize,
     /// CA certificates (PEM) for the broker; if absent, the certificates of the system.
     pub ca: Option<PathBuf>,
@@ -233,7 +234,8 @@ impl server::Server for Mqtt {
         }
     }
 
-    /// At most about half a second after the cancellation, in which it publishes `offline` and disconnects.
+    /// Waits for the end of the client: at most about half a second after the cancellation, during which it
+    /// publishes `offline` and disconnects.
     async fn stopped(self) {
         for task in self.tasks {
             if let Err(error) = task.await {
@@ -243,16 +245,17 @@ impl server::Server for Mqtt {
     }
 }
 
-/// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
-/// raised from now on, or that the previous client left unread, are published, so start it before the buses.
+/// Starts the MQTT client; must be called within a Tokio runtime. The client reconnects until it is cancelled. It
+/// publishes the events that are raised from now on or were left by the previous client, so it must be started
+/// before the buses.
 pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, cancel: CancellationToken) -> Mqtt {
     options.buffer = options.buffer.or_else(Buffer::of_system);
-    // Subscribed here and not in the task, so that no event after this call is missed. Events that the previous client left
-    // unread come first.
+    // The subscription happens here and not in the task, so that no event after this call is missed. Events left by
+    // the previous client come first.
     let (topics, hosts) = stats.broker_rights.begin(&options);
     let kept = options.clone();
     let events = plant.load().events.subscribe();
-    // Taken here as well: what no client has taken when this returns is discarded.
+    // The state is taken over here as well: state that no client has taken when this returns is discarded.
     let (unread, of_client, of_node) = {
         let mut left = stats.mqtt_left.lock();
         (

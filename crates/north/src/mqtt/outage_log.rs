@@ -13,7 +13,7 @@ const REASONS: usize = 16;
 pub(super) struct OutageLog(HashMap<String, Instant>);
 
 impl OutageLog {
-    /// Whether to log this reason now. Reasons that differ only in numbers, such as the time of day, are the same.
+    /// Whether to log this reason now. Reasons that differ only in numbers, such as a time of day, count as equal.
     pub(super) fn permit(&mut self, why: &str, now: Instant) -> bool {
         let reason: String = why.chars().filter(|c| !c.is_ascii_digit()).collect();
         let recent = |at: &Instant| now.saturating_duration_since(*at) < SAME_REASON;
@@ -27,7 +27,8 @@ impl OutageLog {
         true
     }
 
-    /// There is a connection. A certificate that is about to expire may connect now and then, and is not logged each time.
+    /// Notes that there is a connection. A client whose certificate is about to expire may connect now and then,
+    /// which is not logged each time.
     pub(super) fn end(&mut self) {
         self.0.retain(|reason, _| reason.contains("certificate"));
     }

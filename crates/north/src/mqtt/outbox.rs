@@ -1,9 +1,10 @@
 //! Decides what is sent next, and tracks pending acknowledgements.
 //!
-//! Telemetry: only the latest value of a topic waits. Results, events and history: bounded queues in order, whose entries
-//! leave when they are acknowledged (PUBACK). Results, events and telemetry take turns, so that none starves another;
-//! history comes when nothing else waits. Only messages with an acknowledgement count towards the window of the broker;
-//! telemetry has none by default and passes when the window is full.
+//! Messages for the broker. Telemetry: only the latest value of a topic waits. Results, events and history: bounded
+//! queues in order, whose entries are removed when they are acknowledged (PUBACK). Results, events and telemetry
+//! take turns, so that none starves another; history is sent when nothing else waits. Only messages with an
+//! acknowledgement count towards the broker's window; telemetry has none by default and is sent even when the
+//! window is full.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
@@ -12,19 +13,19 @@ use super::Qos;
 use super::store::Number;
 use crate::MqttKind;
 
-/// Maximum number of waiting results, and their size in bytes; beyond it, no commands are received.
+/// Maximum number of waiting results, and their size in bytes; beyond it, no commands are accepted.
 const RESULTS: usize = 16_384;
 const RESULT_BYTES: usize = 32 << 20;
-/// Results that may wait on one topic; beyond it, commands that would be answered there are refused.
+/// Maximum number of results that wait on one topic; beyond it, commands that would be answered there are refused.
 const RESULTS_OF_TOPIC: usize = 2048;
-/// Maximum number of messages of a queue in memory, and their size in bytes; with a buffer, the others wait on disk. An
-/// array of the history has up to 32 KiB.
+/// Maximum number of messages of a queue in memory, and their size in bytes; with a buffer, further messages wait
+/// on disk. An array of the history has up to 32 KiB.
 const KEPT: usize = crate::event::BURST;
 pub(super) const KEPT_BYTES: usize = 16 << 20;
-/// Maximum number of messages loaded from disk at a time, more than any window, and the size from which on no more are.
+/// Maximum number of messages loaded from disk at once, more than any window, and the size at which loading stops.
 const LOADED: usize = 1024;
 pub(super) const LOADED_BYTES: usize = 1 << 20;
-/// Number of lost connections after which a result is dropped: its response topic may be the cause.
+/// Number of lost connections after which a result is dropped: its response topic may cause them.
 const RESULT_ATTEMPTS: u8 = 2;
 
 /// A message for the broker.
@@ -91,7 +92,7 @@ pub(super) struct Delivery {
 struct Slot {
     /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
-    /// Payload in flight with an acknowledgement to come, in case the broker refuses it.
+    /// The payload of a message in flight that will be acknowledged, kept in case the broker refuses it.
     sent: Option<Vec<u8>>,
     /// Whether the message must arrive and lasts: the status, discovery, and the end of a topic.
     lasting: bool,
@@ -116,9 +117,10 @@ struct Entry {
 struct Queue {
     entries: VecDeque<Entry>,
     bytes: usize,
-    /// The broker refused one of them for now; all wait for [`Outbox::retry`], so that the order stays.
+    /// Whether the broker refused one of the messages for now; all then wait for [`Outbox::retry`], so that the
+    /// order is kept.
     put_back: bool,
-    /// Messages given up since the last [`Outbox::take_lost`]: too many waited, or they broke connections.
+    /// Messages dropped since the last [`Outbox::take_lost`], because too many waited or because they broke connections.
     lost: u64,
 }
 
@@ -135,7 +137,7 @@ pub(super) struct Outbox {
     events: Queue,
     history: Queue,
     serial: u64,
-    /// Published, packet id not known yet.
+    /// Published messages whose packet id is not known yet.
     published: VecDeque<Key>,
     /// Published, by packet id.
     unacknowledged: HashMap<u16, Key>,
@@ -168,7 +170,7 @@ impl Outbox {
         self.put_slot(topic, payload, false);
     }
 
-    /// Puts a message like [`Outbox::put`] does, for messages that must arrive and do not expire.
+    /// Adds a message like [`Outbox::put`], for messages that must arrive and do not expire.
     pub(super) fn put_lasting(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         self.put_slot(topic, payload, true);
     }
@@ -181,7 +183,8 @@ impl Outbox {
         }
     }
 
-    /// As [`Outbox::put_lasting`], published before everything else; the broker drops it after `expiry`, s, if there is one.
+    /// Adds a message like [`Outbox::put_lasting`], but ahead of all others; the broker drops it after `expiry`, s,
+    /// if given.
     pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>, expiry: Option<u32>) {
         let slot = self.latest.entry(topic.clone()).or_default();
         slot.expiry = expiry;
@@ -230,13 +233,13 @@ impl Outbox {
         });
     }
 
-    /// Drops the waiting messages up to this one, which are no longer on disk because the buffer was full: they are lost, as
-    /// they would be after a restart. Messages in flight have probably been delivered.
+    /// Drops the waiting messages up to this one: they are no longer on disk because the buffer was full, and count
+    /// as lost, as after a restart. Messages in flight have probably been delivered.
     pub(super) fn drop_gone(&mut self, kind: MqttKind, through: Number) {
         let queue = self.queue_mut(kind);
         let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
         let is_gone = |entry: &Entry| !entry.in_flight && entry.number.is_some();
-        // The numbers ascend, so this ends with the first one that is kept.
+        // The numbers are ascending, so the loop ends at the first message that is kept.
         while let Some(place) = queue.entries.iter().take_while(is_older).position(is_gone) {
             queue.remove(place);
             queue.lost += 1;
@@ -259,19 +262,19 @@ impl Outbox {
         }
     }
 
-    /// Whether another command may be received, because its result would find room.
+    /// Whether another command may be received because there is room for its result.
     pub(super) fn has_room_for_results(&self) -> bool {
         self.results.entries.len() < RESULTS && self.results.bytes < RESULT_BYTES
     }
 
-    /// Whether the results waiting on a topic are so many that commands answered there are refused.
+    /// Whether so many results wait on a topic that further commands answered there are refused.
     pub(super) fn is_crowded(&self, topic: &str) -> bool {
         self.results_of
             .get(topic)
             .is_some_and(|count| *count >= RESULTS_OF_TOPIC)
     }
 
-    /// Number of messages of that kind that may be loaded from disk now.
+    /// Number of messages of this kind that may be loaded from disk now.
     pub(super) fn room(&self, kind: MqttKind) -> usize {
         let queue = self.queue(kind);
         match queue.bytes < LOADED_BYTES {
@@ -329,8 +332,8 @@ impl Outbox {
         self.published.len() + self.unacknowledged.len()
     }
 
-    /// The message to publish next; history only if `may_history`. The message stays in the outbox; confirm with
-    /// [`Outbox::mark_published`] that it was published.
+    /// The message to publish next; history only if `may_history`. The message stays in the outbox until
+    /// [`Outbox::mark_published`] confirms that it was published.
     pub(super) fn next(&self, window: usize, may_history: bool) -> Option<(Key, Message)> {
         let free = self.in_flight() < window;
         if self.has_leader {
@@ -364,14 +367,15 @@ impl Outbox {
         })
     }
 
-    /// The message of `key` was published on the connection; without an acknowledgement to come, its entry is removed.
+    /// Notes that the message of `key` was published on the connection; if it will not be acknowledged, its entry
+    /// is removed.
     pub(super) fn mark_published(&mut self, key: Key, acknowledged: bool) -> Option<Settled> {
         match &key {
             Key::Latest(topic) => {
                 if let Some(slot) = self.latest.get_mut(topic) {
                     (slot.sent, slot.in_flight) = (slot.waiting.take().filter(|_| acknowledged), true);
                 }
-                // The topic is at or near the front: only topics in flight come before it.
+                // The topic is at or near the front: only topics in flight precede it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
@@ -416,8 +420,9 @@ impl Outbox {
         self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }
 
-    /// The broker refused a message. If that holds only `for_now`, or the message must arrive, it stays, to be published again
-    /// after [`Outbox::retry`], and its topic is returned; otherwise [`Outbox::acked`] removes it.
+    /// The broker refused a message. If it did so only `for_now`, or the message must arrive, the message stays, to
+    /// be published again after [`Outbox::retry`], and its topic is returned; otherwise [`Outbox::acked`] removes
+    /// it.
     pub(super) fn put_back(&mut self, packet: u16, for_now: bool) -> Option<Arc<str>> {
         let key = self.unacknowledged.get(&packet)?.clone();
         let topic = match &key {

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-/// Most bytes of a secret: a longer file is not a password.
+/// Most bytes of a secret: a longer file cannot be a password.
 const LONGEST: u64 = 16 << 10;
 
 /// A secret that is not printed in logs.
@@ -19,7 +19,7 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// Where the password comes from.
+/// Source of the password.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Password {
     /// The configuration.
@@ -28,7 +28,7 @@ pub enum Password {
     File(PathBuf),
 }
 
-/// Why a file holds no secret.
+/// Why a file contains no usable secret.
 #[derive(Debug, thiserror::Error)]
 pub enum SecretFault {
     /// The file cannot be read.
@@ -65,7 +65,7 @@ impl Password {
     /// The password now.
     ///
     /// # Errors
-    /// Why the password file holds no secret, with the path of the file.
+    /// If the password file contains no usable secret; contains the reason with the path of the file.
     pub(super) fn read(&self) -> Result<Secret, String> {
         match self {
             Password::Fixed(secret) => Ok(secret.clone()),

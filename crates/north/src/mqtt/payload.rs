@@ -1,5 +1,5 @@
-//! Content of the payloads; `topics` has their names. `publisher` decides which topics a drive has and when they are
-//! published.
+//! Content of the payloads; `topics` has the names of their topics. `publisher` decides which topics a drive has
+//! and when they are published.
 
 use std::time::{Duration, SystemTime};
 
@@ -13,21 +13,21 @@ use crate::permit::HoldView;
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
-/// The points of a drive that are published: index in the profile and name. None of them is a key of the state object:
-/// profiles do not take such names.
+/// The published points of a drive: index in the profile and name. No name is a key of the state object, since
+/// profiles reject such names.
 pub(super) fn published_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
     crate::process_image::public_points(profile)
 }
 
-/// The state object of a drive without its times; a change of it is published.
+/// The state object of a drive without its times; it is published when it changes.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StateContent {
-    /// State of the drive; `None` while it is unknown.
+    /// State of the drive; `None` if it is unknown.
     pub(super) state: Option<State>,
     pub(super) quality: Quality,
-    /// Why the motor does not run, in one word each.
+    /// Why the motor does not run: one word for each cause.
     pub(super) blocked_by: Vec<String>,
-    /// For how long an ordinary stop still waits, in whole seconds.
+    /// How long `min_run` still delays an ordinary stop, in whole seconds.
     pub(super) stop_waits: Option<u64>,
     /// Whether the drive's orders are being written again; `None` where orders never are.
     pub(super) refreshing: Option<bool>,
@@ -79,7 +79,7 @@ pub(super) struct StateObject<'s> {
     pub(super) age: Option<Duration>,
     /// Time of day.
     pub(super) wall: SystemTime,
-    /// Whether the state is no longer current: part of the history.
+    /// Whether the state is from the past, as part of the history.
     pub(super) historical: bool,
     /// Number of points that are left out because the broker takes no larger message.
     pub(super) omitted: usize,
@@ -148,7 +148,7 @@ fn tidy(value: Value) -> Value {
 /// The payload of a point topic.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum PointPayload {
-    /// Nothing good is known: an empty payload, which clears the retained value.
+    /// No good value is known: an empty payload, which clears the retained value.
     Nothing,
     Value(Value),
     /// The state of the drive.
@@ -176,7 +176,7 @@ impl PointPayload {
         }
     }
 
-    /// The bytes: `true`, `false`, a shortest decimal, a word, or nothing.
+    /// The bytes of the payload: `true`, `false`, a shortest decimal, a word, or nothing.
     pub(super) fn render(self, profile: &Profile) -> Vec<u8> {
         match self {
             PointPayload::Nothing => Vec::new(),
@@ -187,7 +187,7 @@ impl PointPayload {
     }
 }
 
-/// The part of a bus message whose changes are published at once.
+/// The part of a bus message that is published at once when it changes.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusState {
     pub(super) up: bool,
@@ -252,7 +252,7 @@ pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTim
     object.to_string().into_bytes()
 }
 
-/// The event object and its topics: that of its drive, or those of all drives of its bus, or of the gateway.
+/// The event object and its topics: the topic of its drive, or those of all drives of its bus or of the gateway.
 pub(super) fn event(topics: &Topics, event: &Event, plant: &Plant) -> (Vec<String>, Vec<u8>) {
     let drives = match &event.drive {
         Some(drive) => vec![drive.clone()],

@@ -1,8 +1,8 @@
 //! Decides when a topic is published: on change, but not before `min_interval`, and at the latest after `max_interval`.
 //! Time is an argument.
 //!
-//! A drive is looked at when its image was updated, when a change may be published at last, and four times a second for
-//! what changes by itself (age).
+//! A drive is checked when its image was updated, when a postponed change may be published, and four times a second
+//! for values that change by themselves (age).
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -107,7 +107,7 @@ enum PointSource {
 struct BusTopic {
     bus: BusHandle,
     topic: Arc<str>,
-    /// The bus as it was last published.
+    /// The bus state as last published, and when.
     state: Option<(BusState, Instant)>,
     figures: Option<(BusFigures, Instant)>,
 }
@@ -137,7 +137,7 @@ impl Publisher {
         }
     }
 
-    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
+    /// Observes this plant from now on; publishes everything again and clears topics that no longer exist.
     /// `besides` are retained topics that other code publishes.
     pub(super) fn adopt(&mut self, plant: &Plant, besides: Vec<Arc<str>>) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
@@ -160,13 +160,13 @@ impl Publisher {
         self.clear(old);
     }
 
-    /// Notes that someone else publishes these retained topics from now on.
+    /// Notes that other code publishes these retained topics from now on.
     pub(super) fn publish_besides(&mut self, besides: Vec<Arc<str>>) {
         let old = std::mem::replace(&mut self.besides, besides);
         self.clear(old);
     }
 
-    /// Clears those of the given topics that are no longer published.
+    /// Clears those of the given topics that are not published any more.
     pub(super) fn clear(&mut self, old: impl IntoIterator<Item = Arc<str>>) {
         let present: BTreeSet<Arc<str>> = self.all_topics().cloned().collect();
         self.vanished.extend(old);
@@ -183,7 +183,8 @@ impl Publisher {
         drives.chain(self.buses.iter().map(|b| &b.topic)).chain(&self.besides)
     }
 
-    /// Publishes everything again, since the broker may have lost it; `max_packet` is the largest packet that it takes.
+    /// Publishes everything again, since the broker may have lost it; `max_packet` is the largest packet that the
+    /// broker accepts.
     pub(super) fn restart(&mut self, max_packet: usize) {
         self.max_packet = max_packet;
         self.vanished_cleared = false;
@@ -242,7 +243,7 @@ impl Publisher {
         (updates, self.next(all, now, buses_at))
     }
 
-    /// Records values while the broker is away, and when to call again; see [`Publisher::tick`].
+    /// Records values while the broker is away; returns when to call again, as [`Publisher::tick`] does.
     pub(super) fn record(&mut self, now: Instant, wall: SystemTime) -> (Vec<Update>, Instant) {
         let mut updates = Vec::new();
         let (pace, mode, most) = (self.pace, self.telemetry.history, self.max_packet);
@@ -250,7 +251,7 @@ impl Publisher {
             let fresh = drive.is_fresh();
             let reading = drive.drive.reading(now);
             if reading.age().is_none() {
-                // The drive was never read, so there is no value of that time.
+                // The drive was never read, so it has no value of that time.
                 drive.look_at = Some(now + LOOK);
                 return;
             }
@@ -277,7 +278,7 @@ impl Publisher {
             .collect()
     }
 
-    /// Looks at the drives that are due, a few in one call; whether none is left.
+    /// Checks the drives that are due, a few in one call; returns whether none is left.
     fn visit_due(&mut self, now: Instant, mut look: impl FnMut(&mut DriveTopics)) -> bool {
         let drives = &self.drives;
         let is_due = |place| drives.get(place).is_some_and(|drive: &DriveTopics| drive.is_due(now));
@@ -444,7 +445,7 @@ fn render(
 }
 
 impl PointTopic {
-    /// A value that is no longer good is cleared at once, and only once.
+    /// Whether a value is due: a value that is no longer good is cleared at once, and only once.
     fn due(&self, pace: PublishInterval, now: Instant, payload: PointPayload) -> bool {
         match (&self.last, payload) {
             (Some((last, _)), PointPayload::Nothing) => *last != PointPayload::Nothing,

@@ -1,4 +1,4 @@
-//! Most messages that a connection publishes in any second. Pure: time is an argument.
+//! Limits the messages that a connection publishes in any second. Pure: time is an argument.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -30,8 +30,8 @@ impl Rate {
         }
     }
 
-    /// Whether another message may be given to the connection at `now`, where so many wait to be written. If not: when there
-    /// may be room.
+    /// Whether another message may be given to the connection at `now`, with this many waiting to be written. If
+    /// not, when there may be room.
     pub(super) fn take(&mut self, waiting: usize, now: Instant) -> Result<(), Instant> {
         if self.limit == 0 {
             return Ok(());

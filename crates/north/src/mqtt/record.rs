@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use super::outbox::Message;
 
-/// Where a record begins; no UTF-8 text contains it. The third byte is the version of the form: `J` is the first, and
-/// whatever this version cannot read needs another.
+/// Start mark of a record, which no UTF-8 text contains. The third byte is the version of the format: `J` is the
+/// first; any format that this version cannot read needs another letter.
 const MARK: [u8; 4] = [0xD7, b'G', b'J', 0xFE];
 const HEADER: usize = 21;
 /// Maximum length of a body; a longer one is damaged.
@@ -19,11 +19,11 @@ const ACKNOWLEDGED: u8 = b'A';
 pub(super) enum Entry {
     /// A message with its number.
     Message(u64, Message),
-    /// All messages up to this number are acknowledged.
+    /// All messages up to this number were acknowledged.
     Acknowledged(u64),
 }
 
-/// A record of the journal, with its place in the file.
+/// A record of the journal, with its position in the file.
 #[derive(Debug, PartialEq)]
 pub(super) struct Record {
     pub(super) entry: Entry,
@@ -66,7 +66,7 @@ fn encode(kind: u8, number: u64, body: &[&[u8]], bytes: &mut Vec<u8>) {
     body.iter().for_each(|part| bytes.extend_from_slice(part));
 }
 
-/// The records of `bytes` in order; between them, as errors, the ranges that are no records.
+/// The records of `bytes` in order; the ranges between them that are not records are returned as errors.
 pub(super) fn records(bytes: &[u8]) -> impl Iterator<Item = Result<Record, Range<usize>>> {
     let mut at = 0;
     let mut next = None;
@@ -95,7 +95,7 @@ pub(super) fn records(bytes: &[u8]) -> impl Iterator<Item = Result<Record, Range
     })
 }
 
-/// The version of the records that `bytes` begin with, if it is not the one that is read here.
+/// The version of the records at the start of `bytes`, if this program cannot read it.
 pub(super) fn other_version(bytes: &[u8]) -> Option<u8> {
     match bytes {
         [0xD7, b'G', version, 0xFE, ..] if *version != b'J' => Some(*version),
@@ -109,7 +109,7 @@ pub fn whole_records(bytes: &[u8]) -> (usize, usize) {
     whole.fold((0, 0), |(count, sum), record| (count + 1, sum + record.range.len()))
 }
 
-/// The record at the beginning of `bytes` and its length, if it is complete and undamaged.
+/// The record at the start of `bytes` and its length, if it is complete and undamaged.
 fn decode(bytes: &[u8]) -> Option<(Entry, usize)> {
     let (header, rest) = bytes.split_first_chunk::<HEADER>()?;
     let head = header.strip_prefix(&MARK)?;

@@ -70,7 +70,7 @@ pub(super) struct Reply {
 }
 
 impl Reply {
-    /// The response topic of the request, or the result topic of the drive if it has none.
+    /// The topic for the result: the response topic of the request or, without one, the result topic of the drive.
     pub(super) fn to(incoming: &Incoming, result: String, drive: &str, allowed: &ResponseTopics) -> Reply {
         let asked = incoming.response_topic.clone().filter(|topic| allowed.allow(topic));
         Reply {

@@ -16,7 +16,7 @@ pub struct Incoming {
     pub topic: String,
     /// A JSON object, or a bare value.
     pub payload: Vec<u8>,
-    /// Whether the message is or was retained, so that it is not a command.
+    /// Whether the message is or was retained, and is therefore not a command.
     pub retain: bool,
     /// Whether the broker marks the message as a repetition.
     pub dup: bool,
@@ -30,14 +30,14 @@ pub struct Incoming {
     pub expiry: Option<u32>,
     /// The sender, from the user property `who`.
     pub who: Option<String>,
-    /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
+    /// Size of a payload that was too long; `payload` then contains only its `id`.
     pub oversized: Option<usize>,
-    /// How the message arrived; `None` if it is processed at once.
+    /// When the message arrived; `None` if it is processed at once.
     pub arrival: Option<Arrival>,
 }
 
 impl Incoming {
-    /// A message that arrived in this way; `None` if its topic is not UTF-8.
+    /// A message that arrived at this time; `None` if its topic is not UTF-8.
     pub(super) fn of(publish: Publish, arrival: Arrival) -> Option<Incoming> {
         let properties = publish.properties.unwrap_or_default();
         let who = properties.user_properties.into_iter().find(|(name, _)| name == "who");
@@ -64,14 +64,14 @@ impl Incoming {
         Some(incoming)
     }
 
-    /// The sender: by its topic, which the broker's rules secure, and for the audit by its user property.
+    /// The sender: given by the topic, which the broker's access rules protect; for the audit, also by its user property.
     pub(super) fn origin(&self, client: &Arc<str>, kind: SourceKind) -> Origin {
         let who = self.who.as_deref().map(|who| excerpt(who.as_bytes()));
         let who = who.as_deref().map_or(self.topic.as_str(), |who| who.trim_matches('`'));
         Origin::of(client.clone(), kind, who)
     }
 
-    /// The parts of the message by which its repetition is recognised.
+    /// The parts of the message by which a repetition is recognised.
     pub(super) fn taken(&self) -> Taken<'_> {
         Taken {
             topic: &self.topic,
@@ -84,8 +84,8 @@ impl Incoming {
     }
 }
 
-/// The `id` of a message, read before the rest, so that a client finds its request in the result whatever else is
-/// wrong. `None` if the payload is not JSON or contains several.
+/// The `id` of a message, read before the rest, so that a client can match the result to its request even if the
+/// rest is invalid. `None` if the payload is not JSON or contains several ids.
 pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
     match point {
         Some(_) => None,
@@ -96,7 +96,7 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
 /// The command in a message on a set topic; `point` is the point of a bare value.
 ///
 /// # Errors
-/// Why the gateway executes nothing of the message.
+/// If the gateway executes nothing of the message; contains the reason.
 pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
     if incoming.retain {
         return Err(Refusal::NotAllowed(
@@ -352,7 +352,8 @@ mod tests {
         assert_eq!(set_point("nothing", "1").unwrap_err().code(), "not_writable");
     }
 
-    /// By its text over every way, by its number too; whole numbers keep every digit.
+    /// An enumeration can be written by its text over every interface, and also by its number; whole numbers keep
+    /// every digit.
     #[test]
     fn enumerations_are_written_by_text() {
         let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 5\n\
@@ -457,7 +458,7 @@ mod tests {
     fn excerpts_are_short() {
         let long = format!(r#"{{"{}": 1}}"#, "n".repeat(60_000));
         let (_, text) = code(set(&long));
-        // Besides the names of all points that can be commanded.
+        // The length without the names of all points that can be commanded.
         assert!(text.len() < 700, "{}", text.len());
         assert_eq!(excerpt(b"\"a\"\x00b\xff"), "`\"a\"\\u{0}b\u{fffd}`");
     }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-/// First and longest wait.
+/// First and longest wait before a refused message is published again.
 const WAIT: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
 
 /// A single wait for all messages refused meanwhile; it doubles while refusals continue.

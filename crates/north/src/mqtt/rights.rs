@@ -1,5 +1,6 @@
-//! The rights of those who publish to the broker. They belong to the configuration and not to the client, which a reload
-//! replaces: commands that wait, and messages that a client still receives while it ends, are judged by what comes next.
+//! The rights of the clients that publish to the broker. They belong to the configuration and not to the gateway's
+//! MQTT client, which a reload replaces: waiting commands, and messages that an ending client still receives, are
+//! judged by the new configuration.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -24,7 +25,7 @@ impl Revocable {
         Right::of(right)
     }
 
-    /// A later right is another one: commands placed under this right do not get it back.
+    /// Ends this right. A later right is separate: commands placed under the ended one do not regain it.
     fn end(&self) {
         let mut right = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         right.store(false, Ordering::Release);
@@ -129,7 +130,7 @@ mod tests {
             assert_eq!(allowed(), (true, true));
             rights.reload(&before, next.as_ref());
             assert_eq!(allowed(), expected, "{what}");
-            // A later client has a right of its own where this one has ended.
+            // A later client gets a new right, because the previous one has ended.
             let (later, _) = rights.begin(&before);
             assert_eq!((allowed(), later.allows("line1")), (expected, true), "{what}");
         }

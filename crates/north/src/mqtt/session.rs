@@ -1,5 +1,5 @@
-//! The session of a client with its broker, for both clients: it connects and subscribes, gives up what cannot be used,
-//! follows reloads, and disconnects. What is published and received is up to the client.
+//! The session of a client with its broker, for both clients: connects and subscribes, gives up unusable
+//! connections, follows reloads, and disconnects. The client decides what is published and received.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -40,7 +40,7 @@ pub(super) struct Common {
     pub(super) stats: Arc<NorthState>,
     /// Woken when a drive was updated.
     pub(super) fresh: Arc<Notify>,
-    /// When to look at the drives, even if none was updated.
+    /// When to check the drives, even if none was updated.
     pub(super) look_at: Instant,
 }
 
@@ -61,8 +61,8 @@ impl Common {
 pub(super) trait Client {
     fn common(&mut self) -> &mut Common;
 
-    /// The next step of the connection. Whatever else the client waits for is handled inside, and is [`Step::Nothing`]
-    /// outside. Cancel safe.
+    /// The next step of the connection. All other events that the client waits for are handled inside and reported
+    /// as [`Step::Nothing`]. Cancel safe.
     async fn next(&mut self) -> Step;
 
     /// The last will of the next connection.
@@ -73,10 +73,10 @@ pub(super) trait Client {
 
     fn filters(&mut self, limits: BrokerLimits) -> Vec<Filter>;
 
-    /// The broker answered the subscriptions: of each, in order, the reason if it refused it.
+    /// Notes the broker's answer to the subscriptions: for each, in order, the reason if it was refused.
     fn answered(&mut self, refused: &[Option<String>]);
 
-    /// The client may publish on this connection from now on.
+    /// Notes that the client may publish on this connection from now on.
     fn ready(&mut self, limits: BrokerLimits);
 
     fn on_message(&mut self, message: Incoming);
@@ -90,13 +90,13 @@ pub(super) trait Client {
     /// The connection is closed.
     fn down(&mut self);
 
-    /// Follows this plant from now on; a reload replaced the previous one.
+    /// Follows this plant from now on, which replaces the previous one after a reload.
     fn adopt(&mut self, plant: Arc<Plant>);
 
     /// Does all else that is due.
     fn check(&mut self, now: Instant);
 
-    /// Looks at the drives that were updated or are due, and sets when to look again.
+    /// Checks the drives that were updated or are due, and sets when to check again.
     fn publish_due(&mut self);
 
     /// Publishes pending messages, as far as the connection allows.
@@ -114,7 +114,7 @@ pub(super) trait Client {
     async fn say_goodbye(&mut self) -> bool;
 }
 
-/// Runs a client until `cancel`, then ends it: the commands in progress come first.
+/// Runs a client until `cancel`, then ends it: commands in progress are completed first.
 pub(super) async fn run(client: &mut impl Client, cancel: CancellationToken) {
     let mut checks = tokio::time::interval(CHECK);
     checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -198,8 +198,8 @@ fn subscribe(client: &mut impl Client, limits: BrokerLimits) {
     }
 }
 
-/// Ends the connection for this reason, with notice to the broker. Once the client is alive, the last will is true:
-/// subscribers learn that it is offline.
+/// Ends the connection and reports the reason to the broker. If the client is alive, the last will is published, so
+/// that subscribers learn that the gateway is offline.
 pub(super) fn give_up(client: &mut impl Client, why: &str) {
     let true_now = client.is_alive();
     client.common().link.give_up(why, true_now);
@@ -232,7 +232,7 @@ async fn leave(client: &mut impl Client) {
         if !client.say_goodbye().await || !client.common().link.disconnect() {
             return;
         }
-        // The broker counts messages still in progress from it as delivered.
+        // Messages that are on their way from the broker count there as delivered, so they are still received.
         loop {
             match client.common().link.next().await {
                 Step::Lost(_) => return,

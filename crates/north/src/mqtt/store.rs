@@ -1,8 +1,8 @@
-//! Passes messages that must not be lost to the outbox and, by a thread of their own, to the disk: however slow the disk
-//! is, nothing else waits for it.
+//! Passes messages that must not be lost to the outbox and, through a separate thread, to the disk: however slow
+//! the disk is, nothing else waits for it.
 //!
-//! While nothing waits on disk, a message goes to the outbox at once and to the disk for the case that the process ends
-//! before it is acknowledged. Otherwise it waits behind the messages on disk.
+//! While no message waits on disk, a new message goes to the outbox at once, and also to the disk in case the
+//! process ends before it is acknowledged. Otherwise it waits behind the messages on disk.
 
 use std::io;
 use std::path::PathBuf;
@@ -19,22 +19,22 @@ use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
 use crate::{MqttKind, NorthState};
 
-/// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
-/// [`KEPT_BYTES`].
+/// Most jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at
+/// most [`KEPT_BYTES`].
 const JOBS: usize = 2 * crate::event::BURST;
 /// Messages that are written at a time.
 const BATCH: usize = 1024;
 /// Time after which messages on disk survive a power failure.
 const SYNC: Duration = Duration::from_secs(1);
-/// Attempts to lock the directory, and the wait between them: a process that is stopping may still hold it.
+/// Attempts to lock the directory, and the wait between them: a process that is stopping may still have it locked.
 const LOCK_ATTEMPTS: u32 = 20;
 const LOCK_WAIT: Duration = Duration::from_millis(50);
 
-/// Number of a message: from 1 in this run, 0 and less for those of earlier runs.
+/// Number of a message: from 1 upward in this run; 0 and negative numbers are messages of earlier runs.
 pub(super) type Number = i64;
 
 enum Job {
-    /// Append this message; the flag tells whether it is in the outbox already.
+    /// Append this message; the flag is true if it is already in the outbox.
     Append(Message, bool),
     /// Note that all messages up to this one are acknowledged.
     Acknowledge(Number),
@@ -49,7 +49,7 @@ enum Job {
 pub(super) enum Loaded {
     /// Number of messages from earlier runs, and the topics published in those runs.
     Opened { waiting: u64, topics: Vec<String> },
-    /// The next messages; nothing up to `through` is left on disk.
+    /// The next messages; no message up to `through` is left on disk.
     Messages {
         messages: Vec<(Number, Message)>,
         through: Number,
@@ -62,9 +62,9 @@ pub(super) struct Store {
     disk: Option<Disk>,
     /// Messages given to the disk.
     pushed: Number,
-    /// Up to here nothing waits on disk.
+    /// Number up to which no messages wait on disk.
     through: Number,
-    /// Up to this number all are acknowledged; `told` is the number that the disk has.
+    /// Number up to which all messages are acknowledged; `told` is the number that the disk thread knows.
     acknowledged: Number,
     told: Number,
     opened: bool,
@@ -88,7 +88,7 @@ struct Shared {
     bytes: AtomicUsize,
     /// Number of the message up to which nothing is kept, because the buffer was full.
     gone: AtomicI64,
-    /// Number of lost messages among the messages after `gone`.
+    /// Number of lost messages among those after `gone`.
     missing: AtomicU64,
 }
 
@@ -109,8 +109,8 @@ impl Shared {
 }
 
 impl Store {
-    /// Opens the buffer of that name for messages of this kind, without waiting for it; without a buffer, messages are not
-    /// kept. If it cannot be used, that is logged and messages wait in memory.
+    /// Opens the buffer with this name for messages of this kind, without waiting for it; without a buffer,
+    /// messages are not kept. If the buffer cannot be used, that is logged and messages wait in memory.
     pub(super) fn open(
         buffer: Option<Buffer>,
         name: &'static str,
@@ -119,7 +119,8 @@ impl Store {
         let Some(buffer) = buffer else {
             return Store::default();
         };
-        // Takes memory as it fills: the channel of the standard library would hold the space of all jobs from the start.
+        // This channel allocates memory as it fills: the channel of the standard library would allocate the space
+        // for all jobs at the start.
         let (jobs, todo) = flume::bounded(JOBS);
         let (sender, loaded) = mpsc::channel(4);
         let shared = Shared::new(stats.clone(), kind);
@@ -137,8 +138,8 @@ impl Store {
         }
     }
 
-    /// Keeps a message. Returns it with its number if it is to be sent now, or if nothing keeps it; `room`: whether the
-    /// outbox has room.
+    /// Stores a message. Returns it with its number if it must be sent now, or if it cannot be stored; `room` means
+    /// that the outbox has room.
     pub(super) fn push(&mut self, message: Message, room: bool) -> Option<(Option<Number>, Message)> {
         let Some(disk) = &self.disk else {
             return Some((None, message));
@@ -166,7 +167,7 @@ impl Store {
         }
     }
 
-    /// The next report of the disk; pending while there is none. Cancel safe.
+    /// The next report of the disk thread; waits until there is one. Cancel safe.
     pub(super) async fn next(&mut self) -> Loaded {
         let report = match &mut self.disk {
             Some(disk) => disk.loaded.recv().await,
@@ -178,12 +179,12 @@ impl Store {
         }
     }
 
-    /// Takes a report; returns the messages to be sent, and the topics of earlier runs.
+    /// Processes a report; returns the messages to send, and the topics of earlier runs.
     pub(super) fn take(&mut self, loaded: Loaded) -> (Vec<(Number, Message)>, Vec<String>) {
         match loaded {
             Loaded::Opened { waiting, topics } => {
                 let older = Number::try_from(waiting).unwrap_or(Number::MAX);
-                // Messages of this run may wait already.
+                // Messages of this run may be waiting already.
                 (self.opened, self.through) = (true, -older);
                 (self.acknowledged, self.told) = (-older, -older);
                 (Vec::new(), topics)
@@ -195,7 +196,8 @@ impl Store {
         }
     }
 
-    /// All messages before `oldest`, which waits in the outbox, are acknowledged; all that were loaded if none waits.
+    /// Notes that all messages before `oldest`, which waits in the outbox, are acknowledged; with `None`, all that
+    /// were loaded.
     pub(super) fn acknowledge(&mut self, oldest: Option<Number>) {
         let acknowledged = oldest.map_or(self.through, |oldest| oldest - 1);
         self.acknowledged = self.acknowledged.max(acknowledged);
@@ -218,8 +220,8 @@ impl Store {
         }
     }
 
-    /// Number of the message up to which nothing is kept any more, because the buffer was full; messages up to there
-    /// that are in the outbox are lost.
+    /// Number up to which no messages are stored any more, because the buffer was full; messages up to it that are
+    /// in the outbox are lost.
     pub(super) fn gone(&self) -> Number {
         let gone = self.disk.as_ref().map(|disk| disk.shared.gone.load(Ordering::Relaxed));
         gone.unwrap_or(Number::MIN)
@@ -243,13 +245,13 @@ impl Store {
 }
 
 impl Disk {
-    /// Hands a message to the disk thread, unless too many bytes wait for it.
+    /// Passes a message to the disk thread, unless too many bytes wait for it.
     fn append(&self, message: &Message, sent: bool) -> bool {
         let bytes = message.bytes();
         if self.shared.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
             return false;
         }
-        // The bytes are added first, so that the thread cannot subtract them earlier.
+        // The bytes are counted first, so that the thread cannot subtract them before.
         self.shared.bytes.fetch_add(bytes, Ordering::Relaxed);
         let given = self.jobs.try_send(Job::Append(message.clone(), sent)).is_ok();
         if !given {
@@ -340,7 +342,7 @@ impl Thread {
                     }
                 }
                 count += 1;
-                // The answer covers the messages present when it is given, no later ones.
+                // The report covers the messages present at this moment, no later ones.
                 if count < BATCH && load.is_none() {
                     next = jobs.try_recv().ok();
                 }
@@ -376,7 +378,7 @@ impl Thread {
     }
 
     fn report(&self, loaded: Loaded) {
-        // At most two reports are in progress; the client may be gone.
+        // At most two reports are on their way; the client may have ended.
         let _ = self.report.try_send(loaded);
     }
 

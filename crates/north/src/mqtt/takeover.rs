@@ -1,5 +1,5 @@
-//! Connections that the broker closes without a reason, again and again, as it does when two clients have one client id. Time
-//! is an argument.
+//! Recognises a broker that repeatedly closes connections without a reason, as it does when two clients have one
+//! client id. Time is an argument.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ pub(super) struct Takeovers {
 }
 
 impl Takeovers {
-    /// The broker closed an accepted connection without a reason; whether to say what that looks like.
+    /// Notes that the broker closed an accepted connection without a reason; returns whether to log the suspected cause.
     pub(super) fn closed(&mut self, now: Instant) -> bool {
         self.closed.push_back(now);
         self.closed.retain(|at| now.saturating_duration_since(*at) < WITHIN);
@@ -31,7 +31,7 @@ impl Takeovers {
         true
     }
 
-    /// The text about the takeover, and what to do about it.
+    /// The text about the suspected second client, and what to do about it.
     pub(super) fn log_text(client_id: &str) -> String {
         format!(
             "the broker closed {CLOSED} connections within a minute without giving a reason; this usually means that \
@@ -53,7 +53,7 @@ mod tests {
         assert!(closed(102));
         assert_eq!((103..700).filter(|s| closed(*s)).count(), 0);
         assert_eq!((700..720).filter(|s| closed(*s)).collect::<Vec<_>>(), [702]);
-        // Such closings come from a broker that is restarted now and then.
+        // A broker that is restarted now and then closes connections like this.
         assert_eq!((10..100).filter(|n| closed(n * 100)).count(), 0);
     }
 }

@@ -19,7 +19,7 @@ pub(super) enum TlsConfigError {
     UnusableIdentity { file: String, cause: Box<IdentityFault> },
 }
 
-/// Reads the certificates and keys of `options`; `None` without TLS. Blocking: it reads files.
+/// Reads the certificates and keys of `options`; `None` without TLS. Blocking, because it reads files.
 ///
 /// # Errors The faulty file, and the remedy.
 pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig>>, TlsConfigError> {

@@ -16,7 +16,7 @@ pub(super) enum Target<'t> {
     Set(&'t str, Option<&'t str>),
     /// The hold of this drive is taken, renewed, released or broken.
     Hold(&'t str),
-    /// All drives, which are stopped.
+    /// Stop all drives.
     StopAll,
 }
 
@@ -48,8 +48,8 @@ impl Topics {
         format!("{}/drive/{drive}/point/{point}", self.root)
     }
 
-    /// The filters of all set topics; with `clients`, also of those that name one of them, and of the holds. For a broker
-    /// that takes no wildcards, the topics of this plant.
+    /// The filters of all set topics; with `clients`, also of those that name one of these clients, and of the
+    /// holds. For a broker without wildcards, the topics of this plant.
     pub(super) fn set_filters(&self, plant: Option<&Plant>, clients: Option<&[String]>) -> Vec<String> {
         let any = || vec!["+".to_string()];
         let of_drive = |drive: DriveHandle| {
@@ -87,7 +87,7 @@ impl Topics {
         filters
     }
 
-    /// The command on a topic, and WHO of `as/WHO`; without `as` the command has no owner. `None` for any other topic.
+    /// The command on a topic, and WHO of `as/WHO`; without `as` the command names no client. `None` for any other topic.
     pub(super) fn parse<'t>(&self, topic: &'t str) -> Option<(Target<'t>, Option<&'t str>)> {
         let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix('/')?;
         let levels: Vec<&str> = rest.split('/').collect();
@@ -110,7 +110,7 @@ impl Topics {
         Some((target, who))
     }
 
-    /// Where the answers to a stop of all drives go.
+    /// The topic for the answers to stop all.
     pub(super) fn result(&self) -> String {
         format!("{}/result", self.root)
     }

@@ -1,4 +1,4 @@
-//! The last packet that the gateway sent: some brokers close a connection over it without a reason.
+//! Remembers the last packet that the gateway sent: some brokers close a connection because of it without a reason.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -32,8 +32,8 @@ impl fmt::Display for Packet {
     }
 }
 
-/// The packets handed to the library, in their order, and the last one that it wrote. Messages and subscriptions are
-/// written in the order in which they were handed over, each among its own.
+/// The packets given to the library, in order, and the last one that it wrote. Messages and subscriptions are each
+/// written in the order in which they were given.
 #[derive(Debug, Default)]
 pub(super) struct Trail {
     messages: VecDeque<Packet>,
@@ -61,17 +61,17 @@ impl Trail {
         }
     }
 
-    /// The library wrote its next message.
+    /// Notes that the library wrote its next message.
     pub(super) fn published(&mut self) {
         self.last = self.messages.pop_front().or(self.last.take());
     }
 
-    /// The library wrote its next packet with subscriptions.
+    /// Notes that the library wrote its next packet with subscriptions.
     pub(super) fn subscribed(&mut self) {
         self.last = self.subscriptions.pop_front().or(self.last.take());
     }
 
-    /// The library asked whether the broker is there.
+    /// Notes that the library sent a ping.
     pub(super) fn pinged(&mut self) {
         self.last = Some(Packet::Ping);
     }

@@ -1,4 +1,4 @@
-//! Parameters of drives: read by background transactions, on demand of a client and every so often, and restored
+//! Parameters of drives: read by background transactions, on request of a client and at intervals, and restored
 //! (`restore`).
 
 mod restore;
@@ -19,7 +19,7 @@ use crate::parameters::{
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, Machine};
 
-/// Longest wait of a request for its turn; then it is repeated.
+/// Longest time for which a request waits for its turn; then it is repeated.
 const EXPIRY: Duration = Duration::from_secs(60);
 /// Time without an answer after which the reading of a drive ends.
 const AWAY: Duration = Duration::from_secs(3600);
@@ -38,7 +38,7 @@ pub struct How {
 /// Begins to read a drive, unless a reading is in progress; the number of the reading.
 ///
 /// # Errors
-/// Why the drive cannot be read.
+/// If the drive cannot be read; contains the reason.
 pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) -> Result<u64, String> {
     let spec = &drive.image.spec;
     if spec.profile.parameters.is_empty() {
@@ -109,7 +109,7 @@ struct Looks {
     waits: Option<String>,
 }
 
-/// Reads the parameters at the `known` addresses, or all where none is known; `seen` receives the progress.
+/// Reads the parameters at the `known` addresses, or all if none is known; `seen` receives the progress.
 async fn read(
     drive: &DriveHandle,
     origin: Origin,
@@ -164,7 +164,7 @@ fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &Para
         .filter(|change| {
             let address = spec.profile.parameters.address(change.id.name());
             match address.and_then(|address| drive.image.written(address)) {
-                // Whether the value was read before that write or after it is not known; the next reading shows it.
+                // Whether the value was read before or after that write is unknown; the next reading shows it.
                 Some((_, at)) if at >= begun => false,
                 Some((own, _)) => change.after != Some(RawValue::Word(own)),
                 None => true,
@@ -203,7 +203,7 @@ fn remaining((done, all): (usize, usize), worked: Duration) -> Option<Duration> 
     Some(worked.checked_div(done)?.saturating_mul(left))
 }
 
-/// The drive's identification, from the points that its profile names for this.
+/// The drive's identification, from the points that its profile defines for this.
 fn identification(drive: &DriveHandle) -> String {
     let reading = drive.reading(Instant::now());
     let profile = &drive.image.spec.profile;
@@ -271,13 +271,13 @@ pub async fn keep_reading(plant: SharedPlant, vault: Arc<Vault>, every: Duration
                 }
                 let failed = matches!(vault.status(&machine).and_then(|status| status.result), Some(Err(_)));
                 let pause = if failed { every.min(AGAIN) } else { every };
-                // A clock that was set back leaves the next reading to the time it has lost.
+                // If the clock was set back, the next reading is postponed by the same time.
                 let is_due = |at: &SystemTime| at.elapsed().is_ok_and(|age| age >= pause);
                 let is_due = begun.get(&machine).is_none_or(is_due);
                 if is_due && online {
                     let origin = Origin::new(SourceKind::Schedule, "every");
                     begun.insert(machine, SystemTime::now());
-                    // Only a drive with parameters, on a line that the gateway owns.
+                    // Only a drive with parameters is read, on a line that the gateway owns.
                     let how = How {
                         afresh: false,
                         pace: Pace::Slow,

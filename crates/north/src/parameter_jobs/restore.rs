@@ -1,8 +1,8 @@
 //! Restores of parameters: preparing, executing, and resuming or setting aside interrupted ones.
 //!
-//! The wishes of the machine in `parameters::restoration` are carried out here: files by threads that may block,
-//! commands by the queue of the bus, one behind the other. While parameters are written the drive takes no commands
-//! except stops, nor while the journal of an unfinished restore is on disk.
+//! Carries out the steps of the state machine in `parameters::restoration`: files on blocking threads, commands
+//! through the queue of the bus, one after the other. While parameters are written, or the journal of an unfinished
+//! restore is on disk, the drive accepts no commands except stops.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -21,7 +21,7 @@ use crate::permit::{limits_passed, may_restore};
 use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
 use crate::process_image::Machine;
 
-/// Longest time for which a command of a restore waits for its turn; it is then given again.
+/// Longest time for which a command of a restore waits for its turn; then it is given again.
 const EXPIRY: Duration = Duration::from_secs(30);
 /// The writes of a restore take at most one part in this number of a line's time.
 const SHARE: u32 = 5;
@@ -38,7 +38,7 @@ pub enum Again {
 /// Starts preparing a restore of `wanted` and returns its number.
 ///
 /// # Errors
-/// Why nothing can be restored to the drive now.
+/// If nothing can be restored to the drive now; contains the reason.
 pub fn prepare(
     vault: &Arc<Vault>,
     drive: DriveHandle,
@@ -71,8 +71,7 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
     let spec = &drive.image.spec;
     let (name, machine) = (&spec.name, &drive.machine());
     let names = vault.names(&spec.profile.name);
-    // Parameters missing in the file are not written, so they need not be read, unless the drive has another
-    // application.
+    // Parameters missing in the file are not written, so they need not be read, unless the drive has another application.
     let known = match wanted.family == spec.profile.name {
         true => Reading::addresses_of(&spec.profile, &wanted),
         false => Default::default(),
@@ -107,7 +106,7 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
     vault.update_restore(machine, |restore| (restore.stage, restore.waits) = (stage, None));
 }
 
-/// The limits of the drive that carrying out a plan passes, in words.
+/// The limits of the drive that carrying out a plan would exceed, as text.
 fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
     let writes = plan.writes.iter().map(|write| (write.address, write.to));
     limits_passed(&drive.reading(Instant::now()), writes)
@@ -116,7 +115,7 @@ fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
 /// Starts writing the prepared restore of that number.
 ///
 /// # Errors
-/// Why the restore is not carried out; nothing was written.
+/// If the restore is not carried out; contains the reason, and nothing was written.
 pub fn carry_out(
     plant: &SharedPlant,
     vault: &Arc<Vault>,
@@ -171,7 +170,7 @@ pub fn carry_out(
     Ok(())
 }
 
-/// The condition that the drive requires before it takes a parameter, if it shows that the condition is not met.
+/// The condition that the drive requires before it accepts a parameter, if the drive shows that the condition is not met.
 fn unmet_need(drive: &DriveHandle, journal: &Journal) -> Option<String> {
     let need = journal.plan.handling.needs.as_ref()?;
     let shows = drive.reading(Instant::now()).sample(need.point).good()?.as_bool();
@@ -181,7 +180,7 @@ fn unmet_need(drive: &DriveHandle, journal: &Journal) -> Option<String> {
 /// Continues a restore that was interrupted.
 ///
 /// # Errors
-/// Why the restore cannot be continued.
+/// If the restore cannot be continued; contains the reason.
 pub async fn take_up(
     plant: &SharedPlant,
     vault: &Arc<Vault>,
@@ -201,7 +200,7 @@ pub async fn take_up(
     let (file, text) = concerned.own(drive)?;
     let mut journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&file, &spec.name, &why))?;
     if journal.of.machine.is_none() {
-        // A journal of an earlier version gets its machine from now on.
+        // A journal of an earlier version gets the identity of its machine from now on.
         journal.of = Owner {
             drive: journal.of.drive,
             bus: spec.bus.clone(),
@@ -222,11 +221,11 @@ pub async fn take_up(
     Ok(())
 }
 
-/// Sets the journal of an interrupted restore aside: the drive stays as it is and takes all commands. A restore in
-/// progress ends before its next parameter and must be released then.
+/// Sets the journal of an interrupted restore aside: the drive keeps its present values and accepts all commands. A
+/// restore in progress ends before its next parameter and must be released then.
 ///
 /// # Errors
-/// Why the drive is not released.
+/// If the drive is not released; contains the reason.
 pub async fn release(
     plant: &SharedPlant,
     vault: &Arc<Vault>,
@@ -287,10 +286,10 @@ pub(super) async fn blocking<T: Send + 'static>(
     }
 }
 
-/// Whether a machine is the one to which a restore belongs, by their identities.
+/// Whether a machine is the one to which a restore belongs, according to their identifications.
 enum Identified {
     Same,
-    /// The identification has not been read yet since the drive came back.
+    /// The identification has not been read since the drive came back online.
     NotYet(String),
     Other(String),
 }
@@ -310,7 +309,7 @@ fn identified(drive: &DriveHandle, of: &Owner) -> Identified {
     }
 }
 
-/// Why the drive takes no commands while parameters are written.
+/// Text of the reason why the drive accepts no commands while parameters are written.
 fn held_while_written(name: &str) -> String {
     format!("the parameters of `{name}` are being restored: until then the drive accepts only stops")
 }
@@ -395,7 +394,7 @@ impl Run {
         done.map_err(|why| format!("{}: {why}; free space or correct its permissions", path.display()))
     }
 
-    /// The machine as it is configured now, under whatever name.
+    /// The machine as it is configured now, under any name.
     ///
     /// # Errors It is not, or that name now belongs to another machine.
     fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
@@ -417,7 +416,7 @@ impl Run {
         Ok(drive)
     }
 
-    /// Gives an order to the drive as that drive is configured now.
+    /// Gives an order to the drive with its present configuration.
     async fn set(&mut self, order: ParameterOrder) {
         let plant = self.plant.load_full();
         let drive = match self.bound(&plant) {
@@ -460,7 +459,7 @@ impl Run {
     /// The restore has ended: the drive accepts commands again, or is held because it is half restored.
     fn over(self) {
         let (done, all) = self.restoration.progress();
-        // A reload may have given the drive another name, by which it is resumed.
+        // A reload may have given the drive another name, under which the restore is resumed.
         let drive = self.plant.load().drive_at(&self.machine);
         let name = drive.as_ref().map_or(&self.name, |drive| &drive.image.spec.name);
         let saved = match self.restoration.journal().plan.handling.save {
@@ -501,7 +500,7 @@ impl Run {
             _ => {}
         }
         if let Some(why) = &held {
-            // Where the drive is no longer configured, an event has reported its remaining journal.
+            // If the drive is no longer configured, an event has reported its remaining journal.
             if let Some(drive) = &drive {
                 let spec = &drive.image.spec;
                 drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));

@@ -1,5 +1,5 @@
-//! Unfinished restores: their journals are on disk. The machine of such a journal takes no commands except stops. A
-//! journal whose machine is no longer configured is reported by an event, and by `drivegate check`.
+//! Unfinished restores, whose journals are on disk. The machine of such a journal accepts no commands except stops.
+//! A journal whose machine is no longer configured is reported by an event, and by `drivegate check`.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use crate::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
 use crate::plant::{DriveHandle, SharedPlant};
 use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
 
-/// A journal and its owner.
+/// A journal with its owner, if the owner can be read.
 type Found = (JournalFile, Result<Owner, String>);
 
 /// A journal that concerns a drive.
@@ -98,7 +98,7 @@ fn found(params: &Path) -> std::io::Result<Vec<Found>> {
         .collect())
 }
 
-/// The journals below a directory of readings that belong to no configured drive: each with what is wrong and what to do.
+/// The journals below a directory of readings that belong to no configured drive, each with the problem and the remedy.
 ///
 /// # Errors
 /// The directory cannot be read.
@@ -137,7 +137,7 @@ fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
     }
 }
 
-/// Why a drive is held when a restore of it was interrupted.
+/// Text of the reason why a drive is locked after an interrupted restore.
 pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     format!(
         "the parameters of `{name}` may be half restored ({why}): the drive accepts only stops until `drivegate \
@@ -146,7 +146,8 @@ pub(super) fn held_unfinished(name: &str, why: &str) -> String {
     )
 }
 
-/// Why a drive is held by a journal of a machine that is no longer configured, and why the restore is not resumed.
+/// Text of the reason why a drive is locked by a journal of a machine that is no longer configured, and why the
+/// restore is not resumed.
 fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
     let but = match claim {
         Claim::Own | Claim::Name => "where no drive is configured now".to_string(),
@@ -184,8 +185,9 @@ struct Configured {
     is_new: bool,
 }
 
-/// Holds the drives with a journal of an interrupted restore, before any client can command them, and reports journals
-/// that belong to none of them. Each machine is checked once; it is held until that is done, however slow the disk.
+/// Locks the drives with a journal of an interrupted restore before any client can command them, and reports
+/// journals that belong to no drive. Each machine is checked once, and stays locked until the check is done,
+/// however slow the disk is.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
     (events, patience): (&Events, &Patience),
@@ -263,7 +265,7 @@ fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
     vault.restore_lock(&drive.machine).set(Some(why));
 }
 
-/// Why a drive is held because of the journal that concerns it.
+/// Text of the reason why a drive is locked because of the journal that concerns it.
 fn why_held(spec: &DriveSpec, (file, owner): &Found, claim: Claim) -> String {
     let name = &spec.name;
     if let (Claim::Place | Claim::Name, Ok(owner)) = (claim, owner) {

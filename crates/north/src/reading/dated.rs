@@ -1,4 +1,4 @@
-//! A stream whose reader dates what it reads.
+//! A stream whose reader records when the bytes arrived.
 
 use std::io;
 use std::os::fd::AsFd;
@@ -19,14 +19,14 @@ pub(crate) trait Source {
     /// Whether the source has bytes to read.
     fn is_readable(&self) -> bool;
 
-    /// Whether the other end has closed or reset the connection, whatever is left to read. An end that has only finished
-    /// writing, and still reads, looks the same before bytes are sent to it.
+    /// Whether the other end has closed or reset the connection, whatever is left to read. A client that has only
+    /// finished writing, and still reads, looks the same until bytes are sent to it.
     fn has_gone(&self) -> bool;
 }
 
 fn shows(source: &impl AsFd, flags: PollFlags) -> bool {
     let mut fds = [PollFd::new(source, flags)];
-    // If the system cannot tell, the answer is no.
+    // If the system cannot answer, the connection counts as open.
     let any = poll(&mut fds, Some(&Timespec::default())).unwrap_or(0) > 0;
     any && fds.iter().any(|fd| fd.revents().intersects(flags))
 }
@@ -58,13 +58,13 @@ impl Source for pipe::Receiver {
         is_readable(self)
     }
 
-    /// A program that closes a pseudo-terminal may have left something to be done.
+    /// A program that closes a pseudo-terminal may have left orders that must still be carried out.
     fn has_gone(&self) -> bool {
         false
     }
 }
 
-/// Within the process nothing stands still alone.
+/// A stream within the process cannot stall separately.
 impl Source for DuplexStream {
     fn is_readable(&self) -> bool {
         false

@@ -1,4 +1,4 @@
-//! When what is read from sockets came: whether the threads that read ran, and when each reader found nothing left.
+//! When bytes read from sockets arrived: whether the reading threads ran, and when each reader last found nothing to read.
 
 mod dated;
 mod reader;

@@ -1,4 +1,4 @@
-//! The reader of one connection: the date of what it reads.
+//! The reader of one connection, which dates the bytes that it reads.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
@@ -30,7 +30,7 @@ struct State {
 }
 
 impl Reader {
-    /// The reader of a connection that was opened at `opened`, on the runtime that this watches.
+    /// The reader of a connection that was opened at `opened`, on the runtime observed by this watch.
     pub(crate) fn new(watch: Arc<Watch>, opened: Instant) -> Reader {
         let dated = Dated {
             asked: opened,
@@ -50,7 +50,7 @@ impl Reader {
         }
     }
 
-    /// A reader on the runtime of this thread, for a connection that is opened now.
+    /// A reader on the runtime of this thread, for a connection opened now.
     pub(crate) fn here() -> Reader {
         Reader::new(Watch::of_this_thread(), Instant::now())
     }
@@ -64,8 +64,8 @@ impl Reader {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The reader found nothing to read at `now`, and waits. The runtime may not have looked since a stall: then
-    /// `is_there` returns whether there is something.
+    /// Notes that the reader found nothing to read at `now` and waits. The runtime may not have checked the socket
+    /// since a stall; `is_there` then returns whether there are bytes.
     pub(crate) fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
         let matters = self.watch.turn(now, None);
         let left = matters && self.watch.just_stalled(now) && is_there();
@@ -76,7 +76,7 @@ impl Reader {
         }
     }
 
-    /// The reader does not read for a time, whatever comes.
+    /// Notes that the reader does not read for some time, whatever arrives.
     pub(crate) fn ceased(&self) {
         self.state().waited = false;
     }
@@ -115,7 +115,7 @@ impl Reader {
         self.arrival(self.state().last)
     }
 
-    /// How the first of what was read came since nothing was left: of all that is read and not taken yet, the earliest.
+    /// The earliest arrival among all bytes that were read and not taken yet.
     pub(crate) fn first(&self) -> Arrival {
         self.arrival(self.state().first)
     }

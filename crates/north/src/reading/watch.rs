@@ -1,8 +1,8 @@
 //! Whether the threads that read sockets run. A task that wakes ten times a second, and with every stop, shows that of a
 //! runtime; what a reader finds before that task ran again counts, too.
 //!
-//! The workers of a runtime that has several share a watch: a stall of one of them is a stall for all, since its tasks
-//! may go on at another one.
+//! The workers of a multi-threaded runtime share a watch: a stall of one of them counts as a stall of all, since
+//! its tasks may continue on another worker.
 
 use std::cell::{Cell, RefCell};
 use std::io;
@@ -20,11 +20,12 @@ use crate::stalls::{Dated, Stall, Stalls, TICK, UNNOTICED};
 thread_local! {
     /// The watch of the runtime that this thread works for.
     static WATCH: RefCell<Option<Arc<Watch>>> = const { RefCell::new(None) };
-    /// When this worker ran last, in nanoseconds of its watch, while it runs; 0 while it rests, or is not one of several.
+    /// When this worker last ran, in nanoseconds of its watch; 0 while it is idle, or if the thread is not one of
+    /// several workers.
     static WORKER_RAN: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Most pauses that wait to be reported: they are reported ten times a second.
+/// Most pauses that wait to be reported; they are reported ten times a second.
 const MOST_UNTOLD: usize = 8;
 
 /// Watches the threads of a runtime.
@@ -33,11 +34,12 @@ pub struct Watch {
     base: Instant,
     /// The time since the machine was started, suspensions included.
     boot: fn() -> Duration,
-    /// A single thread does all: its reads show that it runs.
+    /// Whether a single thread does all the work: its reads then show that it runs.
     single: bool,
-    /// When it ran last, in nanoseconds after `base`; 0 before the watch began: until then nothing is a stall.
+    /// When the runtime last ran, in nanoseconds after `base`; 0 before the watch has started: until then nothing
+    /// counts as a stall.
     ran: AtomicU64,
-    /// By how many nanoseconds the time since the machine was started was ahead of that.
+    /// By how many nanoseconds the boot-time clock was ahead of the monotonic clock at that time.
     boot_ahead: AtomicU64,
     /// Time until which an earlier stall matters.
     matters_until: AtomicU64,
@@ -52,7 +54,7 @@ impl Watch {
         Watch::by(single, since_boot)
     }
 
-    /// For readers in virtual time, in which no machine is suspended: see [`Watch::runs`].
+    /// A watch for readers in virtual time, in which the machine is never suspended; see [`Watch::runs`].
     pub fn in_virtual_time() -> Arc<Watch> {
         Watch::by(true, Duration::default)
     }
@@ -72,7 +74,7 @@ impl Watch {
         })
     }
 
-    /// The watch of the runtime of this thread; one that sees no stalls where the runtime has none.
+    /// The watch of the runtime of this thread; one that sees no stalls if the runtime has none.
     pub fn of_this_thread() -> Arc<Watch> {
         let own = WATCH.with(|watch| watch.try_borrow().ok().and_then(|watch| watch.clone()));
         own.unwrap_or_else(|| Watch::new(false))
@@ -149,8 +151,8 @@ impl Watch {
         self.stalls.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A reader runs at `now`; `boot` is the time since the machine was started, where it matters. Whether a stall, of
-    /// before or just now, matters for what is read.
+    /// Notes that a reader runs at `now`; `boot` is the time since the machine was started, if it matters. Returns
+    /// whether a stall, earlier or just now, affects the arrival time of what is read.
     pub(super) fn turn(&self, now: Instant, boot: Option<Duration>) -> bool {
         let (at, ran) = (self.nanos(now), self.ran.load(Ordering::Relaxed));
         if ran == 0 {
@@ -197,7 +199,7 @@ impl Watch {
         }
     }
 
-    /// The date of what is read at `now`: see [`Stalls::date`].
+    /// The arrival time of bytes read at `now`; see [`Stalls::date`].
     pub(super) fn date(&self, floor: Instant, waited: bool, now: Instant) -> Dated {
         self.stalls().date(floor, waited, now)
     }
@@ -221,7 +223,8 @@ fn in_nanos(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// A runtime of several threads that is watched once [`Watch::run`] runs on it; the calling thread counts as one of it.
+/// A multi-threaded runtime that is watched once [`Watch::run`] runs on it; the calling thread counts as one of its
+/// workers.
 ///
 /// # Errors
 /// The system gives no threads.
@@ -266,7 +269,7 @@ mod tests {
         assert!(!watch.turn(watch.base + Duration::from_secs(60), None));
     }
 
-    /// The reader detects a stall, whether the reader or the task runs first after it.
+    /// The reader detects a stall whether the reader or the watching task runs first after it.
     #[test]
     fn a_reader_knows_of_a_stall_that_has_just_ended() {
         for single in [true, false] {
@@ -315,7 +318,7 @@ mod tests {
         let (watch, start) = watching(false);
         WORKER_RAN.set(watch.nanos(start));
         let now = start + 1200 * MS;
-        // Other workers of the runtime ran the task.
+        // Other workers of the runtime ran the watching task.
         for n in 1..12 {
             let at = start + n * 100 * MS;
             watch.ran_at(at, boot(&watch, at));

@@ -16,24 +16,24 @@ pub(crate) struct CommandWrite {
     pub(crate) word: Option<u16>,
     /// The heartbeat was written.
     pub(crate) heartbeat: bool,
-    /// Why all but a stop is refused; `points` then holds the points of the stop.
+    /// Why everything except a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
 }
 
 /// The state that decides whether a write of 0x8100 resets a fault.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct CommandContext {
-    /// The word last written there; `None` if none was written since the server started.
+    /// The command word last written; `None` if none was written since the server started.
     pub(crate) word: Option<u16>,
     /// The drive has a fault.
     pub(crate) fault: bool,
 }
 
 impl CommandContext {
-    /// Whether `word` requests a fault reset: bit 2 changes from 0 to 1, or it is set without run while the drive has a
-    /// fault, whatever was written before, so that no client has to clear a bit that reads as 0. With run only the
-    /// change counts, so that a client that repeats its word does not restart a motor after each fault. The first word
-    /// with run after the server started does not count, since it may be such a repetition.
+    /// Whether `word` requests a fault reset: bit 2 changes from 0 to 1, or is set without run while the drive has
+    /// a fault, whatever was written before, so that no client has to clear a bit that reads as 0. With run only
+    /// the change counts, so that a client that repeats its word does not restart a motor after each fault. The
+    /// first word with run after the server started does not count, since it may be such a repetition.
     pub(crate) fn resets(self, word: u16) -> bool {
         let runs = word & RUN != 0;
         let changes = self.word.map_or(!runs, |last| last & FAULT_RESET == 0);
@@ -43,8 +43,8 @@ impl CommandContext {
 
 /// Translates a write of `values` from `start` on for a drive of that family.
 ///
-/// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored. A word without run
-/// stops the drive, whatever is wrong with the rest.
+/// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored. A word without
+/// run stops the drive even if the rest of the write is invalid.
 ///
 /// # Errors
 /// If an address is not writable or the family lacks it; otherwise, if a value is invalid.
@@ -69,7 +69,7 @@ pub(crate) fn command(
         points.extend(forward.map(|index| (index, Value::Bool(false))));
         Ok(CommandWrite {
             points,
-            // The reset is not carried out, so the bit is not set by it.
+            // The reset is not carried out, so its bit is not stored.
             word: Some(word & (before.word.unwrap_or_default() | !FAULT_RESET)),
             heartbeat: false,
             refused: Some(refusal),
@@ -152,7 +152,7 @@ fn writable(profile: &Profile, point: ModelPoint) -> Result<PointIndex, Refusal>
     })
 }
 
-/// The points that the word at 0x8100 sets, or why its value is invalid.
+/// The points that the word at 0x8100 sets, or why the word is invalid.
 fn command_word(
     profile: &Profile,
     word: u16,
@@ -182,7 +182,8 @@ fn command_word(
     Ok(None)
 }
 
-/// The word at 0x8100 after its fault reset did not reach the drive, so that the next write with bit 2 resets again.
+/// The word at 0x8100 without its fault reset, which did not reach the drive, so that the next write with bit 2
+/// resets again.
 pub(crate) fn without_reset(word: u16) -> u16 {
     word & !FAULT_RESET
 }

@@ -73,8 +73,8 @@ pub const BUS_REGISTERS: [BusRegister; 8] = [
 ];
 
 impl BusFigures {
-    /// The block of the bus. A bus that is down has no drives online and no load; a load that was not measured yet is 0xFFFF, such
-    /// a cycle 0xFFFFFFFF; counters are modulo 2^32; reserved registers are 0.
+    /// The register block of the bus. A bus that is down has no drives online and no load; a load not measured yet
+    /// is 0xFFFF, an unknown cycle 0xFFFFFFFF; counters are modulo 2^32; reserved registers are 0.
     pub(crate) fn registers(&self) -> [u16; BUS_BLOCK as usize] {
         let count = |n: usize| n.min(usize::from(u16::MAX - 1)) as u16;
         let per_mille = |load: f64| (load.clamp(0.0, 1.0) * 1000.0).round() as u16;

@@ -136,7 +136,7 @@ fn a_stale_drive_has_status_and_age_but_no_values() {
             assert_eq!(&words[at..at + none.len()], none, "{entry:?}");
         }
     };
-    // The link still stands, so the drive is online, but its values are stale.
+    // The drive still counts as online, but its values are stale.
     nothing(&read(&image, late, 0x8000, 21).unwrap(), ONLINE | STALE, 1001);
     assert_eq!(read(&image, late, 0x8100, 4), Ok(vec![0xFFFF, 0x8000, 0xFFFF, 0]));
     let floats = read(&image, late, 0x8200, 26).unwrap();
@@ -357,7 +357,7 @@ fn fault_resets() {
             "{last} then {word}, fault {fault}"
         );
     }
-    // The first word since the start: with run it may be the repetition of a client that has been writing it for hours.
+    // The first word since the start: with run set, it may be a repetition by a client that has been writing it for hours.
     for (word, fault, resets) in [
         (4, false, true),
         (4, true, true),

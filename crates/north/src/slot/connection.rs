@@ -17,7 +17,7 @@ use crate::reading::{Dated, Source};
 
 /// Time for a tool to take an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time after a request in which a tool is in use: it does not yield to another connection of its address.
+/// Time after a request during which a tool counts as in use: it does not yield to another connection from its address.
 const IN_USE: Duration = Duration::from_secs(10);
 /// Time limit for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
@@ -61,8 +61,8 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         }
     }
 
-    /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`. An open request is
-    /// answered then, unless the gateway is `stopping`.
+    /// Serves the tool until it disconnects, is idle for `idle_timeout`, or must yield its `place`. An open request
+    /// is answered before the end, unless the gateway is `stopping`.
     pub(super) async fn serve(
         mut self,
         idle_timeout: Option<Duration>,
@@ -98,7 +98,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         let idle_at = idle_timeout.filter(|_| !self.dialogue.is_waiting());
         let idle_at = idle_at.map(|timeout| (timeout, self.last_request + timeout));
         let wake_at = self.dialogue.wake_at().map(Instant::from_std);
-        // This wake-up makes the place free to yield once the tool rests.
+        // This wake-up lets the place be taken as soon as the tool is idle.
         let rests_at = Some(self.last_request + IN_USE).filter(|at| *at > Instant::now());
         let timer = [wake_at, idle_at.map(|(_, at)| at), rests_at]
             .into_iter()
@@ -126,7 +126,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         Ok(())
     }
 
-    /// Takes bytes that the tool sent.
+    /// Processes bytes that the tool sent.
     fn take(&mut self, bytes: &[u8]) {
         let mut data = Vec::with_capacity(bytes.len());
         match &mut self.port {
@@ -155,7 +155,7 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
     }
 }
 
-/// Sleeps until this time; for ever if no time is given.
+/// Sleeps until this time; for ever with `None`.
 pub(super) async fn sleep_until(at: Option<Instant>) {
     match at {
         Some(at) => tokio::time::sleep_until(at).await,

@@ -1,7 +1,7 @@
 //! The dialogue with one tool, bytes in and out, with the time as an argument.
 //!
-//! A line has one request at a time: a tool that sends another one has given the previous one up, whose answer is dropped,
-//! however it ends. A request accepted for the bus is still carried out.
+//! A line has one request at a time: a tool that sends another request has given up the previous one, whose answer
+//! is dropped, however it ends. A request already accepted for the bus is still carried out.
 
 use std::future::poll_fn;
 use std::sync::Arc;
@@ -15,11 +15,11 @@ use crate::SlotOutcome;
 use crate::codec::{Protocol, Reply, RequestPdu};
 use crate::order::{Arrival, Outcome};
 
-/// A tool is answered within this time from the end of its request, or not at all.
+/// Time from the end of a request within which a tool is answered; later, the answer is dropped.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 /// Time that a byte of a tool takes at least: no line of 460,800 baud brings more, so a tool that floods costs little.
 const BYTE_TIME: Duration = Duration::from_micros(20);
-/// A tool that sends again before it is answered gets no more than one request to the bus in this time, stops apart.
+/// Minimum interval between two requests to the bus, stops excepted, for a tool that sends again before it is answered.
 const IMPATIENT: Duration = Duration::from_millis(20);
 
 /// A request that waits for its answer.
@@ -31,7 +31,7 @@ struct Pending {
     deadline: Instant,
 }
 
-/// A request that has not been given to the bus yet.
+/// A request that was not given to the bus yet.
 #[derive(Debug)]
 struct Held {
     request: ToolRequest,
@@ -52,7 +52,7 @@ pub(super) struct Dialogue {
     held: Option<Held>,
     /// When the last request was given to the bus.
     asked: Option<Instant>,
-    /// When more input of the tool is read; `None` if at once.
+    /// When reading from the tool continues; `None` means at once.
     reads_at: Option<Instant>,
     /// The reply to the tool.
     pub(super) output: Vec<u8>,
@@ -81,8 +81,8 @@ impl Dialogue {
         self.pending.is_some() || self.held.is_some()
     }
 
-    /// Bytes of the tool, which came so, are read at `now`. Requests that it makes are in the queue of the bus when this returns, or held until
-    /// [`Dialogue::wake_at`]. Whether there were any.
+    /// Processes bytes of the tool with this arrival, read at `now`. The requests in them are in the queue of the
+    /// bus when this returns, or held until [`Dialogue::wake_at`]. Returns whether there were any.
     pub(super) fn received(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) -> bool {
         let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         self.reads_at = now.checked_add(BYTE_TIME.saturating_mul(count));
@@ -130,7 +130,7 @@ impl Dialogue {
             .min()
     }
 
-    /// Waits until nothing is due any more: the answer to the last request is in the output, or its time has ended.
+    /// Waits until nothing is pending: the answer to the last request is in the output, or its time has expired.
     pub(super) async fn finished(&mut self) {
         while self.is_waiting() {
             let wake_at = self.wake_at().map(tokio::time::Instant::from_std);
@@ -153,7 +153,7 @@ impl Dialogue {
         self.give_up(SlotOutcome::Abandoned);
     }
 
-    /// The previous request is no longer wanted.
+    /// Gives up the previous request, which the tool no longer waits for.
     fn give_up(&mut self, outcome: SlotOutcome) {
         if self.is_waiting() {
             (self.pending, self.held) = (None, None);
@@ -221,7 +221,7 @@ impl Dialogue {
         }
     }
 
-    /// Takes the answer of the bus, if it is there at `now`, into the output.
+    /// Puts the answer of the bus into the output, if it has arrived at `now`.
     pub(super) fn poll(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<()> {
         let Some(pending) = &mut self.pending else {
             return Poll::Pending;
@@ -251,7 +251,7 @@ impl Dialogue {
             _ => frame_of(protocol, &pending.request, &pending.pdu, outcome),
         };
         let Some(answer) = answer else {
-            // As on a line, nothing is sent, whatever the reason.
+            // As on a line, a missing reply means silence, whatever the reason.
             return self.tool.count(SlotOutcome::NoAnswer);
         };
         if now >= pending.deadline {
@@ -306,7 +306,7 @@ mod tests {
     use crate::codec::Exception;
     use crate::order::{Interruption, Refusal};
 
-    /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, none is silence.
+    /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, `None` is silence.
     fn answer_code(protocol: Protocol, outcome: &Outcome) -> Option<u8> {
         let pdu = RequestPdu::WriteRegisters {
             start: 2000,

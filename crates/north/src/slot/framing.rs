@@ -1,8 +1,9 @@
 //! The bytes of a tool cut into its requests. Pure: time is an argument.
 //!
-//! A serial program writes a frame in pieces, and a network delivers it in lumps, so pauses within a frame decide nothing: a
-//! request is recognised by function, length and check code, in Modbus ASCII and N2 by its end. Only an incomplete frame is given
-//! up by silence. A frame of a function that is not decoded here is whole when its check code is right and nothing follows.
+//! A serial program writes a frame in pieces, and a network delivers it in lumps, so pauses within a frame mean
+//! nothing: the end of a request is found by function, length and check code, in Modbus ASCII and N2 by the end
+//! character. Silence only discards an incomplete frame. A frame of a function that is not decoded here is complete
+//! when its check code is right and nothing follows.
 
 use std::time::{Duration, Instant};
 
@@ -12,8 +13,8 @@ use crate::codec::frames::Frames;
 use crate::codec::{LineFormat, Protocol};
 use crate::order::Arrival;
 
-/// Silence behind half a frame after which the rest is no longer expected: longer than the pauses of serial programs
-/// and the delayed acknowledgements of TCP, shorter than tools wait before they repeat a request.
+/// Silence after an incomplete frame after which its rest is no longer expected: longer than the pauses of serial
+/// programs and the delayed acknowledgements of TCP, shorter than the time after which tools repeat a request.
 const HALF_FRAME: Duration = Duration::from_millis(250);
 
 /// A request of a tool.
@@ -45,13 +46,13 @@ impl Framing {
         }
     }
 
-    /// Adds bytes that arrived in this way and are read at `now`.
+    /// Adds bytes with this arrival that are read at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) {
         self.frames.add(bytes, now);
         self.arrivals.came(bytes.len(), arrival);
     }
 
-    /// The next message of the tool, as far as it is clear at `now`.
+    /// The next complete message of the tool at `now`.
     pub(super) fn next(&mut self, now: Instant) -> Option<ToolFrame> {
         loop {
             let piece = self.frames.next(None, now)?;
@@ -70,7 +71,7 @@ impl Framing {
         self.arrival.clone()
     }
 
-    /// Whether the bytes are blanks and line feeds, which may stand between two lines.
+    /// Whether the bytes are blanks and line feeds, which may occur between two lines.
     fn is_blank(&self, bytes: &[u8]) -> bool {
         self.protocol.is_text() && bytes.iter().all(u8::is_ascii_whitespace)
     }
@@ -266,7 +267,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever comes in whatever pieces: nothing is kept without bound, and a sound request after it is found.
+        /// Property for any bytes in any pieces: memory is bounded, and a valid request after them is found.
         #[test]
         fn any_bytes_are_borne(
             bytes in prop::collection::vec(any::<u8>(), 0..600),

@@ -1,4 +1,4 @@
-//! Clients that may connect to an address of a slot, and how their connections are served.
+//! Decides which clients may connect to an address of a slot, and how their connections are served.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -63,7 +63,7 @@ impl SlotListener {
         }
     }
 
-    /// Serves otherwise from now on. Connections stay where nothing changes for them and their address is still allowed.
+    /// Applies new settings. Connections stay if nothing changes for them and their address is still allowed.
     pub(super) fn update(&self, served: Served) {
         let before = self.served.load_full();
         let alike = before

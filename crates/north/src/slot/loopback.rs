@@ -18,7 +18,7 @@ use crate::plant::SharedPlant;
 pub struct Loopback {
     terms: Arc<Terms>,
     dialogue: Dialogue,
-    /// The connection over which all bytes come, once the first ones have come.
+    /// The connection over which all bytes arrive, once there are any.
     connection: Option<Connection>,
 }
 
@@ -39,7 +39,7 @@ impl Loopback {
         )
     }
 
-    /// Gives the slot this access from now on.
+    /// Sets the access of the slot, as a reload does.
     pub fn reload(&self, access: SlotAccess) {
         let slot = Slot {
             access,
@@ -48,7 +48,7 @@ impl Loopback {
         self.terms.current.store(Arc::new(Options { slots: vec![slot] }));
     }
 
-    /// Another tool of the same slot.
+    /// Another tool on this slot.
     pub fn beside(&self, peer: &str) -> Loopback {
         Loopback::of(self.terms.clone(), peer)
     }
@@ -62,8 +62,8 @@ impl Loopback {
         }
     }
 
-    /// Takes the bytes of the tool, if any, and returns its answer by `now`. A request is in the queue of the bus when this
-    /// returns, or waits until [`Loopback::wake_at`].
+    /// Processes bytes of the tool, if any, and returns its answer up to `now`. A request is in the queue of the
+    /// bus when this returns, or waits until [`Offline::wake_at`].
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
         let arrival = Arrival::over(connection.clone(), now);

@@ -1,8 +1,8 @@
-//! The tool slot: a program that uses the drives' own protocol sees the line as if it were alone on it, over TCP, over a
-//! COM port by RFC 2217 or over a pseudo-terminal.
+//! The tool slot: a program that uses the drives' own protocol sees the line as if no one else used it, over TCP,
+//! over a COM port by RFC 2217 or over a pseudo-terminal.
 //!
-//! `request` reads the request in a frame, `framing` cuts bytes into requests, `terms` decides which requests a slot
-//! permits, `dialogue` puts it together; all of them are pure. `connection` and `pty` do the I/O.
+//! `request` interprets the request in a frame, `framing` splits bytes into requests, `terms` decides which
+//! requests a slot permits, `dialogue` combines them; all of them are pure. `connection` and `pty` do the I/O.
 
 mod connection;
 mod dialogue;
@@ -37,7 +37,7 @@ use crate::tcp_server::{TcpServer, TcpService};
 
 pub use self::loopback::Loopback;
 
-/// Tools that one address of a slot serves at one time, in turns.
+/// Most tools that one address of a slot serves at a time, in turns.
 pub const MAX_TOOLS: usize = 4;
 
 /// The rights of the tools of a slot.
@@ -45,15 +45,15 @@ pub const MAX_TOOLS: usize = 4;
 pub enum SlotAccess {
     #[default]
     Read,
-    /// Tools may also write, like a Modbus TCP client that may write.
+    /// Tools may also write, like a Modbus TCP client with the right to write.
     Write,
-    /// Also send requests that cannot be checked: broadcasts, functions that are not decoded, addresses of no
-    /// configured drive.
+    /// Tools may also send requests that cannot be checked: broadcasts, functions that are not decoded, addresses
+    /// without a configured drive.
     Raw,
 }
 
 impl SlotAccess {
-    /// What the access means, in words.
+    /// Meaning of the access level as text.
     pub fn meaning(self) -> &'static str {
         match self {
             SlotAccess::Read => "tools may only read",
@@ -72,7 +72,7 @@ pub struct Slot {
     pub protocol: Protocol,
     /// Character format of the line.
     pub format: LineFormat,
-    /// Address where the slot takes frames as they are on the line.
+    /// Address on which the slot accepts frames in the form that they have on the line.
     pub listen: Option<SocketAddr>,
     /// Address where a COM port is served by RFC 2217.
     pub rfc2217: Option<SocketAddr>,
@@ -82,7 +82,7 @@ pub struct Slot {
     pub access: SlotAccess,
     /// Networks that may connect.
     pub allow: Vec<IpNet>,
-    /// A connection without a request for that time is closed; `None`: never.
+    /// Time without a request after which a connection is closed; `None` means never.
     pub idle_timeout: Option<Duration>,
 }
 
@@ -134,7 +134,7 @@ pub type Server = TcpServer<Slots, Options>;
 #[derive(Debug)]
 pub struct Slots {
     ptys: Vec<RunningPty>,
-    /// The slots as they are configured now.
+    /// The slots of the present configuration.
     current: Arc<ArcSwap<Options>>,
     plant: SharedPlant,
     stats: Arc<NorthState>,

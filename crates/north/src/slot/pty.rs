@@ -22,11 +22,12 @@ use crate::reading::{Dated, Reader};
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.
 const AGAIN: Duration = Duration::from_secs(5);
-/// Time without a byte after which the program may have been killed: the port then does what its last close does.
+/// Time without a byte after which the program may have been killed: the port then does what the last close of a port does.
 const RESTS: Duration = Duration::from_secs(2);
 
-/// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot runs without it, logs
-/// each reason once, and retries. An open request of a program is answered at the end, unless the gateway is `stopping`.
+/// Serves the pseudo-terminal whose link is `path` until `cancel`. If it cannot be opened, the slot runs without
+/// it, logs each reason once, and retries. An open request of a program is answered at the end, unless the gateway
+/// is `stopping`.
 pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: CancellationToken, stopping: CancellationToken) {
     let bus = terms.slot.bus.clone();
     let mut told = String::new();
@@ -73,7 +74,7 @@ struct Port {
     /// The gateway's end of the pseudo-terminal. The runtime treats it as a pipe.
     reader: Dated<pipe::Receiver>,
     dialogue: Dialogue,
-    /// When bytes last came or went; `None` once the port is idle.
+    /// When bytes were last received or sent; `None` once the port is idle.
     used: Option<Instant>,
 }
 

@@ -1,10 +1,10 @@
-//! The meaning of a tool's frame: a read, a write, or something that may write. Pure.
+//! The meaning of a tool's frame: a read, a write, or a request that may write. Pure.
 
 use crate::codec::n2::{self, Command};
 use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
 
-/// Diagnostics (function 8) that only read: the echo, the diagnostic register and the counters. The others restart or silence
-/// the drive, or clear what it has counted.
+/// Diagnostics (function 8) that only read: the echo, the diagnostic register and the counters. The other
+/// subfunctions restart or silence the drive, or clear its counters.
 const READING_DIAGNOSTICS: [u16; 10] = [0, 2, 11, 12, 13, 14, 15, 16, 17, 18];
 
 /// A valid frame of a tool.
@@ -26,11 +26,11 @@ pub(super) enum Meaning {
     Write(RequestPdu),
     /// May write, and cannot be checked.
     Unchecked(RequestPdu),
-    /// A request that no drive could carry out, with its refusal.
+    /// A request that no drive could carry out, with the refusal for it.
     Faulty(Refused),
 }
 
-/// Why a tool is refused.
+/// Why a request of a tool is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refused {
     /// A Modbus exception.
@@ -96,8 +96,8 @@ fn meaning(pdu: Vec<u8>) -> Meaning {
         Ok(pdu @ (WriteCoil { .. } | WriteRegister { .. } | WriteCoils { .. } | WriteRegisters { .. })) => {
             Meaning::Write(pdu)
         }
-        // The values that these functions write depend on the drive, or go with a read: no limit could be kept. No
-        // supported family has these functions.
+        // The values that these functions write depend on the drive, or go with a read, so no limit could be
+        // checked. No supported family has these functions.
         Ok(MaskWrite { .. } | ReadWrite { .. }) => Meaning::Faulty(Refused::Exception(Exception::FUNCTION)),
         Ok(pdu) => Meaning::Unchecked(pdu),
         // The only known part of function 43 is the device identification.

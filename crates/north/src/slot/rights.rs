@@ -1,5 +1,5 @@
-//! Requests that a tool may send, as its slot is configured now: a reload also counts for a request that waits for its
-//! share of the line, or of which half has come.
+//! Which requests a tool may send, by the present configuration of its slot: a reload also applies to a request
+//! that waits for its share of the line, or that is only half received.
 
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -155,7 +155,7 @@ mod tests {
         frame
     }
 
-    /// When the right goes: behind the first half of the frame, or while the write waits for its share of the line.
+    /// When the right is removed: after the first half of the frame, or while the write waits for its share of the line.
     #[derive(Debug, Clone, Copy, PartialEq)]
     enum Goes {
         Half,
@@ -168,7 +168,7 @@ mod tests {
         let start = RequestPdu::write_register(2000, 1);
         let reference = RequestPdu::write_register(2002, 1000);
         let undecoded = RequestPdu::Other(vec![0x43, 1]);
-        // Address, what is sent, the access before and after, and whether it goes to the bus.
+        // Columns: address, request, access before and after, and whether the request goes to the bus.
         let table = [
             (1, &start, Write, Write, true),
             (1, &start, Write, Read, false),

@@ -1,4 +1,4 @@
-//! Requests that a slot permits its tools, and their way to the bus.
+//! Decides which requests a slot permits its tools, and gives them to the bus.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -43,7 +43,7 @@ pub(super) enum Work {
 }
 
 impl Work {
-    /// How the work ended, with the frame of the drive where it was kept.
+    /// The outcome of the work, with the frame of the drive if it was kept.
     pub(super) fn poll(&mut self, cx: &mut Context<'_>) -> Poll<(Outcome, Option<Vec<u8>>)> {
         match self {
             Work::Exchange(exchange) => exchange.poll(cx),
@@ -56,9 +56,9 @@ impl Work {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
     pub(super) not_before: Instant,
-    /// Whether the request stops a drive: it is then sent at once.
+    /// Whether the request stops a drive, so that it is sent at once.
     pub(super) is_stop: bool,
-    /// Number of stops given to the request's drives so far.
+    /// Number of stops given so far to the drives of the request.
     pub(super) stops: u64,
 }
 
@@ -78,7 +78,7 @@ impl WritePaces {
     }
 }
 
-/// A slot as it is configured now, with the plant that belongs to it.
+/// A slot with its present configuration, and the plant that belongs to it.
 #[derive(Debug)]
 pub(super) struct Terms {
     pub(super) slot: Slot,
@@ -131,7 +131,7 @@ impl Tool {
         self.terms.slot.access != SlotAccess::Read
     }
 
-    /// When the request may go: writes one after the other, in a share of the line; stops at once.
+    /// When the request may be sent: writes one after the other within a share of the line, stops at once.
     pub(super) fn pace(&self, request: &ToolRequest, now: Instant) -> Pace {
         let mut pace = Pace {
             not_before: now,
@@ -174,8 +174,9 @@ impl Tool {
             .collect()
     }
 
-    /// Decides about a request with this arrival, whose drives had this many `stops` when it was complete: after a later stop
-    /// it is not sent. A request given to the bus is in its queue when this returns, and is not sent after `deadline`.
+    /// Decides about a request with this arrival. `stops` is the number of stops that its drives had when it was
+    /// complete: after a later stop it is not sent. A permitted request is in the queue of the bus when this
+    /// returns, and is not sent after `deadline`.
     pub(super) fn decide(
         &self,
         request: &ToolRequest,
@@ -191,7 +192,8 @@ impl Tool {
         let Some(bus) = bus else { return Decision::Silent };
         let drives = self.asked(&plant, request);
         let broadcast = request.is_broadcast(self.protocol());
-        // A stop that came in while it was held may have come at the same time by the clock.
+        // A stop that was accepted while the request was held may have the same time stamp, so the number of stops
+        // is compared.
         let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
         if stopped {
             let before = arrival.asked.checked_sub(Duration::from_nanos(1));
@@ -264,7 +266,7 @@ impl Tool {
             }
         }
         for drive in drives {
-            // A broadcast has no reply, so the stops are placed without one.
+            // A broadcast has no reply, so the stops are placed without waiting for one.
             if let Some(stop) = stop_in(drive, pdu, now) {
                 let request = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
                 drop(drive.place(request.arrived(case.arrival.clone()), now));
@@ -295,7 +297,7 @@ impl Tool {
         Work::Exchange(case.bus.ask(question, &case.plant.writes, case.now))
     }
 
-    /// Refuses what concerns no drive, one or all of them: audited and published once.
+    /// Refuses a request that concerns no drive, one or all of them: audited and published once.
     fn refuse_any(
         &self,
         case: &Case<'_>,
@@ -335,14 +337,15 @@ fn target(request: &ToolRequest, drive: Option<&DriveHandle>) -> Target {
     drive.map_or(Target::Address(request.address), |drive| Target::Drive(drive.index))
 }
 
-/// The stop of a write that takes the run command of the drive away, if it is admitted: the write itself, or the part of it.
+/// The stop in a write that takes the run command of the drive away, if it is admitted: the whole write, or the
+/// part of it that stops.
 fn stop_in(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> Option<Order> {
     let (Parts::One(stop) | Parts::Two(stop, _)) = Parts::of(Order::Write(pdu.clone()), &drive.image.spec.profile);
     let admitted = permit::admit(stop.clone(), &drive.reading(now), Authority::Write).ok()?;
     (admitted.urgency == Urgency::Stop).then_some(stop)
 }
 
-/// Time of a write on the line, with the read that shows its effect.
+/// Wire time of a write and of the read that shows its effect.
 fn cost(drive: &DriveHandle, pdu: &RequestPdu) -> Duration {
     let line = &drive.bus.image.spec;
     let silence = line.protocol.silence(Default::default(), &line.format);

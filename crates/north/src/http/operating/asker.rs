@@ -1,5 +1,6 @@
-//! The user of a request, as an argument of its handler. The right of a user to change something is checked at the head
-//! of the request, and again when its body is complete: a reload may have come in between.
+//! The user of a request, as an argument of its handler. A user's right to change something is checked when the
+//! head of the request has arrived, and again when its body is complete, since a reload may have happened in
+//! between.
 
 use std::sync::Arc;
 
@@ -14,13 +15,13 @@ use super::super::replies::{Refused, Replied};
 use super::state::{Denied, Operator};
 use crate::command_json::MAX_PAYLOAD;
 
-/// A user who may see the state of commands.
+/// A user who may see the state of the operating part.
 pub(in crate::http) struct Viewer(pub(in crate::http) Operator);
 
-/// A user who may give a request that changes something.
+/// A user who may send requests that change something.
 pub(in crate::http) struct Commander(pub(super) Operator);
 
-/// A user with the whole request: its body of at most this many bytes.
+/// A user with a complete request, whose body has at most this many bytes.
 pub(in crate::http) struct Ordered<const MOST_BYTES: usize = MAX_PAYLOAD>(pub(super) Operator, pub(super) Bytes);
 
 impl FromRequestParts<Arc<AppState>> for Viewer {

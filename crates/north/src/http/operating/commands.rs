@@ -1,4 +1,4 @@
-//! Commands and heartbeats over HTTP. The body of a command is that of the MQTT set topics, and so is its result.
+//! Commands and heartbeats over HTTP. A command has the same body and the same result as on the MQTT set topics.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -32,14 +32,14 @@ pub(crate) struct CommandReply {
     body: Vec<u8>,
 }
 
-/// The reply to a command, which may be still to come, for everybody who repeats it.
+/// The reply to a command, possibly still pending, for every client that repeats the command.
 pub(crate) type SharedReply = watch::Receiver<Option<CommandReply>>;
 
 /// A command that was understood, or not.
 enum Progress {
-    /// The reply is known.
+    /// The reply is known already.
     Known(CommandReply),
-    /// The command repeats another one and gets its reply.
+    /// The command repeats an earlier one and gets its reply.
     Repeated(SharedReply),
     /// The command is in the queue of the bus.
     Placed(Box<Waiting>),
@@ -83,7 +83,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         ) => StatusCode::CONFLICT,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
-        // The status of the part that was not carried out.
+        // The status describes the part that was not carried out.
         Outcome::StopOnly(part) | Outcome::StopFailed(part) => status(part),
         Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
         Outcome::TimedOut | Outcome::Unknown(_) | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
@@ -93,11 +93,12 @@ fn status(outcome: &Outcome) -> StatusCode {
     }
 }
 
-/// How the head of a request came, and who reads its body: passwords are compared, and the body is waited for, after that.
+/// When the head of a request arrived, and the reader of its body; comparing the password and waiting for the body
+/// happen later.
 pub(in crate::http) struct Asked(Arrival, Option<Arc<Reader>>);
 
 impl Asked {
-    /// How the request arrived, once its body is read.
+    /// The arrival of the request, after its body was read.
     fn complete(self) -> Arrival {
         match self.1 {
             Some(reader) => self.0.completed(&reader.last()),
@@ -121,7 +122,7 @@ pub(in crate::http) async fn command(
     asked: Asked,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
-    // Judged once more where the command is placed, so that a refusal is audited.
+    // The right is checked again when the command is placed, so that a refusal is audited.
     Commander(operator): Commander,
     Payload(payload): Payload,
 ) -> Replied<CommandReply> {
@@ -138,7 +139,7 @@ pub(in crate::http) async fn command(
         Progress::Repeated(reply) => shared(reply).await,
         Progress::Placed(mut waiting) => match waiting.shared.take() {
             None => Ok(waiting.finished().await),
-            // The result is kept for anyone who repeats the command, also if this client has gone.
+            // The result is kept for any client that repeats the command, even if the first client has disconnected.
             Some((sender, permit)) => {
                 let reply = sender.subscribe();
                 tokio::spawn(async move {
@@ -192,7 +193,7 @@ fn has_run(points: &[(PointIndex, Value)], profile: &Profile) -> bool {
 }
 
 impl Operator {
-    /// As the audit shows it. All that a user does counts as one client.
+    /// The origin for the audit. All requests of a user count as one client.
     pub(in crate::http) fn origin(&self) -> Origin {
         if self.kind != SourceKind::Http {
             let origin = Origin::new(self.kind, self.user.to_string());
@@ -212,9 +213,10 @@ impl Operator {
 }
 
 impl Operating {
-    /// Takes a command whose head came so, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
-    /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
-    /// is always executed, that of a command which does more without the rest.
+    /// Takes a command whose head arrived at this time; `now` is `time` on the calendar. When this returns the
+    /// command is in the queue of its bus, or its reply is known. A repeated command is not executed again: it gets
+    /// the reply of the first one, or is refused. A stop is always executed, but if the repeated command contains
+    /// more, only its stop.
     fn take(
         &self,
         plant: &Plant,
@@ -291,7 +293,7 @@ impl Operating {
         match memory.repeated(&taken, print, stops, now) {
             None => {}
             Some(Repetition::Answered(reply)) => return Err(Known::Reply(reply)),
-            // Replies are shared from the beginning, so none is pending.
+            // A reply is shared from the start, so this state cannot occur.
             Some(Repetition::Pending) => return Err(busy()),
             Some(Repetition::Outdated(why)) => {
                 let why = format!("it repeats an earlier command, {why}; send it with another `id`");
@@ -307,9 +309,9 @@ impl Operating {
     }
 }
 
-/// Why a command is not executed.
+/// A command that is not executed, and why.
 enum Known {
-    /// The command was executed, and this is its reply.
+    /// The command was executed before, with this reply.
     Reply(SharedReply),
     Refused(String),
 }
@@ -335,7 +337,7 @@ pub(in crate::http) struct Commandable<'d> {
     commanded_last: bool,
     /// Name of the client in `[authority]`.
     principal: Option<String>,
-    /// The ranks below this client's own rank.
+    /// The ranks below the rank of this client.
     outranks: Option<Vec<String>>,
 }
 
@@ -394,7 +396,7 @@ pub(in crate::http) async fn heartbeat(
 /// Renews the lease of a drive if this login gave the drive its last command.
 ///
 /// # Errors
-/// Why the lease is not renewed.
+/// If the lease is not renewed; contains the reason.
 fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &'static str> {
     let spec = &drive.image.spec;
     if spec.access != Access::Control {

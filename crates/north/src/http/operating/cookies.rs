@@ -18,7 +18,8 @@ pub(in crate::http) struct Cookies {
 }
 
 impl Cookies {
-    /// Cookies do not know ports, so their names have that of the gateway: several on one machine do not disturb each other.
+    /// Names of the cookies of this gateway. They contain its name because browsers share cookies between all ports
+    /// of a machine, where several gateways may run.
     pub(in crate::http) fn of(gateway: &str, tls: bool) -> Cookies {
         let prefix = if tls { "__Host-" } else { "" };
         Cookies {
@@ -78,7 +79,7 @@ fn key(user: &User) -> hmac::Key {
     hmac::Key::new(hmac::HMAC_SHA256, user.to_string().as_bytes())
 }
 
-/// The one value of that name. Several are none: a foreign page may have set one of them.
+/// The value of the cookie with this name; `None` if there are several, because a foreign page may have set one of them.
 fn find(headers: &HeaderMap, name: &str) -> Option<String> {
     let all = headers
         .get_all(header::COOKIE)

@@ -32,7 +32,7 @@ pub(in crate::http) async fn hold_of(
     }
 }
 
-/// Takes, renews, releases or breaks the hold.
+/// Takes, renews, releases or breaks the hold of a drive.
 pub(in crate::http) async fn hold(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

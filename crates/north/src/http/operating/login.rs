@@ -1,4 +1,4 @@
-//! Logging in and out.
+//! Login and logout of users.
 
 use std::hash::BuildHasher;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use super::sessions::Session;
 use super::state::{Credentials, Denied, Operating, is_own_origin};
 use super::throttle::Source;
 
-/// Most bytes of a login.
+/// Most bytes of the body of a login.
 const MAX_LOGIN: usize = 4096;
 
 /// A session, for the page.
@@ -49,7 +49,8 @@ impl From<Denied> for Refused {
         let mut response = refused(denied.status(), denied.to_string()).into_response();
         let headers = response.headers_mut();
         match denied {
-            // No Basic here: a browser would ask for a password and then send it by itself, whatever page makes a request.
+            // HTTP Basic is not offered here: a browser would ask for a password and then send it with every
+            // request that any page makes.
             Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => {
                 headers.insert(
                     header::WWW_AUTHENTICATE,
@@ -117,8 +118,8 @@ fn credentials(headers: &HeaderMap, body: &[u8]) -> Option<Credentials> {
 }
 
 impl Operating {
-    /// Whose failures count for a login: those of its browser if it has logged in as this user before, else those of its
-    /// address.
+    /// Which count of failures applies to a login: the one of its browser if that has logged in as this user
+    /// before, otherwise the one of its address.
     fn source(&self, given: &Credentials, cookies: &Cookies, headers: &HeaderMap, reached: &Reached) -> Source {
         let known = cookies.known(headers).and_then(|mark| {
             let users = self.users.load_full()?;
@@ -128,7 +129,7 @@ impl Operating {
         known.unwrap_or_else(|| Source::of(reached.peer.ip()))
     }
 
-    /// The cookie by which the browser is known from now on.
+    /// The cookie that identifies the browser from now on.
     fn mark_browser(&self, user: &str, cookies: &Cookies) -> Option<HeaderValue> {
         let mut number = [0; 16];
         SystemRandom::new().fill(&mut number).ok()?;

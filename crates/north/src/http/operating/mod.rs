@@ -1,8 +1,8 @@
-//! Users who may command over HTTP, their sessions, and the proof of identity of a request.
+//! Users who may command over HTTP, their sessions, and how a request is authenticated.
 //!
-//! A browser logs in and has a cookie from then on; a program sends user and password with each request (HTTP Basic). What
-//! changes something also has to come from this gateway's own page, or from no page at all: `is_own_origin`, and a
-//! session's requests repeat its token (`check_csrf`). `sessions` and `throttle` are pure.
+//! A browser logs in and then has a cookie; a program sends user and password with each request (HTTP Basic). A
+//! request that changes something must also come from this gateway's own page or from no page at all
+//! (`is_own_origin`), and in a session must repeat its token (`check_csrf`). `sessions` and `throttle` are pure.
 
 mod asker;
 mod commands;

@@ -1,4 +1,4 @@
-//! Which paths belong to commands.
+//! Decides which paths belong to commands.
 
 use axum::http::Method;
 
@@ -20,7 +20,7 @@ pub(in crate::http) fn is_session(path: &str) -> bool {
     matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
 }
 
-/// Whether a request may be one of those that change something, while commands are on.
+/// Whether a request may change something when commands are enabled.
 pub(in crate::http) fn may_change(method: &Method, path: &str) -> bool {
     let of_drive = |rest: &str| {
         rest.split_once('/')

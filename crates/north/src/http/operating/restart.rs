@@ -1,5 +1,5 @@
-//! Restart of a drive's communication by function 08, subfunction 01: the only request that ends its Listen Only Mode, in which it
-//! answers nothing, this one included [C 7.1.7].
+//! Restart of a drive's communication by function 08, subfunction 01: the only request that ends Listen Only Mode,
+//! in which the drive answers no request, not even this one [C 7.1.7].
 
 use std::future::poll_fn;
 use std::time::{Duration, Instant};
@@ -10,14 +10,14 @@ use crate::order::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
 use crate::plant::{DriveHandle, Question, Shown, Target};
 use crate::process_image::Access;
 
-/// Until the drive is polled again and answers: the longest pause between two probes, and some.
+/// Time within which the drive must be polled again and answer: somewhat longer than the longest pause between two probes.
 const BACK: Duration = Duration::from_secs(12);
 const LOOK: Duration = Duration::from_millis(50);
 
 /// The message for a silent drive.
 const NO_ANSWER: &str = "the drive does not reply: check its power supply, wiring and address";
 
-/// Sends it, and waits until the drive replies again. Success is reported only if it was observed.
+/// Sends the restart and waits until the drive replies again. Success is reported only if a reply was observed.
 pub(super) async fn communication(drive: &DriveHandle, origin: Origin, arrival: Arrival) -> (Answer, Shown) {
     let (spec, now) = (&drive.image.spec, Instant::now());
     if spec.access != Access::Control {
@@ -49,7 +49,7 @@ pub(super) async fn communication(drive: &DriveHandle, origin: Origin, arrival: 
         tokio::time::sleep(LOOK).await;
     }
     let latency = sent.saturating_duration_since(now);
-    // In Listen Only Mode the drive does not answer the request that ends it.
+    // In Listen Only Mode the drive does not even answer the request that ends this mode.
     if outcome == Outcome::TimedOut && answers() {
         let shown = Shown {
             after: Some(now.elapsed()),

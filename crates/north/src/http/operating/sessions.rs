@@ -7,13 +7,14 @@ use std::time::{Duration, Instant};
 use super::super::tokens::hash;
 use crate::hex;
 
-/// A session ends when its user did nothing for that long. Reading values is nothing, so a page that is left alone ends.
+/// Time without activity of the user after which a session ends. Reading values does not count as activity, so the
+/// session of an unattended page ends.
 pub(super) const IDLE: Duration = Duration::from_secs(30 * 60);
-/// Longest time from login to the end of a session, whatever its user does.
+/// Longest time from login to the end of a session, however active its user is.
 const LONGEST: Duration = Duration::from_secs(12 * 3600);
-/// Most sessions of one user; another login ends the one that was used the longest time ago.
+/// Most sessions of one user; a further login ends the one that was unused longest.
 const MOST_OF_USER: usize = 8;
-/// Most sessions; another login ends the one that was used the longest time ago.
+/// Most sessions of all users; a further login ends the one that was unused longest.
 const MOST_SESSIONS: usize = 128;
 
 /// Random numbers for one session.
@@ -46,7 +47,7 @@ impl Session {
     }
 }
 
-/// All sessions. A cookie is kept as its SHA-256 only, so the time of looking it up reveals nothing.
+/// All sessions. Of a cookie only the SHA-256 is kept, so the duration of a lookup reveals nothing.
 #[derive(Debug, Default)]
 pub(super) struct Sessions {
     open: HashMap<[u8; 32], Session>,
@@ -55,7 +56,7 @@ pub(super) struct Sessions {
 }
 
 impl Sessions {
-    /// Begins a session; returns it and the value of its cookie.
+    /// Starts a session; returns it and the value of its cookie.
     pub(super) fn begin(&mut self, user: &Arc<str>, secrets: Secrets, now: Instant) -> (Session, String) {
         self.open.retain(|_, session| now < session.ends());
         self.make_room(MOST_OF_USER, |session| session.user == *user);
@@ -73,7 +74,7 @@ impl Sessions {
         (session, cookie)
     }
 
-    /// Ends the session that was used the longest time ago, if there are `most` of a kind.
+    /// Ends the session that was unused longest, if there are `most` sessions of this kind.
     fn make_room(&mut self, most: usize, kind: impl Fn(&Session) -> bool) {
         let of_kind = || self.open.iter().filter(|(_, session)| kind(session));
         if of_kind().count() < most {
@@ -88,7 +89,7 @@ impl Sessions {
         self.open.get(&hash(cookie)).filter(|session| now < session.ends())
     }
 
-    /// The user of the session did something.
+    /// Notes that the user of the session was active.
     pub(super) fn used(&mut self, cookie: &str, now: Instant) {
         if let Some(session) = self.open.get_mut(&hash(cookie)).filter(|session| now < session.ends()) {
             session.used = now;

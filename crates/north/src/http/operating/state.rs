@@ -1,4 +1,4 @@
-//! Users who may command, their sessions, and who gave a request.
+//! Users who may command, their sessions, and which user sent a request.
 
 use std::collections::HashMap;
 use std::hash::{BuildHasher, RandomState};
@@ -26,7 +26,7 @@ use crate::log_throttle::LogThrottle;
 use crate::order::{Authority, Grants, Proof, Right, SourceKind};
 /// Time for which a password that a program sends with each request is not hashed again.
 const VERIFIED: Duration = Duration::from_secs(300);
-/// Most of them, and most addresses that are known to belong to someone who may command.
+/// Most remembered passwords, and most addresses that are known to belong to a user.
 const MOST_REMEMBERED: usize = 256;
 /// Most commands with pending results, except stops.
 pub(super) const IN_PROGRESS: usize = 256;
@@ -34,7 +34,7 @@ pub(super) const IN_PROGRESS: usize = 256;
 /// Header with the token of a session.
 const CSRF: &str = "x-csrf-token";
 
-/// The state of commands over HTTP. It outlives reloads and listeners.
+/// The state of commands over HTTP. Reloads and changes of listeners keep it.
 #[derive(Debug)]
 pub(in crate::http) struct Operating {
     /// `None`: commands are off.
@@ -43,7 +43,7 @@ pub(in crate::http) struct Operating {
     verifier: Verifier,
     /// Hashes names into keys of the throttle.
     pub(super) hasher: RandomState,
-    /// Key for the marks of passwords in memory; `None` if the system has no random numbers, and no mark is kept then.
+    /// Key for the keyed hashes of passwords in memory; `None` if the system has no random numbers: then none are kept.
     key: Option<hmac::Key>,
     pub(super) north: Arc<NorthState>,
     pub(super) in_progress: Arc<Semaphore>,
@@ -55,7 +55,7 @@ pub(in crate::http) struct Operating {
 pub(super) struct State {
     pub(super) sessions: Sessions,
     throttle: Throttle,
-    /// Passwords that were right: their keyed hash, whose they are, and until when they need not be hashed.
+    /// Passwords that were verified: their keyed hash, their user, and until when they are accepted without Argon2id.
     verified: HashMap<[u8; 32], (Arc<str>, Instant)>,
     /// Addresses from which a user did something, who and when.
     operators: HashMap<IpAddr, (Arc<str>, Instant)>,
@@ -77,7 +77,7 @@ pub(in crate::http) struct Operator {
 }
 
 impl Operator {
-    /// Whether the user may still give requests that change something; the right of a user is equal for every bus.
+    /// Whether the user may still send requests that change something; this right is equal for every bus.
     pub(super) fn is_still_one(&self) -> bool {
         self.right.allows("")
     }
@@ -96,7 +96,7 @@ impl Operator {
     }
 }
 
-/// Why a request is not accepted as the request of a user.
+/// Why a request is not accepted as one of a user.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(in crate::http) enum Denied {
     /// No session and no password.
@@ -158,12 +158,12 @@ impl Operating {
         }
     }
 
-    /// Whether commands are on.
+    /// Whether commands over HTTP are enabled.
     pub(in crate::http) fn is_on(&self) -> bool {
         self.users.load().is_some()
     }
 
-    /// Sets the users who may command; `None`: commands are off. Sessions of users who were removed, or have a new
+    /// Sets the users who may command; `None` disables commands. Sessions of users who were removed, or have a new
     /// password, end.
     pub(in crate::http) fn set_users(&self, users: Option<Users>) {
         // A session is looked up under the same lock, so it ends together with its user.
@@ -180,7 +180,7 @@ impl Operating {
         state.operators.retain(|_, (user, _)| stays(user));
     }
 
-    /// The authority of connections from an address: those from addresses where a user was recently active do not yield
+    /// The authority of connections from an address: those from addresses with a recently active user do not yield
     /// to others, and have reserved places.
     pub(in crate::http) fn authority_at(&self, address: IpAddr, now: Instant) -> Authority {
         if !self.is_on() {
@@ -197,7 +197,7 @@ impl Operating {
     /// The user of a request with these headers, by its session or by its password.
     ///
     /// # Errors
-    /// The user may not command; [`Denied::NotLoggedIn`] if the request names none.
+    /// If the user may not command; [`Denied::NotLoggedIn`] if the request names no user.
     pub(in crate::http) async fn operator(
         &self,
         headers: &HeaderMap,
@@ -210,7 +210,7 @@ impl Operating {
         }
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
-            // The right as it is now: comparing the password takes a while.
+            // The right is read afterwards, because comparing the password takes some time.
             let right = self.right_of(&credentials.user);
             let user = self.verified(&credentials, address, Source::of(address)).await?;
             return Ok(Operator {
@@ -240,7 +240,7 @@ impl Operating {
         })
     }
 
-    /// The right of a user to write, which lasts as long as the file has the user with this password.
+    /// The user's right to write, which lasts as long as the file has the user with this password.
     fn right_of(&self, user: &str) -> Option<Right> {
         let user = self.users.load().as_ref()?.named(user)?.clone();
         let users = self.users.clone();
@@ -251,7 +251,7 @@ impl Operating {
         self.is_on().then(|| self.state().sessions.find(cookie, now).cloned())?
     }
 
-    /// The user of a request that changes something.
+    /// The user of a request that changes something; also checks that the request comes from the gateway's own page.
     ///
     /// # Errors No user, or the request does not come from this gateway's own page.
     pub(in crate::http) async fn commander(
@@ -261,7 +261,7 @@ impl Operating {
         reached: &Reached,
     ) -> Result<Operator, Denied> {
         if reached.local.is_some() {
-            // Browsers do not use a socket, and its file's permissions decide who may.
+            // Browsers do not use the local socket, and the permissions of its file decide who may.
             return self.operator(headers, cookies, reached).await;
         }
         is_own_origin(headers)?;
@@ -283,7 +283,7 @@ impl Operating {
         }
     }
 
-    /// Notes that the user did something: the session and the places of the address stay.
+    /// Notes that the user was active: the session and the places of the address are kept.
     fn used(&self, operator: &Operator, now: Instant) {
         let mut state = self.state();
         if let Some(cookie) = &operator.cookie {
@@ -303,7 +303,7 @@ impl Operating {
         operators.insert(operator.address, (operator.user.clone(), now));
     }
 
-    /// The user whose password this is. A password that was right a short while ago is not hashed again.
+    /// The user with this password. A password that was verified shortly before is not hashed again.
     pub(super) async fn verified(
         &self,
         given: &Credentials,
@@ -317,14 +317,14 @@ impl Operating {
         let known = mark.and_then(|mark| Some((mark, self.state().verified.get(&mark).cloned()?)));
         let source = match known {
             Some((_, (user, until))) if Instant::now() < until => return Ok(user),
-            // The password was right before: failures of others at this address must not delay it.
+            // The password was verified before: failures of others at this address must not delay it.
             Some((mark, _)) => Source::Known(self.hasher.hash_one(mark)),
             None => source,
         };
         let name = self.hasher.hash_one(&given.user);
         let failures = self.state().throttle.begin(source, name, Instant::now());
         let failures = failures.map_err(Denied::TooMany)?;
-        // Whether the user exists must not show, neither by the answer nor by its time.
+        // Neither the answer nor its time may reveal whether the user exists.
         let user = users.named(&given.user);
         let too_long = given.password.len() > MAX_PASSWORD;
         let password = if too_long { "" } else { given.password.as_str() };
@@ -363,7 +363,7 @@ impl Operating {
         hmac::sign(self.key.as_ref()?, text.as_bytes()).as_ref().try_into().ok()
     }
 
-    /// Begins a session of a user who logged in; `None` if the system has no random numbers.
+    /// Starts a session of a user who logged in; `None` if the system has no random numbers.
     pub(super) fn begin(&self, user: &Arc<str>, address: IpAddr, now: Instant) -> Option<(Session, String)> {
         let random = SystemRandom::new();
         let mut secrets = Secrets {
@@ -408,15 +408,15 @@ impl Grants for UserRight {
 
 impl State {
     fn remember(&mut self, mark: [u8; 32], user: &Arc<str>, now: Instant) {
-        // The table has no more entries than users, each of which has one password.
+        // The table has at most one entry for each user, since each has one password.
         if self.verified.len() < MOST_REMEMBERED {
             self.verified.insert(mark, (user.clone(), now + VERIFIED));
         }
     }
 }
 
-/// Whether a request may come from a page of this gateway. Browsers say which page a request comes from; programs say
-/// nothing.
+/// Whether a request can come from a page of this gateway. Browsers report the page that sent a request; programs
+/// report nothing.
 ///
 /// # Errors
 /// The request comes from a page of another origin.

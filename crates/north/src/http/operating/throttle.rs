@@ -1,8 +1,9 @@
 //! How often passwords may be tried. Pure: time is an argument.
 //!
-//! An attacker must not be able to lock an operator out, so attempts of one client never count against another: each
-//! address has its own count, and a browser that has logged in as a user before has one of its own for that user. What
-//! is counted for a user over all addresses holds up only addresses that failed before themselves.
+//! Limits login attempts. An attacker must not be able to lock an operator out, so attempts of one client never
+//! count against another: each address has a separate count, and a browser that has logged in as a user before has
+//! a separate one for that user. Failures counted for a user over all addresses delay only addresses that failed
+//! before themselves.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -17,13 +18,13 @@ const FREE_OF_USER: u32 = 20;
 const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 /// Time without a failed login after which earlier failures are forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(15 * 60);
-/// Most addresses and browsers, and most users, that are distinguished; beyond it the oldest is forgotten.
+/// Most addresses and browsers, and most users, that are counted separately; beyond it the oldest is forgotten.
 const MOST_SOURCES: usize = 4096;
 
-/// Where an attempt comes from.
+/// The source of a login attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Source {
-    /// An address; of IPv6 the network of 64 bits, of which a client may use any.
+    /// An address; for IPv6 its network of 64 bits, in which a client may use any address.
     Address(IpAddr),
     /// A browser that has logged in as this user before.
     Known(u64),
@@ -48,13 +49,14 @@ struct Failures {
 #[derive(Debug, Default)]
 pub(super) struct Throttle {
     sources: HashMap<Source, Failures>,
-    /// By a hash of the name, whether there is such a user or not.
+    /// Failures by a hash of the user name, for existing users and others alike.
     users: HashMap<u64, Failures>,
 }
 
 impl Throttle {
-    /// Begins an attempt to log in as `user`. It counts as failed until [`Throttle::succeeded`], so that attempts at the
-    /// same time are limited too. Returns how many failures its source has: who has fewer goes first.
+    /// Starts an attempt to log in as `user`. The attempt counts as failed until [`Throttle::succeeded`], so that
+    /// simultaneous attempts are limited too. Returns the number of failures of its source: sources with fewer are
+    /// served first.
     ///
     /// # Errors
     /// Time to wait; the attempt then does not count.
@@ -75,7 +77,7 @@ impl Throttle {
         Ok(failures.map_or(0, |failures| failures.count))
     }
 
-    /// The attempt was no guess: the password was right, or there was no time to look at it.
+    /// Notes that the attempt was not a guess: the password was right, or there was no time to verify it.
     pub(super) fn withdraw(&mut self, source: Source, user: u64) {
         uncount(&mut self.sources, source);
         if matches!(source, Source::Address(_)) {

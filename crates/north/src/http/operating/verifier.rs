@@ -1,5 +1,5 @@
-//! Compares passwords with their hashes: one at a time, on a thread of its own with less right to the processor than
-//! everything else, so that no number of logins holds up anybody who is logged in.
+//! Compares passwords with their hashes: one at a time, on a separate thread with low priority, so that no number
+//! of logins delays users who are logged in.
 
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,7 +18,8 @@ const NICE: i32 = 10;
 /// A password that waits to be verified.
 #[derive(Debug)]
 struct Waiting {
-    /// Failures of its source: who has fewer goes first, and is not turned away by who has more.
+    /// Failures of the source of this attempt: sources with fewer are served first, and are not displaced by those
+    /// with more.
     failures: u32,
     number: u64,
     address: IpAddr,
@@ -31,7 +32,7 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// Computes all hashes, whatever their result.
+    /// Computes all hashes in any case, so that the time does not depend on the result.
     fn is_right(&self, workspace: &mut Workspace) -> bool {
         for other in &self.others {
             let _ = std::hint::black_box(workspace.is_password(other, &self.password));
@@ -47,12 +48,12 @@ struct Queue {
     numbered: u64,
     /// A thread takes from the queue.
     served: bool,
-    /// The memory of the thread, while none runs.
+    /// The working memory, while no thread runs.
     workspace: Workspace,
 }
 
 impl Queue {
-    /// Takes a password in, possibly in the place of another, which gets no answer. Returns whether it was taken.
+    /// Adds a password, possibly in place of another one, which then gets no answer. Returns whether it was added.
     fn push(&mut self, mut new: Waiting) -> bool {
         self.waiting.retain(|waiting| !waiting.answer.is_closed());
         self.numbered += 1;
@@ -73,7 +74,7 @@ impl Queue {
         true
     }
 
-    /// The next one: of those with the fewest failures the one that came first.
+    /// The next password: among those with the fewest failures, the one that arrived first.
     fn next(&mut self) -> Option<Waiting> {
         let first = (0..self.waiting.len()).min_by_key(|index| {
             let waiting = self.waiting.get(*index);
@@ -88,8 +89,8 @@ impl Queue {
 pub(super) struct Verifier(Arc<Mutex<Queue>>);
 
 impl Verifier {
-    /// Whether the password is the one behind the first hash; the others are computed all the same. `None` if too many wait, or others
-    /// have an older right.
+    /// Whether the password matches the first hash; the others are always computed as well. `None` if too many
+    /// passwords wait, or others take precedence.
     pub(super) async fn verify(
         &self,
         (hash, others): (Option<&str>, Vec<String>),
@@ -112,7 +113,7 @@ impl Verifier {
             if !queue.push(waiting) {
                 return None;
             }
-            // The thread ends when nothing waits, so an idle gateway has none.
+            // The thread ends when nothing waits, so an idle gateway has no such thread.
             if !queue.served {
                 let own = self.clone();
                 let thread = std::thread::Builder::new().name("logins".to_string());
@@ -126,7 +127,7 @@ impl Verifier {
     }
 
     fn serve(&self) {
-        // If the priority cannot be lowered, the thread competes like any other.
+        // If the priority cannot be lowered, the thread runs with normal priority.
         let _ = rustix::process::nice(NICE);
         let mut workspace = std::mem::take(&mut self.lock().workspace);
         loop {
@@ -142,7 +143,7 @@ impl Verifier {
             let Some(next) = next else { return };
             if !next.answer.is_closed() {
                 let is_right = next.is_right(&mut workspace);
-                // The client may have gone.
+                // The client may have disconnected, so an error is ignored.
                 let _ = next.answer.send(is_right);
             }
         }

@@ -29,7 +29,7 @@ macro_rules! assets {
     };
 }
 
-/// All of them.
+/// All files of the status page.
 pub(in crate::http) const ASSETS: &[Asset] = assets! {
     "image/svg+xml": "icon.svg";
     "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
@@ -39,11 +39,11 @@ pub(in crate::http) const ASSETS: &[Asset] = assets! {
         "trend.js";
 };
 
-/// What the document has in its head for the operating part; its script comes before the page's.
+/// Part of the document's head for operating; its script must come before the script of the page.
 const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
     <script src=\"assets/operate.js\" type=\"module\"></script>";
 
-/// Only this server's own files, no inline code, no forms.
+/// Allows only files of this server: no inline code, no forms.
 pub(in crate::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
     img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
@@ -55,7 +55,7 @@ const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::MotorTorque, "Torque"),
 ];
 
-/// The document with the state of the plant at `now`; `operating` says whether it has the part that commands.
+/// The document with the state of the plant at `now`; `operating` adds the part for commands.
 pub(in crate::http) fn render(plant: &Plant, operating: bool, now: Instant) -> String {
     let mut tables = String::new();
     // Writing to a string cannot fail.
@@ -250,13 +250,13 @@ mod tests {
         assert_eq!(listed, EventKind::ALL.iter().map(|kind| kind.name()).collect());
     }
 
-    /// What stands between quotation marks at the beginning.
+    /// The text between quotation marks at the beginning.
     fn quoted(text: &str) -> Option<&str> {
         let inner = text.strip_prefix('"')?;
         inner.split_once('"').map(|(text, _)| text)
     }
 
-    /// The texts that the page says, in English: what is given to `t`, and what the document marks.
+    /// The English texts of the page: the arguments of `t`, and the marked texts of the document.
     fn said() -> BTreeSet<&'static str> {
         let mut said: BTreeSet<&str> = ["read-only", "commands after login"].into();
         for script in ASSETS.iter().filter(|asset| asset.name.ends_with(".js")) {
@@ -280,7 +280,7 @@ mod tests {
         said
     }
 
-    /// A text that a language lacks would stand in English among the others.
+    /// A text missing in a language would appear in English among the others.
     #[test]
     fn every_language_has_every_text() {
         let languages: Vec<_> = ASSETS

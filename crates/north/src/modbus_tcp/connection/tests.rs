@@ -15,7 +15,7 @@ use crate::order::Authority;
 use crate::plant::Plant;
 use crate::reading::Dated;
 
-/// Read input register 0 of unit 255 in a plant without a bus: answered at once with 02.
+/// Reads input register 0 of unit 255 in a plant without a bus; answered at once with exception 02.
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 255, 4, 0, 0, 0, 1];
 const ANSWER: [u8; 9] = [0, 1, 0, 0, 0, 3, 255, 0x84, 2];
 
@@ -91,7 +91,7 @@ impl PipedClient {
         bytes
     }
 
-    /// Everything received until the connection is closed.
+    /// All bytes received until the connection is closed.
     async fn rest(&mut self) -> Vec<u8> {
         let mut bytes = Vec::new();
         self.client.read_to_end(&mut bytes).await.unwrap();
@@ -120,7 +120,7 @@ async fn an_incomplete_frame_times_out_after_ten_seconds() {
 async fn silent_and_slow_clients_stay_connected() {
     let mut rig = rig(1024);
     tokio::time::sleep(Duration::from_secs(100_000)).await;
-    // Every moment has an incomplete frame, but each frame is completed in time.
+    // The input always ends with an incomplete frame, but each frame is completed in time.
     rig.send(&REQUEST[..5]).await;
     for _ in 0..5 {
         tokio::time::sleep(FRAME_TIMEOUT - Duration::from_secs(1)).await;

@@ -1,4 +1,4 @@
-//! Events and history on their way to the broker: kept in memory or on disk, in order; what is lost is counted.
+//! Events and history on their way to the broker: kept in memory or on disk, in order; losses are counted.
 
 use super::*;
 
@@ -16,7 +16,7 @@ impl PlainClient {
         self.take_pending_events();
     }
 
-    /// Stores all pending events at once, before newer ones displace them.
+    /// Stores all pending events at once, before newer ones can displace them.
     pub(super) fn take_pending_events(&mut self) {
         loop {
             match self.events.try_recv() {
@@ -42,7 +42,7 @@ impl PlainClient {
     }
 
     pub(super) fn store_event(&mut self, event: &Event) {
-        // Refusals have a part of the room only, so that they push out no other event.
+        // Refusals may use only a part of the room, so that they displace no other event.
         if event.kind == EventKind::RefusedCommand && self.waiting_events() >= refusal_limit(&self.options) {
             self.common.stats.mqtt.lost(MqttKind::Event, 1);
             return;
@@ -73,7 +73,7 @@ impl PlainClient {
         }
     }
 
-    /// Gives a message to the store, and to the outbox if its turn has come.
+    /// Gives a message to the store, and to the outbox if it is next in order.
     pub(super) fn keep(&mut self, kind: MqttKind, message: Message) {
         let room = self.outbox.room(kind) > 0;
         let store = self.store_of(kind);
@@ -82,7 +82,7 @@ impl PlainClient {
         }
     }
 
-    /// Keeps what was recorded and not kept yet.
+    /// Stores recorded values that were not stored yet.
     pub(super) fn keep_recorded(&mut self) {
         for Update { topic, payload } in self.publisher.recorded() {
             self.keep(MqttKind::History, Message::not_retained(topic, payload));
@@ -124,7 +124,7 @@ impl PlainClient {
         self.store.remember(topics);
     }
 
-    /// Counts messages that end with this client, because there is no buffer.
+    /// Counts the messages that the outbox has lost, and logs their number once a minute.
     pub(super) fn count_unkept(&mut self) {
         let (events, history) = (
             self.outbox.unkept(MqttKind::Event),

@@ -65,8 +65,7 @@ pub(super) fn subscriptions(
         .collect()
 }
 
-/// Logs what the broker refuses, with the reason for each subscription that it refuses. The gateway can do without the
-/// status that others publish.
+/// Logs which subscriptions the broker refuses, with the reasons. The gateway works without the status messages of others.
 pub(super) fn report_refused(subscriptions: &[(Subscribed, Filter)], refused: &[Option<String>]) {
     let of = |wanted: Subscribed| {
         let pairs = subscriptions
@@ -101,7 +100,7 @@ pub(super) fn report_refused(subscriptions: &[(Subscribed, Filter)], refused: &[
 }
 
 impl PlainClient {
-    /// Clears what the client before a reload has published and this one does not.
+    /// Clears retained topics that the client before a reload published and this one does not.
     pub(super) fn take_over(&mut self) {
         let before = std::mem::take(&mut self.common.stats.mqtt_left.lock().retained);
         self.clear_old(before);
@@ -126,7 +125,7 @@ impl PlainClient {
         own
     }
 
-    /// Gives the next discovery message to the outbox, if the last ones are with the broker.
+    /// Gives the next discovery message to the outbox, if the broker has received the previous ones.
     pub(super) fn announce(&mut self) {
         let Some(announcer) = &mut self.announcer else { return };
         let outbox = &self.outbox;

@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 /// Minimum time between two repairs of the status.
 const PACE: Duration = Duration::from_secs(1);
 
-/// Repairs the status that another client published in the gateway's name, at most once in [`PACE`]; a repair that
-/// comes too early waits.
+/// Repairs the status that another client published in the gateway's name, at most once in [`PACE`]; an earlier
+/// repair is postponed.
 #[derive(Debug, Default)]
 pub(super) struct Repair {
     wanted: bool,
@@ -14,7 +14,7 @@ pub(super) struct Repair {
 }
 
 impl Repair {
-    /// Notes that someone else published a status.
+    /// Notes that another client published a status in the gateway's name.
     pub(super) fn ask(&mut self) {
         self.wanted = true;
     }

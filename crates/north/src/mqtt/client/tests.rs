@@ -114,7 +114,7 @@ async fn lost_events_are_counted() {
     assert_eq!((client.outbox.waiting(), client.missed), (BURST, 10));
 }
 
-/// A fault, then refusals, more than there is room for; events that wait then, and events lost.
+/// Raises a fault and then more refusals than there is room for; returns the number of waiting events and of lost ones.
 async fn a_fault_and_a_flood(client: &mut PlainClient, refusals: usize) -> (u64, u64) {
     burst(client, 1).await;
     for n in 0..refusals {
@@ -164,7 +164,7 @@ async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
     );
 }
 
-/// A reload: bus `line1` with drive `p1` is gone, `line2` with `p2` is there.
+/// Imitates a reload: bus `line1` with drive `p1` is removed, `line2` with `p2` is added.
 fn reload(client: &PlainClient) {
     let mut plant = Plant {
         events: client.common.plant.load().events.clone(),
@@ -244,7 +244,7 @@ async fn a_client_takes_what_the_one_before_left_when_it_is_started() {
     stats.mqtt_left.lock().client.orders = Some(OrdersLeft::default());
     let cancel = CancellationToken::new();
     let started = crate::mqtt::start(options(None), plant, stats.clone(), cancel.clone());
-    // There was no await yet, so its task has not started.
+    // There was no await yet, so the client's task has not started.
     assert!(stats.mqtt_left.lock().client.orders.is_none());
     stats.mqtt_left.discard();
     cancel.cancel();

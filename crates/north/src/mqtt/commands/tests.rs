@@ -83,7 +83,7 @@ impl SetTopics {
         Some(json(&self.commands.answer(ended, SystemTime::UNIX_EPOCH)))
     }
 
-    /// Lets the drive acknowledge the next command, whose effect is not read yet.
+    /// Lets the drive acknowledge the next command; no read has shown its effect yet.
     fn take_order(&self) -> Option<(Order, Receipt)> {
         let pop = |bus: &crate::plant::BusHandle| next_command(&mut bus.queue.lock(), Urgency::Read, self.now);
         let command = self.plant.buses.iter().find_map(pop)?;
@@ -143,7 +143,7 @@ fn a_command_is_executed_and_answered() {
     assert!(bench.commands.is_idle());
 }
 
-/// A client whose `commands` a reload turned off still receives what was on its way.
+/// A client whose `commands` a reload disabled still receives messages that were on their way.
 #[test]
 fn what_was_on_its_way_when_the_right_went_is_refused() {
     use std::sync::atomic::{AtomicBool, Ordering};
@@ -299,7 +299,7 @@ fn commands_are_queued_in_the_order_of_their_messages() {
         drive.image.spec.profile.point_index(name).unwrap()
     };
     let bool_of = |name, on| Order::Points(vec![(index(name), crate::drive::Value::Bool(on))]);
-    // The stop goes first and has removed the commands before it; nothing was polled in between.
+    // The stop is sent first and has removed the commands before it; nothing was polled in between.
     assert_eq!(taken(&bench), Some(bool_of("run", false)));
     assert_eq!(taken(&bench), Some(bool_of("run", true)));
     assert_eq!(taken(&bench), Some(bool_of("fault_reset", true)));
@@ -459,7 +459,7 @@ fn the_audit_names_the_client_that_the_broker_names() {
     assert_eq!(command.ticket.client(), "mqtt");
 }
 
-/// The drive acknowledges the stop of a command, and nothing else of it was queued; the result.
+/// Lets the drive acknowledge the stop of a command, which must be its only queued part; returns the result.
 fn stop_alone(bench: &mut SetTopics, payload: &str) -> Json {
     assert_eq!(bench.take(set("p1/set", payload)), None, "{payload}");
     assert_eq!(bench.queued(), 1, "{payload}");

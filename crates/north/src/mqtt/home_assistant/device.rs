@@ -1,4 +1,4 @@
-//! A device and its message: the gateway with the health of its buses, or a drive.
+//! A Home Assistant device and its message: the gateway with the health of its buses, or a drive.
 
 use serde_json::{Map, Value, json};
 
@@ -37,7 +37,7 @@ pub(super) struct Device {
 
 #[derive(Debug)]
 enum Kind {
-    /// The gateway, with its name and the names of its buses.
+    /// The gateway itself, with its name and the names of its buses.
     Gateway { name: String, buses: Vec<String> },
     /// A drive, with the id of its gateway.
     Drive { drive: DriveHandle, gateway: String },
@@ -55,7 +55,7 @@ impl Device {
         }
     }
 
-    /// A drive of the gateway of this id.
+    /// A drive of the gateway with this id.
     pub(super) fn drive(gateway: &str, sources: &Sources, drive: DriveHandle) -> Device {
         let topic = format!("{}/drive/{}", sources.topics.root(), drive.image.spec.name);
         Device {
@@ -72,8 +72,8 @@ impl Device {
         &self.id
     }
 
-    /// The message, in as many parts as `limit`, the largest payload, requires; each describes the device and some of its
-    /// entities. An entity that is larger by itself is a part of its own.
+    /// The message, in as many parts as `limit`, the largest payload, requires; each part describes the device and
+    /// some of its entities. An entity that exceeds the limit alone is a separate part.
     pub(super) fn payloads(&self, sources: &Sources, limit: usize) -> Vec<Vec<u8>> {
         let (head, entities) = match &self.kind {
             Kind::Gateway { name, buses } => (

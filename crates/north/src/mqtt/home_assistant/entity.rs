@@ -12,7 +12,7 @@ use crate::event::EventKind;
 use crate::mqtt::payload;
 use crate::process_image::{Access, DriveSpec};
 
-/// Entities by their key in the message, in order.
+/// Entities with their keys in the message, in order.
 pub(super) type Entities = Vec<(String, Value)>;
 
 /// The points that can be commanded from Home Assistant, if the drive has them; others are only shown.
@@ -28,7 +28,7 @@ const PERCENT: (f64, f64) = (0.0, 100.0);
 
 /// Units of what is counted.
 const COUNTED: [&str; 7] = ["Wh", "kWh", "MWh", "varh", "kvarh", "kVAh", "m³"];
-/// Words that are written in capitals.
+/// Abbreviations that are written in capitals in the names of entities.
 const CAPITALS: [&str; 8] = ["ac", "dc", "id", "io", "pi", "pid", "pwm", "rms"];
 
 /// A platform of Home Assistant.
@@ -138,7 +138,7 @@ pub(super) fn of_drive(sources: &Sources, id: &str, spec: &DriveSpec) -> Entitie
         .iter()
         .filter_map(|(index, _)| spec.profile.points.get(*index));
     let mut entities: Entities = points.map(|point| drive.of_point(point)).collect();
-    // A button needs no value, so it may belong to a point that is never read.
+    // A button needs no value, so its point may be one that is never read.
     let reset = spec.profile.model_index(ModelPoint::FaultReset);
     let hidden = reset.filter(|index| published.iter().all(|(shown, _)| shown != index));
     let hidden = hidden.and_then(|index| spec.profile.points.get(index));
@@ -207,8 +207,8 @@ impl DriveEntities<'_> {
         Some(self.entity(platform, name, [json!({ "cmd_t": topic, "qos": 1 }), more, shown]))
     }
 
-    /// Limits of a command; none where only the drive knows them, or where they leave one value only, which Home Assistant
-    /// does not accept for a number.
+    /// Limits of a command; `None` if only the drive knows them, or if they allow only one value, which Home
+    /// Assistant does not accept for a number.
     fn limits(&self, point: &Point) -> Option<(f64, f64)> {
         let index = self.spec.profile.point_index(&point.name)?;
         let limits = match self.spec.limits_of(index) {
@@ -262,7 +262,7 @@ impl DriveEntities<'_> {
         self.entity(Platform::Sensor, "state", [self.show("state", &Shown::Plain), more])
     }
 
-    /// The state has its text next to it even if the code is zero; a topic of its own is then empty.
+    /// The state always has its text in a second entity, even if the code is zero: the topic of the text is then empty.
     fn fault_text(&self) -> (String, Value) {
         let topics = &self.sources.topics;
         let (topic, template) = match self.sources.telemetry.state {
@@ -286,8 +286,8 @@ impl DriveEntities<'_> {
         self.entity(Platform::Event, "event", [all])
     }
 
-    /// Takes away what the points of `COMMANDS` were when the drive could be commanded, or could not: a component that is
-    /// named with its platform only.
+    /// Removes the entities that the points of `COMMANDS` had while the drive could be commanded, or could not:
+    /// such an entity is listed with its platform only.
     fn withdrawn(&self, present: &Entities) -> Entities {
         let both = COMMANDS.into_iter().flat_map(|model| {
             let point = self.spec.profile.model_point(model);
@@ -373,11 +373,11 @@ fn quantity(point: &Point) -> Value {
     quantity
 }
 
-/// Whether a count may go down, as a balance does: Home Assistant would take that for a meter that starts again.
+/// Whether a count may decrease, as a balance does: Home Assistant would mistake that for a meter that was reset.
 fn may_fall(point: &Point) -> bool {
     match point.raw().map(|raw| raw.form) {
         Some(form) if form.is_signed() => true,
-        // The energy of a drive on N2 is such a number, and never falls.
+        // The energy of a drive on N2 is such a number, and never decreases.
         Some(Form::F32 | Form::F64) | None => {
             point.model.is_none() && point.range.as_ref().is_none_or(|range| *range.start() < 0.0)
         }
@@ -385,8 +385,8 @@ fn may_fall(point: &Point) -> bool {
     }
 }
 
-/// The device class of Home Assistant that has this unit, if there is one in all versions from 2024.12 on: it refuses the
-/// whole device for a class that it does not know.
+/// The device class of Home Assistant for this unit, if there is one in all versions from 2024.12 on: Home
+/// Assistant rejects the whole device if it does not know the class.
 fn device_class(unit: &str) -> Value {
     let class = match unit {
         "A" | "mA" => "current",

@@ -19,7 +19,7 @@ fn sources(base: &str, commands: bool, [state, points]: [bool; 2]) -> Sources {
     }
 }
 
-/// An announcer of drives with these names, and all that it publishes.
+/// An announcer of drives with these names, and all updates that it publishes.
 fn announced(names: &[&str]) -> (Announcer, Vec<Update>) {
     let mut announcer = Announcer::new("homeassistant", sources("drivegate", true, [true, true]));
     announcer.adopt(&fixture::plant(names));
@@ -95,7 +95,7 @@ fn each_device_has_one_message_and_the_drives_come_by_the_gateway() {
     );
 }
 
-/// In every family, with every kind of telemetry and both kinds of access.
+/// Checked for every family, with every kind of telemetry and both kinds of access.
 #[test]
 fn there_is_one_entity_for_each_published_point() {
     for profile in Profiles::built_in().iter() {
@@ -268,7 +268,7 @@ fn a_broker_with_small_packets_gets_a_device_in_parts() {
     let topics: BTreeSet<&str> = parts.iter().map(|part| part.topic.as_ref()).collect();
     assert_eq!(topics.len(), parts.len());
     assert!(topics.contains("homeassistant/device/drivegate_hall/drive_p1__2/config"));
-    // If packets may be larger, the further topics are cleared.
+    // If packets may be larger, the topics of further parts are cleared.
     announcer.restart(usize::MAX);
     let again = all(&mut announcer, now);
     assert_eq!(

@@ -1,4 +1,4 @@
-//! The files of a journal: their names, their lock, and the errors of the system.
+//! The files of a journal: their names, their lock, and file errors.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind};

@@ -279,7 +279,7 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
     assert_eq!(numbers(&take_all(&mut journal)), (101..201).collect::<Vec<_>>());
 }
 
-/// Whatever the disk does: each message is taken once, in order, or counted as lost; memory is bounded.
+/// Property for any behaviour of the disk: each message is taken once, in order, or counted as lost; memory is bounded.
 #[test]
 fn every_message_is_taken_or_lost_whatever_the_disk_does() {
     let full: fn(&Path) -> io::Result<File> = |_| Err(ErrorKind::StorageFull.into());

@@ -39,7 +39,7 @@ impl PublishedPlant {
         fixture::read(&self.plant, "p1", status, frequency, self.now);
     }
 
-    /// Lets time pass, then publishes; returns the topics below `drivegate/hall/`.
+    /// Advances the time, then publishes; returns the topics below `drivegate/hall/`.
     fn after(&mut self, ms: u64) -> Vec<(String, String)> {
         self.now += Duration::from_millis(ms);
         self.wall += Duration::from_millis(ms);
@@ -112,7 +112,7 @@ fn point_topics_carry_bare_values_and_nothing_that_is_not_good() {
     }
     assert_eq!(payload(&all, "drive/p2/point/running"), Some(""));
     assert_eq!(payload(&all, "drive/p2/point/state"), Some("offline"));
-    // Stale after 1 s: cleared at once, and only once.
+    // After 1 s the value is stale: it is cleared at once, and only once.
     let stale = bench.after(1001);
     assert_eq!(payload(&stale, "drive/p1/point/output_frequency"), Some(""));
     assert_eq!(payload(&stale, "drive/p1/point/state"), Some("offline"));
@@ -329,12 +329,12 @@ fn the_values_of_an_outage_are_recorded() {
     for (mode, expected) in [(History::All, 6), (History::Changes, 3), (History::Off, 0)] {
         let mut bench = PublishedPlant::new();
         bench.publisher.telemetry.history = mode;
-        // The broker goes after this.
+        // The broker disconnects after this.
         bench.after(20);
         let mut arrays = Vec::new();
         for value in [2500, 2500, 2501, 2501, 2501, 2502] {
             bench.read(0x0023, value);
-            // Too little time has passed for another entry.
+            // The interval for another entry has not passed yet.
             for ms in [0, 50, 50] {
                 bench.now += Duration::from_millis(ms);
                 bench.wall += Duration::from_millis(ms);

@@ -1,5 +1,4 @@
-//! The number of the session (bdSeq), which connects the death of a node to its birth, kept over restarts
-//! in a file.
+//! The number of the session (bdSeq), which links the death of a node to its birth, kept over restarts in a file.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -24,7 +23,7 @@ pub(super) struct BdSeq {
 }
 
 impl BdSeq {
-    /// Goes on behind the number in the file, which was used last; begins with 0 without one, or if it cannot be read.
+    /// Continues after the number in the file, which was used last; starts with 0 if there is no file or it cannot be read.
     pub(super) async fn open(dir: &Path, patience: &Patience) -> BdSeq {
         let path = dir.join(SPARKPLUG);
         let read = patience.read({
@@ -41,11 +40,11 @@ impl BdSeq {
         }
     }
 
-    /// The number of the next connection; the file has it when this returns, unless the disk is too slow. A connection that
-    /// no broker accepted leaves its number to the next one.
+    /// The number of the next connection; it is in the file when this returns, unless the disk is too slow. The
+    /// number of a connection that no broker accepted is used again.
     ///
     /// # Errors
-    /// Why the number is not in the file; the number is valid in any case.
+    /// If the number could not be written to the file; the number is valid in any case.
     pub(super) async fn next(&mut self) -> (u8, Result<(), String>) {
         if std::mem::take(&mut self.used) {
             (self.number, self.kept) = (self.number.wrapping_add(1), false);

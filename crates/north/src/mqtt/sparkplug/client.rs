@@ -1,5 +1,5 @@
-//! The edge node as a client of its broker: it owns the session and the commands. It never waits for the broker: what finds
-//! no room is kept, and no more messages are taken from the session until there is room.
+//! The edge node as a client of its broker: owns the session and the commands. It never waits for the broker:
+//! messages without room are kept, and no more are taken from the session until there is room.
 
 mod answers;
 
@@ -34,15 +34,15 @@ use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
 use crate::{MqttKind, NorthState};
 
-/// Most messages published before other events have their turn.
+/// Most messages published before other events are handled.
 const MESSAGES: usize = 64;
 /// Least time between two log lines of one kind.
 const LOGGED: Duration = Duration::from_secs(60);
 
-/// Time that a broker has to say that the primary host is online, before another one is tried.
+/// Time for a broker to report that the primary host is online, before another broker is tried.
 const HOST: Duration = Duration::from_secs(5);
-/// Longest wait for the births when the host comes online, and for the next connection when it went offline: nodes follow one
-/// another.
+/// Longest random wait for the births when the host comes online, and for the next connection when it went offline,
+/// so that the nodes do not all act at once.
 const SPREAD: Duration = Duration::from_secs(2);
 
 /// When the births follow if the host is online now.
@@ -169,7 +169,7 @@ impl NodeClient {
         let (of_node, samples) = model::node_metrics(&self.common.observed, Moment::present());
         self.session.adopt(of_node, definitions);
         self.session.set_node(samples);
-        // The samples are set all at once: a birth has the present state, and a drive that was there has not gone.
+        // All samples are set at once: a birth has the present state, and drives that were online do not appear as lost.
         for place in 0..self.drives.len() {
             self.publish_device(place, now, SystemTime::now());
         }
@@ -211,7 +211,7 @@ impl NodeClient {
         number
     }
 
-    /// Ends this connection; the nodes of a group do so one after another.
+    /// Ends this connection; the nodes of a group do so one after the other.
     fn leave(&mut self) {
         self.leaving = Some(SPREAD.mul_f64(chance()));
     }
@@ -296,7 +296,7 @@ impl NodeClient {
             return false;
         };
         if connection::packet_size(&message) > limits.max_packet {
-            // If this message is not sent, the sequence has a gap, or a birth lacks its metrics.
+            // If this message were not sent, the sequence would have a gap, or a birth would lack its metrics.
             let (topic, most) = (&message.topic, limits.max_packet);
             let why =
                 format!("the broker accepts at most {most} bytes per packet, {topic} needs more; raise its limit");
@@ -469,7 +469,7 @@ impl session::Client for NodeClient {
                 sent = true;
             }
             match self.common.link.next().await {
-                // The broker does not take the death of the node, so it publishes the last will instead.
+                // The broker does not accept the death of the node, so it publishes the last will instead.
                 Step::Lost(_) | Step::Refused(..) => return false,
                 Step::Acked(_) => return true,
                 Step::Message(message) => self.on_message(*message),

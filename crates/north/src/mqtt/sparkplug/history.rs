@@ -1,4 +1,4 @@
-//! Values of one device while there is no receiver: the newest, in memory. Time is an argument.
+//! Values of one device while there is no receiver: keeps the newest, in memory. Time is an argument.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -14,8 +14,8 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Records what differs from `before`, at most once in `least`; keeps `most` values. Returns whether it was recorded,
-    /// and how many older values were given up for it.
+    /// Records the values that differ from `before`, at most once in `least`; keeps `most` values. Returns whether
+    /// anything was recorded, and how many older values were dropped for it.
     pub(super) fn record(
         &mut self,
         before: &[Option<Sample>],

@@ -12,7 +12,7 @@ struct State {
     timestamp: u64,
 }
 
-/// The primary host, as its messages on this connection describe it.
+/// The primary host, according to its messages on this connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Host {
     state: Option<State>,
@@ -26,10 +26,10 @@ impl Host {
         self.state = None;
     }
 
-    /// Takes a STATE message; older ones than the last count for nothing.
+    /// Processes a STATE message; a message older than the last one is ignored.
     ///
     /// # Errors
-    /// Why the payload is no state.
+    /// If the payload is not a valid state; contains the reason.
     pub(super) fn take(&mut self, form: StateForm, payload: &[u8]) -> Result<(), String> {
         let state: State = match form {
             StateForm::Object => serde_json::from_slice(payload).map_err(|error| error.to_string())?,

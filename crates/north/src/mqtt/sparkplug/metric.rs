@@ -5,7 +5,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use super::wire::{self, DataType, MetricValue, PropertyContent, PropertySet};
 use crate::drive::{Quality, Value};
 
-/// A moment: on the clock that measures intervals, and on the calendar.
+/// A moment on two clocks: the monotonic clock for intervals, and the calendar.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Moment {
     pub(super) now: Instant,
@@ -21,7 +21,7 @@ impl Moment {
         }
     }
 
-    /// This moment as ms since 1970.
+    /// This moment as milliseconds since 1970.
     pub(super) fn millis(self) -> u64 {
         self.millis_at(None)
     }
@@ -78,7 +78,7 @@ impl From<Value> for Datum {
 pub(super) enum Pace {
     /// Published after the minimum interval.
     Normal,
-    /// Changes all the time: published once a second, or with others.
+    /// A value that changes continuously: published once a second, or together with others.
     Figure,
 }
 
@@ -87,14 +87,14 @@ pub(super) enum Pace {
 pub(super) struct Definition {
     pub(super) name: String,
     pub(super) datatype: DataType,
-    /// Empty: none.
+    /// Engineering unit; empty if there is none.
     pub(super) unit: String,
     pub(super) low: Option<f64>,
     pub(super) high: Option<f64>,
     pub(super) pace: Pace,
 }
 
-/// The changing part.
+/// The part of a metric that changes.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Sample {
     /// `None` unless the quality is good.

@@ -1,4 +1,4 @@
-//! Which metrics the node and its drives have, and what they are now. Time is an argument.
+//! The metrics of the node and its drives, and their present values. Time is an argument.
 
 use std::time::SystemTime;
 
@@ -11,7 +11,7 @@ use crate::drive::{ModelPoint, Point, PointIndex, Quality, State};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::Reading;
 
-/// The result of the last command over Sparkplug: its code, and why it failed.
+/// Name of the metric for the result of the last command over Sparkplug: its code, and why it failed.
 pub(super) const COMMAND_RESULT: &str = "command_result";
 pub(super) const COMMAND_ERROR: &str = "command_error";
 
@@ -40,7 +40,7 @@ pub(super) struct DriveMetrics {
 }
 
 impl DriveMetrics {
-    /// The metrics with their definitions; `commands`: whether commands over Sparkplug are served.
+    /// The metrics with their definitions; `commands` sets whether commands over Sparkplug are accepted.
     pub(super) fn new(drive: DriveHandle, commands: bool) -> (DriveMetrics, Vec<Definition>) {
         let spec = &drive.image.spec;
         let text = |name: &str| Definition::new(name, DataType::String);
@@ -97,7 +97,7 @@ impl DriveMetrics {
         self.result = before.result.clone();
     }
 
-    /// Whether the drive is there, and its metrics, in the order of their definitions.
+    /// Whether the drive is online, and the samples of its metrics in the order of their definitions.
     pub(super) fn samples(&self, reading: &Reading<'_>, wall: SystemTime) -> Vec<Sample> {
         let moment = Moment { now: reading.now, wall };
         self.sources
@@ -167,7 +167,7 @@ fn datatype(point: &Point) -> DataType {
     }
 }
 
-/// The metrics of the node, and what they are now: `Bus/{bus}/…`, as in the health object of the bus.
+/// The metrics of the node with their present values: `Bus/{bus}/…`, as in the health object of the bus.
 pub(super) fn node_metrics(plant: &Plant, moment: Moment) -> (Vec<Definition>, Vec<Sample>) {
     use DataType::{Double, Int64, String};
     use Pace::{Figure, Normal};

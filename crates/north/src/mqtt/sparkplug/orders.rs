@@ -1,5 +1,5 @@
-//! DCMD messages: each becomes one order, checked, audited and answered like any other. The session has no message for
-//! results, so they become metrics of the drive. Time is an argument.
+//! DCMD messages: each becomes one order, checked, audited and answered like any other. Sparkplug has no message
+//! for results, so they become metrics of the drive. Time is an argument.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -26,10 +26,10 @@ const UNREAD: &str = "a Sparkplug command";
 /// Metrics in a command.
 const METRICS: usize = 64;
 
-/// The commands over Sparkplug.
+/// The command processing of the Sparkplug node.
 #[derive(Debug)]
 pub(super) struct Orders {
-    /// Everything from the connection to the broker counts as one client.
+    /// All messages over the connection to the broker count as one client.
     client: Arc<str>,
     awaited: VecDeque<Awaited>,
     memory: SharedMemory,
@@ -55,7 +55,7 @@ pub(super) struct Finished {
     pub(super) drive: String,
     /// The metrics that were to be changed.
     pub(super) metrics: Vec<usize>,
-    /// The code of the result, and why it failed; empty if it did not.
+    /// The code of the result, and the reason if the command failed; empty if it did not.
     pub(super) code: &'static str,
     pub(super) error: String,
 }
@@ -77,8 +77,8 @@ impl Finished {
 }
 
 impl Orders {
-    /// `memory` outlives this client, so that a command is recognised after a reload; `left` are those of the client
-    /// before.
+    /// `memory` outlives this client, so that a command is recognised after a reload; `left` are the commands of
+    /// the previous client.
     pub(super) fn new(memory: SharedMemory, right: Right, left: Option<NodeOrdersLeft>) -> Orders {
         Orders {
             client: SourceKind::Sparkplug.name().into(),
@@ -93,8 +93,8 @@ impl Orders {
         NodeOrdersLeft(self.awaited)
     }
 
-    /// Takes a command for the device of that name. When this returns, its order is in the queue of the bus, or the result
-    /// is returned. `target` is the drive of that name, with its place in the session.
+    /// Processes a command for the device with this name. When this returns, its order is in the queue of the bus,
+    /// or the result is returned. `target` is the drive of that name, with its index in the session.
     pub(super) fn take(
         &mut self,
         incoming: &Incoming,
@@ -162,7 +162,7 @@ impl Orders {
             ..Taken::default()
         };
         let mut memory = self.memory.lock();
-        // Only the payload, which contains the time, identifies the message.
+        // Only the payload identifies the message; it contains the time.
         let print = memory.fingerprint(&taken, Some(""));
         if memory.repeated(&taken, print, 0, now).is_some() {
             return Err(
@@ -252,7 +252,7 @@ impl Request {
         excerpt(all.join(" ").as_bytes())
     }
 
-    /// The command for the device at this place of the session.
+    /// The command for the device with this index in the session.
     fn asked(
         &self,
         profile: &Profile,
@@ -313,8 +313,8 @@ impl Request {
     }
 }
 
-/// The value of a metric, for any type of number that the host sends; `None` for null, for texts and for values such as
-/// NaN.
+/// The value of a metric, for any type of number that the host sends; `None` for null, for texts and for values
+/// such as NaN.
 fn json(metric: &Metric) -> Option<Json> {
     if metric.is_null == Some(true) {
         return None;

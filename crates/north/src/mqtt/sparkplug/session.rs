@@ -15,14 +15,14 @@ use crate::drive::Quality;
 
 /// Least time between two births of the node on one connection: requests in between are served together.
 const REBIRTH: Duration = Duration::from_millis(250);
-/// Values in one message of the history, and least time between two of them, so that live values have the connection.
+/// Most values in one history message, and the minimum interval between two of them, so that live values take precedence.
 const HISTORY_VALUES: usize = 250;
 const HISTORY_PACE: Duration = Duration::from_millis(25);
 /// Values of an outage that are kept, of all drives together.
 const HISTORY: usize = 200_000;
 /// Bytes of one value in a message of the history, about.
 const HISTORY_BYTES: usize = 100;
-/// Metrics at the beginning of a birth of the node that are no part of its definitions.
+/// Metrics at the start of a birth of the node that are not among its definitions.
 pub(super) const FIXED_METRICS: usize = 2;
 /// The metric with which a host requests a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
@@ -53,14 +53,14 @@ enum Phase {
     Away,
     /// Connected; the primary host is not online.
     Waiting,
-    /// Connected; the birth of the node comes next, at this time at the earliest.
+    /// The node is connected; its birth follows, at this time at the earliest.
     NodeBirth(Option<Instant>),
-    /// The births of the devices follow, from this place on.
+    /// The births of the devices follow, from this index on.
     DeviceBirths(usize),
     Live,
 }
 
-/// The session of a node; it lasts over several connections.
+/// The Sparkplug session of a node, which continues over several connections.
 #[derive(Debug)]
 pub(super) struct Session {
     rules: Rules,
@@ -73,7 +73,7 @@ pub(super) struct Session {
     devices: Vec<Device>,
     /// Devices that are no longer configured and are to be declared dead.
     departed: Vec<String>,
-    /// Index of the device that is looked at first, so that each device has its turn.
+    /// Index of the device that is checked first, so that each device gets its turn.
     cursor: usize,
     rebirth: bool,
     born_at: Option<Instant>,
@@ -104,7 +104,7 @@ impl Session {
         }
     }
 
-    /// The metrics of the node and of the devices from now on. A born node is born again if they differ.
+    /// Sets the metrics of the node and of the devices. A node that was born is born again if they differ.
     pub(super) fn adopt(&mut self, node: Vec<Definition>, devices: Vec<(String, Vec<Definition>)>) {
         let before = self.devices.iter().map(|d| (d.name.as_str(), &d.definitions));
         if self.node.definitions == node && before.eq(devices.iter().map(|(name, d)| (name.as_str(), d))) {
@@ -149,8 +149,8 @@ impl Session {
         death(bd_seq, moment)
     }
 
-    /// The broker accepted the connection with this number and takes packets of this many bytes; the state of the host
-    /// will be reported again.
+    /// Notes that the broker accepted the connection with this number and packets of this size; the state of the
+    /// host will be reported again.
     pub(super) fn opened(&mut self, bd_seq: u8, max_packet: usize) {
         self.bd_seq = bd_seq;
         self.host.forget();
@@ -206,11 +206,11 @@ impl Session {
         self.phase == Phase::Waiting
     }
 
-    /// A message about the primary host. If it makes it online, the births follow at `births_at`. Returns whether the connection is
-    /// to be given up: the host went offline.
+    /// Processes a message about the primary host. If the host comes online, the births follow at `births_at`.
+    /// Returns whether the connection must be given up because the host went offline.
     ///
     /// # Errors
-    /// Why the message is not understood; nothing changes.
+    /// If the message is not valid; contains the reason, and nothing changes.
     pub(super) fn host_state(&mut self, form: StateForm, payload: &[u8], births_at: Instant) -> Result<bool, String> {
         self.host.take(form, payload)?;
         match (self.phase, self.host.is_online()) {
@@ -251,7 +251,7 @@ impl Session {
         (device.present, device.now_is, device.changed) = (present, samples, true);
     }
 
-    /// Publishes these metrics of a device even if they do not change: someone tried to change them.
+    /// Publishes these metrics of a device even without a change: a host has tried to write them.
     pub(super) fn repeat(&mut self, device: usize, metrics: impl IntoIterator<Item = usize>) {
         if let Some(device) = self.devices.get_mut(device) {
             device.repeat.extend(metrics);
@@ -270,7 +270,7 @@ impl Session {
         }
     }
 
-    /// The alias of a metric, if it has one.
+    /// The alias of a metric; `None` if it has none.
     pub(super) fn alias(&self, device: usize, metric: usize) -> Option<u64> {
         match self.devices.get(device)?.namings.get(metric)? {
             Naming::Alias(alias) => Some(*alias),
@@ -288,14 +288,14 @@ impl Session {
         std::mem::take(&mut self.lost)
     }
 
-    /// The death of the node, which is the last message on the connection before it is closed.
+    /// The death of the node: the last message on the connection before it is closed.
     pub(super) fn end(&mut self, moment: Moment) -> Packet {
         self.closed();
         death(self.bd_seq, moment)
     }
 
-    /// The next message if one is due; otherwise when to ask again, unless something happens before. A returned message
-    /// counts as sent.
+    /// The next message if one is due; otherwise when to call again, unless something happens before. A returned
+    /// message counts as sent.
     pub(super) fn next(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         match self.phase {
             Phase::Away | Phase::Waiting => Err(None),
@@ -395,7 +395,7 @@ impl Session {
         self.seq = u8::MAX;
         (self.phase, self.rebirth, self.born_at) = (Phase::DeviceBirths(0), false, Some(moment.now));
         for device in &mut self.devices {
-            // After the birth of the node, hosts know nothing of its devices.
+            // After the birth of the node, hosts know none of its devices.
             (device.born, device.gone) = (false, false);
         }
         let control = Definition::new(REBIRTH_METRIC, DataType::Boolean);

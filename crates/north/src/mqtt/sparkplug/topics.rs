@@ -50,7 +50,7 @@ pub(super) enum StateForm {
 pub(super) struct Topics {
     group: String,
     node: String,
-    /// Empty: none.
+    /// Name of the primary host; empty if there is none.
     primary_host: String,
 }
 
@@ -91,7 +91,7 @@ impl Topics {
         format!("{NAMESPACE}/{}/DCMD/{}/{device}", self.group, self.node)
     }
 
-    /// Topic of the primary host's state, if there is such a host.
+    /// Topic of the primary host's state; `None` without a primary host.
     pub(super) fn state(&self) -> Option<String> {
         (!self.primary_host.is_empty()).then(|| format!("{NAMESPACE}/STATE/{}", self.primary_host))
     }

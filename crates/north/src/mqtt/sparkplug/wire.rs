@@ -1,8 +1,9 @@
-//! The payload of Sparkplug B as Protobuf messages, by the field numbers that the specification publishes (version 3.0,
-//! section 6.4). The derive of `prost` makes encoder and decoder of them, so neither `protoc` nor a build script is needed.
+//! The payload of Sparkplug B as Protobuf messages, by the field numbers of the specification (version 3.0, section
+//! 6.4). The derive of `prost` creates encoder and decoder from them, so neither `protoc` nor a build script is
+//! needed.
 //!
-//! Fields that the gateway neither sends nor reads (metadata, data sets, templates) are absent: a decoder skips what it
-//! does not know.
+//! Fields that the gateway neither sends nor reads (metadata, data sets, templates) are absent: a decoder skips
+//! unknown fields.
 
 use prost::Message as _;
 
@@ -101,7 +102,7 @@ impl Payload {
     }
 
     /// # Errors
-    /// Why the bytes are no payload.
+    /// If the bytes are not a valid payload; contains the reason.
     pub(super) fn decoded(bytes: &[u8]) -> Result<Payload, String> {
         Payload::decode(bytes).map_err(|error| error.to_string())
     }

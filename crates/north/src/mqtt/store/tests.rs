@@ -169,7 +169,7 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
         events: Qos::AtLeastOnce,
         expiry: None,
     });
-    // The first 1,024 messages go to the outbox at once.
+    // The first 1,024 messages enter the outbox at once.
     for n in 0..1240 {
         let message = Message::not_retained("e", format!("{n:200}").into_bytes());
         if let Some((number, message)) = store.push(message, outbox.room(MqttKind::Event) > 0) {

@@ -134,7 +134,7 @@ async fn users_come_and_go() {
     );
 }
 
-/// Each way by which the right of a user goes, and what leaves it.
+/// Each way in which a user loses the right to command, and what ends with it.
 #[tokio::test]
 async fn the_right_of_a_user_is_that_of_the_file_of_now() {
     let user = |name: &str, password: &str| User::new(name, password).unwrap().to_string();

@@ -59,7 +59,7 @@ fn a_repetition_gets_the_previous_result() {
     bench.acknowledge();
     bench.now += 2 * REMEMBERED;
     assert!(bench.take(long).is_some(), "it is remembered until it expires");
-    // Without an id only the mark of the broker shows a repetition.
+    // Without an id, only the broker's DUP flag shows a repetition.
     let bare = set("p1/set", r#"{"speed_reference": 5}"#);
     for _ in 0..2 {
         assert_eq!(bench.take(bare.clone()), None);
@@ -76,7 +76,7 @@ fn a_repetition_is_known_after_a_reload() {
     let result = bench.acknowledge();
     bench.reload_client();
     assert_eq!(json(&bench.take(run(1)).unwrap()), result);
-    // The client that would have published this result has gone.
+    // The client that would have published this result no longer exists.
     assert_eq!(bench.take(run(2)), None);
     bench.reload_client();
     assert_eq!(json(&bench.take(run(2)).unwrap())["error"]["code"], "not_allowed");
@@ -110,7 +110,7 @@ fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
     assert_eq!(again, None, "the first one's result is still to come");
 }
 
-/// Takes a run command, which this function returns, and a stop after it.
+/// Takes a run command, which is returned, and a stop after it.
 fn run_and_stop(bench: &mut SetTopics) -> Incoming {
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     for command in [run.clone(), set("p1/set", r#"{"id": 2, "run": false}"#)] {
@@ -139,7 +139,7 @@ fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
         assert_eq!(again["error"]["code"], "not_allowed", "{again}");
         assert_eq!(bench.queued(), 0);
     }
-    // This holds even without a stop in between.
+    // A repeated start is not executed, even without a stop in between.
     let start = set("p1/set", r#"{"id": 3, "run": true}"#);
     assert_eq!(bench.take(start.clone()), None);
     bench.acknowledge();

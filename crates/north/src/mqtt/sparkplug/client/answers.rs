@@ -7,7 +7,7 @@ use crate::mqtt::sparkplug::topics::Kind;
 use rumqttc::mqttbytes::QoS;
 
 impl NodeClient {
-    /// Subscriptions of the node: commands for itself, the primary host, commands for its devices.
+    /// Subscriptions of the node: commands for the node, state of the primary host, commands for its devices.
     pub(super) fn subscriptions(&self, limits: BrokerLimits) -> Vec<Filter> {
         let topics = &self.topics;
         let plain = |path| Filter {
@@ -28,7 +28,7 @@ impl NodeClient {
 
     pub(super) fn report_refused(&self, filters: &[Filter], refused: &[Option<String>]) {
         for (filter, why) in filters.iter().zip(refused) {
-            // Most hosts do without the topic of version 2.2.
+            // Most hosts do not use the state topic of version 2.2.
             let spare = self.topics.old_state().is_some_and(|old| old == filter.path);
             if let Some(why) = why
                 && !spare
@@ -42,7 +42,8 @@ impl NodeClient {
         }
     }
 
-    /// A birth without the metrics for which the broker's packets are too small; the session leaves them out from now on.
+    /// A birth without the metrics for which the broker's packet limit is too small; the session leaves them out
+    /// from now on.
     pub(super) fn fitted(&mut self, mut packet: Packet) -> Packet {
         let Some(limits) = self.common.link.limits() else {
             return packet;

@@ -1,4 +1,4 @@
-//! The metrics of the node or of one drive: what was published of them, and what is due.
+//! The metrics of the node or of one drive: which values were published, and which are due.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -20,7 +20,7 @@ pub(super) struct Device {
     pub(super) most: usize,
     pub(super) present: bool,
     pub(super) born: bool,
-    /// Whether the device went away since its birth, even if it is back.
+    /// Whether the device was lost since its birth, even if it has returned.
     pub(super) gone: bool,
     pub(super) now_is: Vec<Sample>,
     /// The metrics as last published or recorded.
@@ -28,7 +28,7 @@ pub(super) struct Device {
     /// Metrics that are published although they did not change.
     pub(super) repeat: Vec<usize>,
     pub(super) sent_at: Option<Instant>,
-    /// Whether the present samples may differ from those sent.
+    /// Whether the present samples may differ from those that were sent.
     pub(super) changed: bool,
     pub(super) history: Recorder,
 }
@@ -57,7 +57,7 @@ impl Device {
         names.zip(self.namings.iter().copied()).collect()
     }
 
-    /// All metrics, including those of which nothing is known; they count as published at `now`.
+    /// All metrics, including those without a known value; they count as published at `now`.
     pub(super) fn birth(&mut self, moment: Moment) -> Vec<Metric> {
         let unknown = moment.sample(None);
         let samples = self.now_is.iter().chain(std::iter::repeat(&unknown));
@@ -104,7 +104,7 @@ impl Device {
         (metrics, None)
     }
 
-    /// The metric with its present value.
+    /// Publishes the metric with its present value.
     fn publish(&mut self, place: usize) -> Option<Metric> {
         let (definition, naming) = (self.definitions.get(place)?, *self.namings.get(place)?);
         let sample = self.now_is.get(place)?;
@@ -132,7 +132,7 @@ impl Device {
     }
 }
 
-/// Gives each metric of `device` its alias: the one it had `before`, else one that no metric ever had.
+/// Assigns an alias to each metric of `device`: the one it had `before`, otherwise one that no metric ever had.
 pub(super) fn name(device: &mut Device, before: Option<&Device>, alias: bool, last: &mut u64) {
     let known = before.map(Device::aliases).unwrap_or_default();
     if alias {

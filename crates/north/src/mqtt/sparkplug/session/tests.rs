@@ -46,19 +46,19 @@ struct SessionWithHost {
     start: Instant,
     /// Time since the start, ms.
     time: u64,
-    /// Time from the host's message that it is online to the births, ms.
+    /// Time from the message that the host is online to the births, ms.
     births_after: u64,
     host: Watcher,
 }
 
-/// A host: its knowledge of the node, and every rule that it can check.
+/// A host that checks the node: its knowledge of the node, and every rule that a host can check.
 #[derive(Default)]
 struct Watcher {
     seq: Option<u64>,
     bd_seq: Option<u8>,
     /// Alias to device and name, as of the last births.
     aliases: BTreeMap<u64, (String, String)>,
-    /// All aliases that were ever used.
+    /// All aliases that were used so far.
     ever: BTreeMap<u64, (String, String)>,
     born: BTreeSet<String>,
     births: usize,
@@ -292,7 +292,7 @@ fn births_come_first_and_only_of_devices_that_are_there() {
     bench.tell(2, true, 6.0);
     bench.send(9);
     assert_eq!(bench.kinds(), [of(Kind::DeviceBirth, "p2")]);
-    // The drive goes away and returns before anything was sent; its death is sent in any case.
+    // The drive is lost and returns before anything was sent; its death is sent in any case.
     bench.tell(2, false, 6.0);
     bench.tell(2, true, 6.0);
     bench.send(9);
@@ -322,7 +322,7 @@ fn changes_keep_their_distance() {
         (bench.kinds(), bench.value("p0", "a")),
         (vec![of(Kind::DeviceData, "p0")], Some(3.0))
     );
-    // The value returns to the one last sent before anything is sent, so nothing is sent.
+    // The value returns to the one last sent before a message is due, so nothing is sent.
     bench.time += 10;
     bench.tell(0, true, 4.0);
     bench.tell(0, true, 3.0);
@@ -403,7 +403,7 @@ fn the_primary_host_opens_and_ends_the_session() {
     let death = bench.session.end(bench.tick());
     bench.host.see(&death);
     assert_eq!(bench.send(9), 0);
-    // The next connection waits for a state message of its own.
+    // The next connection waits for a new state message.
     bench.connect(1);
     bench.session.subscribed();
     assert_eq!(bench.send(9), 0);
@@ -428,7 +428,7 @@ fn an_outage_is_told_afterwards_in_order() {
     for step in 1..=600u32 {
         bench.time += 60;
         bench.tell(0, true, f64::from(step));
-        // The value is unchanged, so it is not recorded.
+        // The value is unchanged, so nothing is recorded.
         bench.tell(1, true, 0.0);
         expected.push((f64::from(step), bench.time));
     }
@@ -457,7 +457,7 @@ fn what_there_is_no_room_for_is_counted() {
         bench.time += 100;
         bench.tell(0, true, f64::from(step));
     }
-    // Two metrics come first, then one at a time; the session keeps five.
+    // Two metrics are recorded first, then one at a time; the session keeps five.
     assert_eq!((bench.waiting(), bench.session.take_lost()), (5, 6));
     let mut off = SessionWithHost::new(
         Rules {

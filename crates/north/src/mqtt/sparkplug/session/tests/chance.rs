@@ -15,8 +15,9 @@ impl Dice {
     }
 }
 
-/// Lost connections, births on request, drives that come and go, reloads, a host that goes offline: a thousand
-/// connections. The watcher checks every message; at the end of each connection the host knows the present state.
+/// A thousand connections with lost connections, births on request, drives that come and go, reloads, and a host
+/// that goes offline. The watcher checks every message; at the end of each connection the host knows the present
+/// state.
 #[test]
 fn a_thousand_connections() {
     for seed in 0..4 {
@@ -61,7 +62,7 @@ fn a_thousand_connections() {
                 bench.tell(device, present[device], number);
                 bench.send(dice.below(6) as usize);
             }
-            // Everything that is due, and what the pace holds back.
+            // Publishes everything that is due, also values postponed by the pace.
             for _ in 0..400 {
                 bench.time += 50;
                 bench.send(64);
