@@ -1,12 +1,13 @@
-//! A device server that closes its connection soon after a reply. A request that is sent before the close is seen goes into
-//! a connection that the server no longer reads: it holds the line until its time is over. So the bus notes after how many
-//! replies, and how soon, the server closes, and sends nothing in that time. Pure: time is an argument.
+//! Handles a device server that closes its connection soon after a reply. A request sent before the close is
+//! noticed is lost in a connection that the server no longer reads, and blocks the line until its time limit. So
+//! the bus learns after how many replies, and how soon, the server closes, and sends nothing during that time.
+//! Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
 /// A connection that ends later than that after a reply is not closed because of the reply.
 const SOON: Duration = Duration::from_millis(60);
-/// Wait for the server to close, beyond twice the time that it took before.
+/// Time to wait for the server to close, in addition to twice the time that it took before.
 const MARGIN: Duration = Duration::from_millis(10);
 /// Number of further replies over one connection after which the server counts as one that stays connected.
 const STAYED: u32 = 3;
@@ -14,13 +15,13 @@ const STAYED: u32 = 3;
 /// Knowledge of a device server and of its present connection.
 #[derive(Debug, Default)]
 pub(super) struct ClosingServer {
-    /// Replies over this connection, and when the last one came.
+    /// Number of replies over this connection, and when the last one arrived.
     replies: u32,
     last: Option<Instant>,
     habit: Option<Habit>,
 }
 
-/// The server closes a connection after this number of replies and within this time.
+/// The learned behaviour of a server: it closes a connection after this number of replies and within this time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Habit {
     replies: u32,
@@ -33,12 +34,12 @@ impl ClosingServer {
         (self.replies, self.last) = (0, None);
     }
 
-    /// The port was lost: the next server is another one.
+    /// Notes that the port was lost: the next connection may lead to another server.
     pub(super) fn lost(&mut self) {
         *self = ClosingServer::default();
     }
 
-    /// A reply came over the connection.
+    /// Notes that a reply arrived over the connection.
     pub(super) fn replied(&mut self, now: Instant) {
         self.replies = self.replies.saturating_add(1);
         self.last = Some(now);
@@ -46,7 +47,8 @@ impl ClosingServer {
         self.habit.take_if(stays);
     }
 
-    /// The server closed the connection; `asked`: a request had been sent over it since the last reply.
+    /// Notes that the server closed the connection; `asked` means that a request had been sent over it since the
+    /// last reply.
     pub(super) fn closed(&mut self, asked: bool, now: Instant) {
         let within = self.last.map(|last| now.saturating_duration_since(last));
         let Some(within) = within.filter(|within| *within <= SOON) else {
@@ -92,7 +94,7 @@ mod tests {
                 assert_eq!(server.closes_until(), Some(now + 20 * MS));
                 server.closed(false, now + 5 * MS);
             }
-            // The server stays from now on: after a few more replies that is believed.
+            // The server keeps its connections from now on, which is learned after a few more replies.
             server.connected();
             (0..replies + STAYED).for_each(|_| server.replied(now));
             assert!(server.closes_until().is_some());

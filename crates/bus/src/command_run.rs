@@ -1,4 +1,5 @@
-//! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
+//! A command on its way through the line, step by step: control words made from the known words, pulses, safe order
+//! of writes. Pure.
 
 mod control;
 mod ending;
@@ -30,7 +31,7 @@ use crate::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
 };
 
-/// Most stops to a drive that are sent before the end of a started pulse.
+/// Most stops to a drive that are sent before the end of a pulse in progress.
 const MOST_STOPS: u32 = 8;
 
 /// The next step of a command.
@@ -43,7 +44,7 @@ pub enum Next {
     Done,
 }
 
-/// The properties of the command that its steps depend on.
+/// The parts of the command that decide its steps.
 #[derive(Debug)]
 struct Scope {
     /// Whether the command sets every bit that can be commanded, except reset bits.
@@ -58,7 +59,7 @@ struct Scope {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum OnWire {
     Nothing,
-    /// Only reads that prepare a write were sent.
+    /// Only reads that prepare a write were sent so far.
     Reads,
     /// A write was sent, or the read of a command that reads.
     Command,
@@ -69,7 +70,7 @@ enum OnWire {
 enum Phase {
     /// The steps as ordered.
     Steps,
-    /// The last word of a sequence, which starts the motor, was sent: if the rest fails, a stop follows.
+    /// The last word of a start sequence was sent, which starts the motor: if the rest fails, a stop follows.
     MotorStarted,
     /// The end of a pulse, or that stop, which is sent whatever happens.
     OnlyEnds,
@@ -104,13 +105,13 @@ struct Tries {
 #[derive(Debug)]
 pub struct CommandRun {
     urgency: Urgency,
-    /// With which it competes for the line; a redundant stop has that of a command.
+    /// Rank by which the command competes for the line; a redundant stop has the rank of an ordinary command.
     pub rank: Urgency,
     scope: Scope,
     actions: VecDeque<Action>,
     not_before: Option<Instant>,
     expires: Instant,
-    /// Everyone waiting for its result: the client that sent it, then those that joined.
+    /// Tickets of all clients that wait for the result: the client that sent the command, then those that joined.
     tickets: Vec<Ticket>,
     effects: Vec<Effect>,
     tries: Tries,
@@ -120,13 +121,13 @@ pub struct CommandRun {
     reply: Reply,
     on_wire: OnWire,
     known: Known,
-    /// The drive refused the function by which its present step was written: the other one is tried.
+    /// The drive refused the function code of the present step, so the alternative function is being tried.
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
-    /// The drive is being read to see whether its motor runs.
+    /// The reads in progress that show whether the motor runs.
     look: Option<StateRead>,
-    /// The ordered direction, where it waits for the next start.
+    /// The ordered direction, if it takes effect at the next start.
     next_start: Option<bool>,
     /// Whether the command sets the direction, or starts the motor.
     turns: bool,
@@ -134,7 +135,7 @@ pub struct CommandRun {
     held_up: bool,
     /// Stops that were done since the command's last write.
     overtaken: u32,
-    /// The command as it was ordered.
+    /// The command in the form in which it was ordered.
     intent: Intent,
     /// The start that the command causes, of a motor whose starts are counted.
     pub(super) start: Option<Start>,
@@ -232,7 +233,7 @@ impl CommandRun {
         }
     }
 
-    /// The stop of a client that it is, as it was ordered: the bus that takes the place of this one sends it as a whole.
+    /// The client's stop in the form in which it was ordered: the bus that replaces this one sends it completely.
     ///
     /// # Errors
     /// The command is not a stop of a client.
@@ -249,7 +250,7 @@ impl CommandRun {
         Ok(Command::begun_stop(self.intent, was_begun, ticket, joined))
     }
 
-    /// The command as it was ordered.
+    /// The command in the form in which it was ordered.
     pub fn intent(&self) -> &Intent {
         &self.intent
     }
@@ -274,8 +275,8 @@ impl CommandRun {
         self.expires
     }
 
-    /// The thread did not run for long, with the machine suspended for `slept` of it. A command that has started is not
-    /// continued.
+    /// Handles a long stall of the bus thread; `slept` is the part during which the machine was suspended. A
+    /// command in progress is not continued.
     pub fn interrupted(&mut self, slept: Duration, now: Instant) {
         let expires = self.expires.checked_sub(slept).unwrap_or(now);
         self.expires = if self.reached_the_wire() {
@@ -285,7 +286,7 @@ impl CommandRun {
         };
     }
 
-    /// Whether a client gave the command, not the gateway itself.
+    /// Whether a client gave the command, and not the gateway itself.
     pub fn is_of_client(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
@@ -318,7 +319,7 @@ impl CommandRun {
         self.phase != Phase::OnlyEnds
     }
 
-    /// Whether the command, or a part of it, was on the wire; a preparatory read does not count.
+    /// Whether at least a part of the command was on the wire; a preparatory read does not count.
     pub fn has_begun(&self) -> bool {
         self.on_wire == OnWire::Command
     }
@@ -328,7 +329,7 @@ impl CommandRun {
         self.on_wire != OnWire::Nothing
     }
 
-    /// The parameter that the command sets, if it sets one.
+    /// The state of a parameter write, if the command is one.
     fn parameter(&mut self) -> Option<&mut ParameterRun> {
         match self.actions.front_mut() {
             Some(Action::Parameter(run)) => Some(run),
@@ -336,15 +337,16 @@ impl CommandRun {
         }
     }
 
-    /// Whether its write must be the next transaction: the drive just reported whether its motor runs, for a parameter or for a
-    /// word that does not say whether it is to; or it sets a bit of a settings register that was just read.
+    /// Whether the write must be the very next transaction: the drive has just reported whether its motor runs (for
+    /// a parameter, or a word that does not decide that), or a settings register was just read to change one of its
+    /// bits.
     pub fn is_checked(&mut self) -> bool {
         let settings = self.known.check == Check::Read && self.settings().is_some();
         settings || self.known.motor.is_some() || self.parameter().is_some_and(|run| run.is_checked())
     }
 
-    /// Another transaction goes first: before a parameter or such a word is written, the motor state is read again, and so are the
-    /// other settings in the register.
+    /// Notes that another transaction goes first: the motor state, or the other settings of the register, must then
+    /// be read again before the write.
     pub fn others_go_first(&mut self) {
         if self.settings().is_some() || self.known.motor.take().is_some() {
             self.known.check = Check::NotYet;
@@ -354,7 +356,8 @@ impl CommandRun {
         }
     }
 
-    /// The register of the present step if that changes one bit of it and leaves other settings as the drive has them.
+    /// The register of the present step, if the step changes one bit and must leave other settings of the register
+    /// unchanged.
     fn settings(&self) -> Option<(Table, u16)> {
         let raw = match self.actions.front()? {
             Action::Bits { raw, .. } | Action::PulseLow { raw, .. } | Action::PulseHigh { raw, .. } => raw,
@@ -396,7 +399,8 @@ impl CommandRun {
         !self.may_write_on() && self.overtaken >= MOST_STOPS
     }
 
-    /// `unbegun` if no part of the command was sent; otherwise the command was cut short, and its end is unknown.
+    /// The outcome `unbegun` if no part of the command was sent; otherwise the command was cut short, and its
+    /// result is unknown.
     fn unless_begun(&self, unbegun: Outcome, why: Interruption) -> Outcome {
         if self.has_begun() {
             Outcome::Interrupted(why)
@@ -405,8 +409,8 @@ impl CommandRun {
         }
     }
 
-    /// The reply to its last step may have been a late one: the step is repeated when no late reply can arrive any
-    /// more.
+    /// The reply to the last step may be a late reply to an earlier request: the step is repeated when no late
+    /// reply can arrive any more.
     pub fn wait_for_late_replies(&mut self) {
         self.ask_before_repeating();
         self.tries.doubt = Doubt::LateReply;
@@ -418,19 +422,19 @@ impl CommandRun {
         }
     }
 
-    /// Whether the command waits while a late reply could be mistaken for the reply to its step. A stop waits only once
-    /// it was sent.
+    /// Whether the command waits because a late reply could be mistaken for the reply to its step. A stop is sent
+    /// first and waits only afterwards.
     pub fn waits_for_late(&self) -> bool {
         self.urgency != Urgency::Stop || self.tries.doubt == Doubt::LateReply
     }
 
-    /// The command must wait for a late reply: values that it has read are outdated by then.
+    /// Notes that the command must wait for a late reply: the values that it has read are outdated afterwards.
     pub fn hold_up(&mut self) {
         self.held_up = true;
     }
 
-    /// The command may continue. Returns whether it first repeats the reads from before the wait: the motor may have
-    /// been stopped meanwhile.
+    /// Continues the command after a wait. Returns whether it first repeats its reads: the motor may have been
+    /// stopped meanwhile.
     pub fn asks_again(&mut self) -> bool {
         let held_up = std::mem::take(&mut self.held_up);
         if held_up && self.is_checked() {
@@ -450,7 +454,7 @@ impl CommandRun {
         self.by_other_function = false;
     }
 
-    /// Whether the command has expired, and its remaining steps are not cancelled yet.
+    /// Whether the command has expired while steps remain that were not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && self.may_write_on()
     }
@@ -487,7 +491,7 @@ fn turns(profile: &Profile, order: &Order) -> bool {
     }
 }
 
-/// Why no parameter is written: the family does not report whether the motor is stopped.
+/// The refusal of a parameter write because the family does not report whether the motor is stopped.
 fn running_unknown(profile: &Profile) -> Refusal {
     Refusal::NotWritable(format!(
         "profile `{}` does not say where the drive reports whether its motor runs; no parameter is written",

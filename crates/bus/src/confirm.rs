@@ -1,4 +1,4 @@
-//! Whether an acknowledged command shows its effect: the first read after it that shows it confirms it. Pure.
+//! Confirms an acknowledged command by the first later read that shows its effect. Pure.
 
 use std::time::{Duration, Instant};
 
@@ -9,11 +9,11 @@ use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
-/// A motor is decelerating if its speed falls by more than this, in Hz, or in percent if no frequency is read. Less is
-/// ripple.
+/// A motor counts as decelerating if its speed falls by more than this, in Hz, or in percent if no frequency is
+/// read. Less is ripple.
 const RIPPLE: f64 = 0.25;
 
-/// On a busy line, the next read may come late; a missing effect is reported only after this multiple of the
+/// On a busy line the next read may be late; a missing effect is reported only after this multiple of the
 /// confirmation time.
 const UNREAD: u32 = 5;
 
@@ -54,7 +54,7 @@ impl Effect {
     }
 }
 
-/// The effects of the command that the plan reads; empty if it reads none.
+/// The effects of the command that polling will show; empty if it shows none.
 pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
     let mut effects: Vec<Effect> = Vec::new();
     let mut add = |effect: Option<Effect>| {
@@ -92,7 +92,7 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
                 }
             }
         }
-        // A parameter is read back before it is acknowledged.
+        // A parameter is read back before it is acknowledged, so it needs no confirmation.
         Order::Parameter(_) => {}
         Order::Read(_) => {}
     }
@@ -113,7 +113,7 @@ fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effec
     readable.then_some(Effect::ReadBack(index, value))
 }
 
-/// Whether the reading shows the effect, by samples that were read after `since`; none where there is no such sample.
+/// Whether the reading shows the effect, by samples read after `since`; `None` if there are no such samples.
 fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> {
     let after = |sample: crate::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
     let model = |point| after(reading.model(point));
@@ -142,8 +142,8 @@ fn is_standstill(output_frequency: Value) -> bool {
     output_frequency.as_f64() == 0.0
 }
 
-/// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band
-/// does not; the percentage where the profile has nothing else.
+/// The speed of the motor in either direction: its output frequency, because that falls to zero while a percentage
+/// of a band does not; the percentage if the profile has nothing else.
 fn speed(reading: &Reading<'_>) -> Option<Speed> {
     let has = |point: &ModelPoint| reading.spec.profile.model_point(*point).is_some();
     let point = [ModelPoint::OutputFrequency, ModelPoint::ActualSpeed]
@@ -168,7 +168,7 @@ struct Speed {
 #[derive(Debug, Clone, Copy)]
 struct Awaited {
     effect: Effect,
-    /// Whether the drive was read since, as far as it could show it: not every value is read in every round.
+    /// Whether the drive was read since, as far as the effect could show: not every value is read in every round.
     was_read: bool,
 }
 
@@ -289,8 +289,8 @@ pub struct Unconfirmed {
 pub struct Confirmations(Vec<Watch>);
 
 impl Confirmations {
-    /// A command was acknowledged at `now`; `reading` is the drive as it is known then. Older commands that want the
-    /// contrary are not waited for any more.
+    /// Watches for the effects of a command that was acknowledged at `now`; `reading` is the known state of the
+    /// drive at that time. Older commands with the opposite effect are no longer watched.
     pub fn watch(&mut self, effects: Vec<Effect>, receipts: Vec<Receipt>, reading: &Reading<'_>, now: Instant) {
         self.0.retain(|w| {
             let pointless = |old: &Effect| effects.iter().any(|new| new.same_subject(*old));
@@ -351,8 +351,8 @@ impl Confirmations {
         }
     }
 
-    /// The commands that had no effect in time, as text, each once. For a motor still decelerating, or points not read
-    /// since, nothing is reported yet, but the wait ends.
+    /// Commands whose effect did not appear in time, as text, each once. For a motor that is still decelerating, or
+    /// points not read since, nothing is reported yet, but the wait ends.
     pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<Unconfirmed> {
         let mut late = Vec::new();
         self.0.retain_mut(|watch| {
@@ -382,7 +382,7 @@ impl Confirmations {
         self.0.clear();
     }
 
-    /// Whether none is watched.
+    /// Whether no command is being watched.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

@@ -24,7 +24,7 @@ use crate::stalls::Stalls;
 /// Next action on the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
-    /// Read the received bytes; if none are there, write what [`BusCore::sending`] returns to the port.
+    /// Read the received bytes; if there are none, write the frame that [`BusCore::sending`] returns to the port.
     Send,
     /// Wait for bytes, or until this time.
     Wait {
@@ -40,7 +40,7 @@ pub enum Action {
 /// Reaction to a device server that closed the connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Closed {
-    /// Reconnect at once: the server has replied over it, or a reply may arrive over the next one.
+    /// Reconnect at once: the server has replied over this connection, or a reply may still arrive over the next one.
     Reconnect,
     /// Reconnect when there is something to send.
     ReconnectToAsk,
@@ -61,8 +61,8 @@ struct Connection {
     vain: u32,
 }
 
-/// Most consecutive connections that may end during a transaction: a server may have a shorter timeout for a drive that
-/// is off, or close after one request, but one that never replies does not reach the drives.
+/// Most consecutive connections that may end during a transaction. A server may have a shorter time limit for a
+/// drive that is off, or close after one request; but a server that never replies does not reach the drives.
 const MOST_IN_VAIN: u32 = 3;
 
 /// The request to send when the line is clear.
@@ -74,7 +74,7 @@ struct Chosen {
     since: Instant,
 }
 
-/// A bus without its thread.
+/// A bus without the thread that runs it.
 #[derive(Debug)]
 pub struct BusCore {
     bus: BusHandle,
@@ -82,7 +82,7 @@ pub struct BusCore {
     master: Master,
     report: Report,
     chosen: Option<Chosen>,
-    /// Until when a reply to a request of the previous bus may arrive: the line is left idle.
+    /// Until when a reply to a request of the previous bus may arrive; nothing is sent before.
     quiet_until: Option<Instant>,
     /// The transaction on the line.
     asked: Option<Turn>,
@@ -93,7 +93,7 @@ pub struct BusCore {
     writes: Arc<WriteStats>,
     /// Empty list, kept for its memory.
     news: Vec<News>,
-    /// Stalls of the bus's thread; none before it runs.
+    /// Stalls of the bus thread; `None` before it runs.
     stalls: Option<Stalls>,
     /// Whether the thread was stalled since the request on the line was sent.
     stood: bool,
@@ -134,9 +134,9 @@ impl BusCore {
         }
     }
 
-    /// Records that the thread runs at `now`; `boot` is the time since the machine was started, suspensions included.
-    /// Returns whether the thread was stalled since it ran last: then bytes that came meanwhile must be read before
-    /// anything else.
+    /// Records that the thread runs at `now`; `boot` is the time since the machine was started, including
+    /// suspensions. Returns whether the thread was stalled since it last ran: bytes that arrived meanwhile must
+    /// then be read before anything else.
     pub fn note_run(&mut self, now: Instant, boot: Duration) -> bool {
         let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
         let before = stalls.last_run();
@@ -152,7 +152,7 @@ impl BusCore {
         true
     }
 
-    /// Records that the thread runs on: since it ran last it did other work, such as opening the port.
+    /// Records that the thread was not stalled but did other work since it last ran, such as opening the port.
     pub fn runs_on(&mut self, now: Instant, boot: Duration) {
         match &mut self.stalls {
             Some(stalls) => stalls.go_on(now, boot),
@@ -173,8 +173,8 @@ impl BusCore {
         self.report.bus_up(now);
     }
 
-    /// A device server closed the connection, which is not a line fault if it replies: the drives' states stay as they
-    /// are, and pending requests keep waiting. Returns what to do with the port.
+    /// Handles a device server that closed the connection. If the server replies, this is not a line fault: the
+    /// drives' states do not change, and pending requests keep waiting. Returns what to do with the port.
     pub fn closed(&mut self, now: Instant) -> Closed {
         self.server.closed(self.line.is_underway(), now);
         self.line.cut();
@@ -189,7 +189,7 @@ impl BusCore {
             return Closed::Reconnect;
         }
         if asked && !self.line.is_underway() {
-            // No reply came, but the connection lasted as long as a reply may take.
+            // No reply arrived, but the connection lasted as long as a reply may take.
             return Closed::ReconnectToAsk;
         }
         if asked && anew && vain + 1 < MOST_IN_VAIN {
@@ -218,7 +218,7 @@ impl BusCore {
         self.command_came();
     }
 
-    /// The port is lost or cannot be opened: everything is stale at once, and all pending requests end.
+    /// Handles a port that was lost or cannot be opened: all values are stale at once, and all pending requests end.
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
@@ -265,7 +265,7 @@ impl BusCore {
         }
     }
 
-    /// Chooses what to send next; otherwise returns the time until which nothing is sent.
+    /// Chooses the next frame to send; otherwise returns the time until which nothing is sent.
     fn choose(&mut self, now: Instant) -> Option<Instant> {
         let mut news = std::mem::take(&mut self.news);
         let next = self.master.next(now, &mut news);
@@ -291,7 +291,7 @@ impl BusCore {
         let mut frame = Vec::with_capacity(32);
         self.bus.image.spec.protocol.encode(&request, &mut frame);
         if frame.is_empty() {
-            // The protocol has no such request, so that the drive has no such address.
+            // The protocol has no such request, so the result is as if the drive had no such address.
             let refused = Ended::Reply(Reply::Exception(Exception::ADDRESS));
             self.done(
                 &turn,
@@ -335,8 +335,8 @@ impl BusCore {
         }
     }
 
-    /// The chosen frame is written to the port at `now`: call this before writing, since what the port does with it is
-    /// unknown.
+    /// Notes that the chosen frame is written to the port at `now`. Must be called before writing, since the effect
+    /// of a failed write is unknown.
     pub fn sending(&mut self, now: Instant) -> &[u8] {
         let Some(Chosen {
             turn,
@@ -430,7 +430,7 @@ impl BusCore {
         self.report_all(news, now);
     }
 
-    /// The drive of a turn, if the bus has such a drive.
+    /// The drive of a turn, if it is configured on the bus.
     fn known(&self, turn: &Turn) -> Option<DriveIndex> {
         Some(turn.drive).filter(|drive| self.bus.image.drives.get(*drive).is_some())
     }

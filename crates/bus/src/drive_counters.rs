@@ -1,5 +1,5 @@
-//! The drives' own counters of the line (function 08), read while transactions with them fail: they show which
-//! direction is disturbed. Uses only a negligible share of the line.
+//! The line counters of the drives themselves (function 08), read while transactions with them fail: they show
+//! which direction is disturbed. The reads use only a negligible share of the line.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -50,7 +50,7 @@ impl DriveCounters {
         }
     }
 
-    /// Requests what is due, and takes what was read.
+    /// Requests the counters that are due, and processes what was read.
     pub(super) fn poll(
         &mut self,
         bus: &BusHandle,
@@ -98,8 +98,8 @@ impl DriveCounters {
                             }
                         }
                     }
-                    // A drive that refuses the counters is left alone for long; a request that was lost on the line is
-                    // repeated sooner.
+                    // A drive that refuses the counters is left alone for a long time; a request that was lost on
+                    // the line is repeated sooner.
                     Ok(Answer {
                         outcome: Outcome::Exception(_),
                         ..

@@ -26,8 +26,8 @@ pub(super) struct DriveState {
     pub(super) fresh: Duration,
     /// Command words of the drive.
     pub(super) words: KnownWords,
-    /// Places that orders write, and the place of the command word if the drive shows its own: these are kept from every
-    /// read.
+    /// Registers that orders write, and the register of the command word if the drive reports its own word: these
+    /// are learned from every read.
     pub(super) commanded: Vec<(Table, u16)>,
     /// Replies that the drive may still send.
     pub(super) late: LateReplies,
@@ -36,9 +36,9 @@ pub(super) struct DriveState {
     pub(super) supervision: Supervision,
     /// Refresh for the drive's own timeout.
     pub(super) refresh: Refresh,
-    /// Why the refresh ended, until that is reported.
+    /// Why the refresh ended; `None` after that was reported.
     pub(super) refresh_ended: Option<End>,
-    /// Commands that the drive acknowledged and has not shown yet.
+    /// Commands that the drive acknowledged but whose effect it has not shown yet.
     pub(super) confirmations: Confirmations,
     /// Started commands, one of each rank, so that commands of a rank keep their order.
     runs: [Option<CommandRun>; 3],
@@ -50,14 +50,14 @@ pub(super) struct DriveState {
     pub(super) answers_within: Duration,
     /// Whether the drive was read since its confirmations were checked.
     pub(super) was_read: bool,
-    /// When its reference, and an end of its frequency range, were written last, whether or not it took that.
+    /// When reference, and an end of the frequency range, were last written, whether or not the drive accepted it.
     pub(super) written: LastWritten,
-    /// A start (true) or a stop was acknowledged, and the guards have not taken note of it.
+    /// A start (true) or a stop was acknowledged, and the guards have not been informed yet.
     pub(super) acknowledged: Option<bool>,
-    /// Whether `[authority]` is on: the senders of executed commands are then kept, and whether these were stops.
+    /// Whether `[authority]` is on: the senders of executed commands are then recorded, and whether these were stops.
     pub(super) has_authority: bool,
     pub(super) carried_out: Vec<(Origin, bool)>,
-    /// Whether the drive is under local control; none while that is not known.
+    /// Whether the drive is under local control; `None` while that is unknown.
     pub(super) local: Option<bool>,
 }
 
@@ -84,7 +84,7 @@ fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
 }
 
 impl DriveState {
-    /// State of a drive about which nothing is known; its status is read every `round` at best.
+    /// State of a drive about which nothing is known yet; its status is read at most every `round`.
     pub(super) fn new(spec: &DriveSpec, round: Duration) -> DriveState {
         let profile = &spec.profile;
         DriveState {
@@ -155,8 +155,8 @@ impl DriveState {
         }
         for urgency in order {
             loop {
-                // The motor state of a faulted drive may be from before the fault; the drive does not run by its run
-                // command.
+                // The motor state of a faulted drive may be from before the fault; the drive then does not run by
+                // its run command.
                 let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
                 let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
                     break;
@@ -189,7 +189,7 @@ impl DriveState {
         wake_at.map_or(Wanted::Nothing, Wanted::Wait)
     }
 
-    /// Whether stop after stop went before the end of a pulse, and the next one is not on the wire yet.
+    /// Whether stops were sent repeatedly before the end of a pulse, and the next stop is not on the wire yet.
     fn pulse_is_put_off(&self) -> bool {
         let [stop, command, _] = &self.runs;
         let waits = command.as_ref().is_some_and(CommandRun::is_put_off);
@@ -279,7 +279,7 @@ impl DriveState {
         self.refresh_ended = ended.or(self.refresh_ended.take());
     }
 
-    /// Ends the refresh for this reason, if it has started.
+    /// Ends a refresh in progress for this reason.
     pub(super) fn end_refresh(&mut self, why: End) {
         let ended = self.refresh.end(why);
         self.refresh_ended = ended.or(self.refresh_ended.take());
@@ -313,8 +313,8 @@ impl DriveState {
         self.stopped.is_some()
     }
 
-    /// Whether a stop is redundant: the drive acknowledged one, a later sample shows the motor stopped, and no started
-    /// command may start it.
+    /// Whether a further stop is redundant: the drive acknowledged one, a later sample shows the motor stopped, and
+    /// no command in progress may start it.
     pub(super) fn stands_by_stop(&self, reading: &Reading<'_>) -> bool {
         let begun = self.runs.get(slot(Urgency::Command)).and_then(Option::as_ref);
         let running = reading.model(ModelPoint::Running);
@@ -326,7 +326,7 @@ impl DriveState {
                 .is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
     }
 
-    /// A stop goes before what is left of a started command.
+    /// Sends a stop before the rest of a command in progress.
     pub(super) fn stop_goes_first(&mut self) {
         if let Some(run) = self.run(Urgency::Command) {
             run.stop_goes_first();
@@ -354,7 +354,8 @@ impl DriveState {
         }
     }
 
-    /// A bit of another command must not bring back what an unanswered stop took away.
+    /// Forgets the words after an unanswered stop, so that a bit written for another command does not restore what
+    /// the stop took away.
     fn forget_words(&mut self) {
         self.words.forget();
     }
@@ -374,13 +375,13 @@ impl DriveState {
         }
     }
 
-    /// The drive may have taken these words, or not.
+    /// Notes that the drive may or may not have received these words.
     pub(super) fn may_have_taken(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
         self.words.in_doubt(table, items, control);
         self.stopped = None;
     }
 
-    /// The drive has restarted: everything known about it is void.
+    /// The drive has restarted, so everything known about it is invalid.
     pub(super) fn restarted(&mut self) {
         self.end_refresh(End::Restart);
         self.words.forget();

@@ -1,27 +1,30 @@
-//! Replies that a drive may still send after its transaction was given up: a late one must not be mistaken for the
-//! reply to a later request. Pure: time is an argument.
+//! Replies that a drive may still send after its transaction was given up: such a late reply must not be mistaken
+//! for the reply to a later request. Pure: time is an argument.
 //!
-//! A Modbus reply names neither register nor request. After a transaction without a valid reply, the reply may come
-//! during a later transaction. It is recognised by address, function and length; only a request to the same drive whose
-//! reply would look the same could be answered wrongly. Such a request waits until no late reply can come any more. The
-//! same request may be sent again at once: whichever reply comes, it is true of the same registers.
+//! A Modbus reply names neither register nor request. After a transaction without a valid reply, the reply may
+//! arrive during a later transaction. Address, function and length distinguish it from most replies; only a request
+//! to the same drive with a reply of equal form could be answered wrongly. Such a look-alike request waits until no
+//! late reply can arrive any more. The identical request may be sent again at once: whichever reply arrives is true
+//! for the same registers.
 //!
-//! The reply that comes then may still be the older one, with the newer one to come: a drive that is always a little slower than
-//! the deadline stays one reply behind as long as a request is repeated. Until that is settled, samples are dated by the request
-//! before. A reply that cannot be any of these settles it: a drive answers in order, so a reply to a request of another form
-//! shows that no earlier reply is still to come. A plan has such requests: its slow reads.
+//! The reply that then arrives may be the older one, with the newer one still to come: a drive that is always
+//! slightly slower than the deadline stays one reply behind as long as a request is repeated. Until this is
+//! settled, samples get the time of the previous request. A reply that cannot be one of these settles it: a drive
+//! answers in order, so after a reply to a request of another form no earlier reply can arrive. A plan has such
+//! requests: its slow reads.
 //!
-//! ReplyShape-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
-//! held back too after a while, and the drive gets the time to catch up.
+//! Look-alike requests do not rely on that order: they only wait for the time to pass. While one waits, the request
+//! whose reply is late is also held back after a while, so that the drive can catch up.
 //!
-//! A write acknowledged late proves nothing once the drive may have taken another write in between: the same
-//! write then waits as a look-alike does. A stop does not wait, so the first acknowledgement of such a stop proves nothing:
-//! it may belong to the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
-//! written in between, either acknowledgement is true: the drive's last word is a stop.
+//! A late acknowledgement of a write proves nothing once the drive may have received another write in between: the
+//! same write then waits like a look-alike. A stop does not wait, so the first acknowledgement of such a stop
+//! proves nothing: it may belong to the earlier stop, and the stop is sent once more, which does no harm. If
+//! nothing was written in between, either acknowledgement is true: the drive's last word is a stop.
 //!
-//! A stop does not wait for look-alikes, either. The acknowledgement of a write of several registers or coils has first
-//! address and count, not the values. So a stop by such a write is sent again for each acknowledgement of another one
-//! that may still come. From then on it is the stop whose acknowledgement may come late, instead of the other write's.
+//! A stop does not wait for look-alikes either. The acknowledgement of a write of several registers or coils
+//! contains first address and count, not the values. So a stop by such a write is sent again for each
+//! acknowledgement of another write that may still arrive. From then on, late acknowledgements are expected for the
+//! stop instead of the other write.
 
 use std::time::{Duration, Instant};
 
@@ -29,12 +32,12 @@ use crate::codec::RequestPdu;
 
 /// Time after which a missing reply is no longer expected.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
-/// How long a look-alike waits before the request whose reply is late is held back for it.
+/// How long a look-alike request waits before the request whose reply is late is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Most attempts of one write that may be acknowledged late: neither the drive nor anything in between buffers more.
+/// Most attempts of one write that may be acknowledged late: neither the drive nor any device in between buffers more.
 const KEPT: u32 = 3;
 
-/// Replies that one drive may still send.
+/// Late replies of one drive that may still arrive.
 #[derive(Debug, Default)]
 pub struct LateReplies {
     expected: Vec<LateReply>,
@@ -43,22 +46,22 @@ pub struct LateReplies {
 #[derive(Debug)]
 struct LateReply {
     pdu: RequestPdu,
-    /// When the first of the transactions that were given up in a row began; `None` once the request was answered.
+    /// When the first in the present series of failed transactions began; `None` once the request was answered.
     since: Option<Instant>,
     until: Instant,
-    /// Lateness of the reply, if it was the older one.
+    /// How late the last reply was, if it was the older one.
     late: Duration,
-    /// When the last answered request was sent: if its reply was the older one, the next reply belongs to this request.
+    /// When the last answered request was sent: if its reply was the older one, the next reply belongs to that request.
     before: Option<Instant>,
-    /// Time until which the newer reply may come.
+    /// Time until which the newer of two replies may arrive.
     newer: Option<Instant>,
-    /// Each reply belongs to its own request: the drive has replied to another request since.
+    /// Whether each reply certainly belongs to its own request, because the drive has replied to another request since.
     settled: bool,
-    /// Since when a request of equal form waits.
+    /// Since when a request with a reply of equal form has been waiting.
     wanted: Option<Instant>,
-    /// Replies that may still come.
+    /// Number of replies that may still arrive.
     count: u32,
-    /// How many of them are of tries before another write, which the drive may have taken.
+    /// How many of these replies belong to attempts before another write that the drive may have received.
     overtaken: u32,
 }
 
@@ -120,7 +123,7 @@ impl LateReplies {
         self.expected.retain(|late| late.ends() > now);
         for late in &mut self.expected {
             if late.pdu == *pdu {
-                // The newer reply will be about as late as the older one was, if it was the older one.
+                // If the reply was the older one, the newer one will be about as late.
                 if let Some(since) = late.since.take() {
                     late.late = now.saturating_duration_since(since).max(late.late).min(FORGOTTEN_AFTER);
                 }
@@ -133,8 +136,8 @@ impl LateReplies {
         self.overtake(pdu);
     }
 
-    /// A reply to `pdu` came that is not an exception: no reply to an earlier request of another form is still to come. The
-    /// reply shows nothing where it may itself be the late reply to an earlier request. To be called before
+    /// Notes a reply to `pdu` that is not an exception: no reply to an earlier request of another form can arrive
+    /// any more. It proves nothing if it may itself be a late reply to an earlier request. Must be called before
     /// [`LateReplies::answered`].
     pub(crate) fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
         let owed = |late: &&LateReply| late.ends() > now && are_alike(&late.pdu, pdu);
@@ -146,7 +149,8 @@ impl LateReplies {
         }
     }
 
-    /// The drive may have taken `pdu`: an acknowledgement of an earlier write does not show how it is now.
+    /// Notes that the drive may have received `pdu`: an acknowledgement of an earlier write no longer shows its
+    /// present state.
     fn overtake(&mut self, pdu: &RequestPdu) {
         let others = self.expected.iter_mut().filter(|late| late.pdu != *pdu);
         for late in others.filter(|late| pdu.is_write() && late.pdu.is_write()) {
@@ -154,9 +158,9 @@ impl LateReplies {
         }
     }
 
-    /// Whether the reply to `pdu`, sent at `sent`, may belong to an earlier request: to another one of equal form, or to
-    /// an equal write before another one. To be called before [`LateReplies::answered`]; true once for each late reply,
-    /// and `pdu`, which is to be sent again, is expected in its place.
+    /// Whether the reply to `pdu`, sent at `sent`, may belong to an earlier request: to another one of equal form,
+    /// or to an identical write before another write. True once for each late reply; `pdu` must then be sent again,
+    /// and its reply is expected instead. Must be called before [`LateReplies::answered`].
     pub(crate) fn proves_nothing(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
         let owed = |late: &LateReply| late.ends() > sent;
         let same = |late: &&mut LateReply| owed(late) && late.pdu == *pdu && late.overtaken > 0;
@@ -177,30 +181,31 @@ impl LateReplies {
         true
     }
 
-    /// The latest time at which the request of an answer to `pdu` at `now` may have been sent: earlier than the present
-    /// request while a late reply to an equal request may come. To be called before [`LateReplies::answered`].
+    /// The earliest time at which the request answered at `now` by a reply to `pdu` may have been sent: before the
+    /// present request while a late reply to an identical request may arrive. Must be called before
+    /// [`LateReplies::answered`].
     pub(crate) fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
         let doubtful = |late: &LateReply| late.ends() > now && !late.settled;
         let same = self.expected.iter().find(|late| late.pdu == *pdu && doubtful(late));
         same.map_or(now, |late| late.since.or(late.before).unwrap_or(now))
     }
 
-    /// Time until which any reply may still come.
+    /// Time until which any late reply may arrive.
     pub fn until(&self) -> Option<Instant> {
         self.expected.iter().map(LateReply::ends).max()
     }
 
-    /// Number of requests whose replies may still come.
+    /// Number of requests whose replies may still arrive.
     pub(super) fn owed(&self, now: Instant) -> usize {
         self.expected.iter().filter(|late| late.ends() > now).count()
     }
 
-    /// Whether any reply may still come.
+    /// Whether any late reply may still arrive.
     pub fn may_come(&self, now: Instant) -> bool {
         self.expected.iter().any(|late| late.ends() > now)
     }
 
-    /// Until when `pdu` must wait because a late reply could pass for its own.
+    /// Until when `pdu` must wait because a late reply could be mistaken for its own.
     pub fn blocks(&mut self, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let mut until = None;
         for late in self.expected.iter_mut().filter(|late| late.ends() > now) {
@@ -215,19 +220,19 @@ impl LateReplies {
     }
 }
 
-/// Whether the reply to one of these requests could pass for the reply to the other.
+/// Whether the reply to one of these requests could be mistaken for the reply to the other.
 pub fn are_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
     ReplyShape::of(a) == ReplyShape::of(b)
 }
 
-/// The part of a request that its reply shows.
+/// The part of a request that can be recognised in its reply.
 #[derive(Debug, PartialEq, Eq)]
 enum ReplyShape<'r> {
     /// Function and length of a read.
     Read(u8, usize),
     /// Function, first address and count of a write of several items.
     Several(u8, u16, usize),
-    /// The function of a request that is not decoded.
+    /// The whole request, which the reply echoes.
     Function(u8),
     /// Everything: the request is echoed whole.
     Whole(&'r RequestPdu),

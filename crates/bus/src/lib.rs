@@ -18,8 +18,8 @@
 //! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
 //! - [`news`]: the results of the master; `report` applies them to the process image, to events and to the log.
 //!
-//! Only `line_loop` and [`prober`] do I/O and read the clock; everything else takes time as an argument. `report` and
-//! `tap`, which feeds the trace, add the time of day to what they report.
+//! Only `line_loop` and [`prober`] do I/O and read the clock; all other modules take time as an argument. `report`
+//! and `tap`, which feeds the trace, add the time of day to their reports.
 
 mod closing_server;
 pub mod command_run;

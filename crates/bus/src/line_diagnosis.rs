@@ -1,5 +1,5 @@
-//! Feeds the diagnosis of a line with its transactions, and publishes its verdicts. Uses no clock except for the time
-//! of day of verdicts.
+//! Feeds the diagnosis of a line with its transactions, and publishes the verdicts. Uses no clock except for the
+//! time of day of verdicts.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -17,9 +17,9 @@ use crate::diagnosis::{
 use crate::drive::{DriveIndex, PerDrive, PlannedRead};
 use crate::process_image::BusImage;
 
-/// Time for which a trip by a drive's own timeout is shown.
+/// Time for which a trip by a drive's own communication timeout is shown.
 const TRIP_SHOWN: Duration = Duration::from_secs(600);
-/// One failed request of so many makes a line unsound: what is not answered there may have been lost.
+/// A line with one failed request in this number is unsound: an unanswered request there may simply have been lost.
 const UNSOUND: u32 = 20;
 
 #[derive(Debug)]
@@ -30,9 +30,9 @@ pub(super) struct LineDiagnosis {
     debounce: Debounce,
     /// Silence before the request that is on the line.
     gap: Duration,
-    /// Each drive's own counters: since the first reading of this series of errors, and the last reading.
+    /// The counters of each drive itself: at the start of the present series of errors, and at the last reading.
     by_drive: PerDrive<Option<(CountedByDrive, CountedByDrive)>>,
-    /// The last trip of each drive by its own timeout, for [`TRIP_SHOWN`].
+    /// The last trip of each drive by its own communication timeout, kept for [`TRIP_SHOWN`].
     trips: PerDrive<Option<(Instant, Finding)>>,
     /// Reads to which each drive never replies, as of the last step.
     unanswered: PerDrive<Vec<PlannedRead>>,
@@ -41,7 +41,8 @@ pub(super) struct LineDiagnosis {
 }
 
 impl LineDiagnosis {
-    /// A line whose port is not open yet, with that silence before requests and that time for the first byte of a reply.
+    /// The diagnosis of a line whose port is not open yet, with this silence before requests and this time for the
+    /// first byte of a reply.
     pub(super) fn new(
         image: Arc<BusImage>,
         silence: Duration,
@@ -119,7 +120,7 @@ impl LineDiagnosis {
         at: Instant,
     ) {
         let transaction = &exchanged.transaction;
-        // A drive may well ignore a request of a tool that no codec knows.
+        // A drive may ignore a request of a tool with an unknown function, so that is no evidence.
         if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
             return;
         }
@@ -183,7 +184,7 @@ impl LineDiagnosis {
         reads.is_some_and(|reads| reads.iter().any(|read| read.pdu() == *pdu))
     }
 
-    /// A drive has a new fault: remembers it where the drive's own timeout seems to have tripped it.
+    /// Notes a new fault of a drive, if the drive's own communication timeout seems to be the cause.
     pub(super) fn tripped(&mut self, drive: DriveIndex, trip: own_timeout::Trip, now: Instant) {
         let profile = self.image.drives.get(drive).map(|image| &image.spec.profile);
         let found = profile.and_then(|profile| own_timeout::finding(drive, profile, trip));
@@ -203,7 +204,7 @@ impl LineDiagnosis {
         })
     }
 
-    /// Requests to that drive in the last minute, other than for registers that it never answers.
+    /// Answered and failed requests to this drive in the last minute, except those for registers that it never answers.
     fn answered_and_failed(&self, drive: DriveIndex) -> [u32; 2] {
         let sum = |signs: &[Sign]| {
             let counts = self.figures.drives.get(drive);

@@ -1,5 +1,5 @@
-//! The running bus: the only code on this side that does I/O. One thread owns the line and does what the [`BusCore`]
-//! returns.
+//! The running bus: the only code of the master that does I/O. One thread owns the line and does what the
+//! [`BusCore`] returns.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use crate::order::{Outcome, WriteStats};
 use crate::plant::BusHandle;
 use crate::stalls::Stalls;
 
-/// First and longest pause between two tries to open the port.
+/// First and longest pause between two attempts to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
-/// Longest wait for the transaction on the line when the bus is to stop: a present drive replies within it, an absent
-/// one must not delay a stop or a reload for its full `response_timeout`.
+/// Longest wait for the transaction on the line when the bus is to end: a present drive replies within it, and an
+/// absent one must not delay a stop or a reload for its full `response_timeout`.
 const LAST_EXCHANGE: Duration = Duration::from_secs(1);
 /// Longest time between two signs of life of the thread, even while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
@@ -33,16 +33,16 @@ pub struct BusTask {
     handle: BusHandle,
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
-    /// Hands over to the bus when the bus begins; present until then.
+    /// Channel for the handover to the prepared bus; present until the bus begins.
     begin: Option<SyncSender<Handover>>,
     thread: Option<std::thread::JoinHandle<Handover>>,
 }
 
 impl BusTask {
-    /// Starts the bus in a thread of its own.
+    /// Starts the bus in a separate thread.
     ///
     /// # Errors
-    /// If the system gives no thread.
+    /// If the system cannot create a thread.
     pub fn start(
         handle: BusHandle,
         options: BusOptions,
@@ -58,7 +58,7 @@ impl BusTask {
     /// that.
     ///
     /// # Errors
-    /// If the system gives no thread.
+    /// If the system cannot create a thread.
     pub fn prepare(
         handle: BusHandle,
         options: BusOptions,
@@ -76,7 +76,7 @@ impl BusTask {
         let name = format!("bus-{}", handle.image.spec.name);
         let (begin, begun) = sync_channel::<Handover>(1);
         let thread = std::thread::Builder::new().name(name).spawn(move || {
-            // A bus that is dropped before it began has nothing to end.
+            // A bus that is dropped before it began needs no ending.
             let Ok(before) = begun.recv() else {
                 return Handover::default();
             };
@@ -94,10 +94,10 @@ impl BusTask {
         })
     }
 
-    /// Lets a prepared bus open its port; nothing further can fail. `before` is the handover of the previous bus.
+    /// Lets a prepared bus open its port; nothing can fail after this. `before` is the handover of the previous bus.
     pub fn begin(&mut self, before: Handover) {
         if let Some(begin) = self.begin.take() {
-            // The channel has room for the value, and the thread waits for it.
+            // The channel has room for the value and the thread waits for it, so sending cannot fail.
             let _ = begin.send(before);
         }
     }
@@ -157,8 +157,8 @@ const LOOK_AGAIN: Duration = Duration::from_millis(5);
 /// Time for the log to be written before the process ends.
 const LAST_WORDS: Duration = Duration::from_millis(200);
 
-/// A bus that panicked would accept commands that nothing serves, and show the last values forever: a stop would be
-/// lost. A process that exits is restarted, and its clients notice.
+/// Ends the process if the bus thread panics: otherwise commands would be accepted that nothing serves, a stop
+/// would be lost, and the last values shown forever. A process that exits is restarted, and its clients notice.
 fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
         let bus = std::thread::current().name().unwrap_or_default().to_string();
@@ -172,8 +172,8 @@ fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     })
 }
 
-/// The pauses between two tries to open the port: each twice as long as the one before. A port that goes again at once
-/// is opened ever less often.
+/// The pauses between two attempts to open the port: each twice as long as the one before, so that a port that is
+/// lost again at once is opened less and less often.
 #[derive(Debug)]
 struct ReopenPauses {
     next: Duration,
@@ -191,7 +191,7 @@ impl ReopenPauses {
         self.next = REOPEN.0;
     }
 
-    /// After a port was open for that time, pauses start from the shortest again.
+    /// Starts again with the shortest pause if the port was open for this time.
     fn was_open_for(&mut self, time: Duration) {
         if time >= REOPEN.1 {
             self.next = REOPEN.0;
@@ -223,11 +223,11 @@ impl Worker {
         let handle = self.handle.clone();
         let core = ListenCore::new(handle, &self.options, events, writes, Instant::now());
         self.keep_open(core);
-        // Drives of such a bus have no leases, and no request was sent to them.
+        // A listening bus has no leases and sent no requests, so there is nothing to hand over.
         Handover::default()
     }
 
-    /// Serves the port as long as it is there and opens it again and again, until the bus is to stop.
+    /// Serves the port while it exists, and opens it again whenever it is lost, until the bus is to end.
     fn keep_open<C: Core>(&self, mut core: C) -> C {
         line::sharpen_timers();
         let mut pauses = ReopenPauses::default();
@@ -235,7 +235,7 @@ impl Worker {
         while !self.stopping() {
             let spec = &self.handle.image.spec;
             let go_on = || !self.stopping();
-            // The watch starts before the try, so that no change is missed after it.
+            // The watch starts before the attempt, so that no change is missed after it.
             let watching = Arrival::of(&spec.port);
             let arrival = match C::open(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
                 Ok((line, warnings)) => {
@@ -266,11 +266,11 @@ impl Worker {
         core
     }
 
-    /// Serves an open port until the bus is to stop. A device server that closes its connection after a reply or after a pause
-    /// is not a lost port: it is reconnected.
+    /// Serves an open port until the bus is to end. A device server that closes its connection after a reply or
+    /// after a pause does not count as a lost port: the gateway reconnects.
     ///
     /// # Errors
-    /// Why the port is lost.
+    /// If the port is lost; contains the reason.
     fn stay_connected<C: Core>(&self, core: &mut C, names: &mut Names, mut line: C::Line) -> Result<(), String> {
         loop {
             let Err(lost) = core.serve(self, &line) else {
@@ -315,8 +315,8 @@ impl Worker {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Waits before the next attempt to open the port: for that time, or until the device appears, which it returns; at
-    /// least the first pause.
+    /// Waits before the next attempt to open the port: for this time, or until the device appears, which is
+    /// returned; at least for the first pause.
     fn rest(&self, pause: Duration, arrival: Option<&Arrival>) -> bool {
         let began = Instant::now();
         let mut until = began + pause;
@@ -336,11 +336,11 @@ impl Worker {
         let mut buffer = [0u8; 512];
         let mut break_off = None;
         core.runs_on(Instant::now(), line::since_boot());
-        // The transaction on the line is ended first: anyone who comes after would talk into its reply.
+        // The transaction on the line is completed first: the next user of the line would otherwise send into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
             if core.note_run(now, line::since_boot()) {
-                // Bytes that came during the stall are a reply, although its time is over.
+                // Bytes that arrived during the stall are a reply, although its time limit has passed.
                 let count = line.receive(&mut buffer)?;
                 core.received(buffer.get(..count).unwrap_or_default(), now);
             }
@@ -350,7 +350,7 @@ impl Worker {
             let woken = match core.poll(now) {
                 Action::Send if self.stopping() => return Ok(()),
                 Action::Send => {
-                    // A thread that was held up may not have seen the last bytes.
+                    // A delayed thread may not have read the last bytes yet.
                     let count = line.receive(&mut buffer)?;
                     let now = Instant::now();
                     if count > 0 {
@@ -384,7 +384,7 @@ impl Worker {
         Ok(())
     }
 
-    /// Serves without a connection until something is to be sent, or the bus is to stop.
+    /// Waits without a connection until a request is to be sent, or the bus is to end.
     fn wait_to_ask(&self, core: &mut BusCore) {
         core.runs_on(Instant::now(), line::since_boot());
         while !self.stopping() {
@@ -409,7 +409,7 @@ impl Worker {
     fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut stalls = Stalls::new(Instant::now(), line::since_boot());
-        // Earliest time at which the bytes that are read next may have come.
+        // Earliest time at which the bytes read next may have arrived.
         let mut since = None;
         while !self.stopping() {
             let now = Instant::now();
@@ -539,7 +539,7 @@ mod tests {
 
     use super::*;
 
-    /// Environment variable of the child process that the test below starts to see it die.
+    /// Environment variable for the child process that the test below starts to see it exit.
     const DIES: &str = "DRIVEGATE_TEST_DIES";
 
     #[test]
@@ -562,7 +562,7 @@ mod tests {
         let mut pauses = ReopenPauses::default();
         assert_eq!(next(&mut pauses), first);
         assert_eq!(next(&mut pauses), [REOPEN.1; 6]);
-        // The port opens and is lost again at once.
+        // The port opens and is lost again after a short time.
         pauses.was_open_for(Duration::from_millis(2999));
         assert_eq!(pauses.next(), REOPEN.1);
         pauses.was_open_for(REOPEN.1);

@@ -1,5 +1,5 @@
-//! The half-duplex line as its owner sees it: how long it has been silent, and the transaction in progress. Pure: bytes
-//! and time are arguments; a loop with a port, or a test without one, does the rest.
+//! The state of a half-duplex line: how long it has been silent, and the transaction in progress. Pure: bytes and
+//! time are arguments; a loop with a port, or a test without one, does the rest.
 
 use std::time::{Duration, Instant};
 
@@ -8,32 +8,33 @@ use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_
 use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::drive::plan::WireTime;
 
-/// Time after which the bus sends on a line that never goes silent: a stop must get out.
+/// Time after which the bus sends even on a line that never goes silent, so that a stop can get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
 
-/// Baud rates are off by at most 2 %, and times are not exact: anything faster than this share of its time is too
-/// early.
+/// Baud rates are off by at most 2 %, and times are not exact: a reply faster than this share of its wire time is
+/// too early.
 const ALMOST: f64 = 0.9;
 
-/// Replies that are whole before the wire could have carried them show a line without wire time: a simulation, or another
-/// baud rate behind a device server. A single one may be a late reply, or one that came twice, and on a busy machine not all
-/// replies of such a line are early; so they are weighed, and each regular reply takes 1 back. From this weight on, early
-/// replies are believed.
+/// Replies that are complete before the wire could have carried them show a line without wire time: a simulation,
+/// or another baud rate behind a device server. A single one may be a late or duplicate reply, and on a busy
+/// machine not all replies of such a line are early; so early replies add weight, and each regular reply takes 1
+/// back. From this weight on, early replies are accepted.
 const WITHOUT_WIRE_TIME: u32 = 64;
 /// Greatest weight of early replies: this number of regular replies restores the protection of a line.
 const MOST_WEIGHT: u32 = 256;
 /// Weight of an early reply that can hardly belong to another request. A single one is enough, until the next regular
 /// reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
-/// Weight of an early reply that was not believed, with nothing after it: two are enough. If the regular reply follows,
-/// the early one came twice or late, as on a wire: that takes all weight back.
+/// Weight of an early reply that was not accepted and not followed by another: two are enough. If the regular reply
+/// follows, the early one was a duplicate or a late one, as on a real wire: that removes all weight.
 const WEIGHT_OF_DOUBTED: u32 = 40;
-/// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
+/// Weight of any early reply on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
-/// Weight that a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks like an
-/// early one: while fewer than one reply in four is early, the line keeps its protection.
+/// Weight that a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks
+/// like an early one: while fewer than one reply in four is early, the line keeps its protection.
 const REGULAR_ON_N2: u32 = 8;
-/// Weight of an early reply that could belong to another request and was believed. One in nine keeps the line as it is.
+/// Weight of an early reply that was accepted although it could belong to another request. If one reply in nine is
+/// like that, the line stays as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
 /// How a request is to be sent.
@@ -43,16 +44,16 @@ pub struct Sending {
     pub silence: Duration,
     /// Time for the first byte of the reply.
     pub response_timeout: Duration,
-    /// The last reply on the line, if it came once more, could pass for this one's.
+    /// Whether a duplicate of the last reply on the line could be mistaken for the reply to this request.
     pub could_be_doubled: bool,
-    /// A late reply to an earlier request may come.
+    /// Whether a late reply to an earlier request may arrive.
     pub late_may_come: bool,
 }
 
 /// A completed transaction.
 #[derive(Debug)]
 pub struct Exchanged {
-    /// A transaction with its end, and all received bytes.
+    /// A transaction with its result and all received bytes.
     pub transaction: Transaction,
     /// How the transaction ended.
     pub ended: Ended,
@@ -60,19 +61,21 @@ pub struct Exchanged {
     pub began: Instant,
     /// When the drive detected the end of the request.
     pub sent: Instant,
-    /// When the last bytes arrived, as far as they can be the drive's; the end of the request if none did.
+    /// When the last bytes arrived that can be the drive's; the end of the request if there were none.
     pub heard_at: Instant,
-    /// When it ended. However late that was noticed: no later than a reply can have left the drive.
+    /// When the transaction ended. Even if that was noticed late, this is the latest time at which a reply can have
+    /// left the drive.
     pub at: Instant,
     /// Time on the wire of the received bytes.
     pub reply_time: Duration,
     /// How long the line was in use, including the silence after the transaction.
     pub took: Duration,
-    /// The reply was whole before the line could have carried it: the lowest baud rate at which it could have been.
+    /// For a reply that was complete before the line could have carried it: the lowest baud rate at which that
+    /// would be possible.
     pub beats: Option<u32>,
 }
 
-/// Findings about the line from its transactions. They are kept for the next connection to the same line.
+/// Properties of the line learned from its transactions, kept for the next connection to the same line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Learned {
     protocol: Protocol,
@@ -83,7 +86,7 @@ pub struct Learned {
     early_weight: u32,
 }
 
-/// A line with its settings.
+/// A line with its settings, and the transaction on it.
 #[derive(Debug)]
 pub struct LineState {
     protocol: Protocol,
@@ -93,7 +96,7 @@ pub struct LineState {
     owed: Duration,
     /// End of the last character on the line, either direction.
     quiet_since: Instant,
-    /// Time before which nothing is sent: a reply to the previous master may arrive.
+    /// Time before which nothing is sent, because a reply to the previous master may arrive.
     left_alone: Instant,
     learned: Learned,
     underway: Option<Underway>,
@@ -153,7 +156,7 @@ impl LineState {
         }
     }
 
-    /// The connection was closed. A request that was sent over it may still be on the wire behind the server, and its
+    /// Handles a closed connection. A request sent over it may still be on the wire behind the server, and its
     /// reply may arrive over the next connection: the transaction continues until its deadline.
     pub fn cut(&mut self) {
         if let Some(underway) = &mut self.underway {
@@ -166,8 +169,8 @@ impl LineState {
         self.quiet_since
     }
 
-    /// When a request may go out that is wanted since `since`, to a drive that needs `own` silence before it: when the line
-    /// has been silent long enough, or has babbled too long.
+    /// When a request that has been wanted since `since` may be sent to a drive that needs `own` silence before it:
+    /// when the line has been silent long enough, or has babbled too long.
     pub(crate) fn clear_at(&self, since: Instant, own: Duration) -> Instant {
         let since = since.max(self.left_alone);
         let silence = self.silence_before(own);
@@ -180,7 +183,7 @@ impl LineState {
         own.max(self.owed)
     }
 
-    /// Silence before a request to a drive without a silence of its own.
+    /// Silence before a request to a drive without a setting of its own.
     pub(crate) fn silence(&self) -> Duration {
         self.silence
     }
@@ -205,7 +208,7 @@ impl LineState {
     pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, late: N2LateReplies, now: Instant) {
         let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
         let sent = now + self.format.chars(frame.len());
-        // A reply cannot be whole before its own time on the wire has ended.
+        // A reply cannot be complete before its wire time has passed.
         let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
         let earliest = sent + least.mul_f64(ALMOST);
         let doubtful = is_doubtful(&request, sending);
@@ -256,7 +259,7 @@ impl LineState {
         self.underway.as_ref().map(|underway| underway.transaction.deadline())
     }
 
-    /// Adds bytes received at `now`. Returns the transaction if they complete it.
+    /// Adds bytes received at `now`. Returns the transaction if these bytes complete it.
     pub fn received(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
             self.begin_silence(now);
@@ -276,8 +279,8 @@ impl LineState {
     /// Time went by.
     ///
     /// # Errors
-    /// The time until which more bytes are awaited, while the transaction is not over; none where there is no
-    /// transaction.
+    /// Ends the transaction if its time limit has passed; otherwise returns the time until which more bytes are
+    /// awaited, or `None` if there is no transaction.
     pub fn on_time(&mut self, now: Instant) -> Result<Exchanged, Option<Instant>> {
         let Some(underway) = self.underway.as_mut() else {
             return Err(None);
@@ -319,7 +322,7 @@ impl LineState {
             heard_at,
             at,
             reply_time,
-            // A reply that came faster than the wire could carry it frees the line no sooner.
+            // A reply that arrived faster than the wire could carry it does not free the line sooner.
             took: at.max(heard_at).saturating_duration_since(began) + self.owed,
             beats,
         })
@@ -339,8 +342,8 @@ impl LineState {
         }
     }
 
-    /// Weighs what the end of a transaction shows of the wire time. `early`: faster than the wire; `doubtful`: the
-    /// reply could be another one's.
+    /// Evaluates what the end of a transaction shows about the wire time. `early` means that the reply was faster
+    /// than the wire; `doubtful` that it could belong to another request.
     fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
         let believed = self.learned.early_weight >= WITHOUT_WIRE_TIME;
         let weight = match ended {
@@ -357,7 +360,7 @@ impl LineState {
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
             Ended::Reply(_) if doubtful => 0,
             Ended::Reply(_) => self.weight_of(WEIGHT_OF_EARLY),
-            // The other bytes may be the rest of the reply itself.
+            // The other bytes may be the rest of the same reply.
             Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => self.weight_of(WEIGHT_OF_DOUBTED),
             Ended::Silent | Ended::Corrupt(_) => 0,
         };

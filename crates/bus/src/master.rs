@@ -50,22 +50,22 @@ use crate::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Ur
 use crate::plant::{BusHandle, turn_away};
 use crate::process_image::{DriveImage, Timing};
 
-/// Longest time between two looks of the bus at its drives and queue.
+/// Longest time between two checks of the bus at its drives and queue.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
-/// Response timeouts for which an N2 reply may come late.
+/// Number of response timeouts within which a late N2 reply may arrive.
 const N2_LATE: u32 = 3;
 /// Longest wait for a late reply: a silent drive is probed within 10 s.
 const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
-/// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
-/// slower: probed every 10 s, it costs less than 2 % of the line by that.
+/// Time for the first byte of the reply to a probe of an offline drive, or to a stop, unless the drive is known to
+/// be slower: probing it every 10 s then costs less than 2 % of the line.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
-/// One in this number of probes waits as long as any request, because the drive may be slow.
+/// One in this number of probes waits as long as any other request, because the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
 /// A transaction: drive, purpose and request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
-    /// Place of the drive on the bus.
+    /// Index of the drive on the bus.
     pub drive: DriveIndex,
     /// Purpose of the transaction.
     pub purpose: Purpose,
@@ -86,7 +86,7 @@ pub enum Purpose {
         /// The purpose of the step.
         step: StepPurpose,
     },
-    /// The background request that has its turn.
+    /// The background request that is next to be sent.
     Background,
     /// A step of the refresh of the drive.
     Refresh,
@@ -109,7 +109,7 @@ impl Turn {
         &self.pdu
     }
 
-    /// The rank of the turn's command; none for a poll or a background transaction.
+    /// The rank of the turn's command; `None` for a poll or a background transaction.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
             Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
@@ -125,7 +125,7 @@ impl Turn {
     }
 }
 
-/// How a turn ended.
+/// The result of a turn.
 #[derive(Debug)]
 pub struct TurnEnd {
     /// How the transaction ended.
@@ -140,7 +140,7 @@ pub struct TurnEnd {
     pub took: Duration,
     /// The invalid bytes were the drive's own reply, damaged.
     pub mangled: bool,
-    /// A whole reply came, and was not believed because the line could not have carried it so soon.
+    /// Whether a complete reply was rejected because the line could not have carried it so soon.
     pub doubted: bool,
     /// The reply frame as the drive sent it, for [`Purpose::Background`].
     pub frame: Vec<u8>,
@@ -167,7 +167,7 @@ impl Carried {
         }
     }
 
-    /// The lease after a time in which it did not run.
+    /// The lease, with the time limit extended by a period in which the gateway did not run.
     #[must_use]
     pub fn after(self, stood: Duration) -> Carried {
         Carried {
@@ -177,12 +177,12 @@ impl Carried {
     }
 }
 
-/// State that a stopped bus hands over to the next one on the same line.
+/// State that an ended bus hands over to the next one on the same line.
 #[derive(Debug, Clone, Default)]
 pub struct Handover {
-    /// The leases of its drives, in their order, with what is refreshed under them.
+    /// The leases of its drives, in their order, with the orders that are refreshed under them.
     pub leases: Vec<Carried>,
-    /// Time until which a reply to its request may arrive; `None` if no bus used the line before.
+    /// Time until which a reply to its last request may arrive; `None` if no bus used the line before.
     pub quiet_until: Option<Instant>,
     /// Findings about the line.
     pub learned: Option<Learned>,
@@ -200,23 +200,22 @@ pub struct Master {
     drives: PerDrive<DriveState>,
     /// Conditions that a transaction may have to wait for.
     waits: Waits,
-    /// The last reply on the line, valid or damaged, which may be repeated.
+    /// The last reply on the line, valid or damaged, of which a duplicate may arrive.
     last_answered: Option<(DriveIndex, RequestPdu)>,
     turns: Turns,
-    /// The background request that has its turn, or is on the line.
+    /// The background request that is next to be sent, or is on the line.
     background: Option<Begun>,
     /// The last one was passed on to drives of the bus as a command.
     passed_on_last: bool,
     shutdown: Option<Shutdown>,
-    /// Whether the line was in use before it was opened: by this bus, or by the one before it.
+    /// Whether this bus, or the one before it, used the line before it was opened.
     successor: bool,
     writes: Arc<WriteStats>,
     /// Consecutive probes without a reply, by drive.
     probes: PerDrive<u32>,
-    /// A reply may have come late since before the transaction that is on the line.
+    /// Whether a late reply was already possible before the transaction that is on the line.
     late_before: bool,
-    /// How much longer refreshes have used the line than polls since then: refreshes may use it at most as long as
-    /// polls.
+    /// How much longer refreshes have used the line than polls since then: refreshes may use it at most as long as polls.
     refresh_debt: Duration,
 }
 
@@ -324,7 +323,7 @@ impl Master {
         queue.gate.settle(|_| false);
         drop(queue);
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
-            // A heartbeat that came while the port was lost has not been taken yet.
+            // A heartbeat that arrived while the port was lost has not been evaluated yet.
             if let Some(at) = image.take_heartbeat() {
                 drive.supervision.renew(at);
             }
@@ -414,7 +413,7 @@ impl Master {
                     DEFAULT_EXPIRY,
                     writes,
                 );
-                // A drive that takes no order any more has none of the gateway's starts on its way.
+                // A drive that accepts no orders any more has no start of the gateway pending.
                 tracing::debug!(target: "drivegate::bus::master", drive = %image.spec.name, ?ordered, "a stop again");
             }
         }
@@ -511,8 +510,8 @@ impl Master {
             silence: self.silence_of(turn),
             response_timeout: self.timeout_of(turn),
             late_may_come: self.late_before,
-            // An N2 reply does not even show its drive. The last request on a line that was in use before is not known
-            // when it is opened again.
+            // An N2 reply does not even show its drive. After reopening a line that was in use, the last request on
+            // it is unknown.
             could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
                 false => *of == turn.drive && are_alike(last, &turn.pdu),
@@ -534,7 +533,7 @@ impl Master {
         timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
     }
 
-    /// The drive's own times, where it has any.
+    /// The drive's own times, if it has any configured.
     fn timing_of(&self, drive: DriveIndex) -> Timing {
         let image = self.bus.image.drives.get(drive);
         image.map_or_else(Timing::default, |image| image.spec.timing)
@@ -548,12 +547,12 @@ impl Master {
         self.timing_of(drive).retries.unwrap_or(self.retries)
     }
 
-    /// Silence before the request of that turn, and after its reply before a request to another drive.
+    /// Silence before the request of this turn, and after its reply before a request to another drive.
     pub(crate) fn silence_of(&self, turn: &Turn) -> Duration {
         self.timing_of(turn.drive).silence.unwrap_or(self.silence)
     }
 
-    /// How long a reply may come late on an N2 line.
+    /// Time within which a late reply may arrive on an N2 line.
     pub(super) fn n2_window(&self) -> Duration {
         let own = self
             .bus
@@ -565,12 +564,12 @@ impl Master {
         (N2_LATE * longest).min(LONGEST_N2_LATE)
     }
 
-    /// The reads that each drive never answers while it answers others.
+    /// The reads that each drive never answers although it answers others.
     pub(crate) fn unanswered(&self) -> PerDrive<Vec<PlannedRead>> {
         self.schedule.unanswered()
     }
 
-    /// Takes the late replies that may still arrive on an N2 line, for the transaction about to start.
+    /// Takes the late replies that may still arrive on an N2 line, for the transaction that is about to start.
     pub(crate) fn take_late(&mut self) -> N2LateReplies {
         std::mem::take(&mut self.waits.n2_late)
     }
@@ -581,7 +580,7 @@ impl Master {
     }
 }
 
-/// Looks at the lease of a drive.
+/// Evaluates the lease of a drive.
 pub(super) fn supervise(
     bus: &BusHandle,
     index: DriveIndex,

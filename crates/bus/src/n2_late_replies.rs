@@ -1,15 +1,15 @@
 //! Late replies on an N2 line. Pure: time is an argument.
 //!
-//! An N2 reply names neither drive nor request; it shows only its form. After a transaction without a valid reply, the
-//! reply may come during a later transaction, of any drive. So the line remembers which forms may still come, and for
-//! how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot be
-//! the reply of the present transaction is the late one, which is no longer expected from then on. A reply whose form a
-//! late one may share by chance, such as a refusal, is not accepted.
+//! An N2 reply names neither drive nor request; it shows only its form. After a transaction without a valid reply,
+//! the reply may arrive during a later transaction with any drive. So the line remembers which forms may still
+//! arrive, and for how long. Meanwhile no request is sent whose reply has such a form; other requests continue. A
+//! frame of a form that cannot be the reply of the present transaction is the late one, and is no longer expected.
+//! A reply whose form a late one may share by chance, such as a refusal, is not accepted.
 //!
-//! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has another
-//! form, no reply to an earlier request is still to come. Process data may be requested again at once, as long as the
-//! request was not answered since: whichever reply comes, it is the same object of the same drive. Its value is dated by
-//! the first of these requests.
+//! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has
+//! another form, no reply to an earlier request can arrive. Process data may be requested again at once if the
+//! request was not answered since: whichever reply arrives belongs to the same object of the same drive. The value
+//! then gets the time of the first of these requests.
 
 use std::time::{Duration, Instant};
 
@@ -21,7 +21,7 @@ use crate::drive::{PlannedRead, PollClass};
 /// Late replies remembered; beyond that the oldest is forgotten.
 const KEPT: usize = 16;
 
-/// The replies that may still come on one line.
+/// The late replies that may still arrive on one line.
 #[derive(Debug, Clone, Default)]
 pub struct N2LateReplies(Vec<Late>);
 
@@ -45,10 +45,10 @@ struct Late {
     form: Form,
     /// The device type that an identity would show.
     device: u8,
-    /// When the first request was sent whose reply may come late.
+    /// When the first request was sent whose late reply may arrive.
     asked: Instant,
     until: Instant,
-    /// Replies that may still come: the request was sent so often without success.
+    /// Number of replies that may still arrive: the request was sent that often without success.
     count: u32,
     /// Whether an equal request was answered since, by an unknown one of the replies.
     answered: bool,
@@ -57,17 +57,17 @@ struct Late {
 /// The meaning of a valid frame in a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Taken {
-    /// The frame may be the reply: no late reply has its form.
+    /// The frame can only be the reply: no late reply has its form.
     Reply,
     /// The frame is a late reply: this many bytes are to be dropped.
     Late(usize),
-    /// The frame may be the reply or a late one. The number of late replies stays, perhaps with the reply itself among
-    /// them.
+    /// The frame may be the reply or a late one. The number of expected late replies stays, since the reply itself
+    /// may still arrive.
     Doubtful,
 }
 
 impl N2LateReplies {
-    /// No valid reply came until `now`, and none will later than in the time of `window`.
+    /// Notes that no valid reply arrived until `now`; a late one can only arrive within `window`.
     pub fn given_up(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
         self.0.retain(|late| late.until > now);
         let Some(form) = form(asked.pdu) else { return };
@@ -113,22 +113,22 @@ impl N2LateReplies {
         late.map(|late| late.asked)
     }
 
-    /// Number of replies that may still come.
+    /// Number of late replies that may still arrive.
     pub(super) fn owed(&self, now: Instant) -> usize {
         self.0.iter().filter(|late| late.until > now).count()
     }
 
-    /// Whether any reply may still come.
+    /// Whether any late reply may still arrive.
     pub fn may_come(&self, now: Instant) -> bool {
         self.0.iter().any(|late| late.until > now)
     }
 
-    /// Time until which any reply may still come.
+    /// Time until which any late reply may arrive.
     pub fn until(&self) -> Option<Instant> {
         self.0.iter().map(|late| late.until).max()
     }
 
-    /// Until when a request must wait because a late reply could pass for its own.
+    /// Until when a request must wait because a late reply could be mistaken for its own.
     pub fn blocks(&self, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let wanted = form(pdu)?;
         self.alike(wanted, now).map(|late| late.until).max()
@@ -158,7 +158,7 @@ impl N2LateReplies {
         };
         let mut alike = self.0.iter().filter(|late| late.could_be(&answer));
         let is_own = match &answer {
-            // Any request may be refused in this way, as the drive waits for Identify.
+            // Any request may be refused like this while the drive waits for Identify.
             Answer::Nak(code) if Exception::n2(*code) == Exception::N2_RESTARTED => {
                 alike.all(|late| late.address == address)
             }
@@ -184,7 +184,7 @@ impl N2LateReplies {
         }
     }
 
-    /// Notes that the frame was a late reply, which is no longer expected.
+    /// Notes that the frame was a late reply, which is then no longer expected.
     pub fn has_arrived(&mut self, frame: &[u8]) {
         let answer = self::frame(frame).map(|(_, answer)| answer);
         let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
@@ -193,7 +193,7 @@ impl N2LateReplies {
         }
     }
 
-    /// The answer was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it was not.
+    /// Notes a doubtful answer: if it was a late one, the reply itself may still arrive; otherwise the late one may.
     pub(crate) fn doubted(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
         let alike = |late: &&mut Late| Some(late.form) == form(asked.pdu);
         if let Some(late) = self.0.iter_mut().find(alike) {
@@ -203,7 +203,7 @@ impl N2LateReplies {
     }
 }
 
-/// Whether the reply to one of these requests could pass for the reply to the other.
+/// Whether the reply to one of these requests could be mistaken for the reply to the other.
 pub fn n2_look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
     let forms = form(a).zip(form(b));
     forms.is_none_or(|(a, b)| a.is_like(b) || b.is_like(a))
@@ -240,7 +240,7 @@ impl Late {
         self.address == address && self.pdu == *pdu
     }
 
-    /// Whether the late reply may still come and pass for a reply of this form.
+    /// Whether the late reply may still arrive and be mistaken for a reply of this form.
     fn could_pass_for(&self, wanted: Form, now: Instant) -> bool {
         self.until > now && self.form.is_like(wanted)
     }

@@ -1,8 +1,9 @@
 //! Messages of an N2 bus to a drive other than reads and commands (reference/n2.md 2 and 4). Pure: time is an argument.
 //!
-//! A drive that has restarted answers nothing before it is identified; then it reports, to polls, all it has. So a
-//! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
-//! is read. `N00` at any time means that it has restarted: the same again.
+//! N2 sessions. A drive that has restarted answers nothing before it is identified; then it reports all its values
+//! in reply to polls. So a drive is first identified, then its reports are fetched (and discarded: their layout is
+//! unknown, values are read), and then it is read. `N00` at any time means that the drive has restarted, so the
+//! session begins again.
 //!
 //! Late replies are recognised in `n2_late_replies`.
 
@@ -14,16 +15,16 @@ use crate::codec::{Exception, Reply};
 use crate::drive::{DriveIndex, PerDrive};
 use crate::order::Urgency;
 
-/// Number of polls in which a drive must report all its changes.
+/// Number of polls within which a drive must have reported all its changes.
 pub const MOST_POLLS: u8 = 16;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// The drive was never identified, or not since it went away.
+    /// The drive was never identified, or not since it went offline.
     Unknown,
     /// The drive has reported that it waits for Identify.
     Waiting,
-    /// The drive reports its changes: polls left, and whether the next one acknowledges the report before.
+    /// The drive is reporting its changes: number of polls left, and whether the next one acknowledges the previous report.
     Reporting { left: u8, again: bool },
     /// The drive is read and commanded.
     Ready,
@@ -45,9 +46,9 @@ struct Drive {
 pub enum Progress {
     /// The next step is decided again.
     Going,
-    /// The drive is of another type than its profile has; reported once.
+    /// The drive has another device type than its profile; reported once.
     Unlike(u8),
-    /// Something has changed, so the drive must be read.
+    /// The drive reported a change, so it must be read.
     Changed,
     /// The drive has restarted.
     Restarted,
@@ -120,7 +121,8 @@ impl N2Sessions {
         }
     }
 
-    /// Any transaction with the drive has ended; [`Progress::Failed`] if it was refused although just identified.
+    /// Notes the end of any transaction with the drive; [`Progress::Failed`] if it was refused although the drive
+    /// was just identified.
     pub fn transaction_ended(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
             return match self.drives.is_empty() {
@@ -146,14 +148,14 @@ impl N2Sessions {
         }
     }
 
-    /// Drives that are due for a poll and would get no request otherwise, because nothing of them is read so often.
+    /// Drives that are due for a poll and would get no other request, because none of their points is read often enough.
     pub(crate) fn neglected(&self, now: Instant) -> impl Iterator<Item = DriveIndex> {
         let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
         let drives = self.drives.enumerate();
         drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)
     }
 
-    /// The drive no longer replies, so it must be identified again.
+    /// Notes that the drive no longer replies, so that it must be identified again.
     pub fn gone(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);

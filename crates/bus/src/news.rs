@@ -8,7 +8,7 @@ use crate::drive::{DriveIndex, PlannedRead};
 use crate::order::Refusal;
 use crate::queue::Denied;
 
-/// A result of the master. Drives are named by their place on the bus.
+/// A result of the master. Drives are given by their index on the bus.
 #[derive(Debug, Clone, PartialEq)]
 pub enum News {
     /// A round of the fast class was started, this time after the previous one.
@@ -17,20 +17,20 @@ pub enum News {
     SlowRound(Option<Duration>),
     /// The drive replied to a read of the plan.
     Read {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
         /// The read.
         read: PlannedRead,
         /// The reply, a word for each item.
         words: Vec<u16>,
-        /// When, at the latest: earlier than now where it may have been the reply to an earlier try.
+        /// Latest possible time of the reading: earlier than now if the reply may belong to an earlier attempt.
         at: Instant,
     },
     /// The drive replies (again).
     Online(DriveIndex),
     /// The drive no longer replies.
     Offline(DriveIndex),
-    /// The drive has restarted: everything known about it is void.
+    /// The drive has restarted, so everything known about it is invalid.
     Restarted(DriveIndex),
     /// The drive reports an N2 device type other than its profile expects.
     Unlike(DriveIndex, u8),
@@ -42,7 +42,7 @@ pub enum News {
     LeaseRanOut(DriveIndex),
     /// The action of a lease that expired cannot be written.
     ActionRefused {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
         /// The command in one line.
         what: String,
@@ -51,14 +51,14 @@ pub enum News {
     },
     /// An attempt at the action of an expired lease failed; with the reason, unless reported before.
     ActionFailed {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
         /// Reason of the failure, as text.
         why: Option<String>,
     },
     /// The action of an expired lease was acknowledged after this number of failed tries.
     ActionTaken {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
         /// Number of failures before.
         failures: u32,
@@ -67,7 +67,7 @@ pub enum News {
     RunningUnknown(DriveIndex),
     /// The refresh for the drive's own timeout has ended.
     RefreshEnded {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
         /// Reason of the end, as text.
         why: String,
@@ -76,16 +76,17 @@ pub enum News {
     Denied(Denied),
     /// An interlock does not hold, and the motor is stopped by that.
     Tripped {
-        /// Place of the drive.
+        /// Index of the drive on the bus.
         drive: DriveIndex,
-        /// The interlock, and why it does not hold.
+        /// The interlock, and why it is not satisfied.
         why: String,
     },
-    /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.
+    /// A supervised drive runs although no client is known to have commanded it; with whether its lease is started
+    /// for that.
     RunsUnsupervised(DriveIndex, Adopted),
 }
 
-/// Whether a drive that ran when the gateway started got its lease started.
+/// Whether the lease was started for a drive that ran when the gateway started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Adopted {
     /// The lease of the drive runs from now on.

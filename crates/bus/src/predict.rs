@@ -1,8 +1,8 @@
-//! Predicts what a bus will achieve, from its configuration alone. Pure.
+//! Predicts the cadence and load of a bus from its configuration alone. Pure.
 //!
-//! A round of the fast class is all fast requests of the bus once; it starts every `cycle`, or without idle
-//! time when the line cannot carry that. Slow requests fill the idle time of a round as far as they fit in
-//! whole, and get [`SLOW_SHARE`] of the line at least. Requests of the class `once` cost nothing in the long run.
+//! A round of the fast class consists of all fast requests of the bus; it starts every `cycle`, or without idle
+//! time if the line cannot carry that. Slow requests fill the idle time of a round as far as they fit completely,
+//! and get at least [`SLOW_SHARE`] of the line. Requests of the class `once` cost nothing in the long run.
 
 mod cadence;
 mod faster;
@@ -25,14 +25,14 @@ use crate::process_image::{BusSpec, DriveSpec};
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
-/// Most of the line that is planned for if there is a choice: the rest is for commands, retries and drives slower than
+/// Maximum planned load of the line if there is a choice: the rest is for commands, retries and drives slower than
 /// their profile.
 const MOST_LOAD: f64 = 0.8;
 
 /// Least share of the line that polls have while refreshes run.
 const LEAST_LEFT: f64 = 0.5;
 
-/// Part of a cadence by which it may be missed before it is reported.
+/// Relative deviation from a cadence that is not reported as missed.
 const TOLERANCE: f64 = 0.001;
 
 /// A request of the plan of a bus.
@@ -42,7 +42,7 @@ pub struct PredictedRequest {
     pub drive: DriveIndex,
     /// The request.
     pub read: PlannedRead,
-    /// Whole transaction: request, its recognition by the drive, turnaround, reply, silence.
+    /// Duration of the whole transaction: request, its recognition by the drive, turnaround, reply, silence.
     pub wire: Duration,
 }
 
@@ -59,7 +59,7 @@ pub struct Prediction {
     pub demand: f64,
     /// Share of the line that will be in use, 0..=1.
     pub load: f64,
-    /// Share of the line that the refreshes of all drives take while all of them are going.
+    /// Share of the line that the refreshes of all drives take while all are active.
     pub refreshes: f64,
     /// Cadences that the line cannot carry.
     pub shortage: Option<Shortage>,
@@ -68,9 +68,9 @@ pub struct Prediction {
 /// The cycles that the line cannot carry, at least one, and the remedies.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shortage {
-    /// The fast class, if it is missed.
+    /// The fast class, if its cycle is missed.
     pub fast: Option<Missed>,
-    /// The slow class, if it is missed.
+    /// The slow class, if its cycle is missed.
     pub slow: Option<Missed>,
     /// Changes that would each carry all cadences, best first.
     pub remedies: Vec<Remedy>,
@@ -144,7 +144,7 @@ impl Prediction {
 struct Rounds {
     fast: f64,
     slow: f64,
-    /// Number of requests in a slow round, and the longest of them.
+    /// Number of requests in a slow round, and the duration of the longest.
     slow_requests: f64,
     longest_slow: f64,
     /// Share of the line that refreshes take.
@@ -168,7 +168,7 @@ impl Rounds {
     }
 }
 
-/// The line, its drives and the requested cycles.
+/// The line with its drives and the requested cycles.
 struct Line<'a> {
     spec: &'a BusSpec,
     silence: Silence,
@@ -359,7 +359,7 @@ impl<'a> Line<'a> {
         bauds
     }
 
-    /// Buses that the drives fit on, first fit by decreasing time; none when a single drive needs too much.
+    /// Number of buses needed for the drives, first fit by decreasing time; `None` if a single drive needs too much.
     fn split(&self, baud: u32) -> Option<usize> {
         let mut drives = self.rounds(baud);
         let time = |one: &Rounds| one.fast + one.slow;
@@ -428,7 +428,7 @@ fn whole_milliseconds(seconds: f64) -> Duration {
 }
 
 impl Shortage {
-    /// The shortage and its remedies as a finding.
+    /// The shortage and its remedies as a finding of `check`.
     pub fn finding(&self) -> Finding {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
         let mut cadences = Vec::new();

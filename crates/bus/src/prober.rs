@@ -1,4 +1,4 @@
-//! Single transactions on a line without another master, for commands that look for drives.
+//! Single transactions on a line without another master, for commands that search for drives.
 
 use std::time::{Duration, Instant};
 
@@ -9,7 +9,7 @@ use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::diagnosis::signature::{self, Shape};
 use crate::line::{Line, Lost, Woken};
 
-/// A line with its settings.
+/// A line with its settings, for single transactions.
 #[derive(Debug)]
 pub struct Prober<'l> {
     line: &'l Line,
@@ -44,7 +44,7 @@ impl Answer {
         let echoed = seen.starts_with(sent);
         let values = matches!(&exchanged.ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
         let turnaround = exchanged.transaction.first_byte().filter(|_| values).map(|first| {
-            // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
+            // If the driver delivers a reply as a whole, its first byte arrived earlier by the duration of the reply.
             let by_first = first.saturating_duration_since(exchanged.sent);
             let by_last = now.saturating_duration_since(exchanged.sent);
             by_first.min(by_last.saturating_sub(exchanged.reply_time))
@@ -105,7 +105,7 @@ impl Prober<'_> {
     /// Listens for `time` without a request.
     ///
     /// # Errors
-    /// If the port is lost.
+    /// If the port is lost while listening.
     pub fn listen_for(&mut self, time: Duration) -> Result<(), Lost> {
         let until = Instant::now() + time;
         while Instant::now() < until {
@@ -117,7 +117,7 @@ impl Prober<'_> {
     /// Sends one request and returns its result.
     ///
     /// # Errors
-    /// If the port is lost.
+    /// If the port is lost during the transaction.
     pub fn ask(&mut self, request: &Request) -> Result<Answer, Lost> {
         let since = Instant::now();
         while let Some(clear) =
@@ -149,7 +149,7 @@ impl Prober<'_> {
         }
     }
 
-    /// Listens until then, or until bytes arrive. Returns the transaction if they complete it.
+    /// Listens until this time, or until bytes arrive. Returns the transaction if they complete it.
     fn listen(&mut self, until: Instant) -> Result<Option<Exchanged>, Lost> {
         let mut buffer = [0u8; 512];
         if self.line.wait(until, None, !self.state.is_underway())? != Woken::Readable {

@@ -1,6 +1,7 @@
-//! Proves the commands of a profile with `[control]`: every state of a drive, every command, each frame lost, refused or repeated,
-//! a stop and the end of its time at every step. It runs the commands of the bus themselves ([`super::command_run`]), not a copy,
-//! against the worst drive that has such a profile. Pure: the time of day is only where its own time begins.
+//! Proves the commands of a profile with `[control]`: every state of a drive, every command, each frame lost,
+//! refused or repeated, a stop and the end of its time limit at every step. The proof runs the command code of the
+//! bus itself ([`super::command_run`]), not a copy, against the worst drive that matches the profile. Pure: the
+//! clock is only read once, for the start of virtual time.
 
 mod drive;
 mod frame;
@@ -18,7 +19,7 @@ use crate::order::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
 };
 
-/// Requests after which a command should have ended, reads of a state for which it waits among them.
+/// Most requests of a command, including the reads of a state that it waits for; a command that sends more has no end.
 const MOST_FRAMES: usize = 1000;
 /// Duration of a request, and the pause before a state is read again.
 const EXCHANGE: Duration = Duration::from_millis(10);
@@ -35,7 +36,7 @@ pub struct Proof {
     pub frames: usize,
 }
 
-/// A case in which a command does what it must not.
+/// A case in which a command does something that it must not do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Counterexample {
     /// The fault.
@@ -43,7 +44,7 @@ pub struct Counterexample {
     /// State of the drive before the command.
     pub state: String,
     pub command: String,
-    /// The requests, with their words in hex, and their results.
+    /// The requests of the case with their words in hex, and their results.
     pub frames: Vec<String>,
 }
 
@@ -93,7 +94,7 @@ enum Event {
     Expiry(usize),
 }
 
-/// A command, as the points that it sets.
+/// A command as the points that it sets.
 type Sets = &'static [(ModelPoint, bool)];
 
 const STOP: Sets = &[(ModelPoint::Run, false)];
@@ -111,8 +112,8 @@ const COMMANDS: [Sets; 10] = [
     &[(ModelPoint::FaultReset, true), (ModelPoint::Run, true)],
 ];
 
-/// Proves the profile, whether `[control]` or points of one bit each say how it is commanded; of one without commands there is
-/// nothing to be proved.
+/// Proves the profile, whether it is commanded by `[control]` or by points of one bit each; a profile without
+/// commands needs no proof.
 ///
 /// # Errors
 /// A counterexample.
@@ -156,8 +157,8 @@ impl Proof {
     }
 }
 
-/// Neither a writable point nor a parameter may share a register with the commands, except a point that has bits of its own in a
-/// word whose other bits are kept.
+/// Checks that neither a writable point nor a parameter shares a register with the commands, except a point with
+/// its own bits in a word whose other bits are kept.
 fn overlaps(profile: &Profile) -> Result<(), Box<Counterexample>> {
     let found = |what: String, command: String| {
         Err(Box::new(Counterexample {
@@ -189,7 +190,7 @@ struct Case<'p> {
     profile: &'p Profile,
     control: &'p Control,
     start: Start,
-    /// Whether the gateway knows the control word.
+    /// Whether the gateway knows the control word at the start of the case.
     known: bool,
     sets: Sets,
     order: Order,
@@ -203,12 +204,12 @@ struct Progress<'p> {
     frames: Vec<Frame>,
     /// When the reset was set.
     reset_at: Option<Instant>,
-    /// Whether the motor ran when the command was given, or at a stop in between.
+    /// Whether the motor ran when the command was given, or was running at a stop in between.
     ran: bool,
 }
 
 impl<'p> Case<'p> {
-    /// A case; `None` if the profile lacks one of the points, or a drive has no such state.
+    /// A case of the proof; `None` if the profile lacks one of the points, or its drives have no such state.
     fn new(profile: &'p Profile, control: &'p Control, start: Start, known: bool, sets: Sets) -> Option<Case<'p>> {
         Drive::new(profile, control, start)?;
         let values = sets
@@ -274,7 +275,7 @@ impl<'p> Case<'p> {
         CommandRun::new(command, self.profile)
     }
 
-    /// Runs the command to its end with this event; returns its requests.
+    /// Runs the command to its end while this event happens; returns its requests.
     fn run(&self, event: Event) -> Result<Vec<Frame>, Box<Counterexample>> {
         let now = Instant::now();
         let Some(drive) = Drive::new(self.profile, self.control, self.start) else {
@@ -289,7 +290,7 @@ impl<'p> Case<'p> {
             reset_at: None,
         };
         if self.known {
-            // The gateway knows a restarted drive as it was when it ran.
+            // The gateway still knows a restarted drive in the state from when it ran.
             let before = match self.start {
                 Start::RestartedSince => Drive::new(self.profile, self.control, Start::Running { reverse: false }),
                 _ => None,
@@ -377,7 +378,7 @@ impl<'p> Case<'p> {
         };
         run.sent(&step);
         self.note(&step, fate, progress)?;
-        // A run command that stands anyway is not given by the word that keeps it.
+        // A run command that is set anyway is not counted as given by the word that keeps it.
         let stood = self
             .control
             .is_run(self.control.at, progress.drive.word(self.control.at));
@@ -389,7 +390,7 @@ impl<'p> Case<'p> {
             }
             Some(Fate::ReplyLost) | None => Some(progress.drive.receives(&step.pdu)),
         };
-        // The drive changes nothing between two looks at its state, so there need not be many.
+        // Repeated reads of the drive's state change nothing, so a few of them are enough.
         let again = progress.frames.iter().rev().take(2).all(Frame::is_read) && progress.frames.len() > 1;
         progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
         self.check(&step, progress, stopped, stood)?;
@@ -465,7 +466,7 @@ impl<'p> Case<'p> {
     }
 
     fn keeps_always(&self, word: u16) -> bool {
-        // A whole word of the profile is exempt, as the profile writes it unchanged.
+        // A complete word from the profile is exempt, as the profile requires it to be written unchanged.
         let wholes = self.control.runs().into_iter().chain([self.control.stop]);
         let mut wholes = wholes.chain(self.control.fault_reset.map(|reset| reset.setting));
         self.control.always.holds(word) || wholes.any(|setting| setting.mask == u16::MAX && setting.value == word)
@@ -494,7 +495,7 @@ impl<'p> Case<'p> {
             return Err(self.wrong("the motor runs after a stop", progress));
         }
         if self.is_stop() && event == Event::None {
-            // Bits of a word stay as the drive has them, which takes a read before where that is not known.
+            // Other bits of a word must be kept, which needs a read first if the word is unknown.
             let reads = usize::from(self.control.own_word == OwnWord::Kept && !self.known);
             let first = progress.frames.iter().take(1 + reads).find(|frame| frame.is_write());
             if !outcome.is_ok() || runs || first.is_none() {

@@ -1,9 +1,9 @@
-//! The refresh of one drive: what its clients ordered last is written again every so often, for a drive whose own timeout counts only
-//! writes of its control word or reference. Pure: time is an argument.
+//! The refresh of one drive: the last orders of its clients are written again at intervals, for a drive whose own
+//! communication timeout counts only writes of its control word or reference. Pure: time is an argument.
 //!
-//! A round reads first and writes then: the drive must show that it runs by the repeated word, or stands by a stop, and that no other
-//! client has written to it. A contradiction ends the refresh, and only an acknowledged order of a client starts it again. A refresh
-//! renews no lease, and does not count as an order or a start.
+//! A refresh round first reads, then writes: the drive must show that it runs by the repeated word, or stands by a
+//! stop, and that no other client has written to it. A contradiction ends the refresh, and only an acknowledged
+//! order of a client starts it again. A refresh renews no lease, and does not count as an order or a start.
 
 mod end;
 mod ordered;
@@ -21,7 +21,7 @@ use crate::drive::{ModelPoint, Profile, Repeats};
 use crate::order::written;
 use crate::process_image::{Reading, RestoreLock};
 
-/// Periods in which a drive that does not answer may come back.
+/// Number of refresh intervals within which a drive that does not answer may return.
 const PERIODS: u32 = 3;
 
 /// Origin of the order that started a refresh.
@@ -29,7 +29,7 @@ const PERIODS: u32 = 3;
 enum Beginner {
     /// The order of a client, whose lease the refresh needs.
     Client,
-    /// The order of a drill, which feeds the timeout until it goes silent to try it.
+    /// The order of a drill, which keeps the drive's timeout from acting until the drill goes silent to test it.
     Drill,
     /// The action of a lease that expired: it needs no lease.
     Action,
@@ -44,7 +44,7 @@ struct Going {
     /// Stops of the drive that were accepted before.
     stops: u64,
     due: Instant,
-    /// The motor was seen to run by its run command, or to stand by its stop.
+    /// Whether the motor was seen to run by its run command, or to stand by its stop.
     seen: bool,
     /// The drive has not answered since.
     lost: Option<Instant>,
@@ -52,7 +52,7 @@ struct Going {
     by: Beginner,
 }
 
-/// A refresh, as handed over to the bus that takes the place of this one.
+/// A refresh as it is handed over to the bus that replaces this one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Repeated {
     ordered: Ordered,
@@ -70,9 +70,9 @@ pub(super) enum OrderEnd {
     Action,
     /// The drive refused a step of the order.
     Refused,
-    /// Which part of the order the drive took is unknown.
+    /// It is unknown which part of the order the drive accepted.
     Unknown,
-    /// An order of the gateway itself was sent.
+    /// An order of the gateway itself was sent to the drive.
     Other,
 }
 
@@ -90,7 +90,7 @@ pub(super) struct Around {
 /// The refresh of one drive.
 #[derive(Debug, Default)]
 pub(super) struct Refresh {
-    /// Interval of the refresh, and its parts; none where nothing is refreshed.
+    /// Interval of the refresh, and what is repeated; `None` if the drive is not refreshed.
     settings: Option<(Duration, Repeats)>,
     repeated: Repeated,
     round: Option<Round>,
@@ -100,7 +100,8 @@ pub(super) struct Refresh {
     says_run: bool,
     /// The drive does not take word and reference in one request.
     apart: bool,
-    /// The lease ended the refresh: only its action, or an order with a run command or stop, begins another one.
+    /// Whether the lease ended the refresh: then only its action, or an order with a run command or stop, starts
+    /// another one.
     by_lease: bool,
 }
 
@@ -113,7 +114,7 @@ impl Refresh {
         }
     }
 
-    /// Goes on where the bus before this one ended: the drive has to answer soon.
+    /// Continues the refresh of the previous bus: the drive has to answer soon.
     pub(super) fn take_over(&mut self, repeated: Repeated, now: Instant) {
         if self.settings.is_some() {
             self.repeated = repeated;
@@ -185,7 +186,7 @@ impl Refresh {
         !repeats.word || (control.refresh_with_reference && self.repeated.ordered.reference.is_some())
     }
 
-    /// An order that was sent is over. Why that ends the refresh, if it does.
+    /// Notes the end of an order that was sent. Returns why the refresh ends, if it does.
     pub(super) fn order_over(&mut self, profile: &Profile, how: OrderEnd, held: bool, now: Instant) -> Option<End> {
         self.round = None;
         let (begins, by) = match how {
@@ -193,7 +194,7 @@ impl Refresh {
             OrderEnd::Done => (held, Beginner::Client),
             OrderEnd::Drill => (held, Beginner::Drill),
             OrderEnd::Action => (self.by_lease, Beginner::Action),
-            // The part taken before may be another command than the repeated one.
+            // The part of the order that the drive accepted before may belong to another command than the repeated one.
             OrderEnd::Refused if self.repeats_what_was_ordered() => return None,
             OrderEnd::Refused | OrderEnd::Unknown => return self.end(End::Unknown),
             OrderEnd::Other => return self.end(End::Other),
@@ -223,7 +224,7 @@ impl Refresh {
             false => ordered.word.is_some_and(|word| word & !control.known_bits() == 0),
         };
         let due = ordered.fed.unwrap_or(now) + every;
-        // Orders that only set a reference change nothing of what was seen, however often they come.
+        // Orders that only set a reference do not change the observed state of the motor, however often they come.
         let goes_on = |going: &Going| !self.says_run && Some(going.does) == ordered.does && going.by == by;
         let before = self.repeated.going.filter(goes_on);
         let anew = |does| Going {
@@ -242,7 +243,7 @@ impl Refresh {
         self.repeated.going = going.or(ordered.does.map(anew)).filter(|_| fits);
     }
 
-    /// Ends the refresh, and forgets what it repeats. Returns the reason where it had started.
+    /// Ends the refresh, and forgets what it repeats. Returns the reason if the refresh had started.
     pub(super) fn end(&mut self, why: End) -> Option<End> {
         let had_begun = self.has_begun();
         match why {
@@ -250,7 +251,7 @@ impl Refresh {
                 (self.repeated.going, self.round) = (None, None);
                 self.by_lease = true;
             }
-            // The reference stays in force, and may be repeated with the word of the stop.
+            // The reference stays in force, and may be repeated together with the word of the stop.
             End::Stop => {
                 (self.repeated.going, self.round) = (None, None);
                 (self.repeated.ordered.does, self.repeated.ordered.word) = (None, None);
@@ -264,7 +265,7 @@ impl Refresh {
         (self.repeated, self.round, self.by_lease) = (Repeated::default(), None, false);
     }
 
-    /// Looks at the drive, to which no order is under way. Why that ends the refresh, if it does.
+    /// Checks a drive to which no order is in progress. Returns why the refresh ends, if it does.
     pub(super) fn check(&mut self, reading: &Reading<'_>, around: Around) -> Option<End> {
         let (every, _) = self.settings?;
         let going = self.repeated.going.as_mut()?;
@@ -290,7 +291,7 @@ impl Refresh {
     /// When the next round is due; `None` if no round is awaited.
     pub(super) fn due(&self) -> Option<Instant> {
         let going = self.repeated.going?;
-        // A run command is repeated to a motor that was seen to run by it.
+        // A run command is only repeated to a motor that was seen to run by it.
         (going.does == InForce::Stop || going.seen).then_some(going.due)
     }
 

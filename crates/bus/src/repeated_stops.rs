@@ -1,5 +1,5 @@
-//! A stop behind a write that got no answer, where a network may hold the write up and let the stop pass: it is written
-//! again, so that the write does not have the last word. Pure: time is an argument.
+//! Repeats a stop after a write that got no answer, because a network may delay the write and let the stop overtake
+//! it: without the repetition the write could have the last word. Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use crate::codec::RequestPdu;
 use crate::drive::Profile;
 use crate::order::written;
 
-/// Times after the stop at which it is written again.
+/// Times after the stop at which the stop is written again.
 const AGAIN: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(3)];
 /// Time for which a write without an answer may still arrive.
 const MAY_ARRIVE: Duration = Duration::from_secs(30);
@@ -36,7 +36,7 @@ impl RepeatedStops {
         }
     }
 
-    /// Notes that a request is sent: a start supersedes the stop before it.
+    /// Notes that a request is sent: a start supersedes an earlier stop.
     pub(super) fn sending(&mut self, profile: &Profile, pdu: &RequestPdu, now: Instant) {
         match runs_by(profile, pdu) {
             Some(true) => self.due = [None; AGAIN.len()],

@@ -26,7 +26,7 @@ use crate::process_image::{
 };
 use crate::stalls::Stall;
 
-/// The load of the line is calculated over this time.
+/// Time over which the load of the line is calculated.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
 /// Older readings show neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
@@ -228,8 +228,9 @@ impl Report {
         });
     }
 
-    /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
-    /// for each loss: why it cannot be opened again then is a reason of the same one, and the state shows it.
+    /// Takes all drives offline before the bus is shown as down, so that no reader of a bus that is down finds good
+    /// values. Reported once for each loss of the port: later reasons why it cannot be opened only appear in the
+    /// state.
     pub(super) fn bus_down(&mut self, why: &str, now: Instant) {
         self.diagnosis.figures().port_lost(now);
         let news = self.up || !self.down_reported;
@@ -292,7 +293,8 @@ impl Report {
         );
     }
 
-    /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did in between.
+    /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did respond
+    /// in between.
     fn check_own_response(&mut self, index: DriveIndex, now: Instant) {
         let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
             return;
@@ -337,14 +339,14 @@ impl Report {
             Some(Value::Integer(code)) => code,
             _ => 0,
         };
-        // A code that was read before the fault came, in a request of its own, is not that of the fault.
+        // A fault code that was read in a separate request before the fault appeared does not belong to the fault.
         let before_the_fault = shown.at < reading.model(ModelPoint::Fault).at;
         if fault.as_bool() && code == 0 && shown.good().is_some() && before_the_fault {
             return false;
         }
         let active = fault.as_bool().then_some(code);
         match self.faults.get_mut(index) {
-            // The code goes before its bit, or is not read at times: the fault is the same.
+            // The code disappears before its bit, or is sometimes not read: the fault is still the same one.
             Some(Some(before)) if active == Some(0) && *before != 0 => return false,
             Some(before) if *before != active => *before = active,
             _ => return false,
@@ -395,8 +397,8 @@ impl Report {
         });
     }
 
-    /// A request was sent at `began`, on a line that had been silent since `quiet_since`: for the recorder, and for
-    /// trace subscribers; `None` without any.
+    /// Records a request sent at `began`, on a line that had been silent since `quiet_since`, for the recorder and
+    /// for trace subscribers; `None` if there is neither.
     pub(super) fn tape_request(
         &self,
         index: Option<DriveIndex>,
@@ -414,7 +416,7 @@ impl Report {
         Some(tap)
     }
 
-    /// Gives the recorder the reply to a request, which may be empty.
+    /// Gives the recorder the bytes received after a request; there may be none.
     pub(super) fn tape_reply(&self, index: Option<DriveIndex>, heard: &[u8], ended: &Ended, now: Instant) {
         tap::tape(&self.image, index, heard, tap::taped(ended), now);
     }
@@ -482,7 +484,7 @@ impl Report {
         }
         let mut turnaround = None;
         if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
-            // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
+            // If the driver delivers a reply as a whole, its first byte arrived earlier by the duration of the reply.
             let by_first = first.saturating_duration_since(exchanged.sent);
             let by_last = now.saturating_duration_since(exchanged.sent);
             let by_last = by_last.saturating_sub(exchanged.reply_time);
@@ -516,7 +518,7 @@ impl Report {
     }
 }
 
-/// The counter for a transaction that ended this way.
+/// The counter that a transaction with this result belongs to.
 fn counted(ended: &Ended) -> Counted {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Counted::Exception,
@@ -526,7 +528,7 @@ fn counted(ended: &Ended) -> Counted {
     }
 }
 
-/// Marks a drive as offline, even one that never replied. False if it already is.
+/// Marks a drive as offline, even one that never replied. Returns false if it already is.
 fn goes_offline(drive: &DriveImage) -> bool {
     if matches!(drive.snapshot().link, Link::Offline(_)) {
         return false;

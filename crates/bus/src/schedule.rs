@@ -1,10 +1,11 @@
 //! Decides what is sent next: cycles, fairness and back-off. Pure: time is an argument.
 //!
-//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls, background transactions. Five rules
-//! soften it: after eight commands in a row a due poll goes first; commands, and the reads that they cause, have no
-//! more of a line that is busy with polls than process data; slow polls that had less than their share of the time
-//! ([`slow_share`]) go before fast ones; background transactions have the idle time and else a small share
-//! ([`crate::order::Pace`]); a drive that does not answer is probed so seldom that it costs at most 2 %.
+//! Decides what the bus sends next. Order: stop, other commands, forwarded reads, due fast polls, due slow polls,
+//! background transactions. Five rules modify this order: after eight commands in a row a due poll goes first;
+//! commands, and the reads that they cause, get no more of a line that is busy with polls than process data; slow
+//! polls that had less than their share of the time ([`slow_share`]) go before fast ones; background transactions
+//! have the idle time and otherwise a small share ([`crate::order::Pace`]); a drive that does not answer is probed
+//! so rarely that it costs at most 2 %.
 
 mod background;
 mod choice;
@@ -30,11 +31,12 @@ pub const COMMANDS_IN_A_ROW: u32 = 8;
 pub const SLOW_SHARE: f64 = 0.05;
 /// Largest share that slow polls get, however many they are.
 const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
-/// Share of what commands leave that slow polls get while something was never read: unknown values are worth more than known ones.
+/// Share of the time left by commands that slow polls get while some values were never read: unknown values are
+/// more urgent than known ones.
 const FIRST_SHARE: f64 = 0.5;
 
-/// Share of a saturated line for slow polls whose cycle would need `demand`: with many requests (one per object on N2)
-/// they get more than the minimum, and finish a round in six times their cycle.
+/// Share of a saturated line for slow polls whose cycle would need `demand`: with many requests (one per object on
+/// N2) they get more than the minimum, and finish a round in six times their cycle.
 pub fn slow_share(demand: f64) -> f64 {
     (demand / 6.0).clamp(SLOW_SHARE, MOST_SLOW_SHARE)
 }
@@ -58,7 +60,7 @@ pub struct Poll {
 pub enum Decision {
     /// Take a command of at least that rank.
     Command(Urgency),
-    /// Read.
+    /// Read the registers of this poll.
     Poll(Poll),
     /// No request is due before this time.
     Idle(Instant),
@@ -80,7 +82,7 @@ pub enum Polled {
 /// The change caused by a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
-    /// The poll changes nothing.
+    /// The result of the poll does not change the state of the drive.
     None,
     /// The drive replies (again).
     Online,
@@ -97,7 +99,7 @@ pub struct Cadence {
     pub fast: Duration,
     /// Aimed at for the slow class.
     pub slow: Duration,
-    /// Tries after the first, for a drive without a number of its own.
+    /// Number of retries for a drive without a setting of its own.
     pub retries: u32,
 }
 
@@ -110,7 +112,7 @@ pub struct RoundStart {
     pub cycle: Option<Duration>,
 }
 
-/// The reason why a poll has its turn.
+/// The reason why a poll was chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
     Due,
@@ -126,7 +128,7 @@ pub struct Schedule {
     cadence: Cadence,
     drives: PerDrive<DriveSchedule>,
     round: VecDeque<(DriveIndex, PlannedRead)>,
-    /// Reads of the round that decide the state of a drive that is still unknown: no slow poll goes before them.
+    /// Reads of this round that decide the state of a drive whose state is unknown: no slow poll goes before them.
     state_first: Vec<(DriveIndex, PlannedRead)>,
     round_due: Instant,
     round_started: Option<Instant>,
@@ -137,16 +139,17 @@ pub struct Schedule {
     slow_credit: Duration,
     /// Share of all time that the credit grows by.
     slow_share: f64,
-    /// Why the poll that was chosen last has its turn.
+    /// Why the last poll was chosen.
     turn: Turn,
     /// Time up to which the credit is calculated.
     earned_until: Instant,
-    /// Time on the line taken by commands, and by reads they caused, since then.
+    /// Time on the line taken by commands, and by reads they caused, since the last poll.
     commanded: Duration,
     /// Time on the line that slow polls took since the start of the round.
     slow_took: Duration,
-    /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
-    /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
+    /// Upper limit of the credit of slow polls. More would allow a burst of slow polls that delays fast ones,
+    /// although idle time would soon serve the slow ones. With less than one request, and the time until it can be
+    /// sent, they would not reach their share.
     most_credit: Duration,
     /// A probe failed since the last fast poll.
     probed: bool,
@@ -210,7 +213,7 @@ impl Schedule {
         }
     }
 
-    /// Tries after the first of each drive, where it has a number of its own.
+    /// Sets the number of retries for each drive that has its own setting.
     pub fn try_again(&mut self, retries: impl Iterator<Item = Option<u32>>) {
         for (drive, own) in self.drives.iter_mut().zip(retries) {
             drive.retries = own.unwrap_or(drive.retries);
@@ -270,7 +273,7 @@ impl Schedule {
         self.share.commanded(urgency, took);
     }
 
-    /// Notes that a step of a refresh was on the line for `took`; it has the rank of a fast poll.
+    /// Notes that a step of a refresh was on the line for `took`; refreshes have the rank of fast polls.
     pub(crate) fn refreshed(&mut self, took: Duration) {
         self.share.polled(took);
     }
@@ -288,7 +291,7 @@ impl Schedule {
                 self.commanded += took;
                 self.share.read(took);
             }
-            // Neither the least share of slow polls nor an absent drive is charged to process data alone.
+            // Process data alone is charged neither for the minimum share of slow polls nor for an absent drive.
             Turn::OnCredit => self.share.polled(Duration::ZERO),
             Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
             Turn::Due => self.share.polled(took),
@@ -303,7 +306,7 @@ impl Schedule {
             self.slow_credit = match turn {
                 Turn::OnCredit => self.slow_credit.saturating_sub(took),
                 Turn::Asked => self.slow_credit,
-                // There was room for this poll, so the others will find room too.
+                // There was room for this poll, so there will be room for the others too.
                 Turn::Due => Duration::ZERO,
             };
             if turn != Turn::Asked {
@@ -312,7 +315,8 @@ impl Schedule {
             self.note_slow(now);
         }
         if matches!(polled, Polled::Failed | Polled::Garbled) && self.is_trial(poll.drive, &poll.read) {
-            // A drive that keeps silent to what no manual states, or answers something else, is not away for that.
+            // A drive that does not answer a read that no manual describes, or answers it wrongly, is not offline
+            // because of that.
             self.not_proved(poll.drive, &poll.read, TRIAL_PAUSE.1, now);
             return Change::None;
         }
@@ -324,12 +328,12 @@ impl Schedule {
         }
     }
 
-    /// The reads that each drive never answers while it answers others.
+    /// The reads that each drive never answers although it answers others.
     pub(crate) fn unanswered(&self) -> PerDrive<Vec<PlannedRead>> {
         self.drives.iter().map(DriveSchedule::unanswered).collect()
     }
 
-    /// The drive replied to a command: it is alive, and probed at once if it was offline.
+    /// Notes that the drive replied to a command: it is present, and is probed at once if it was offline.
     pub fn seen(&mut self, drive: DriveIndex, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.failures, drive.doubted) = (0, false);
@@ -348,8 +352,8 @@ impl Schedule {
         }
     }
 
-    /// Notes that an online drive did not reply to a command: its process data is read next, to find out whether it is
-    /// still there before more is sent.
+    /// Notes that an online drive did not reply to a command: its process data is read next, to find out whether it
+    /// is still present before more is sent.
     pub(crate) fn doubted(&mut self, index: DriveIndex) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
         let Some(drive) = self.drives.get_mut(index).filter(online) else {
@@ -375,14 +379,14 @@ impl Schedule {
         self.drives.get(drive).is_some_and(|drive| drive.is_trial(read))
     }
 
-    /// Records that a reply to this read showed more than its first item.
+    /// Notes that a reply to this read contained more than its first item, which proves the read.
     pub fn proved(&mut self, drive: DriveIndex, read: &PlannedRead) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.unproved.retain(|block| !block.covers(read.table, read.start));
         }
     }
 
-    /// Notes that no reply to this read proved it: its items are read singly, and the whole read is tried again later.
+    /// Notes that no reply has proved this read: its items are read singly, and the whole read is tried again later.
     pub(crate) fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.take_apart(read, now, pause);
@@ -406,7 +410,7 @@ impl Schedule {
         }
     }
 
-    /// Polls that were postponed are due again, as far as they may go now.
+    /// Makes postponed polls due again, as far as they may be sent now.
     pub fn recall(&mut self, now: Instant, may_go: impl Fn(DriveIndex, &PlannedRead) -> bool) {
         for (index, drive) in self.drives.enumerate_mut() {
             let postponed = drive.items.iter_mut().filter(|item| item.postponed);
@@ -433,7 +437,7 @@ impl Schedule {
         }
     }
 
-    /// Makes the reads of an address due at once, since a command changed it.
+    /// Makes the reads of an address due at once, because a command changed it.
     pub fn read_soon(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
@@ -447,7 +451,7 @@ impl Schedule {
         }
     }
 
-    /// Everything is read again from a drive, including points read once.
+    /// Reads everything of a drive again, including points of the class `once`.
     pub(crate) fn read_again(&mut self, index: DriveIndex, now: Instant) {
         let Some(drive) = self.drives.get_mut(index) else {
             return;
@@ -460,7 +464,7 @@ impl Schedule {
         self.state_first(index, None);
     }
 
-    /// Puts the reads that decide a drive's state in front of the round, apart from the one that was just answered.
+    /// Moves the reads that decide a drive's state to the front of the round, except the one that was just answered.
     fn state_first(&mut self, index: DriveIndex, just_read: Option<PlannedRead>) {
         let Some(drive) = self
             .drives
@@ -486,8 +490,8 @@ impl Schedule {
         }
     }
 
-    /// Makes the reads for a new fault due at once: those that the profile names for a fault, and the slow reads that
-    /// cover more of it. They take no more of the line than slow reads have anyway.
+    /// Makes the reads for a new fault due at once: those that the profile names for faults, and the slow reads
+    /// that cover more details of it. They take no more of the line than other slow reads.
     pub(crate) fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
         for item in items.into_iter().flatten() {
@@ -533,7 +537,7 @@ impl Schedule {
         }
     }
 
-    /// A session step was needed before a drive's poll, which is still due: the others have their turn in between.
+    /// Notes that a session step was sent before a drive's poll, which is still due: the other polls are served in between.
     pub(crate) fn session_done(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             (drive.heard, drive.failures) = (true, 0);
@@ -542,7 +546,7 @@ impl Schedule {
         self.share.polled(Duration::ZERO);
     }
 
-    /// Polls the drive no more until this time; none: all drives are polled.
+    /// Does not poll this drive until this time; `None` polls all drives.
     pub fn keep_quiet(&mut self, quiet: Option<(DriveIndex, Instant)>) {
         for (index, drive) in self.drives.enumerate_mut() {
             drive.quiet_until = quiet.filter(|(quiet, _)| *quiet == index).map(|(_, until)| until);

@@ -1,9 +1,11 @@
-//! Whether process data holds the value of its profile. On several families a selector parameter decides the content of a
-//! register of process data; the profile names the register that always has the value ([`Point::monitor`]), and the two are
-//! compared when the drive comes online, until a comparison proves something. Pure.
+//! Checks whether process data still has the values that the profile assumes. On several families a selector
+//! parameter decides the content of a process data register; the profile names the register that always has the
+//! value ([`Point::monitor`]), and the two are compared when the drive comes online, until a comparison proves
+//! something. Pure.
 //!
-//! From the first comparison that differs on, the value comes from the monitoring register, which is slower and always right.
-//! Two comparisons that agree bring the process data back; three that differ show that the selection was changed.
+//! After the first comparison that differs, the value comes from the monitoring register, which is slower and
+//! always right. Two comparisons that agree switch back to the process data; three that differ show that the
+//! selection was changed.
 
 use std::time::{Duration, Instant};
 
@@ -14,11 +16,12 @@ use crate::process_image::Reading;
 const DIFFERING: u8 = 3;
 /// Matching comparisons in a row after which process data is trusted again.
 const AGREEING: u8 = 2;
-/// First and longest pause before a value is compared again that proved nothing, such as 0 of a motor that stands.
+/// First and longest pause before a value is compared again after a comparison that proved nothing, such as 0 of a
+/// standing motor.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(600));
 /// Pause between two looks at process data that is 0 in a motor that does not run.
 const LOOK: Duration = Duration::from_millis(500);
-/// Values that move differ by that part of them, or by that many counts, without a changed selection.
+/// Relative difference, or difference in counts, that changing values may have although the selection is right.
 const TOLERANCE: f64 = 0.1;
 const COUNTS: f64 = 50.0;
 
@@ -48,7 +51,8 @@ struct Compared {
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Trust {
-    /// No comparison has proved anything; the next one where there is something to compare, and the pause after it.
+    /// No comparison has proved anything yet; when to compare next, if there is something to compare, and the pause
+    /// after that.
     Unproven(Instant, Duration),
     Proven,
     /// Number of comparisons that differed, and of those that agreed since.
@@ -62,7 +66,7 @@ enum Trust {
 enum Verdict {
     Agrees,
     Differs,
-    /// Both values are about 0, or the register may not exist.
+    /// The comparison proves nothing: both values are about 0, or the register may not exist.
     Nothing,
 }
 
@@ -71,7 +75,7 @@ enum Verdict {
 pub(super) struct Findings {
     /// Monitoring points to be read, and when.
     pub(super) wanted: Vec<(PointIndex, Instant)>,
-    /// The points whose value comes from their monitoring register from now on, if that changed.
+    /// The points whose value comes from their monitoring register from now on, if that has changed.
     pub(super) monitored: Option<Vec<PointIndex>>,
     /// Points now known to differ, with both values: the first ones of the drive.
     pub(super) differ: Vec<(PointIndex, f64, f64)>,
@@ -109,7 +113,7 @@ impl Selections {
         }
     }
 
-    /// The drive refuses that read: a monitoring register that it does not have proves nothing.
+    /// Notes that the drive refuses this read: a missing monitoring register proves nothing.
     pub(super) fn refused(
         &mut self,
         drive: DriveIndex,
@@ -130,7 +134,7 @@ impl Selections {
         self.findings(drive, reading, Vec::new(), Vec::new(), Vec::new())
     }
 
-    /// The drive answered this read, and has the values of `reading` after it.
+    /// Notes that the drive answered this read and has the values of `reading` after it.
     pub(super) fn read(&mut self, drive: DriveIndex, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
         let now = reading.now;
         let profile = &reading.spec.profile;
@@ -225,7 +229,7 @@ impl Compared {
         }
     }
 
-    /// When it is to be compared, where process data that was just read gives a reason.
+    /// When to compare the point, if the process data just read gives a reason for it.
     fn comparison_due(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
         let Trust::Unproven(next, pause) = self.trust else {
             return None;
@@ -263,13 +267,12 @@ impl Compared {
     }
 }
 
-/// Whether the point is a number that has a meaning by itself, such as a fault code: two values are equal or different,
-/// never near.
+/// Whether the point is a number such as a fault code, whose values are either equal or different, never close.
 fn is_code(point: &Point) -> bool {
     point.unit.is_empty()
 }
 
-/// Compares process data, as it was right before and right after its monitoring register was read.
+/// Compares process data from right before and right after the read of its monitoring register.
 fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict {
     let (point, monitor) = of;
     let (low, high) = (around.0.min(around.1), around.0.max(around.1));

@@ -1,5 +1,5 @@
-//! Starts of guarded drives, as the line sees them: what was written, what was read; and the stops of interlocks that do not hold
-//! any more. Pure: time is an argument.
+//! Starts of guarded drives on the line: which were written and which were read; and the stops of interlocks that
+//! no longer hold. Pure: time is an argument.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,7 +19,7 @@ use crate::process_image::{DriveImage, Reading};
 use crate::stalls::Stall;
 use crate::start_guard::BusGuards;
 
-/// First and longest pause before a motor that an interlock stopped and that runs on is stopped again.
+/// First and longest pause before a motor that keeps running after an interlock's stop is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
 /// Time after a stall of the thread in which a point that was not read since stops no motor.
 const FIRST_READ: Duration = Duration::from_secs(10);
@@ -65,7 +65,7 @@ impl StartGate {
         })
     }
 
-    /// The start of that drive that an order of that client causes, if its starts are counted.
+    /// The start of this drive that an order of this client causes, if its starts are counted.
     pub(super) fn start_of(&self, intent: &Intent, origin: &Origin, drive: DriveIndex) -> Option<Start> {
         let starts = self.guards.guards(drive) && intent.effects.on(drive).starts();
         starts.then(|| Start {
@@ -108,7 +108,7 @@ impl StartGate {
         self.guards.guards(index)
     }
 
-    /// Takes the results to report.
+    /// Takes the results that are to be reported.
     pub(super) fn take_news(&mut self) -> Vec<News> {
         std::mem::take(&mut self.told)
     }

@@ -1,11 +1,11 @@
-//! Supervision: polling keeps a drive's own watchdog satisfied even when no client commands it. So a drive can have a
-//! lease, renewed by the commands and heartbeats of a commanding client; when it expires while the drive runs, or its
-//! run command is set, the configured action is written. Not a safety function. Pure: time is an argument.
+//! Supervision: polling keeps a drive's own watchdog satisfied even if no client commands it. So a drive can have a
+//! lease, renewed by the commands and heartbeats of a commanding client; when it expires while the drive runs, or
+//! its run command is set, the configured action is written. Not a safety function. Pure: time is an argument.
 //!
-//! A lease begins when a command reached the wire, and again when that order ended. A command that waits holds the
-//! lease, no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client
-//! that is back suspends an action that is not on the wire yet; if its order ends without reaching the wire, the action
-//! is due again.
+//! A lease begins when a command has reached the wire, and again when that order has ended. A waiting command keeps
+//! the lease alive, but only until the order expires; one that was refused, expired or replaced renews nothing. A
+//! client that returns suspends an action that is not on the wire yet; if its order ends without reaching the wire,
+//! the action is due again.
 
 use std::time::{Duration, Instant};
 
@@ -22,7 +22,7 @@ use crate::drive::{
 use crate::order::{Answer, Outcome, Refusal};
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
-/// How long an action that was not acknowledged waits before it is written again.
+/// Time after which an action that was not acknowledged is written again.
 const AGAIN: Duration = Duration::from_secs(1);
 /// Most reasons for a failed action that are distinguished; each is reported once.
 const MOST_REASONS: usize = 8;
@@ -46,7 +46,7 @@ enum State {
     Held(Instant),
     /// The lease expired while the drive ran, and the action is not acknowledged yet.
     RanOut,
-    /// The lease ended: the motor stood without a run command when it expired, or the action was acknowledged.
+    /// The lease has ended: the motor stood without a run command when it expired, or the action was acknowledged.
     Ended,
 }
 
@@ -65,7 +65,7 @@ impl Lease {
         State::Held(since).into()
     }
 
-    /// The lease after a time in which it did not run.
+    /// The lease, with its time limit extended by a period in which the gateway did not run.
     #[must_use]
     pub fn after(self, stood: Duration) -> Lease {
         match self.state {
@@ -77,8 +77,8 @@ impl Lease {
         }
     }
 
-    /// The protection that ends with the lease if no drive continues it, as text; none for a lease that has ended or
-    /// never started.
+    /// The protection that ends with the lease if no drive continues it, as text; `None` for a lease that has ended
+    /// or never started.
     pub fn ends(self) -> Option<&'static str> {
         match self.state {
             State::Unheard | State::RunsUnheard | State::Ended => None,
@@ -91,16 +91,16 @@ impl Lease {
 /// The inputs of supervision, except process data.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Orders {
-    /// Until when a client's queued or started command holds the lease.
+    /// Until when a client's queued or started command keeps the lease alive.
     pub(super) held_until: Option<Instant>,
 }
 
 /// Request of supervision.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Demand {
-    /// Supervision requests nothing.
+    /// Supervision requires no action.
     None,
-    /// Write this point of the model; the result goes to [`Supervision::ordered`].
+    /// Write this point of the model; report the result to [`Supervision::ordered`].
     Write(ModelPoint, Value),
     /// Withdraw an action that is queued and not started.
     Withdraw,
@@ -117,7 +117,7 @@ pub(super) struct Supervision {
     refused: Option<Refusal>,
     /// Whether it was reported that the drive does not show whether it runs.
     blind_reported: bool,
-    /// For how long the drive has answered without showing whether its motor runs, and until when that is calculated.
+    /// How long the drive has answered without showing whether its motor runs, and when that was last calculated.
     waited: Option<(Duration, Instant)>,
     /// A failure of the action that is not reported yet.
     failure: Option<Outcome>,
@@ -161,8 +161,8 @@ impl Supervision {
         self.begin_anew();
     }
 
-    /// The gateway itself received nothing for this time: the lease lasts longer by it, by one timeout in all since it was
-    /// renewed.
+    /// Extends the lease by a time during which the gateway itself received nothing, by at most one timeout since
+    /// the lease was renewed.
     pub(super) fn prolong(&mut self, time: Duration, timeout: Duration) {
         if let State::Held(since) = &mut self.lease.state {
             let time = time.min(timeout.saturating_sub(self.lease.prolonged));
@@ -171,7 +171,7 @@ impl Supervision {
         }
     }
 
-    /// Begins anew, because the action or the lease is another one.
+    /// Starts again, because the action or the lease has changed.
     fn begin_anew(&mut self) {
         (self.refused, self.next_try) = (None, None);
         (self.failure, self.failures) = (None, 0);
@@ -235,9 +235,9 @@ impl Supervision {
         }
     }
 
-    /// Handles the expiry of a lease that ran since `since`. Whether a silent drive, or one not read since, runs is
-    /// unknown: its lease stays until it is read. A drive that replies without reporting that is not waited for
-    /// indefinitely.
+    /// Handles the expiry of a lease that started at `since`. Whether a drive runs that is silent, or not read
+    /// since, is unknown: its lease stays until it is read. For a drive that replies without reporting this, the
+    /// wait is limited.
     fn runs_out(
         &mut self,
         since: Instant,
@@ -250,7 +250,7 @@ impl Supervision {
         let Some(running) = self.running(reading, words, in_vain, news, drive) else {
             return;
         };
-        // A motor may run, or start, by its run command whatever its status shows.
+        // A motor with its run command on may run, or start, whatever its status shows.
         let commanded = || is_commanded(reading, words, since, in_vain);
         let Some(acts) = running.then_some(true).or_else(commanded) else {
             return;
@@ -269,8 +269,8 @@ impl Supervision {
         }
     }
 
-    /// Counts for how long the drive has answered without showing whether its motor runs. The time in which it does not answer
-    /// is not counted: after it everything is read again.
+    /// Counts how long the drive has answered without showing whether its motor runs. Time in which it does not
+    /// answer is not counted: everything is read again after that.
     fn count_in_vain(&mut self, reading: &Reading<'_>, now: Instant) {
         let is_shown =
             |point| reading.spec.profile.model_point(point).is_none() || reading.model(point).good().is_some();
@@ -285,7 +285,7 @@ impl Supervision {
         self.waited = Some((time, now));
     }
 
-    /// Whether that has lasted for as long as a read of what is to be seen may take.
+    /// Whether the drive has answered for as long as a read of its running state may take.
     fn waits_in_vain(&self, reading: &Reading<'_>) -> bool {
         let online = reading.snapshot.link.is_online();
         let time = self.waited.map_or(Duration::ZERO, |(time, _)| time);
@@ -298,8 +298,8 @@ impl Supervision {
         online && time >= patience
     }
 
-    /// Whether the motor runs. Where the drive answers but does not say, its run command stands for it, and one that
-    /// is not known either is taken to be set.
+    /// Whether the motor runs. If the drive answers without reporting this, its run command counts instead; an
+    /// unknown run command counts as set.
     fn running(
         &mut self,
         reading: &Reading<'_>,
@@ -361,7 +361,7 @@ impl Supervision {
         }
     }
 
-    /// Writes the action; for a silent drive, when it is back.
+    /// Writes the action; to a silent drive, when it is back.
     fn act(&mut self, reading: &Reading<'_>, now: Instant) -> Demand {
         let waits = self.answer.is_some();
         let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
@@ -411,7 +411,8 @@ impl Supervision {
     }
 }
 
-/// Whether the drive, which answers, does not say whether its motor runs: it refuses the point, or nothing reads it.
+/// Whether the drive answers without reporting whether its motor runs, because it refuses the point or the point is
+/// not read.
 fn does_not_say(reading: &Reading<'_>) -> bool {
     let Some(point) = reading.spec.profile.model_point(ModelPoint::Running) else {
         return true;
@@ -426,9 +427,9 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
     }
 }
 
-/// Whether the run command is set in the drive's word, as it was read since the last order or, where it is waited for
-/// without success or not reported, as it was last written; none while it is to be read yet. What is not known either
-/// counts as unset.
+/// Whether the run command is set in the drive's word, as read since the last order; as last written, if waiting
+/// for the read was useless or the drive does not report its word; `None` while it must still be read. A word
+/// unknown in both ways counts as unset.
 fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_vain: bool) -> Option<bool> {
     let sample = reading.model(ModelPoint::Run);
     if let Some(run) = sample.good().filter(|_| sample.at.is_some_and(|at| at > since)) {
@@ -445,7 +446,7 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
     Some(written_run(reading, words).unwrap_or(false))
 }
 
-/// The run command in the drive's word as it is known.
+/// The run command in the drive's word, as far as the word is known.
 pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
     let profile = &reading.spec.profile;
     let place = profile.run_place()?;
@@ -458,7 +459,7 @@ fn has_run_out(since: Instant, timeout: Duration, now: Instant) -> bool {
     now.saturating_duration_since(since) >= timeout
 }
 
-/// Whether this outcome is a failed action: not if another command replaced it, or the bus restarts.
+/// Whether this outcome is a failed action; not if another command replaced the action, or the bus restarts.
 fn has_failed(outcome: &Outcome) -> bool {
     !matches!(
         outcome,
@@ -466,7 +467,7 @@ fn has_failed(outcome: &Outcome) -> bool {
     )
 }
 
-/// A drive's own response to a silent master, as far as its registers show.
+/// A drive's own response to a silent master, as far as its registers show it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OwnResponse {
     /// The response was not read yet, or the profile has no point for it.
@@ -477,14 +478,14 @@ pub(super) enum OwnResponse {
     On,
 }
 
-/// Points with a drive's own response to a silent master, and the value that means none.
+/// Points that show a drive's own response to a silent master, with the value that means no response.
 const RESPONSES: [(&str, f64); 3] = [
     (FIELDBUS_FAULT_RESPONSE, 0.0),
     (COMMUNICATION_TIMEOUT, 0.0),
     (COMMUNICATION_ERROR_REACTION, 3.0),
 ];
 
-/// The drive's own response: none where any of the points that the profile has shows that.
+/// The drive's own response; "none" only if one of the profile's points shows that.
 pub(super) fn own_response(reading: &Reading<'_>) -> OwnResponse {
     let mut seen = OwnResponse::Unknown;
     for (name, none) in RESPONSES {

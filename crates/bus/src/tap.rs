@@ -1,7 +1,7 @@
 //! The frames of a line, for the recorder and the trace: requests, replies, times and meaning.
 //!
-//! Time on the wire is calculated from the bytes: a driver may hand a reply over byte by byte, or whole when its last
-//! byte is there.
+//! Records frames with their times on the wire, which are calculated from the bytes: a driver may deliver a reply
+//! byte by byte, or as a whole when its last byte has arrived.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -26,7 +26,7 @@ pub(super) struct Tap {
 }
 
 impl Tap {
-    /// The transaction whose request was given to the line at `began`.
+    /// The record of a transaction whose request was given to the line at `began`.
     pub(super) fn new(
         image: Arc<BusImage>,
         index: Option<DriveIndex>,
@@ -69,8 +69,8 @@ impl Tap {
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
         let parts = describe::parts(protocol, &self.request, &self.frame, &self.hearing.bytes, answered);
-        // The outcome belongs to its own part; without such a part (nothing or only foreign frames came), it belongs to
-        // none.
+        // The outcome belongs to the part that is the reply; without such a part (nothing, or only foreign frames
+        // arrived), it belongs to none.
         let its_kind = if answered { Kind::Reply } else { Kind::Garbage };
         let its_part = parts.iter().rposition(|part| part.kind == its_kind);
         let mut quiet_since = self.hearing.sent;
@@ -103,7 +103,7 @@ impl Tap {
     }
 }
 
-/// Gives the recorder a request, or all bytes that came until its transaction was over.
+/// Gives the recorder a request, or all bytes received until its transaction ended.
 pub(super) fn tape(image: &BusImage, drive: Option<DriveIndex>, bytes: &[u8], verdict: Verdict, at: Instant) {
     image.tape.frame(|| TapedFrame {
         at,
@@ -188,7 +188,7 @@ impl Hearing {
         let last = part.range.end.saturating_sub(1);
         let first = self.arrival(part.range.start).unwrap_or(quiet_since);
         let end = self.arrival(last).unwrap_or(first);
-        // The first byte was on the wire for a character before it arrived, and the whole frame for its own time.
+        // The first byte was on the wire for one character before it arrived, and the whole frame for its own duration.
         let by_first = first.checked_sub(self.format.chars(1)).unwrap_or(first);
         let by_last = end.checked_sub(self.format.chars(part.range.len())).unwrap_or(end);
         (by_first.min(by_last).saturating_duration_since(quiet_since), end)

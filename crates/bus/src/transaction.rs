@@ -1,12 +1,12 @@
-//! One transaction on the line: pure, driven by bytes and time.
+//! One transaction on the line. Pure: driven by bytes and time.
 //!
-//! Garbage does not end a transaction at once: noise may have run into the beginning of a sound reply, and the rest of
-//! a broken one may still be on the line. The transaction goes on until as many characters came as a reply has, or
-//! nothing more came for their time, never beyond the deadline. A whole Modbus reply behind the garbage is accepted:
-//! address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they would have to
-//! be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage it is not
-//! accepted, the request is repeated. N2 replies are not accepted there at all. Bytes before the colon of a Modbus
-//! ASCII frame are not garbage but noise, which its decoder skips.
+//! Garbage does not end a transaction at once: noise may have hit the start of a valid reply, and the rest of a
+//! broken one may still be on the line. The transaction continues until as many characters arrived as a reply has,
+//! or no more arrived for their duration, but never beyond the deadline. A complete Modbus reply after garbage is
+//! accepted: address, function, length and check code match, which random bytes do once in 2^40; in Modbus ASCII
+//! they would also have to be digits between a colon and CR LF. An exception is shorter and may split a block:
+//! after garbage it is not accepted, and the request is repeated. N2 replies are never accepted after garbage.
+//! Bytes before the colon of a Modbus ASCII frame are not garbage but noise, which its decoder skips.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
@@ -23,10 +23,10 @@ const GARBAGE_GAP: u32 = 4;
 /// Silence after a reply of unknown length that makes it complete: longer than a USB adapter buffers bytes.
 const WHOLE_AFTER: Duration = Duration::from_millis(20);
 
-/// Why a reply is rejected that may be a late one to an earlier request.
+/// Reason to reject a reply that may be a late reply to an earlier request.
 pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
-/// Why a transaction has no reply if the device server closed the connection after its request.
+/// Reason why a transaction has no reply if the device server closed the connection after its request.
 pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply arrived over the next one";
 
 /// How a transaction ended.
@@ -34,7 +34,7 @@ pub const CONNECTION_CLOSED: &str = "the device server closed the connection, an
 pub enum Ended {
     /// The drive replied, perhaps with an exception: it is alive.
     Reply(Reply),
-    /// Nothing valid arrived before the deadline: the drive is on its way to offline.
+    /// No valid frame arrived before the deadline: counts towards going offline.
     Silent,
     /// An invalid reply: retried once the line is silent.
     Corrupt(&'static str),
@@ -78,7 +78,8 @@ pub struct Transaction {
     ignored_before: Option<Instant>,
     /// Late replies that may still arrive on an N2 line.
     late: N2LateReplies,
-    /// A frame that is the reply, unless another one comes until the deadline: the first one was then a late reply.
+    /// A frame that counts as the reply unless another one arrives before the deadline: then the first one was a
+    /// late reply.
     unless_another: Option<(Vec<u8>, Reply)>,
 }
 
@@ -118,8 +119,8 @@ impl Transaction {
         }
     }
 
-    /// Doubts a reply that is complete before `earliest`, when request and reply cannot both have been on the wire: it
-    /// is the last reply once more, or the echo of a write.
+    /// Rejects a reply that is complete before `earliest`, because request and reply cannot both have been on the
+    /// wire by then: it is a duplicate of the last reply, or the echo of a write.
     pub(crate) fn doubt_before(&mut self, earliest: Instant) {
         self.doubted_before = Some(earliest);
     }
@@ -149,8 +150,8 @@ impl Transaction {
         std::mem::take(&mut self.late)
     }
 
-    /// Whether the bytes that could not be believed were the drive's reply, mangled: they begin like it or are as long.
-    /// No further reply is then expected.
+    /// Whether the rejected bytes were the drive's reply in damaged form: they begin like it or have its length. No
+    /// further reply is then expected.
     pub(crate) fn is_mangled_reply(&self) -> bool {
         self.protocol.begins_reply(&self.request, &self.received)
     }
@@ -225,7 +226,7 @@ impl Transaction {
                         return self.on_time(now);
                     }
                 }
-                // The echo of the request can look like a broken reply until it is whole.
+                // The echo of the request can look like a broken reply until it is complete.
                 _ if self.frame.starts_with(&self.received) => return self.on_time(now),
                 Decoded::Corrupt(_) if self.ignored_before.is_some_and(|end| now < end) => {
                     self.foreign += 1;
@@ -235,7 +236,7 @@ impl Transaction {
                 }
                 Decoded::Incomplete => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
-                        // A new colon began a frame again, which may be complete until the deadline.
+                        // A new colon has started another frame, which may be complete before the deadline.
                         self.garbage = None;
                         self.on_time(now)
                     });
@@ -250,8 +251,9 @@ impl Transaction {
         }
     }
 
-    /// Whether a doubtful frame is worth the time until the deadline: it reports a restart, or the device type, without
-    /// which nothing else can be requested. If each such answer were in doubt for the one before, that would never end.
+    /// Whether it is worth waiting until the deadline to confirm a doubtful frame: it reports a restart, or the
+    /// device type, without which nothing else can be requested. If each such answer were doubted because of the
+    /// previous one, that would never end.
     fn awaits_another(&self) -> bool {
         let identifies = matches!(self.request.pdu, RequestPdu::N2(Session::Identify));
         let restarted = matches!(
@@ -264,7 +266,7 @@ impl Transaction {
         identifies || restarted
     }
 
-    /// Keeps the frame at the beginning as the reply, unless another one comes.
+    /// Keeps the frame at the start of the input as the reply, unless another one arrives.
     fn hold_doubtful(&mut self) -> bool {
         let Decoded::Reply { used, reply } = self.protocol.decode(&self.request, &self.received) else {
             return false;
@@ -328,7 +330,7 @@ impl Transaction {
         Some(self.replied(at, used, reply))
     }
 
-    /// How long more characters of the garbage may still come.
+    /// How long further characters of the garbage may still arrive.
     fn rest_time(&self) -> Duration {
         let expected = self.protocol.reply_chars(&self.request.pdu).max(1);
         let missing = expected.saturating_sub(self.received.len()) as u32 + GARBAGE_GAP;
@@ -363,9 +365,9 @@ impl Transaction {
         Step::Done(ended)
     }
 
-    /// An adapter that receives its own bytes returns the request before the reply. A read cannot be answered by its
-    /// own frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known
-    /// already.
+    /// Removes the echo of the request before the reply, if the adapter receives its own bytes. A read cannot be
+    /// answered by its own frame, so such a frame is an echo; the reply to a write of one register can equal the
+    /// request, so there it must already be known that the adapter echoes.
     fn strip_echo(&mut self) -> bool {
         let could_be_echo = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
         let noise = self.protocol.noise(&self.received);
@@ -379,9 +381,9 @@ impl Transaction {
         true
     }
 
-    /// Whether the adapter echoes, as far as this transaction shows. Only an answered request with a different reply
-    /// shows it: a reply without an echo before it means that an earlier echo was spurious, and relying on it would
-    /// swallow the acknowledgements of all writes.
+    /// Whether the adapter echoes, as far as this transaction shows. Only an answered request whose reply differs
+    /// from it shows this: a reply without an echo before it means that an earlier echo was spurious, and relying
+    /// on that one would swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));
         (is_unlike_its_reply(&self.request.pdu) && (self.echo_seen || answered)).then_some(self.echo_seen)

@@ -1,14 +1,15 @@
 //! Stops to a silent drive: when the next one may be sent. Pure: time is an argument.
 //!
-//! A person presses the button again, and the drive may listen again at any moment: the next stop goes out after the others
-//! had the line for as long as the last one took it. Stops without end must not take half of the line: beyond a few in a row
-//! they get a tenth, but wait no longer than for one reply.
+//! Limits repeated stops to a silent drive. A person presses the button again, and the drive may listen again at
+//! any moment: the next stop is sent after the other requests had the line for as long as the last stop took.
+//! Endless stops must not take half of the line: beyond a few in a row they get a tenth, but wait no longer than
+//! for one reply.
 
 use std::time::{Duration, Instant};
 
-/// Stops in a row that go out in turn with the rest.
+/// Number of unanswered stops in a row that alternate with the other requests.
 const IN_TURN: f64 = 8.0;
-/// Beyond that the pause is this multiple of the duration of the last one, up to the time for a reply.
+/// Pause after further stops, as a multiple of the duration of the last one, up to the time for a reply.
 const PAUSE: u32 = 10;
 
 /// The unanswered stops of one drive.
@@ -23,7 +24,7 @@ pub(super) struct VainStops {
 }
 
 impl VainStops {
-    /// Notes that a transaction of a stop got no reply and took the line for `took`.
+    /// Notes that a stop got no reply and took the line for `took`.
     pub(super) fn not_answered(&mut self, took: Duration) {
         self.took += took;
     }
@@ -50,7 +51,7 @@ impl VainStops {
         *self = VainStops::default();
     }
 
-    /// Until when the next stop waits.
+    /// Until when the next stop waits; `None` if it need not wait.
     pub(super) fn waits_until(&self, now: Instant) -> Option<Instant> {
         self.until.filter(|until| *until > now)
     }

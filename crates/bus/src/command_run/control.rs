@@ -1,8 +1,8 @@
 //! Commands of a family that follows the `[control]` of its profile: the words of a start, a stop, a change of direction and a
 //! reset, and the steps of a sequence. Pure.
 //!
-//! A stop is one write and waits for nothing. A sequence is entered by a run command only; one that fails behind its last word
-//! ends with a stop.
+//! Steps of a command to a drive with `[control]`. A stop is one write and waits for nothing. Only a run command
+//! starts a sequence; a sequence that fails after its last word ends with a stop.
 
 use std::time::{Duration, Instant};
 
@@ -18,23 +18,22 @@ use crate::order::Refusal;
 /// Pause between two looks at a state for which a sequence waits.
 pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);
 
-/// A word of the control register, made of what the drive has when its turn comes.
+/// A word for the control register, made from the word that the drive has when it is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Word {
     /// A stop, with a direction where the order has one.
     Stop(Option<bool>),
-    /// The direction alone.
+    /// Only the direction is set.
     Direction(bool),
-    /// Whether the direction may be written to a place of its own; that write follows.
+    /// Checks whether the direction may be written to its separate register; that write follows.
     DirectionElsewhere(bool),
-    /// The direction that was kept for this start, at a place of its own.
+    /// Writes the direction that was kept for this start to its separate register.
     KeptDirection,
     /// A run, with a direction where the order has one.
     Run(Option<bool>),
-    /// The word of this number in the sequence.
+    /// The word with this number in the start sequence.
     Sequence(usize, Option<bool>),
-    /// Before a pulse of these bits, usually a reset: the bits are not set, nor is the run command of a motor that
-    /// stands.
+    /// Prepares a pulse of these bits, usually a reset: clears the bits, and the run command if the motor stands.
     ResetLow(Setting),
     /// The pulse.
     ResetHigh(Setting),
@@ -72,11 +71,11 @@ impl Word {
 pub(super) enum Made {
     /// The request to send.
     Send(Step),
-    /// Nothing is sent, as the drive has the word.
+    /// Nothing is sent because the drive already has the word.
     Nothing,
     /// The running state must be read before the word is made.
     Look,
-    /// Nothing is sent: this direction is kept for the next start.
+    /// Nothing is sent now: this direction is kept for the next start.
     AtNextStart(bool),
     /// The order is refused, as its effect would be unknown.
     Refused(Refusal),
@@ -91,9 +90,9 @@ pub(super) struct AwaitedState {
     mask: Mask,
     /// Time after which the sequence is given up.
     pub(super) timeout: Duration,
-    /// The step with its word, as text.
+    /// The step as text, with its word.
     step: String,
-    /// When the wait began.
+    /// When the wait for this state began.
     pub(super) since: Option<Instant>,
     /// The last reading.
     seen: Option<u64>,
@@ -164,7 +163,7 @@ pub(super) struct Ordered {
 }
 
 impl Ordered {
-    /// Notes the value, if the point follows from `[control]`.
+    /// Adds the value to the command, if `[control]` defines how its point is written. Returns whether it does.
     pub(super) fn note_value(&mut self, profile: &Profile, index: PointIndex, value: Value) -> bool {
         let is = |point: ModelPoint| {
             let model = profile.model_index(point);
@@ -226,7 +225,7 @@ impl Ordered {
         }
         match (self.run, self.reverse) {
             (Some(true), reverse) => actions.extend(runs(control, profile, reverse)),
-            // A stop is a command of its own; here it is one that names no other command.
+            // A stop is split off from other commands before, so this command contains nothing else.
             (Some(false), reverse) => actions.extend(stops(control, profile, reverse)),
             (None, Some(reverse)) if elsewhere.is_none() => actions.push(Action::Word(Word::Direction(reverse))),
             (None, _) => {}
@@ -254,7 +253,7 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
     actions
 }
 
-/// The control word where it is a coil, which has no other bits.
+/// The control word as a coil, if it is one; a coil has no other bits.
 fn coil_of(control: &Control) -> Option<ControlItem> {
     Some(control.at).filter(|at| at.table == Table::Coil)
 }
@@ -274,7 +273,7 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
             }
         }
         Some(place) => {
-            // One wait serves both: the run command goes low, and the reset returns to its former value.
+            // One pause serves both: the run command is taken away, and the reset bit returns to its former value.
             if !stopped {
                 actions.push(Action::Word(Word::ResetLow(setting)));
             }
@@ -294,7 +293,7 @@ fn resets(control: &Control, profile: &Profile, stopped: bool) -> Vec<Action> {
     actions
 }
 
-/// A pulse of these bits of the control word.
+/// The actions of a pulse of these bits of the control word.
 pub(super) fn pulse(setting: Setting, wait: Duration) -> [Action; 5] {
     [
         Action::Word(Word::ResetLow(setting)),
@@ -305,7 +304,7 @@ pub(super) fn pulse(setting: Setting, wait: Duration) -> [Action; 5] {
     ]
 }
 
-/// The word at a place of its own between two resets.
+/// The word of a separate reset register between two resets.
 fn low_of(setting: &Setting) -> u16 {
     match setting.value {
         0 => setting.mask,
@@ -348,7 +347,7 @@ fn write(place: ControlItem, word: u16, profile: &Profile) -> RequestPdu {
     }
 }
 
-/// Whether the first word of a sequence can be left out, and all but the last: the motor runs by this very command.
+/// Whether all words of a sequence but the last can be left out, because the motor already runs by this command.
 pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) -> bool {
     let Some(control) = profile.control.as_ref().filter(|_| running) else {
         return false;
@@ -357,7 +356,7 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
     own.is_some_and(|own| control.is_run(control.at, own))
 }
 
-/// The request of a word with the control word as it is known; or the read of the control word where it is not known.
+/// The request that writes a word, based on the known control word; or the read of the control word if it is not known.
 pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Known) -> Made {
     let Some(control) = profile.control.as_ref() else {
         return Made::Nothing;
@@ -398,7 +397,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
                 let run = if reverse { back } else { forward };
                 match runs && run.place.is_none() {
                     true => sent(at, run.applied(stays)),
-                    // While the motor stands no bit of the drive holds the direction.
+                    // While the motor stands, no bit of the drive stores the direction.
                     false => Made::AtNextStart(reverse),
                 }
             }
@@ -440,7 +439,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         Word::ResetLow(_) | Word::ResetHigh(_) if runs && control.restarts_on_reset => {
             Made::Refused(Refusal::NotAllowed(RESTARTS_ON_RESET.to_string()))
         }
-        // The word of a motor that runs stays as it is, as does one that the drive has.
+        // Nothing is written if the motor runs and the reset has a separate register, or if the drive already has the word.
         Word::ResetLow(reset) if runs && reset.place.is_some() || own == Some(stays) => Made::Nothing,
         Word::ResetHigh(reset) => sent(at, reset.applied(stays)),
         Word::ResetLow(_) | Word::ResetEnd(_) => sent(at, stays),
@@ -452,13 +451,13 @@ const STOPS_BY_RESET: &str = "the motor is running, and on this family a reset w
 const RESTARTS_ON_RESET: &str = "the motor is running, and on this family a reset starts a motor that has tripped meanwhile; \
      nothing was written";
 
-/// Whether a reset within the control word takes the run command away.
+/// Whether a reset by the control word also takes the run command away.
 fn stops_by_reset(control: &Control, reset: Setting) -> bool {
     reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run))
 }
 
-/// Which other bits may be written with a word; a word that decides whether the motor is to run needs no read. `released` is the
-/// control word as it is known, without a reset.
+/// Which other bits may be written together with a word; a word that itself decides whether the motor runs needs no
+/// read. `released` is the known control word without a reset.
 ///
 /// # Errors
 /// The word is not made.
@@ -473,7 +472,7 @@ fn may_stand(
     let Some(wants) = word.wants() else {
         return Ok(Verdict::AsItStands);
     };
-    // The drive may have taken a stop that it has not acknowledged, and its motor still comes down.
+    // The drive may have received a stop that it did not acknowledge, and its motor may still be slowing down.
     if known.stopped {
         return Ok(Verdict::WithoutRun);
     }
@@ -493,7 +492,7 @@ fn may_stand(
     }
 }
 
-/// The run command as it is known at the drive; `None` if the drive is known to have a stop.
+/// The run command that the drive is known to have; `None` if it is known to have a stop.
 fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option<KnownRun> {
     let place = control.run_place();
     let own = place == control.at;
@@ -510,8 +509,8 @@ fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option
     }
 }
 
-/// Whether the word is read from the drive first: where a bit keeps its value. A stop and a start do without, unless
-/// the other bits of the word are to be kept and it is not known.
+/// Whether the word must first be read from the drive, because a bit is to keep its value. A stop and a start need
+/// no read, unless the other bits must be kept and are unknown.
 fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> bool {
     let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
     if is_coil || known.blind || known.check != Check::NotYet {
@@ -519,15 +518,15 @@ fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> 
     }
     match (control.own_word, word) {
         (OwnWord::Shadow, _) => false,
-        // These words are not written to the control word.
+        // These words are not written to the control register.
         (_, Word::DirectionElsewhere(_) | Word::KeptDirection) => false,
         (OwnWord::Read, Word::Stop(_) | Word::ResetEnd(_)) => false,
         (OwnWord::Read, Word::Run(_)) if control.run_place() != control.at => false,
         (OwnWord::Read, Word::ResetHigh(_) | Word::Run(_) | Word::Sequence(..)) => own.is_none(),
         (OwnWord::Read, Word::Direction(_) | Word::ResetLow(_) | Word::Others(_)) => true,
         (OwnWord::Kept, word) => own.is_none_or(|own| {
-            // A run command that the order does not name may have been taken away elsewhere since the word was read, and to
-            // write it would start the motor.
+            // A run command that the order does not contain may have been taken away elsewhere since the word was
+            // read; writing it again would start the motor.
             let running = known.motor.map_or(known.running, |motor| motor == Motor::Runs);
             let is_taken_away = !running && matches!(word, Word::ResetLow(_));
             let stops = is_taken_away || control.is_stop(control.at, own);
@@ -537,7 +536,7 @@ fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> 
     }
 }
 
-/// The word of a run command, and its place where that is not the control word.
+/// The word for a run command, and its register if that is not the control word.
 fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWords) -> (Option<ControlItem>, u16) {
     let ordered = reverse.or(words.at_next_start());
     match &control.run {
@@ -564,14 +563,14 @@ fn read_of(place: ControlItem) -> Step {
     Step::new(StepPurpose::ReadWord, RequestPdu::Read { table, start, count })
 }
 
-/// Whether the word of this number is the last of the sequence, which starts the motor.
+/// Whether the word with this number is the last of the sequence, which starts the motor.
 pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
     let run = profile.control.as_ref().map(|control| &control.run);
     matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())
 }
 
-/// The place of `[control]` whose word is learned from the drive's reports; `None` if the drive reports something else
-/// there.
+/// The register of `[control]` whose word is learned from the drive's reports; `None` if the drive reports
+/// something else there.
 pub fn read_place(profile: &Profile) -> Option<ControlItem> {
     let control = profile.control.as_ref()?;
     (control.own_word == OwnWord::Read).then_some(control.at)

@@ -1,4 +1,4 @@
-//! How a command ends: taken back, cut short, refused at its turn, or answered.
+//! How a command ends: withdrawn, interrupted, refused before it is sent, or answered.
 
 use std::time::Instant;
 
@@ -10,7 +10,7 @@ use crate::confirm::Effect;
 use crate::order::{Interruption, Outcome, Receipt, Refusal};
 
 impl CommandRun {
-    /// Ends the command with this outcome; a motor that it started is stopped.
+    /// Ends the command with this outcome; if it started a motor, that is stopped.
     pub(super) fn give_up(&mut self, outcome: Outcome) {
         self.actions.clear();
         self.cut.get_or_insert(outcome);
@@ -22,8 +22,8 @@ impl CommandRun {
         }
     }
 
-    /// Ends a command that the rules deny, except for the end of a pulse. A motor that it started is left to the client
-    /// that has the drive now, or that stopped it; else it is stopped.
+    /// Ends a command that the rules refuse, but still sends the end of a pulse. A motor that it started is left to
+    /// the client that has since taken the drive or stopped it; otherwise it is stopped.
     pub fn denied(&mut self, outcome: Outcome) {
         let outcome = match outcome {
             Outcome::Refused(refusal @ (Refusal::HeldByOther(_) | Refusal::NeedsTake(_))) => {
@@ -46,12 +46,12 @@ impl CommandRun {
         self.cut_off(outcome);
     }
 
-    /// Whether the command is still pending: nothing of it was sent, or the drive was busy each time.
+    /// Whether the command has had no effect yet: nothing of it was sent, or the drive was busy each time.
     pub fn is_owed(&self) -> bool {
         !self.has_begun() || (self.tries.busy > 0 && !self.in_doubt())
     }
 
-    /// Result of a command that is withdrawn before it is due.
+    /// Outcome of a command that is withdrawn before it is sent.
     pub fn taken_back(&self) -> Outcome {
         match self.has_begun() {
             true => Outcome::Exception(Exception::BUSY),
@@ -68,7 +68,7 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// A stop of its motor goes before what it still sends, the end of a pulse.
+    /// Notes that a stop of this motor is sent before the rest of the command, the end of a pulse.
     pub fn stop_goes_first(&mut self) {
         self.known.stopped = true;
     }
@@ -89,7 +89,7 @@ impl CommandRun {
         let high = self.actions.iter().any(Action::is_reset);
         self.actions
             .retain(|a| !high && (a.ends_reset() || matches!(a, Action::Wait(_))));
-        // Without the end of a pulse behind them the remaining holds are pointless.
+        // If no end of a pulse follows, the remaining pauses are pointless.
         if !self.actions.iter().any(Action::ends_reset) {
             self.actions.clear();
         }
@@ -113,7 +113,8 @@ impl CommandRun {
         }
     }
 
-    /// Reports the acknowledgement. Returns what a read must show, and the receipts of those waiting for that.
+    /// Reports the acknowledgement. Returns the effects that a read must show, and the receipts of the clients that
+    /// wait for it.
     pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
         let receipts = self.tickets.into_iter();
         let receipts = receipts
@@ -129,7 +130,7 @@ impl CommandRun {
             .for_each(|ticket| ticket.answer(outcome.clone(), now));
     }
 
-    /// Ends a command that cannot continue: with `unbegun` if nothing of it was sent.
+    /// Ends a command that cannot continue; with the outcome `unbegun` if nothing of it was sent.
     pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
         let outcome = match &self.cut {
             Some(outcome) => outcome.clone(),

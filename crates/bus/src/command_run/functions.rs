@@ -1,5 +1,5 @@
-//! Functions that a drive takes for a write of one item: as its profile has them, until the drive itself shows otherwise.
-//! Pure.
+//! Function codes that a drive accepts for a write of one item: those of its profile, until the drive itself shows
+//! otherwise. Pure.
 
 use crate::codec::{Protocol, RequestPdu};
 use crate::drive::Profile;
@@ -39,7 +39,7 @@ impl TakenFunctions {
         self.refuses_22 |= matches!(pdu, RequestPdu::MaskWrite { .. });
     }
 
-    /// The drive took that write of one item after it refused the same by the other function.
+    /// Notes that the drive accepted this write of one item after it had refused it with the other function.
     pub(super) fn took(&mut self, pdu: &RequestPdu) {
         match pdu {
             RequestPdu::WriteRegister { .. } => self.registers_by_16 = Some(false),
@@ -51,7 +51,7 @@ impl TakenFunctions {
     }
 }
 
-/// The write of one item by the other function; none for anything else.
+/// The same write of one item by the other function; `None` for any other request.
 pub(super) fn other_function(pdu: &RequestPdu) -> Option<RequestPdu> {
     match pdu {
         RequestPdu::WriteRegister { address, value } => Some(RequestPdu::WriteRegisters {

@@ -1,4 +1,4 @@
-//! The known command words of a drive.
+//! The command words of a drive, as far as they are known.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
@@ -11,23 +11,23 @@ use crate::order::written;
 
 /// The registers and coils of a drive whose bits are commanded, as the drive has them.
 ///
-/// Filled by reading the drive's own words and by acknowledged writes, never by assumption.
+/// Command words learned by reading the drive and from acknowledged writes, never by assumption.
 #[derive(Debug, Default)]
 pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
-    /// The bits that a write took away last, and when, of each word.
+    /// For each word, the bits that the last write took away, and when.
     fell: BTreeMap<(Table, u16), (u16, Instant)>,
     /// Arrival time of the reply that is being applied.
     now: Option<Instant>,
-    /// The stop word by each of the control words that the drive may have, where they are two.
+    /// The stop word, computed for each control word that the drive may have, if there are two.
     stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
-    /// Whether the ordered direction differs from the drive's word: the next start uses it.
+    /// Whether the ordered direction differs from the drive's word, so that the next start must set it.
     waits_for_start: bool,
     /// Words that were read successfully at least once.
     reported: BTreeSet<(Table, u16)>,
-    /// The functions that the drive takes, which it keeps over a restart.
+    /// The function codes that the drive accepts, which a restart of the drive does not change.
     pub(super) functions: TakenFunctions,
 }
 
@@ -41,11 +41,11 @@ impl KnownWords {
         }
     }
 
-    /// Stores acknowledged words as known.
+    /// Remembers the words of an acknowledged write.
     pub fn written(&mut self, sent: &RequestPdu) {
         self.stop = None;
         if let RequestPdu::MaskWrite { address, .. } = sent {
-            // Other bits of the word may have been changed since.
+            // Other bits of the word may have changed since it was known.
             self.words.remove(&(Table::Holding, *address));
         }
         for (table, address, word) in written(sent).into_iter().flat_map(|(table, items)| {
@@ -70,14 +70,14 @@ impl KnownWords {
         self.now = Some(now);
     }
 
-    /// When the last write took one of these bits of a word away, if it did.
+    /// When the last write took one of these bits of a word away; `None` if it did not.
     pub(super) fn fell(&self, table: Table, address: u16, bits: u16) -> Option<Instant> {
         let (fell, at) = self.fell.get(&(table, address))?;
         (fell & bits != 0).then_some(*at)
     }
 
-    /// Forgets these words, which the drive may or may not have taken. A stop needs no known word if it is the same with the
-    /// control word from before and with this one.
+    /// Forgets these words, which the drive may or may not have received. A stop needs no known word if it is equal
+    /// for the old and the new control word.
     pub(crate) fn in_doubt(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
         for (address, word) in items {
             let before = self.words.remove(&(table, *address));
@@ -90,7 +90,7 @@ impl KnownWords {
         }
     }
 
-    /// The stop word, where the control word of the drive is one of two, and it is that by either.
+    /// The stop word if the drive has one of two control words and the stop is equal for both.
     pub(super) fn stop_by_either(&self) -> Option<u16> {
         self.stop
     }
@@ -100,7 +100,7 @@ impl KnownWords {
         self.reported.contains(&(table, address))
     }
 
-    /// The word at an address, if it is known.
+    /// The word at an address; `None` if it is unknown.
     pub fn get(&self, table: Table, address: u16) -> Option<u16> {
         self.words.get(&(table, address)).copied()
     }
@@ -112,7 +112,7 @@ impl KnownWords {
             .all(|(address, word)| self.get(table, *address) == Some(*word))
     }
 
-    /// Whether the drive is known to have something else than that, by now or earlier.
+    /// Whether the drive is known to have, or to have had, other values than these.
     pub(super) fn differs(&self, table: Table, items: &[(u16, u16)]) -> bool {
         items
             .iter()
@@ -124,7 +124,7 @@ impl KnownWords {
         (self.direction, self.waits_for_start) = (Some(reverse), true);
     }
 
-    /// Another order has set the direction since, or started the motor.
+    /// Forgets the kept direction: another order has since set the direction or started the motor.
     pub(crate) fn forget_direction(&mut self) {
         self.waits_for_start = false;
     }
@@ -134,8 +134,8 @@ impl KnownWords {
         self.direction.filter(|_| self.waits_for_start)
     }
 
-    /// Forgets the words of a drive that may have restarted or taken an unanswered write: they are read again before a
-    /// bit is changed.
+    /// Forgets the words of a drive that may have restarted or received an unanswered write: they are read again
+    /// before a bit is changed.
     pub fn forget(&mut self) {
         self.words.clear();
         self.stop = None;

@@ -63,7 +63,7 @@ impl CommandRun {
         self.cut_off(outcome);
     }
 
-    /// Until when the command sends nothing, if that time is not over.
+    /// Until when the command sends nothing; `None` if it may send now.
     fn pauses_until(&mut self, now: Instant) -> Option<Instant> {
         if let Some(pause) = self.tries.pause.take() {
             let end = if self.may_write_on() { self.expires } else { now + pause };
@@ -128,8 +128,9 @@ impl CommandRun {
         step
     }
 
-    /// The first action changes nothing. Nothing to take away: the pulse starts at once, without the pause behind, unless its bits
-    /// fell just now; until when they stay low then. Nothing to change: nothing is overridden that would have to be released.
+    /// Skips the first action if it changes nothing. With nothing to take away, a pulse starts at once without its
+    /// pause, unless its bits were cleared just before: then it starts when they have been low long enough. With
+    /// nothing to change, no override is made that would have to be released.
     fn pass_over(&mut self, words: &KnownWords, profile: &Profile, now: Instant) -> Option<Instant> {
         let fell = self.low_since(words, profile);
         self.pop();
@@ -144,7 +145,8 @@ impl CommandRun {
         high_at
     }
 
-    /// When the command before took away the bits that are pulsed next: between two pulses they are low as long as in one.
+    /// When the previous command took away the bits of the next pulse: between two pulses they must be low as long
+    /// as within one.
     fn low_since(&self, words: &KnownWords, profile: &Profile) -> Option<Instant> {
         let at = profile.control.as_ref()?.at;
         match self.actions.front() {
@@ -155,7 +157,7 @@ impl CommandRun {
         }
     }
 
-    /// A sequence waits for a state: the read of it, as long as its time is not over.
+    /// The read of the state that a sequence waits for, while its time limit has not passed.
     fn awaits(&mut self, now: Instant) -> Option<Step> {
         let Some(Action::Await(state)) = self.actions.front_mut() else {
             return None;
@@ -169,7 +171,8 @@ impl CommandRun {
         None
     }
 
-    /// The motor runs by this very command: of a sequence the last word alone is sent, which changes nothing or the direction.
+    /// The motor already runs by this command: only the last word of the sequence is sent, which changes nothing or
+    /// only the direction.
     fn only_last_word(&mut self, reverse: Option<bool>, profile: &Profile) {
         let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(number, _)) if control::is_last(profile, *number));
         while self.actions.front().is_some_and(|action| !last(action)) {
@@ -177,7 +180,7 @@ impl CommandRun {
         }
         if let Some(Action::Word(word @ Word::Sequence(..))) = self.actions.front_mut() {
             let Word::Sequence(number, _) = *word else { return };
-            // A sequence of one word must not restart with its first word.
+            // A sequence of one word must not begin again with its first word.
             *word = match number {
                 0 => Word::Run(reverse),
                 number => Word::Sequence(number, reverse),

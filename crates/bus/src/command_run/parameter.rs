@@ -18,9 +18,9 @@ const LOOKS: u32 = 3;
 enum Stage {
     /// The value is read from the drive.
     Value,
-    /// The drive is read to see whether its motor runs.
+    /// The drive is being read to see whether its motor runs.
     Running,
-    /// The motor stands: the write goes next on the line.
+    /// The motor stands: the write must be the next transaction on the line.
     Write,
     /// Releases the N2 override.
     Release,
@@ -51,7 +51,7 @@ pub(super) struct ParameterRun {
 }
 
 impl ParameterRun {
-    /// A run that has not started; none where the family does not report whether its motor runs.
+    /// The run of a parameter write that has not started; `None` if the family does not report whether its motor runs.
     pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
         let look = StateRead::at_running(profile)?;
         let mut run = ParameterRun {
@@ -91,12 +91,12 @@ impl ParameterRun {
         Step { purpose, pdu }
     }
 
-    /// Whether the motor was just found standing: the write must be next on the line.
+    /// Whether the motor was just found standing, so that the write must be next on the line.
     pub(super) fn is_checked(&self) -> bool {
         self.stage == Stage::Write
     }
 
-    /// Another request went on the line: whether the motor runs is read again.
+    /// Another request was sent first, so the motor state is read again.
     pub(super) fn check_again(&mut self) {
         if self.stage == Stage::Write {
             self.asks_running();
@@ -183,7 +183,7 @@ impl ParameterRun {
     fn take_value(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
-            // The client sees from the reply that nothing was written.
+            // The reply itself shows the client that nothing was written.
             let reply = if self.in_doubt { Reply::Written } else { reply.clone() };
             return Then::Over(Outcome::Acknowledged(reply));
         }

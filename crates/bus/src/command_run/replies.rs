@@ -12,9 +12,9 @@ use crate::order::{Outcome, Urgency};
 
 /// Pause before a parameter is read back once more.
 const LOOK_AGAIN: Duration = Duration::from_millis(100);
-/// First and longest pause before a step that the drive was too busy for is tried again.
+/// First and longest pause before a step is repeated because the drive was busy.
 const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(500));
-/// The longest one before a stop: the gateway that is about to end has little time for it.
+/// Longest such pause before a stop: a gateway that is about to end has little time for it.
 const BUSY_STOP: Duration = Duration::from_millis(100);
 /// Tries in a row of the end of a pulse, which has no other end.
 const MOST_BUSY: u32 = 10;
@@ -67,7 +67,7 @@ impl CommandRun {
                 self.looked(&reply);
                 None
             }
-            // The exception says nothing about an earlier try that was not answered.
+            // The exception does not show what happened to an earlier attempt that was not answered.
             (StepPurpose::Execute, Reply::Exception(code)) if self.in_doubt() => self.ended(Outcome::Unknown(code)),
             (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
             (purpose, reply) => {
@@ -102,7 +102,7 @@ impl CommandRun {
         None
     }
 
-    /// Ends the command with this outcome; where its sequence started the motor, a stop goes before that.
+    /// Ends the command with this outcome; if its sequence started the motor, a stop is sent first.
     fn ended(&mut self, outcome: Outcome) -> Option<Outcome> {
         if self.urgency == Urgency::Stop || self.phase != Phase::MotorStarted {
             let cut = self.cut.clone().filter(|_| !self.may_write_on());
@@ -120,7 +120,7 @@ impl CommandRun {
             StepPurpose::ReadWord | StepPurpose::Look => self.urgency != Urgency::Stop && !self.ends_pulse(),
             _ => false,
         };
-        // A read that the drive is still working on has changed nothing, so it is repeated.
+        // A read that the drive is still processing has changed nothing, so it is repeated.
         let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy()
             || (*code == Exception::ACKNOWLEDGE && matches!(step.purpose, StepPurpose::ReadWord | StepPurpose::Look)));
         if !(is_busy && waits) || (!self.may_write_on() && self.tries.busy >= MOST_BUSY) {
@@ -133,7 +133,7 @@ impl CommandRun {
         self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
         self.tries.busy = self.tries.busy.saturating_add(1);
         if self.known.check == Check::Read {
-            // The word may have changed again by the next try.
+            // The word may have changed again by the next attempt.
             self.known.check = Check::NotYet;
         }
         true
@@ -143,8 +143,8 @@ impl CommandRun {
         self.actions.front().is_some_and(Action::ends_reset)
     }
 
-    /// Notes that the drive does not know the function of a write. Returns whether another function can be tried, once;
-    /// nothing else can stop a drive that takes only functions 15 and 16.
+    /// Notes that the drive does not know the function of a write. Returns whether the other function can be tried,
+    /// once: only so can a drive be stopped that accepts functions 15 and 16 only.
     fn has_another_function(&mut self, step: &Step, words: &mut KnownWords) -> bool {
         if matches!(step.pdu, RequestPdu::MaskWrite { .. }) {
             words.functions.refused(&step.pdu);
@@ -188,7 +188,7 @@ impl CommandRun {
         if let Some((table, address)) = self.settings()
             && words.is_reported(table, address)
         {
-            // The drive reported its settings before: they may have changed since.
+            // The drive reported its settings before the refusal: they may have changed since.
             return Some(refused);
         }
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
@@ -202,7 +202,8 @@ impl CommandRun {
         Some(refused)
     }
 
-    /// The value remains written: a supervisor that looks away only misses changes at the panel.
+    /// The value was written but could not be released to the drive's own control, which is logged and is not a
+    /// failure: only changes at the panel then have no effect.
     fn not_released(&mut self, why: &str) -> Option<Outcome> {
         tracing::warn!(target: "drivegate::bus::command_run", "an output was written but not released to the drive's own control: {why}");
         self.tries.failures = 0;
@@ -210,7 +211,7 @@ impl CommandRun {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// No valid reply came; `how` is the way it failed. Returns the outcome when the tries are used up.
+    /// No valid reply arrived, for the reason `how`. Returns the outcome when all attempts are used up.
     pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
         self.tries.failures += 1;
         self.tries.unanswered = how;
@@ -251,7 +252,7 @@ impl CommandRun {
             _ => {}
         }
         if step.pdu.is_write() && self.known.check == Check::Read {
-            // The word may have changed again by the next try.
+            // The word may have changed again by the next attempt.
             self.known.check = Check::NotYet;
         }
         if over && self.phase == Phase::MotorStarted {
@@ -271,13 +272,13 @@ impl CommandRun {
         self.tries.doubt = self.tries.doubt.max(Doubt::Unanswered);
     }
 
-    /// Whether the drive may have taken a write that it did not answer: its words are then unknown.
+    /// Whether the drive may have received a write that it did not answer: its words are then unknown.
     pub(crate) fn in_doubt(&self) -> bool {
         self.tries.doubt != Doubt::No
     }
 
-    /// The word was read without success. Returns whether the command goes on with the known word: where the drive
-    /// never reports it (`unreadable`), and at the end of a pulse, which must not wait for a read.
+    /// The word could not be read. Returns whether the command continues with the known word: if the drive never
+    /// reports it (`unreadable`), and at the end of a pulse, which must not wait for a read.
     fn goes_on(&mut self, unreadable: bool) -> bool {
         let goes_on = self.known.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {
@@ -287,9 +288,9 @@ impl CommandRun {
         goes_on
     }
 
-    /// The drive's own word cannot be read. A stop goes out all the same: no read stands in its way. So does a
-    /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
-    /// and ends with `outcome`.
+    /// Decides how a command continues whose word cannot be read from the drive. A stop is sent anyway; so is a
+    /// command to a standing motor, and one that sets every bit. Any other command could stop or turn a running
+    /// motor, and ends with `outcome`.
     fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
         if self.urgency != Urgency::Stop && self.known.running && !self.scope.whole {
             return Some(outcome);

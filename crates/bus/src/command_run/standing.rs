@@ -1,14 +1,15 @@
-//! Whether a drive stands as an order takes it to stand that does not say whether the motor is to run: what may be written of a run
-//! command that the gateway remembers. Pure.
+//! Decides whether an order that does not itself say whether the motor is to run may repeat the remembered run
+//! command, from the observed state of the drive. Pure.
 //!
-//! A drive that restarted, or was stopped at its panel, stands, and its run command is gone: the word from memory would start it.
+//! A drive that restarted, or was stopped at its panel, has lost its run command and stands: the remembered word
+//! would start it.
 
 use crate::order::Refusal;
 
-/// State of the motor as the drive showed it in this command, right before the write.
+/// State of the motor as the drive reported it during this command, right before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Motor {
-    /// The motor runs by the bus, as far as the drive shows its control place.
+    /// The motor runs by the bus, as far as the drive reports its control place.
     Runs,
     /// The motor runs, and is commanded elsewhere.
     RunsElsewise,
@@ -18,7 +19,7 @@ pub(crate) enum Motor {
     NotShown,
 }
 
-/// The run command in the drive's word as it is known.
+/// The run command in the drive's word, as far as it is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum KnownRun {
     /// The run command is set.
@@ -33,11 +34,11 @@ pub(super) enum KnownRun {
 pub(super) enum Wants {
     /// The direction, within the control word.
     Direction,
-    /// The direction, where it is written to a place of its own.
+    /// The direction, which has a separate register.
     DirectionElsewhere,
     /// A reset within the control word.
     Reset,
-    /// The control word before a reset that is written to a place of its own.
+    /// The control word before a reset that has a separate register.
     ResetElsewhere,
     /// The end of a reset, which is sent whatever happens.
     ResetEnd,
@@ -45,10 +46,10 @@ pub(super) enum Wants {
     Others,
 }
 
-/// The word that may be written.
+/// The decision which word may be written.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Verdict {
-    /// The word with the run command that stands.
+    /// The word is written with its present run command.
     AsItStands,
     /// The word without a run command.
     WithoutRun,
@@ -57,8 +58,9 @@ pub(super) enum Verdict {
     Refused(Refusal),
 }
 
-/// Decides the word that an order may write to a drive whose known word is not a stop. `told`: the drive itself reported its word
-/// in this command; the word of a running drive is then current, whichever client commands it.
+/// Decides the word that an order may write to a drive whose known word is not a stop. `told` means that the drive
+/// itself reported its word during this command; the word of a running drive is then current, whichever client
+/// commands it.
 pub(super) fn judge(wants: Wants, holds: KnownRun, told: bool, motor: Motor) -> Verdict {
     use Verdict::{AsItStands, AtNextStart, WithoutRun};
 
@@ -99,7 +101,7 @@ fn refused(why: &str) -> Verdict {
     )))
 }
 
-/// The refusal of an order whose look at the drive brought nothing.
+/// The refusal of an order because the reads before it had no result.
 pub(super) fn not_seen(why: &str) -> Refusal {
     Refusal::NotKnown(format!(
         "whether the motor runs was asked right before the control word would have been written, and {why}; the word was not sent"
@@ -125,8 +127,8 @@ mod tests {
     const MOTORS: [Motor; 4] = [Motor::Runs, Motor::RunsElsewise, Motor::Stands, Motor::NotShown];
     const HELD: [KnownRun; 3] = [KnownRun::Run, KnownRun::Other, KnownRun::Unknown];
 
-    /// r with the run command as it is, w without run, n at the next start, x refused, ? refused as unknown. One column for
-    /// each of `WANTS`.
+    /// Letters: r with the present run command, w without run, n at the next start, x refused, ? refused as
+    /// unknown. One column for each entry of `WANTS`.
     const TABLE: &str = "\
         Run     told Runs         r r r r r r
         Run     told RunsElsewise r r r r r r
@@ -173,7 +175,7 @@ mod tests {
         assert_eq!(rows, 6 * 20);
     }
 
-    /// Where no look is made, the verdict does not depend on the motor.
+    /// In all cases in which no read is made, the verdict does not depend on the motor.
     #[test]
     fn a_look_is_spared_only_where_it_decides_nothing() {
         for (wants, holds) in WANTS.into_iter().flat_map(|wants| HELD.map(|holds| (wants, holds))) {
@@ -192,7 +194,7 @@ mod tests {
         }
     }
 
-    /// Whatever is wanted: a run command from memory goes only to a motor that is seen to run.
+    /// For every kind of order, a run command from memory is only sent to a motor that is seen to run.
     #[test]
     fn no_run_command_from_memory_reaches_a_motor_that_is_not_seen_to_run() {
         for wants in WANTS {

@@ -1,5 +1,5 @@
-//! The reads of a drive right before a word is written to it: the requests that show whether its motor runs, and the replies to
-//! them. Pure.
+//! The reads right before a word is written to a drive: the requests that show whether its motor runs, and their
+//! evaluation. Pure.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use crate::drive::model::Kind;
 use crate::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
 use crate::order::Outcome;
 
-/// A state of the drive, with the registers or bits that show it, whether it is one bit, a masked register or derived.
+/// A state of the drive with the registers or bits that show it, as one bit, a masked register or a derived value.
 #[derive(Debug, Clone, PartialEq)]
 struct Shown {
     parts: Vec<(Raw, Kind)>,
@@ -20,7 +20,7 @@ struct Shown {
 }
 
 impl Shown {
-    /// The bits that show a point; none where the profile does not have it.
+    /// The bits that show a point; `None` if the profile does not have the point.
     fn of(profile: &Profile, point: ModelPoint) -> Option<Shown> {
         let index = profile.model_index(point)?;
         let derived = match &profile.points.get(index)?.source {
@@ -51,7 +51,7 @@ impl Shown {
     }
 }
 
-/// A look at a drive: the reads that are left, and the words that were read.
+/// A series of reads before a write: the remaining reads, and the words read so far.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct StateRead {
     running: Shown,
@@ -65,18 +65,18 @@ pub(crate) struct StateRead {
 }
 
 impl StateRead {
-    /// A look at whether the motor runs; `None` if the family does not report that.
+    /// Reads that show whether the motor runs; `None` if the family does not report that.
     pub(super) fn at_running(profile: &Profile) -> Option<StateRead> {
         StateRead::of(profile, &[])
     }
 
-    /// The reads that show whether the motor runs by the bus: a faulted drive may show its motor as it was before the fault, and
-    /// one that is commanded at its panel does not run by a word of the gateway.
+    /// Reads that show whether the motor runs by a command from the bus: a faulted drive may still show the motor
+    /// state from before the fault, and a drive under panel control does not run by a word of the gateway.
     pub(crate) fn at_motor(profile: &Profile) -> Option<StateRead> {
         StateRead::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
     }
 
-    /// The running bit is read last, so that it is the newest.
+    /// Reads of these points and of the running bit, which is read last so that it is the newest.
     fn of(profile: &Profile, more: &[ModelPoint]) -> Option<StateRead> {
         let shown = |point: ModelPoint| more.contains(&point).then(|| Shown::of(profile, point)).flatten();
         let running = Shown::of(profile, ModelPoint::Running)?;
@@ -107,7 +107,7 @@ impl StateRead {
         more.unwrap_or(&self.first).clone()
     }
 
-    /// All requests of the look.
+    /// All requests of this series of reads.
     pub(crate) fn requests(&self) -> impl Iterator<Item = &RequestPdu> {
         [&self.first].into_iter().chain(&self.more)
     }
@@ -129,7 +129,7 @@ impl StateRead {
         self.words.clear();
     }
 
-    /// Whether the motor runs; `None` if the replies do not say so.
+    /// Whether the motor runs; `None` if the replies do not show it.
     pub(super) fn runs(&self) -> Option<bool> {
         self.running.value(&self.words)
     }
@@ -147,7 +147,7 @@ impl StateRead {
 }
 
 impl CommandRun {
-    /// The request of a look at the motor; `None` if the family does not report whether it runs.
+    /// The next request of the reads that show the motor state; `None` if the family does not report it.
     pub(super) fn state_request(&mut self, profile: &Profile) -> Option<Step> {
         if self.look.is_none() {
             self.look = StateRead::at_motor(profile);
@@ -172,8 +172,7 @@ impl CommandRun {
         self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
     }
 
-    /// Handles a look without a result: nothing is written except the end of a pulse, which then carries no run
-    /// command.
+    /// Handles reads without a result: nothing is written except the end of a pulse, which then contains no run command.
     pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
         self.look = None;
         if self.ends_pulse() {
@@ -186,7 +185,7 @@ impl CommandRun {
         Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
     }
 
-    /// The outcome of an earlier try that was not answered takes precedence over this outcome.
+    /// This outcome, unless an earlier attempt that was not answered determines the outcome.
     pub(super) fn unless_in_doubt(&self, outcome: Outcome) -> Outcome {
         match self.in_doubt() {
             true => self.tries.unanswered.clone(),
@@ -194,7 +193,7 @@ impl CommandRun {
         }
     }
 
-    /// The direction is kept for the next start, and its write left out.
+    /// Keeps the direction for the next start and leaves out its write.
     pub(super) fn keep_direction(&mut self, reverse: bool) {
         if self.in_doubt() {
             self.give_up(self.tries.unanswered.clone());
@@ -214,7 +213,7 @@ impl CommandRun {
         self.effects.clear();
     }
 
-    /// Keeps the direction that the command ordered or, where it ordered another one, drops the kept one.
+    /// Keeps the direction that the command ordered; if it set another one, drops the kept one.
     pub(crate) fn note_direction(&self, words: &mut KnownWords) {
         match self.next_start {
             Some(reverse) => words.keep_direction(reverse),
@@ -229,7 +228,7 @@ impl CommandRun {
     }
 }
 
-/// Adds the read of a raw value, to the read before it where one request takes both.
+/// Adds the read of a raw value, joined with the previous read if one request can read both.
 fn read_with(reads: &mut Vec<RequestPdu>, profile: &Profile, raw: &Raw) {
     let (table, start, count) = (raw.table, raw.address, raw.form.items());
     let end = start.saturating_add(count);
@@ -265,7 +264,8 @@ mod tests {
         StateRead::at_motor(Profiles::built_in().get(name).unwrap()).unwrap()
     }
 
-    /// The drive of a family answers each request with the words that it has at these addresses.
+    /// Simulates a drive that answers each request with these words at these addresses; returns the motor state
+    /// found, and the requests.
     fn motor(name: &str, at: &[(u16, u16)]) -> (Motor, Vec<(u16, u16)>) {
         let (mut look, mut asked) = (look(name), Vec::new());
         loop {
@@ -285,7 +285,8 @@ mod tests {
         }
     }
 
-    /// By hand from the manuals: a bit, a masked register, alternatives, a stop that still turns, coils, bits of N2.
+    /// Cases written by hand from the manuals: a bit, a masked register, alternatives, a stopped drive whose motor
+    /// still turns, coils, bits of N2.
     #[test]
     fn every_kind_of_family_shows_its_motor() {
         use Motor::{Runs, RunsElsewise, Stands};

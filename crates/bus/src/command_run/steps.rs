@@ -1,4 +1,4 @@
-//! The steps of a command in the order that is safe, and the request that each of them is.
+//! The steps of a command in their safe order, and the request for each step.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -24,25 +24,25 @@ pub(super) enum Action {
         table: Table,
         items: Vec<(u16, u16)>,
     },
-    /// Gives what was overridden before back to the drive's own control; that it fails changes nothing.
+    /// Ends an earlier override, so that the drive controls the value itself again; a failure changes nothing.
     Release(RequestPdu),
     /// Bits of one word; its other bits keep their known values.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
-    /// Takes a bit away that is written as a pulse and is not in the control word, if set.
+    /// Clears a pulse bit outside the control word, if it is set.
     PulseLow { raw: Raw, bit: u8, invert: bool },
     /// Sets the bit of a pulse.
     PulseHigh { raw: Raw, bit: u8, invert: bool },
-    /// Takes the bit of a pulse away again.
+    /// Clears the bit at the end of a pulse.
     PulseEnd { raw: Raw, bit: u8, invert: bool },
-    /// Two update periods of the drive, as a rule.
+    /// A pause, usually two update periods of the drive.
     Wait(Duration),
     /// A word of the control register by `[control]` of the profile.
     Word(Word),
     /// Waits for the state that ends a step of a sequence.
     Await(Box<AwaitedState>),
-    /// Sets a reset at a place of its own.
+    /// Sets a reset in its separate register.
     ResetElsewhere(RequestPdu),
-    /// Takes the reset away again.
+    /// Clears the reset in its separate register.
     ResetOver(RequestPdu),
     /// A parameter, with several steps.
     Parameter(Box<ParameterRun>),
@@ -51,16 +51,15 @@ pub(super) enum Action {
 /// The purpose of a request of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepPurpose {
-    /// Reads the drive's own word, whose other bits are to stay as they are.
+    /// Reads the drive's own word, whose other bits must not change.
     ReadWord,
     /// Reads whether the drive has the value already, which would spare its memory a write.
     Compare,
-    /// Carries out the order.
+    /// Carries out the order itself.
     Execute,
-    /// Gives an overridden output back to the drive's own control.
+    /// Ends an override, so that the drive controls the output itself again.
     Release,
-    /// Reads whether the motor runs, right before a write of a parameter, or of a word that does not decide whether it
-    /// is to run.
+    /// Reads whether the motor runs, right before a write of a parameter or of a word that does not itself decide that.
     Look,
     /// Reads the state that ends a step of a sequence.
     AskState,
@@ -105,11 +104,11 @@ impl Step {
 pub(super) enum Check {
     NotYet,
     Read,
-    /// The drive does not report its word.
+    /// The drive does not report its word, so reading it is useless.
     InVain,
 }
 
-/// The other inputs of a step's request, in addition to the known words.
+/// What is known for building a step's request, in addition to the known words.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) check: Check,
@@ -117,17 +116,17 @@ pub(super) struct Known {
     pub(super) blind: bool,
     /// Whether the command decides whether the motor is to run.
     pub(super) names_run: bool,
-    /// Whether a stop of the motor is on its way: nothing then carries a run command, whatever the drive shows.
+    /// Whether a stop of the motor is on its way: then no word contains a run command, whatever the drive reports.
     pub(super) stopped: bool,
     /// Whether the motor runs, as last reported.
     pub(super) running: bool,
     /// The drive changes bits of a register by itself.
     pub(super) masks: bool,
-    /// State of the motor as the drive showed it right before; none without a look.
+    /// State of the motor as the drive reported it right before; `None` if it was not read.
     pub(super) motor: Option<Motor>,
 }
 
-/// A word and the bits of it that change.
+/// A word, with the bits of it that change.
 type WordChange = (Raw, Vec<(u8, bool)>);
 
 /// Whether a command sets every bit of the profile that can be commanded, reset bits apart.
@@ -137,8 +136,8 @@ pub(super) fn sets_all_bits(profile: &Profile, values: &[(PointIndex, Value)]) -
     bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
 }
 
-/// Why a command cannot be sent: a point without a register in the drive, or a value that does not fit its register.
-/// Admitted commands have neither; a command that has must not end as if the drive had taken it.
+/// Why a command cannot be sent: a point has no register in the drive, or a value does not fit its register.
+/// Admitted commands have neither problem; a command that has one must not end as if the drive had accepted it.
 pub(super) fn unsendable(profile: &Profile, values: &[(PointIndex, Value)]) -> Option<Refusal> {
     values.iter().find_map(|(index, value)| {
         let Some(point) = profile.points.get(*index) else {
@@ -174,7 +173,7 @@ pub(super) fn names_run(profile: &Profile, values: &[(PointIndex, Value)]) -> bo
     })
 }
 
-/// The bits of its first word that a raw value takes.
+/// The bits of its first word that a raw value uses.
 fn bits_of(raw: &Raw) -> u16 {
     match raw.form {
         Form::Bit { bit, .. } => 1u16.checked_shl(bit.into()).unwrap_or_default(),
@@ -186,7 +185,7 @@ fn bits_of(raw: &Raw) -> u16 {
     }
 }
 
-/// The actions of a command. `stopped`: the command is the rest of one whose stop went before it.
+/// The actions of a command. `stopped` means that the command is the rest of one whose stop was sent before.
 pub(super) fn actions(
     profile: &Profile,
     values: &[(PointIndex, Value)],
@@ -247,7 +246,8 @@ pub(super) fn actions(
             true if raw.table == Table::Holding => Action::Word(Word::Others(setting_of(&changes))),
             _ => Action::Bits { raw, changes },
         });
-    // A stop goes first, a run command last. Without one, nothing is written before it is seen whether the words may be.
+    // A stop goes first, a run command last. Without either, nothing is written before a read has shown whether the
+    // words may be written.
     let commands = control.actions(profile, stop, stopped);
     if stop {
         commands
@@ -297,7 +297,7 @@ fn pulse(raw: &Raw, bit: u8, invert: bool, length: Duration) -> [Action; 5] {
     ]
 }
 
-/// Bits of the control word, and what they become.
+/// Bits of the control word with their new values.
 fn setting_of(changes: &[(u8, bool)]) -> Setting {
     let bits = |of: &dyn Fn(bool) -> bool| {
         let of = changes.iter().filter(|(_, on)| of(*on));
@@ -322,19 +322,18 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
     }
 }
 
-/// The request of an action with the words as they are known; a read where a word is not known; `None` where there is
-/// nothing to do.
+/// The request for an action with the known words; a read if a word is unknown; `None` if nothing is to be done.
 pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: Known) -> Option<Step> {
     let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
     match action {
-        // These actions are converted into requests when their turn comes.
+        // These actions become requests only when they are reached.
         Action::Wait(_) | Action::Word(_) | Action::Await(_) => None,
         Action::Send(pdu) | Action::ResetElsewhere(pdu) | Action::ResetOver(pdu) => Some(execute(pdu)),
         Action::Parameter(run) => Some(run.step()),
         Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),
         Action::Change { pdu, table, items } => match known.check {
-            // An earlier read is not proof: the value may have been changed at the drive since. It must not let a write
-            // be left out.
+            // An earlier read is not proof, because the value may have been changed at the drive since: a write
+            // must not be left out because of it.
             Check::NotYet if words.differs(*table, items) => Some(execute(pdu)),
             Check::NotYet => {
                 let read = read_of(*table, items).map(|read| Step::new(StepPurpose::Compare, read));
@@ -350,7 +349,7 @@ pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, kn
     }
 }
 
-/// The write that changes bits of one word, or the read that it needs before.
+/// The write that changes bits of one word, or the read that it needs first.
 fn bits(
     action: &Action,
     raw: &Raw,
@@ -397,7 +396,7 @@ fn bits(
     ))
 }
 
-/// The write that changes these bits, whatever the others are.
+/// The mask write that changes these bits and keeps the others.
 fn mask(address: u16, changes: &[(u8, bool)]) -> RequestPdu {
     let bits = |on: bool| {
         let of = changes.iter().filter(|(_, to)| *to == on);
@@ -410,8 +409,9 @@ fn mask(address: u16, changes: &[(u8, bool)]) -> RequestPdu {
     }
 }
 
-/// A write that spares the drive's memory, where its words wear it: left out when the drive reports that it has them;
-/// an N2 override is released afterwards, where the profile requires that. A stop is never left out.
+/// Converts a write to spare the drive's memory, if writing wears it: the write is left out if the drive reports
+/// that it already has the values; an N2 override is released afterwards if the profile requires that. A stop is
+/// never left out.
 pub(super) fn write_on_change(action: Action, profile: &Profile) -> Vec<Action> {
     let written = match &action {
         Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),
@@ -433,7 +433,7 @@ pub(super) fn write_on_change(action: Action, profile: &Profile) -> Vec<Action> 
     [change].into_iter().chain(release).collect()
 }
 
-/// The read of the words of a write.
+/// The read of the words that a write would set.
 fn read_of(table: Table, items: &[(u16, u16)]) -> Option<RequestPdu> {
     let (start, _) = *items.first()?;
     let count = u16::try_from(items.len()).ok()?;

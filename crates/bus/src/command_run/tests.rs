@@ -72,7 +72,7 @@ impl ObedientDrive {
         (CommandRun::new(command, &self.profile), receiver)
     }
 
-    /// Registers of the drive; the status words show that it is commanded by the bus, and whether its motor runs.
+    /// Registers of the drive; the status words show that it is controlled by the bus, and whether its motor runs.
     fn shows(&self, start: u16, count: u16) -> Reply {
         let status = [(2100, u16::from(self.running) << 1), (2101, 1 << 13)];
         let word = |address| {
@@ -146,7 +146,7 @@ fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
     let mut bench = ObedientDrive::new(0);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 4), (20, 2000, 0)]);
-    // The bit is set already, and so is the run bit of a motor that stands with a fault.
+    // The reset bit is already set, and so is the run bit, although the motor stands with a fault.
     let mut bench = ObedientDrive::new(0x0005);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0)]);
@@ -177,12 +177,12 @@ fn a_stop_purges_what_was_begun() {
     // The run bit is not sent any more; the reference was.
     let cut_short = Outcome::Interrupted(Interruption::Stop);
     assert_eq!(start.purge(), Some(cut_short.clone()));
-    // The start is on the wire, and its answer is awaited.
+    // The start is on the wire, and its answer is pending.
     let (mut start, _a) = bench.begin(&points, Urgency::Command);
     let sent = sends(&bench, &mut start);
     start.sent(&sent);
     assert_eq!(start.purge(), Some(cut_short));
-    // A read that comes before the write changes nothing at the drive.
+    // A read that precedes the write changes nothing in the drive.
     bench.words.forget();
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut start);
@@ -273,7 +273,7 @@ fn exceptions_and_silence_end_it() {
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), Some(Outcome::TimedOut));
-    // The last try decides; the time that runs out in between ends it as the try before did.
+    // The last attempt determines the outcome; if time runs out in between, the outcome is that of the attempt before.
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
     assert_eq!(command.failed(&sent, Outcome::Garbled, 1), Some(Outcome::Garbled));
@@ -377,8 +377,8 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     assert_eq!(sends(&bench, &mut start), read, "it is asked again");
 }
 
-/// A drive evaluates its control word once in an update period: a bit that the previous word took away and that is set again at
-/// once does not count as an edge.
+/// A drive evaluates its control word once per update period: a bit that the previous word cleared and that is set
+/// again at once does not count as an edge.
 #[test]
 fn a_reset_bit_that_a_stop_took_away_is_low_as_long_as_between_two_pulses() {
     for (late, expected) in [(0, 20), (15, 5), (5000, 0)] {
@@ -392,7 +392,8 @@ fn a_reset_bit_that_a_stop_took_away_is_low_as_long_as_between_two_pulses() {
     }
 }
 
-/// The drive is too busy for the write of a command, which is tried again: how long after its beginning, and how it ends.
+/// The drive is too busy for the write of a command, which is repeated: the time of each attempt after the first,
+/// and the outcome.
 fn busy(points: &[(&str, f64)], urgency: Urgency, times: usize) -> (Vec<u128>, Outcome) {
     let mut bench = ObedientDrive::new(0);
     bench.words.learn(Table::Holding, 2000, 1);
@@ -484,12 +485,12 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
         assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
     }
     let order = [("run", 1.0), ("reverse", 1.0)];
-    // The other bits of the word belong to the application.
+    // The other bits of the word are used by the application.
     let (mut both, _a) = bench.begin(&order, Urgency::Command);
     let read = sends(&bench, &mut both);
     let ended = both.answered(&read, refused(), &mut bench.words);
     assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)));
-    // A family whose word has no other bits.
+    // A family whose control word has no other bits.
     bench.profile = Profiles::built_in().get("eaton-svx").unwrap().clone();
     let (mut both, _a) = bench.begin(&order, Urgency::Command);
     let read = sends(&bench, &mut both);

@@ -63,7 +63,7 @@ impl CommandedDrive {
         self.acknowledge(&self.order(point, value));
     }
 
-    /// 10 ms later the drive answered with these words.
+    /// Stores these words as the drive's answer 10 ms later.
     fn read(&mut self, start: u16, words: &[u16]) {
         self.now += Duration::from_millis(10);
         let now = self.now;
@@ -128,7 +128,7 @@ fn a_stop_is_confirmed_when_the_motor_does_not_run_or_stands() {
     }
 }
 
-/// From 10 Hz down the speed in percent of the band from 10 Hz no longer shows the deceleration.
+/// Below 10 Hz, the speed in percent of a band that begins at 10 Hz no longer shows the deceleration.
 #[test]
 fn below_the_minimum_frequency_the_motor_still_slows_down() {
     let mut rig = CommandedDrive::new();
@@ -147,7 +147,7 @@ fn below_the_minimum_frequency_the_motor_still_slows_down() {
     assert_eq!(told, "the motor is still slowing down, 8 Hz");
 }
 
-/// Whatever a family shows of its motor and faults confirms its orders, be it a bit, a state of a word, or a coil.
+/// Every way in which a family reports its motor and faults confirms its orders: a bit, a state of a word, or a coil.
 #[test]
 fn every_family_confirms_what_it_shows() {
     let shows_nothing = ["lenze-i550"];
@@ -252,7 +252,7 @@ fn what_is_read_seldom_is_not_missing_before_it_was_read() {
     );
     assert!(rig.confirmations.is_empty());
 
-    // Never read: not known, once.
+    // The point was never read: the effect is reported as unknown, once.
     order(&mut rig, true);
     rig.read(2100, &[2]);
     rig.now += Duration::from_secs(9);
@@ -388,8 +388,9 @@ fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
 }
 
 proptest! {
-    /// Whatever a drive shows after a stop: it is confirmed only by a read that showed it not running or standing, and by any
-    /// such read in time; else it stays acknowledged, reported at most once; and nothing is waited for without an end.
+    /// Property for any reports of a drive after a stop: the stop is confirmed only by a read that showed the drive
+    /// not running or at standstill, and by any such read in time; otherwise it stays acknowledged, reported at
+    /// most once; and no wait is endless.
     #[test]
     fn a_stop_is_confirmed_or_told_or_neither(
         reads in proptest::collection::vec((1u64..900, any::<bool>(), 0u16..5_000), 1..60),
@@ -423,7 +424,7 @@ proptest! {
     }
 }
 
-/// An HVX whose bypass is on: its drive stands, and its motor is on the mains.
+/// An HVX whose bypass is on: its drive has stopped, but its motor runs on the mains.
 #[test]
 fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
     // Status: ready, running, bypass and fire mode.

@@ -38,8 +38,8 @@ fn echoes_of_writes() {
     assert!(late.blocks(&other, now).is_some());
 }
 
-/// A drive answers each request 110 ms after it was sent, while the deadline is 105 ms: it is one reply behind all the
-/// time. Two reads that look alike are always due.
+/// A drive answers each request after 110 ms while the deadline is 105 ms, so it is always one reply behind. Two
+/// look-alike reads are always due.
 #[test]
 fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
     let (a, b) = (read(2100, 3), read(2104, 3));
@@ -132,7 +132,7 @@ fn the_first_acknowledgement_of_a_stop_that_was_overtaken_proves_nothing() {
     assert!(!late.proves_nothing(&stop, now, now), "the second one counts");
     late.answered(&stop, now, now);
     assert_eq!(late.blocks(&run, now), None);
-    // The late reply is no longer expected after this time.
+    // After this time the late reply is no longer expected.
     late.given_up(&stop, now - DEADLINE, now);
     late.answered(&run, now, now);
     let later = now + FORGOTTEN_AFTER;
@@ -156,7 +156,7 @@ fn an_acknowledgement_that_may_be_that_of_a_look_alike_proves_nothing() {
         assert!(late.proves_nothing(&stop, now, now));
         assert!(!late.proves_nothing(&stop, now, now), "the second one counts");
         late.answered(&stop, now, now);
-        // The stop went out twice and was acknowledged once.
+        // The stop was sent twice and acknowledged once.
         assert!(late.blocks(&run, now).is_some());
         let later = now + FORGOTTEN_AFTER;
         assert_eq!(late.blocks(&run, later), None);
@@ -200,8 +200,8 @@ fn a_write_that_was_not_answered_may_have_been_taken_all_the_same() {
     assert!(!late.proves_nothing(&write(0), now, now));
 }
 
-/// The ages of the samples of a request every 20 ms, answered after 5 ms, of which one reply was lost. Every so many rounds
-/// something else is read.
+/// The ages of the samples of a request every 20 ms, answered after 5 ms, after one reply was lost. Another
+/// register is read every `other` rounds.
 fn ages_after_a_lost_reply(other: u32) -> Vec<Duration> {
     let start = Instant::now();
     let (mut late, ms) = (LateReplies::default(), Duration::from_millis);

@@ -1,12 +1,12 @@
 use super::*;
 use crate::codec::{RequestPdu, Table, rtu};
 
-/// A line at 9600 baud on which every reply could be the last one once more.
+/// A line at 9600 baud on which every reply may be a duplicate of the previous one.
 struct DoublingLine {
     line: LineState,
     protocol: Protocol,
     now: Instant,
-    /// Replies are counted from the begin of the request, as if it took no time.
+    /// Whether replies are timed from the start of the request, as if the request took no time.
     at_once: bool,
 }
 
@@ -128,7 +128,7 @@ fn early_replies_again_and_again_show_a_line_without_wire_time() {
     assert!(!rig.believes(EARLY), "a wire all the same");
 }
 
-/// A simulated drive on a busy machine: some of its replies are early, some are not.
+/// A simulated drive on a busy machine: some of its replies are early, others are not.
 #[test]
 fn a_line_on_which_some_replies_are_early_loses_few_of_them() {
     for early_in_ten in 2..10u32 {
@@ -188,7 +188,7 @@ fn a_drive_has_its_own_silence_before_its_request_and_after_its_reply() {
     }
 }
 
-/// Every tenth reply comes twice and the next one is lost, so its copy is alone in its exchange.
+/// Every tenth reply is doubled and the next one is lost, so that the duplicate is alone in its transaction.
 #[test]
 fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
     let mut rig = DoublingLine::of(Protocol::N2);
@@ -200,7 +200,7 @@ fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
     }
 }
 
-/// With less, requests that go first as long as their share lasts would take the whole line.
+/// With a shorter minimum time, prioritised requests within their share would take the whole line.
 #[test]
 fn a_line_without_wire_time_is_taken_as_long_as_the_gateway_leaves_it_alone() {
     for protocol in [Protocol::ModbusRtu, Protocol::N2] {

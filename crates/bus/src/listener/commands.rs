@@ -1,6 +1,6 @@
-//! Commands of another master: reported when they change, so that a master that writes equal words in every cycle fills neither
-//! audit nor log. Commands that switch are reported at once, references once a second at most, the last one in any case. Pure:
-//! time is an argument.
+//! Commands of another master: reported when they change, so that a master that writes equal words in every cycle
+//! fills neither audit nor log. Commands that switch something are reported at once, references at most once a
+//! second, the last one in any case. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Registers of one drive whose last written values are known.
 const KEPT: usize = 256;
 
-/// A command of the other master to report.
+/// A command of the other master that must be reported.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Commanded {
     /// The command in one line.
@@ -26,7 +26,7 @@ pub struct Commanded {
     pub changes: Vec<Change>,
     /// The result.
     pub outcome: Outcome,
-    /// When the command began.
+    /// When the request of the command began on the line.
     pub began: Instant,
     /// When the outcome of the command was known.
     pub at: Instant,
@@ -43,7 +43,7 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// Processes a write received from `began` to `at`; returns what must be reported of it now.
+    /// Processes a write received from `began` to `at`; returns the commands to report now.
     pub fn process_write(
         &mut self,
         (spec, protocol): (&DriveSpec, Protocol),
@@ -101,7 +101,7 @@ impl Commands {
         self.waiting.as_ref().and(self.told).map(|told| told + PAUSE)
     }
 
-    /// The points that a write changes, and whether it switches something.
+    /// The points that a write changes, and whether it switches something on or off.
     fn changes(&self, spec: &DriveSpec, table: Table, items: &[(u16, u16)], fresh: &[u16]) -> (Vec<Change>, bool) {
         let (mut changes, mut switches) = (Vec::new(), false);
         let written = spec.profile.points.iter().filter(|point| point.write);

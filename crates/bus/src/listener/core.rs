@@ -1,5 +1,5 @@
-//! A bus that only listens, without its thread: what another master and its drives say goes into the process image, events and
-//! the audit. Pure: bytes and time are arguments, and nothing goes out.
+//! A bus that only listens, without its thread: the traffic of another master and its drives is recorded in the
+//! process image, events and the audit. Pure: bytes and time are arguments, and nothing is ever sent.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,12 +19,12 @@ use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
 use crate::transaction::Ended;
 
-/// A drive is offline after this time without a reply, or after three of its usual pauses if that is longer.
+/// Time without a reply after which a drive is offline, or three of its usual pauses if that is longer.
 const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// The state of one drive, except its image.
+/// The state of one drive apart from its image.
 #[derive(Debug)]
 struct Known {
     address: u8,
@@ -36,7 +36,7 @@ struct Known {
     /// after drive.
     pause: Duration,
     commands: Commands,
-    /// First addresses of its values of two registers, which are never stored in halves.
+    /// First addresses of values with two registers, which are never stored by halves.
     wide: Vec<(Table, u16)>,
 }
 
@@ -50,7 +50,7 @@ pub struct ListenCore {
     drives: PerDrive<Known>,
     /// Tries of the other master, after the first, before a drive is offline.
     retries: u32,
-    /// Reads of process data in this round of the other master, and when it began.
+    /// Reads of process data in the present round of the other master, and when the round began.
     round: (Vec<(DriveIndex, Table, u16)>, Option<Instant>),
     heard: Vec<Traffic>,
     /// Something was received since the port was opened or reconnected.
@@ -103,7 +103,8 @@ impl ListenCore {
         self.refuse_all(now);
     }
 
-    /// A device server closed the connection. Where something was received by it, it is connected to again at once.
+    /// Handles a device server that closed the connection. If bytes were received over it, the gateway connects
+    /// again at once.
     pub fn closed(&mut self) -> Closed {
         match std::mem::take(&mut self.heard_any) {
             true => Closed::Reconnect,
@@ -123,8 +124,8 @@ impl ListenCore {
         self.report.bus_down(why, now);
     }
 
-    /// Answers whatever came into the queue all the same, which [`crate::permit::admit`] prevents, and a gateway that is about to
-    /// end: there is nothing to stop.
+    /// Answers commands that entered the queue although [`crate::permit::admit`] prevents it, and a gateway that is
+    /// about to end: there is nothing to stop.
     pub(crate) fn refuse_all(&mut self, now: Instant) {
         let name = &self.bus.image.spec.name;
         let refusal = Refusal::NotAllowed(format!("bus `{name}` only listens; nothing is sent"));
@@ -247,7 +248,7 @@ impl ListenCore {
         self.report.diagnosis.foreign_exchange(index, exchange);
         let no_answer = matches!(&exchange.ended, Some(Ended::Reply(Reply::Exception(code))) if code.is_no_answer());
         let answered = matches!(exchange.ended, Some(Ended::Reply(_))) && !no_answer;
-        // Bytes behind an unknown command may be its reply.
+        // Bytes after an unknown command may be its reply.
         let is_known = exchange.request.is_some();
         if let Some(ended) = exchange.ended.as_ref().filter(|_| is_known) {
             image.count(match ended {
@@ -258,7 +259,7 @@ impl ListenCore {
                 Ended::Corrupt(_) => Counted::Corrupt,
             });
         }
-        // A Modbus reply carries the address of its drive, so any answer proves that the drive is alive.
+        // A Modbus reply contains the address of its drive, so any reply proves that the drive is alive.
         let is_alive = exchange.doubt.is_none() || self.bus.image.spec.protocol != Protocol::N2;
         if answered && is_alive {
             let interval = exchange.at.saturating_duration_since(known.heard);
@@ -317,7 +318,7 @@ impl ListenCore {
         let mut words = words;
         let mut start = start;
         let is_wide = |address: Option<u16>| address.is_some_and(|address| known.wide.contains(&(table, address)));
-        // The read begins with the second half of a value whose first half is before it.
+        // The read begins with the second half of a value.
         if is_wide(start.checked_sub(1)) {
             let Some(next) = start.checked_add(1) else { return };
             (start, words) = (next, words.get(1..).unwrap_or_default());
@@ -382,8 +383,9 @@ impl ListenCore {
     }
 }
 
-/// The longest pause lately, after one more: a longer one counts at four times the last at most, so that a rest of the other master
-/// delays no later notice; a long one is forgotten by an eighth of the time since, however many replies came in it.
+/// The longest recent pause, updated by one more. A longer one counts as at most four times the previous, so that a
+/// rest of the other master does not delay later notices; a long one is reduced by an eighth of the time since,
+/// however many replies arrived in it.
 fn pause_after(last: Duration, pause: Duration) -> Duration {
     let most = last.max(Duration::from_secs(1)) * 4;
     let left = last.saturating_sub(pause / 8);
@@ -397,7 +399,7 @@ fn decoder(bus: &BusHandle) -> Decoder {
     Decoder::new(spec.protocol, spec.format, n2)
 }
 
-/// First addresses of the values of two registers.
+/// First addresses of all values with two registers.
 fn wide(profile: &Profile) -> Vec<(Table, u16)> {
     let raw = profile.points.iter().filter_map(|point| point.raw());
     raw.filter(|raw| raw.form.items() == 2)
@@ -413,13 +415,13 @@ mod tests {
     fn the_pause_of_a_round_outlasts_the_reads_of_one_drive() {
         let seconds = Duration::from_secs;
         let mut pause = Duration::ZERO;
-        // The other master makes forty reads of this drive, then forty seconds of reads of others.
+        // The other master reads this drive forty times, then other drives for forty seconds.
         for _ in 0..4 {
             pause = pause_after(pause, seconds(40));
             pause = (0..40).fold(pause, |pause, _| pause_after(pause, Duration::from_millis(30)));
         }
         assert!(pause > seconds(39) && pause <= seconds(40), "{pause:?}");
-        // Read all the time, after a rest of an hour.
+        // The drive is read continuously after a rest of an hour.
         let rested = pause_after(Duration::from_millis(30), seconds(3600));
         assert_eq!(rested, seconds(4));
         let later = (0..2000).fold(rested, |pause, _| pause_after(pause, Duration::from_millis(30)));

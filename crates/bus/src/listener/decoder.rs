@@ -1,7 +1,7 @@
 //! Decodes the traffic of another master and its drives, transaction by transaction. Pure: bytes and time are
 //! arguments.
 //!
-//! A reply is accepted only where it is certain which request it answers:
+//! A reply is accepted only if it is certain which request it answers:
 //!
 //! - its request came directly before it, with at most the glitch of a line that changes direction between them: a request that
 //!   was mangled on the way may be among more;
@@ -25,10 +25,10 @@ use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
 use crate::n2_late_replies::{Asked, N2LateReplies, Taken};
 use crate::transaction::{Ended, MAY_BE_LATE};
 
-/// A request without a reply has ended after that time, unless the next request comes first: the longest
+/// Time after which a request without a reply has ended, unless the next request comes first: the longest
 /// `response_timeout`.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// No late reply of N2 comes after that time: that of the gateway as a master.
+/// Time after which no late N2 reply can arrive, as for the gateway as a master.
 const N2_LATE: Duration = n2::RESPONSE_TIMEOUT.saturating_mul(3);
 /// Bytes of garbage that are kept of one transaction.
 const KEPT: usize = 512;
@@ -47,7 +47,7 @@ pub enum Traffic {
         bytes: Vec<u8>,
         /// When the bytes had come.
         at: Instant,
-        /// Since when the line had been silent.
+        /// Since when the line had been silent before these bytes.
         quiet_since: Instant,
     },
 }
@@ -63,13 +63,13 @@ pub struct Exchange {
     pub frame: Vec<u8>,
     /// Since when the line had been silent before the request.
     pub quiet_since: Instant,
-    /// When the request began.
+    /// When the request began on the line.
     pub began: Instant,
     /// When the request was complete.
     pub sent: Instant,
-    /// All bytes that came after the request.
+    /// All bytes received after the request.
     pub heard: Vec<u8>,
-    /// When the first byte of the reply began; `None` if nothing came.
+    /// When the first byte of the reply began; `None` if no bytes arrived.
     pub replied: Option<Instant>,
     /// When the transaction was over.
     pub at: Instant,
@@ -82,7 +82,7 @@ pub struct Exchange {
 }
 
 impl Exchange {
-    /// The reply, if it certainly belongs to this request.
+    /// The reply, if it certainly answers this request.
     pub fn believed(&self) -> Option<(&Request, &Reply)> {
         match (&self.request, &self.ended, self.doubt) {
             (Some(request), Some(Ended::Reply(reply)), None) => Some((request, reply)),
@@ -91,7 +91,7 @@ impl Exchange {
     }
 }
 
-/// A request whose reply may come.
+/// A request whose reply may still arrive.
 #[derive(Debug)]
 struct Open {
     address: u8,
@@ -102,7 +102,7 @@ struct Open {
     sent: Instant,
     /// Bytes after the request that are not a frame.
     garbage: Vec<u8>,
-    /// Whether the request could be a reply; the next request would then look like a reply to it.
+    /// Whether the request could also be a reply; the next request would then look like a reply to it.
     ambiguous: bool,
 }
 
@@ -119,12 +119,12 @@ pub struct Decoder {
     quiet_since: Option<Instant>,
     late: BTreeMap<u8, LateReplies>,
     n2_late: N2LateReplies,
-    /// Until when the reply to a damaged request may come.
+    /// Until when the reply to a damaged request may arrive.
     mangled_until: Option<Instant>,
 }
 
 impl Decoder {
-    /// A line without any bytes so far. `n2` has the options of its drives, by address.
+    /// A decoder for a line without any bytes so far. `n2` has the options of its drives, by address.
     pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
         Decoder {
             protocol,
@@ -145,7 +145,7 @@ impl Decoder {
         over.into_iter().chain(self.frames.patience()).min()
     }
 
-    /// Adds bytes; the last of them arrived at `now`.
+    /// Adds bytes, the last of which arrived at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Traffic>) {
         // A frame whose time for its rest has ended is cut before the new bytes are added.
         self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);
@@ -204,7 +204,7 @@ impl Decoder {
         }
     }
 
-    /// Whether the frame of a request could be a reply to the request before it: 24 bits, or a list of registers.
+    /// Whether the frame of this request could be a reply to the request before it: 24 bits, or a list of registers.
     fn could_be_reply(&self, pdu: &RequestPdu) -> bool {
         let mut bytes = Vec::new();
         pdu.encode(&mut bytes);
@@ -232,7 +232,7 @@ impl Decoder {
         self.over(Some(Ended::Reply(reply)), at, Some(began), doubt, heard);
     }
 
-    /// Why the reply in `bytes` may be the late one to an earlier request.
+    /// Why the reply in `bytes` may be a late reply to an earlier request.
     fn late(&mut self, bytes: &[u8], at: Instant) -> Option<&'static str> {
         let request = self.open.as_ref()?.request.as_ref()?;
         let may_be_late = match self.protocol {
@@ -260,7 +260,7 @@ impl Decoder {
         });
     }
 
-    /// No reply came to the request that is open: the next request came at `now`, or its time has ended.
+    /// Ends the open request without a reply: the next request came at `now`, or its time limit has passed.
     fn give_up(&mut self, now: Instant, heard: &mut Vec<Traffic>) {
         let Some(open) = &self.open else { return };
         let mangled = open

@@ -34,7 +34,7 @@ pub struct Guess {
 }
 
 impl Guess {
-    /// A port that is set to `format`; the protocols that it may carry are tried, all of `protocols` at once.
+    /// A guess for a port that is set to `format`; all protocols of `protocols` are tried at the same time.
     pub fn new(format: LineFormat, protocols: &[Protocol]) -> Guess {
         let allowed = protocols.iter().filter(|protocol| protocol.allows(&format));
         let one = |protocol: &Protocol| Try {

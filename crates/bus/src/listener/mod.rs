@@ -7,7 +7,7 @@
 //! - [`n2_survey`]: what confirms or contradicts the assumptions about N2. Pure.
 //! - [`guess`]: protocol and format of a line from what is received with a setting. Pure.
 //!
-//! Nothing here can send: the thread ([`crate::BusTask`]) holds a [`crate::line::Receiver`], which has no way to.
+//! No code here can send: the thread ([`crate::BusTask`]) has a [`crate::line::Receiver`], which offers no way to send.
 
 pub mod commands;
 pub mod core;

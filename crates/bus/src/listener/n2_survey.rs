@@ -18,7 +18,7 @@ type Seen = BTreeMap<String, u64>;
 /// Observations on an N2 line.
 #[derive(Debug, Default)]
 pub struct N2Survey {
-    /// Lines of master and drives by whether their checksum is the sum of their characters.
+    /// Number of lines of master and drives whose checksum is, or is not, the sum of their characters.
     sums: [u64; 2],
     /// Regions of overrides and releases by their digits.
     widths: Seen,
@@ -28,7 +28,7 @@ pub struct N2Survey {
     devices: Seen,
     /// Times at which a drive wanted to be identified.
     unidentified: u64,
-    /// Overrides of analog outputs, and releases of them.
+    /// Number of overrides of analog outputs, and of their releases.
     overrides: u64,
     releases: u64,
     /// Polls, by form and by what was answered.
@@ -39,7 +39,7 @@ pub struct N2Survey {
     /// Digits of the answers to reads of floats and integers.
     floats: Seen,
     integers: Seen,
-    /// Refusals by their form.
+    /// Number of refusals, by their form.
     refusals: Seen,
     /// Floats that are no number.
     no_numbers: Seen,
@@ -262,7 +262,7 @@ fn list(seen: &Seen) -> String {
 mod tests {
     use super::*;
 
-    /// A request and its reply, both without the carriage return.
+    /// A request and its reply, both given without the carriage return.
     fn exchange(began: Instant, request: &str, reply: &str) -> Traffic {
         Traffic::Exchange(Box::new(Exchange {
             address: 1,

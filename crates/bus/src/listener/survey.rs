@@ -1,4 +1,4 @@
-//! Which addresses another master polls, which registers, and how often. Pure: time is an argument.
+//! Records which addresses and registers another master polls, and how often. Pure: time is an argument.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -30,7 +30,7 @@ pub struct Asked {
 }
 
 impl Asked {
-    /// Mean time between two of these requests, once it was received twice.
+    /// Mean time between two of these requests, if it was received at least twice.
     pub fn cycle(&self) -> Option<Duration> {
         let intervals = u32::try_from(self.count.checked_sub(1)?).ok().filter(|n| *n > 0)?;
         Some(self.last.saturating_duration_since(self.first) / intervals)
@@ -40,7 +40,7 @@ impl Asked {
 /// The traffic of one address.
 #[derive(Debug, Clone, Default)]
 pub struct Address {
-    /// Each request, by its text.
+    /// Each request of the other master, keyed by its text.
     pub requests: BTreeMap<String, Asked>,
     /// Requests that got an answer, perhaps a refusal.
     pub answered: u64,
@@ -59,8 +59,8 @@ impl Address {
         Some(self.turnaround / answered)
     }
 
-    /// The profiles of this protocol whose registers contain all answered reads; first come the profiles that name most of the
-    /// registers read. Empty if nothing was read.
+    /// The profiles for this protocol whose registers include all answered reads; those that name most of the
+    /// registers come first. Empty if nothing was read.
     pub fn fitting(&self, profiles: &Profiles, protocol: Protocol) -> Vec<String> {
         let answered = self.requests.values().filter(|asked| asked.answered > 0);
         let reads: Vec<(Table, u16, u16)> = answered.filter_map(|asked| asked.read).collect();
@@ -167,14 +167,14 @@ impl Survey {
         ends.map_or(Duration::ZERO, |(first, last)| last.saturating_duration_since(first))
     }
 
-    /// The cycle of the other master: that of the request that it repeats most often.
+    /// The cycle of the other master: the cycle of the request that it repeats most often.
     pub fn cycle(&self) -> Option<Duration> {
         let all = self.addresses.values().flat_map(|address| address.requests.values());
         all.max_by_key(|asked| asked.count).and_then(Asked::cycle)
     }
 }
 
-/// A request without the values that it writes, which differ from one time to the next.
+/// Text of a request without the values that it writes, which differ each time.
 fn words(protocol: Protocol, pdu: &RequestPdu) -> String {
     let text = describe::request_on(protocol, pdu);
     match text.split_once(" = ") {

@@ -23,25 +23,25 @@ use crate::transaction::{CONNECTION_CLOSED, Ended};
 /// Time of a transaction whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
 
-/// A choice for the line: a command to drives that waited among their others, or a background request.
+/// What background traffic sends next: a command to drives that waited its turn among the others, or a background request.
 #[derive(Debug)]
 pub(super) enum Sending {
     Command(Box<Command>),
     Request(Box<BackgroundRequest>),
 }
 
-/// A background transaction that has its turn.
+/// A background transaction that was chosen for sending.
 #[derive(Debug)]
 pub(super) struct Begun {
     pub(super) sending: Sending,
-    /// Whose share of the time the transaction takes; none where it goes as a command.
+    /// The share that pays for the time of the transaction; `None` if it goes as a command.
     pub(super) admission: Option<Admission>,
-    /// Whether its transaction is, or was, on the line.
+    /// Whether its transaction is on the line, or was.
     pub(super) sent: bool,
 }
 
 impl Begun {
-    /// The command to drives of the bus, where it is one.
+    /// The command to drives of the bus, if this is one.
     pub(super) fn command(&self) -> Option<&Command> {
         match &self.sending {
             Sending::Command(command) => Some(command),
@@ -117,7 +117,7 @@ impl Begun {
             Sending::Request(request) => (request.ticket, request.passed_on),
         };
         if let Some(passed_on) = passed_on {
-            // The tool may have gone.
+            // The tool may have disconnected, so an error is ignored.
             let _ = passed_on.frame.send(frame);
         }
         ticket.answer(outcome, now);
@@ -125,10 +125,10 @@ impl Begun {
 }
 
 impl Master {
-    /// The background transaction that goes now, in time that is left over (`idle`) or instead of a poll that is due.
+    /// The background transaction to send now, in time that is left over (`idle`) or instead of a poll that is due.
     ///
     /// # Errors
-    /// When to look again; `None` if no request waits.
+    /// When to check again; `None` if no request waits.
     pub(super) fn background(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
         self.drop_background_in_vain(now);
         let mut again: Option<Instant> = None;
@@ -163,7 +163,7 @@ impl Master {
         }
     }
 
-    /// Ends requests that can no longer be sent: expired, or their drive is offline.
+    /// Ends requests that can no longer be sent: they expired, or their drive is offline.
     fn drop_background_in_vain(&mut self, now: Instant) {
         let Master { bus, schedule, .. } = self;
         let mut queue = bus.queue.background();
@@ -182,7 +182,7 @@ impl Master {
         }
     }
 
-    /// Takes the next request of that pace from the queue, if it may go.
+    /// Takes the next request of this pace from the queue, if it may be sent.
     fn begin_background(&mut self, pace: Pace, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
         let queue = self.bus.queue.clone();
         let mut waiting = queue.background();
@@ -229,7 +229,7 @@ impl Master {
         WireTime::of(spec.protocol, &spec.format, pdu).total(turnaround, silence)
     }
 
-    /// Whether the background transaction that was chosen may still go.
+    /// Whether the chosen background transaction may still be sent.
     pub(super) fn background_is_due(&self, now: Instant) -> bool {
         let Some(begun) = self.background.as_ref().filter(|begun| begun.expires() > now) else {
             return false;
@@ -237,7 +237,7 @@ impl Master {
         let bus = &self.bus.image.spec.name;
         let command = match &begun.sending {
             Sending::Command(command) => command,
-            // A request without its right is refused when it is chosen again.
+            // A request that has lost its right is refused when the next choice is made.
             Sending::Request(request) => return lost_right(request, Stage::Write, bus).is_none(),
         };
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
@@ -280,7 +280,7 @@ impl Master {
         }
     }
 
-    /// Whether a background transaction that a client requested has its turn.
+    /// Whether a background transaction requested by a client is chosen for sending.
     pub(super) fn background_of_others(&self) -> bool {
         let begun = self.background.as_ref();
         begun.is_some_and(|begun| begun.origin().kind != SourceKind::Schedule)
@@ -332,8 +332,8 @@ impl Master {
         begun.answer(outcome, frame, now);
     }
 
-    /// Stores read values in the process image as well. A drive that was identified, or polled for changes, may have
-    /// restarted or reported changes to the tool, so it is read again.
+    /// Stores read values in the process image as well. A drive that a tool identified, or polled for changes, may
+    /// have reported a restart or changes to the tool, so it is read again.
     fn note_background_read(
         &mut self,
         turn: &Turn,
@@ -365,8 +365,8 @@ impl Master {
         }
     }
 
-    /// Forgets, for all drives that received an unchecked write, the words that it wrote, and every command word if the written
-    /// words are unknown.
+    /// Forgets, for all drives that received an unchecked write, the words that it wrote, and all command words if
+    /// the written words are unknown.
     fn unchecked_write(&mut self, begun: &Begun, turn: &Turn, outcome: &Outcome, now: Instant) {
         let writes = written(&turn.pdu);
         for index in begun.command().into_iter().flat_map(Command::reach) {
@@ -397,7 +397,7 @@ impl Master {
         }
     }
 
-    /// The address of a turn, where no drive is configured at it.
+    /// The address of a turn, if no drive is configured at that address.
     pub fn stranger(&self, turn: &Turn) -> Option<u8> {
         let begun = self
             .background
@@ -417,9 +417,9 @@ impl Master {
         address == Some(0) && begun.drive() == NO_DRIVE && self.waits.sessions.is_empty()
     }
 
-    /// How long the first byte of the reply is waited for where that is not as with the gateway's own requests: after a broadcast
-    /// the drives have time to carry it out, and a request that is not decoded takes no more of the line than
-    /// [`LONGEST_UNCHECKED`].
+    /// Time limit for the first byte of the reply, where it differs from the gateway's own requests: after a
+    /// broadcast the drives get time to carry it out, and a request that is not decoded may take at most
+    /// [`LONGEST_UNCHECKED`] of the line.
     pub(super) fn passed_on_timeout(&self, turn: &Turn) -> Option<Duration> {
         if self.is_broadcast(turn) {
             return Some(BROADCAST_PAUSE);
@@ -427,7 +427,7 @@ impl Master {
         let RequestPdu::Other(_) = &turn.pdu else { return None };
         let spec = &self.bus.image.spec;
         let wire = WireTime::of(spec.protocol, &spec.format, &turn.pdu);
-        // The length of an unchecked reply is known only when it has arrived.
+        // The length of an unchecked reply is only known once it has arrived.
         let patient = self.response_timeout_of(turn.drive) + spec.format.chars(LONGEST);
         Some(patient.min(LONGEST_UNCHECKED.saturating_sub(wire.request + wire.reply)))
     }
@@ -475,7 +475,7 @@ impl Master {
     }
 }
 
-/// Why a write for a tool is not sent any more, if its client has lost the right to write to that bus.
+/// Why a write for a tool is not sent any more, if its client has lost the right to write to this bus.
 fn lost_right(request: &BackgroundRequest, stage: Stage, bus: &str) -> Option<Refusal> {
     request.passed_on.as_ref().filter(|passed_on| passed_on.may_write)?;
     client_access(stage, false, request.ticket.origin(), bus).err()

@@ -13,9 +13,10 @@ use crate::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEn
 use crate::queue::{Chosen, Ready};
 use crate::schedule::{Decision, Poll};
 
-/// Transactions of one rank in a row, while a lower one waits, before that has its turn.
+/// Most transactions of one rank in a row while a lower rank waits; then the lower one is served.
 const IN_A_ROW: u32 = 8;
-/// Decisions without a transaction before the rest waits for the next look: commands that end without one are answered.
+/// Most decisions without a transaction before the rest waits for the next call: commands that end without one are
+/// answered.
 const MOST_DECISIONS: usize = 1000;
 
 /// The ranks, the highest first.
@@ -26,7 +27,7 @@ const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
 pub(super) struct Turns([u32; 3]);
 
 impl Turns {
-    /// Which of the ranks that wait has its turn: the highest, unless it had eight in a row.
+    /// Which of the waiting ranks is served next: the highest, unless it had eight transactions in a row.
     fn rank(&self, waits: impl Fn(Urgency) -> bool) -> Option<Urgency> {
         let mut waiting = RANKS.into_iter().filter(|rank| waits(*rank)).peekable();
         while let Some(rank) = waiting.next() {
@@ -38,7 +39,7 @@ impl Turns {
         None
     }
 
-    /// Counts a turn of this rank, with lower ranks waiting or not.
+    /// Counts a transaction of this rank, with lower ranks waiting or not.
     fn served(&mut self, rank: Urgency, lower_waits: bool) {
         for (of, count) in RANKS.into_iter().zip(&mut self.0) {
             if of < rank {
@@ -58,13 +59,13 @@ struct NextStep {
     step: Step,
 }
 
-/// The wants of all commands at one time.
+/// What all started commands need at one time.
 #[derive(Default)]
 struct Commands {
     /// Next steps by rank.
     ready: [Option<NextStep>; 3],
     queued: [Option<Chosen>; 3],
-    /// When further commands may go.
+    /// When further commands may be sent.
     wake_at: Option<Instant>,
 }
 
@@ -80,7 +81,7 @@ impl Commands {
 }
 
 impl Master {
-    /// Chooses until there is something for the line, or nothing to do.
+    /// Makes decisions until there is a request for the line, or nothing to do.
     ///
     /// # Errors
     /// The time until which nothing is to be done, after `now`.
@@ -94,7 +95,7 @@ impl Master {
         Err(soon)
     }
 
-    /// Makes one decision; none where it changed the conditions of the decision.
+    /// Makes one decision; `None` if it changed the conditions for the next decision.
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
         let quiet = self.bus.queue.quiet(now);
@@ -128,7 +129,7 @@ impl Master {
             }
             return match rank {
                 Some(rank) => self.command(rank, &mut commands, now),
-                // The broadcast that stops the whole line goes before the stops that wait for it.
+                // The broadcast that stops the whole line goes before the single stops, which wait for it.
                 None => Some(
                     self.stop_the_line(now)
                         .map_err(|_| commands.wake_at.unwrap_or(now + super::LOOK_ROUND)),
@@ -158,8 +159,8 @@ impl Master {
         }
     }
 
-    /// The write of a parameter to a drive that reported, in the transaction before, that its motor stands: nothing but
-    /// a stop goes between the two.
+    /// The write of a parameter to a drive that has just reported that its motor stands: only a stop may come
+    /// between the two.
     fn checked_write(&mut self, now: Instant) -> Option<NextStep> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);
         let Master { drives, bus, waits, .. } = self;
@@ -273,7 +274,7 @@ impl Master {
         }
     }
 
-    /// A command of that rank has its turn: a started one, or the next one of the queue has started.
+    /// Serves a command of this rank: a started one, or the next one of the queue, which is then started.
     fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Option<Result<Turn, Instant>> {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
@@ -288,7 +289,7 @@ impl Master {
             return self.begin_passed_on(command, None, now).map(Ok);
         }
         self.begin(command, chosen.rank, now);
-        // The started commands are judged again: one may wait, or another may go first.
+        // The started commands are judged again: one may wait, or another may be sent first.
         None
     }
 
@@ -375,7 +376,7 @@ impl Master {
         Some(Ok(turn))
     }
 
-    /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not expired.
+    /// Whether a turn chosen earlier may still be sent at `now`: the time of its command has not expired.
     pub(crate) fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
         if turn.purpose == Purpose::Background {
             return self.background_is_due(now);
@@ -394,13 +395,13 @@ impl Master {
         !(is_action && self.client_is_back(turn.drive))
     }
 
-    /// The command under way, unless it expired while the line went silent.
+    /// The command in progress, unless it expired while the bus waited for silence on the line.
     fn run_in_time(&mut self, drive: DriveIndex, slot: Urgency, now: Instant) -> Option<&mut CommandRun> {
         let run = self.drives.get_mut(drive).and_then(|drive| drive.run(slot));
         run.filter(|run| !run.is_late(now))
     }
 
-    /// Whether a client came back while the line went silent, which suspends the action of its lease.
+    /// Whether a client came back while the bus waited for silence, which suspends the action of the lease.
     fn client_is_back(&self, drive: DriveIndex) -> bool {
         let image = self.bus.image.drives.get(drive);
         image.is_some_and(|image| image.has_heartbeat()) || self.bus.queue.lock().client_waits_until(drive).is_some()
@@ -412,13 +413,13 @@ impl Master {
     }
 }
 
-/// The time of a stop begins when the stop does, however long it waited for its turn.
+/// Starts the time limit of a stop when the stop itself starts, however long it waited.
 fn begin_time(stop: &mut Command, now: Instant) {
     let window = &mut stop.intent.window;
     window.expires = window.expires.max(now + DEFAULT_EXPIRY);
 }
 
-/// While a started stop is in progress, no other command goes to its drive.
+/// Whether a command must wait because a stop of its drive is in progress.
 fn waits_for_stop(drive: &DriveState, command: &Command) -> bool {
     command.urgency() == Urgency::Command && drive.is_busy(Urgency::Stop)
 }
@@ -432,7 +433,7 @@ pub(super) fn may_begin(drive: &mut DriveState, command: &Command, online: bool,
     if urgency == Urgency::Stop {
         return drive.vain_stops.waits_until(now).map_or(Ready::Now, Ready::At);
     }
-    // A command to a drive that is away is answered at once.
+    // A command to an offline drive is answered at once.
     if let Order::Read(pdu) | Order::Write(pdu) = &command.intent.order
         && online
         && let Some(until) = drive.late.blocks(pdu, now)

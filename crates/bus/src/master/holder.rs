@@ -1,4 +1,4 @@
-//! Holders of the drives, as the line sees them: whose orders were carried out, and which drive is under local control.
+//! Reports to the holds of the drives: whose orders were carried out, and which drive is under local control.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -46,8 +46,8 @@ pub(super) fn report_control(
     }
 }
 
-/// Takes the run command away, so that nothing starts when the local control place gives the drive back. If a local control place
-/// was found at the start of the gateway, nothing is written.
+/// Takes the run command away, so that nothing starts when local control returns the drive to the bus. If local
+/// control was already active when the gateway started, nothing is written.
 fn stop_at_local(
     bus: &BusHandle,
     index: DriveIndex,

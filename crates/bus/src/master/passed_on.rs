@@ -1,4 +1,4 @@
-//! Requests forwarded for a tool, and the gateway's own broadcasts: when they may be sent, and the sending.
+//! Requests forwarded for a tool, and the gateway's own broadcasts: decides when they may be sent, and sends them.
 
 use std::time::Instant;
 
@@ -19,7 +19,7 @@ pub(super) fn drop_unwanted(pending: &mut Pending, now: Instant) {
 }
 
 impl Master {
-    /// The order that is passed on next to drives of the bus, if it may go where nothing is in a hurry.
+    /// The next order to pass on to drives of the bus, if it may be sent while no command is urgent.
     pub(super) fn pass_on(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();
@@ -62,7 +62,7 @@ impl Master {
         })
     }
 
-    /// The broadcast of a stop of all drives, which goes before their own stops where it can go at once.
+    /// The broadcast of a stop of all drives, which is sent before their single stops if that is possible at once.
     pub(super) fn broadcast_stop(&mut self, now: Instant) -> Option<Turn> {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();
@@ -75,10 +75,10 @@ impl Master {
         self.begin_passed_on(command, None, now)
     }
 
-    /// The broadcast of the shutdown, if it may go: the line is free for it.
+    /// The broadcast for the shutdown, if the line is free for it.
     ///
     /// # Errors
-    /// When to look again; `None` if no stop waits.
+    /// When to check again; `None` if no stop waits.
     pub(super) fn stop_the_line(&mut self, now: Instant) -> Result<Turn, Option<Instant>> {
         let queue = self.bus.queue.clone();
         let mut pending = queue.lock();
@@ -91,7 +91,7 @@ impl Master {
         self.begin_passed_on(command, None, now).ok_or(None)
     }
 
-    /// Begins what is passed on and was taken from the queue.
+    /// Starts a passed-on request that was taken from the queue.
     pub(super) fn begin_passed_on(
         &mut self,
         command: Command,
@@ -112,7 +112,8 @@ impl Master {
     }
 }
 
-/// Whether the drives of a queued command are ready for it. One drive that is away answers for itself.
+/// Whether the drives of a queued command are ready for it. A single drive that is offline does not count: the
+/// command is answered for it.
 pub(super) fn is_ready(
     command: &Command,
     online: bool,

@@ -41,7 +41,7 @@ impl Master {
         }
     }
 
-    /// The gateway itself did not run for this time and received nothing: leases last longer by it.
+    /// Prolongs the leases by a time during which the gateway did not run and received nothing.
     pub(crate) fn prolong(&mut self, time: Duration) {
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
             if let Some(supervision) = &image.spec.supervision {

@@ -1,4 +1,4 @@
-//! The state of its drives that the master reports to the gate, and the check before each frame of a started command.
+//! The state of the drives that the master reports to the gate, and the check before each frame of a started command.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,11 +13,11 @@ use crate::plant::BusHandle;
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
 
-/// How old a frequency range may be on which a command rests whose turn came. Whether it was too old for the command
-/// was decided when that was accepted.
+/// Maximum age of the frequency range on which a command depends when it is about to be sent. Whether the range was
+/// too old for the command was decided when the command was accepted.
 const RANGE_AGE: Duration = Duration::from_secs(60);
 
-/// State of the drives when the turn of a command comes.
+/// State of the drives when a command is about to be sent.
 pub(super) struct AtTurn {
     images: Vec<Arc<DriveImage>>,
     written: PerDrive<LastWritten>,
@@ -42,7 +42,7 @@ impl Facts for AtTurn {
     }
 }
 
-/// Whether the next frame of a started command may go. The end of a pulse is always sent, and so is a stop.
+/// Whether the next frame of a started command may be sent. A stop and the end of a pulse are always sent.
 pub(super) fn may_write(
     bus: &BusHandle,
     index: DriveIndex,
@@ -71,7 +71,7 @@ pub(super) fn may_write(
     bus.queue.lock().gate.ask(&ask)
 }
 
-/// The next need of the started commands of a drive, once those that may not go on have ended.
+/// The next need of the started commands of a drive, after those that may not continue have ended.
 pub(super) fn next_need(
     bus: &BusHandle,
     index: DriveIndex,
@@ -94,7 +94,7 @@ pub(super) fn next_need(
     }
 }
 
-/// Ends a started command; its refusal is reported as if it had come at once.
+/// Ends a started command; its refusal is reported like an immediate one.
 fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outcome) {
     if let (Outcome::Refused(refusal), Some(ticket)) = (&outcome, run.first_ticket()) {
         let denied = Denied {
@@ -109,14 +109,14 @@ fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outco
 }
 
 impl Master {
-    /// Whether the frame of a started command that was chosen earlier may still go.
+    /// Whether a chosen frame of a started command may still be sent.
     pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
         let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return true;
         };
         let written = drive.written;
         let Some(run) = drive.run(slot) else { return true };
-        // A denied command is refused, or waits, when it is chosen again.
+        // A denied command is refused, or made to wait, at the next choice.
         matches!(
             may_write(&self.bus, index, image, (run, written), now),
             Verdict::Go | Verdict::LookFirst

@@ -1,4 +1,4 @@
-//! When the refresh of a drive has its turn, and what follows from the replies to its steps.
+//! When the refresh of a drive is sent, and what follows from the replies to its steps.
 
 use std::time::{Duration, Instant};
 
@@ -13,7 +13,7 @@ use crate::permit::{Ask, Facts, Stage, Verdict};
 use crate::refresh::{Around, End};
 use crate::transaction::Ended;
 
-/// Most of the time of refreshes that polls get back.
+/// Limit for the time of refreshes that polls get back.
 const MOST_DEBT: Duration = Duration::from_secs(2);
 
 /// Whether a refresh may write.
@@ -24,7 +24,7 @@ enum May {
 }
 
 impl Master {
-    /// Ends refreshes that time, samples or accepted orders contradict, and reports which go on.
+    /// Ends refreshes that time, samples or accepted orders contradict, and reports which refreshes continue.
     pub(super) fn check_refreshes(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master { bus, drives, .. } = self;
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
@@ -53,14 +53,16 @@ impl Master {
         }
     }
 
-    /// The next step of a round that has read: only stops, and orders to this drive, go between its frames.
+    /// The next step of a refresh round that has done its reads: only stops, and orders to this drive, go between
+    /// its frames.
     pub(super) fn refresh_goes_on(&mut self, now: Instant) -> Option<Turn> {
         let under_way = |(_, drive): &(DriveIndex, &DriveState)| drive.refresh.is_under_way() && !drive.has_runs();
         let (index, _) = self.drives.enumerate().find(under_way)?;
         self.refresh_step(index, now)
     }
 
-    /// The first step of the round that is due longest. Polls get the line for as long as refreshes had it, unless it is `idle`.
+    /// The first step of the refresh round that is overdue longest. Polls get the line for as long as refreshes had
+    /// it, unless it is `idle`.
     pub(super) fn refresh(&mut self, idle: bool, now: Instant) -> Option<Turn> {
         if !self.refresh_debt.is_zero() && !idle {
             return None;
@@ -81,7 +83,7 @@ impl Master {
         self.due_refreshes().map(|(due, _)| due).min()
     }
 
-    /// Whether a drill sends nothing to that drive, so that its own timeout acts.
+    /// Whether a drill wants nothing sent to this drive, so that the drive's own timeout acts.
     fn is_quiet(&self, index: DriveIndex) -> bool {
         self.waits.quiet.is_some_and(|(quiet, _)| quiet == index)
     }
@@ -124,7 +126,7 @@ impl Master {
         })
     }
 
-    /// Whether a frame of a refresh that was chosen earlier may still go.
+    /// Whether a chosen frame of a refresh may still be sent.
     pub(super) fn may_still_refresh(&mut self, turn: &Turn, now: Instant) -> bool {
         let is_under_way = self
             .drives
@@ -133,8 +135,8 @@ impl Master {
         is_under_way && matches!(self.may_refresh(turn.drive, Stage::Write, now), May::Yes)
     }
 
-    /// Judges a refresh by the rules, in the name of the gateway: a standing order is repeated, whoever holds the drive
-    /// now.
+    /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, whoever holds the
+    /// drive now.
     fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
         let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
             return May::NotNow;

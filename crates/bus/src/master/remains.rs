@@ -1,4 +1,4 @@
-//! The remains of faults and commands on a bus: none, on a line that has been fault-free for a while. Pure.
+//! What a bus still keeps of past faults and commands: nothing, after a while without faults. Pure.
 
 use std::time::Instant;
 
@@ -6,10 +6,10 @@ use super::Master;
 use crate::drive_state::DriveState;
 
 /// State that a bus still keeps of failed transactions and of started commands. On a sound line without commands
-/// everything in it ends by itself: its `Default`.
+/// all of it ends by itself and equals `Default`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Remains {
-    /// Requests whose reply may still come late.
+    /// Requests whose late replies may still arrive.
     pub late_replies: usize,
     /// Addresses without a configured drive from which one may.
     pub strangers: usize,

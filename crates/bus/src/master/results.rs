@@ -60,8 +60,8 @@ impl Master {
         self.schedule.monitor(drive, covers, at);
     }
 
-    /// Records the reply that may still come for the transaction: none where the drive's own reply came damaged, unless
-    /// that may have been a late reply to an earlier transaction.
+    /// Records the reply that may still arrive for the transaction. None is expected if the drive's own reply
+    /// arrived damaged, unless the damaged one may have been a late reply to an earlier transaction.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
         if self.is_broadcast(turn) {
             // A broadcast has no reply.
@@ -114,13 +114,14 @@ impl Master {
         }
     }
 
-    /// Whether the drive's own reply came damaged; not where that may have been a late reply to an earlier transaction.
+    /// Whether the drive's own reply arrived damaged; false if the damaged one may have been a late reply to an
+    /// earlier transaction.
     fn came_mangled(&self, end: &TurnEnd) -> bool {
         end.mangled && !self.late_before
     }
 
-    /// Records the reply that may still come on an N2 line. Reads that waited for a late reply that will not come are
-    /// due again.
+    /// Records the reply that may still arrive on an N2 line. Reads that waited for a late reply that will not come
+    /// are due again.
     fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, came_mangled: bool, now: Instant) {
         let configured = self.bus.image.drives.get(turn.drive);
         let Some(address) = configured
@@ -155,7 +156,8 @@ impl Master {
         }
     }
 
-    /// A step that N2 needs before a poll or a command has ended: that is chosen again, or has failed with it.
+    /// Handles the end of a step that N2 needs before a poll or a command: the poll or command is chosen again, or
+    /// has failed with the step.
     fn session_went_on(
         &mut self,
         drive: DriveIndex,
@@ -191,7 +193,7 @@ impl Master {
         }
     }
 
-    /// The drive has restarted: no known state of it holds.
+    /// Handles a drive that has restarted: nothing known about it is valid any more.
     pub(super) fn restarted(&mut self, drive: DriveIndex, now: Instant, news: &mut Vec<News>) {
         if let Some(state) = self.drives.get_mut(drive) {
             state.restarted();
@@ -203,7 +205,7 @@ impl Master {
     /// Applies the result of a poll.
     fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.refresh_debt = self.refresh_debt.saturating_sub(end.took);
-        // After a session step before the poll this is known already.
+        // After a session step before the poll, this is already recorded.
         let heard = self.waits.sessions.transaction_ended(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
@@ -211,7 +213,7 @@ impl Master {
         let took = end.took;
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
-            // A gateway in between cannot reach the drive: its exception is no evidence about the drive.
+            // A gateway in between cannot reach the drive: its exception shows nothing about the drive.
             Ended::Reply(reply) if says_no_answer(&reply) => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) if self.proves_nothing(poll, &reply) => {
@@ -222,9 +224,9 @@ impl Master {
                 self.read(poll.drive, poll.read, reply, (end.began, end.at), now, news);
                 Polled::Ok
             }
-            // The stall may have lost the reply: the drive does not count as away before another request.
+            // The reply may have been lost by the stall: the drive does not count as offline before another request.
             Ended::Silent if end.stood => Polled::Garbled,
-            // The drive is present, although a reply that came so early is not accepted yet.
+            // The drive is present, although such an early reply is not accepted yet.
             Ended::Silent if end.doubted => Polled::Garbled,
             Ended::Silent => Polled::Failed,
             Ended::Corrupt(_) => Polled::Garbled,
@@ -237,8 +239,8 @@ impl Master {
         }
         let change = self.schedule.poll_done(poll, polled, took, now);
         if poll.probe && end.doubted {
-            // The drive is there: a second early reply is accepted, so it is requested at once instead of with the next
-            // probe.
+            // The drive is present: a second early reply is accepted, so the drive is requested at once instead of
+            // with the next probe.
             self.schedule.seen(poll.drive, now);
         }
         if let Some(round) = self.schedule.take_slow_round() {
@@ -252,8 +254,8 @@ impl Master {
         }
     }
 
-    /// Whether the reply answers a read that no manual states, and may come from a drive that ignores the number of items: all
-    /// behind the first is 0. A reply that shows more proves the read permanently, until the drive goes away.
+    /// Whether the reply to a read that no manual describes may come from a drive that ignores the number of items:
+    /// all items after the first are 0. A reply with more proves the read until the drive goes offline.
     fn proves_nothing(&mut self, poll: &Poll, reply: &Reply) -> bool {
         if !self.schedule.is_trial(poll.drive, &poll.read) {
             return false;
@@ -267,7 +269,7 @@ impl Master {
         !shows_more
     }
 
-    /// The drive no longer replies: anyone who waits for it is answered, but for the stop, which is its probe.
+    /// Handles a drive that no longer replies: all waiting commands are answered, except the stop, which serves as a probe.
     fn went_offline(&mut self, index: DriveIndex, now: Instant, news: &mut Vec<News>) {
         if let Some(drive) = self.drives.get_mut(index) {
             drive.went_offline(now);
@@ -430,7 +432,7 @@ impl Master {
             drive.vain_stops.not_answered(took);
         }
         let retries = match *ended {
-            // The request may never have reached the drive, so the failure is no evidence about it.
+            // The request may never have reached the drive, so the failure shows nothing about the drive.
             Ended::Corrupt(CONNECTION_CLOSED) => retries.max(1),
             // A reply lost during a stall of the thread also earns one more try.
             _ if online => retries.max(u32::from(stood)),
@@ -449,8 +451,8 @@ impl Master {
         }
     }
 
-    /// Registers were written, or may be: they are read back soon. An earlier reading of the frequency range is invalid
-    /// where an end of it was among them, and both ends are read again.
+    /// Registers were written, or may have been: they are read back soon. If an end of the frequency range is among
+    /// them, an earlier reading of the range is invalid, and both ends are read again.
     pub(super) fn note_write(&mut self, index: DriveIndex, table: Table, items: &[(u16, u16)], now: Instant) {
         let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return;
@@ -489,12 +491,12 @@ fn says_no_answer(reply: &Reply) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer())
 }
 
-/// Whether the reply to a step of a command leaves open the result: as if none had come.
+/// Whether the reply to a step of a command leaves the result open, as if there had been no reply.
 fn leaves_open(reply: &Reply, step: &Step) -> bool {
     matches!(reply, Reply::Exception(code) if code.is_no_answer() || (step.pdu.is_write() && code.leaves_open()))
 }
 
-/// The session step in place of a command's step, since the drive requires it first.
+/// The session step to send instead of a command's step, because the drive requires it first.
 fn unheard(session: Session) -> Step {
     Step {
         purpose: StepPurpose::Execute,

@@ -1,4 +1,4 @@
-//! The end of the gateway: polls cease, and each drive that is configured so gets its stop.
+//! The end of the gateway: polling stops, and each drive with `on_shutdown = "stop"` gets its stop.
 
 use std::sync::Arc;
 use std::task::{Context, Waker};
@@ -16,8 +16,8 @@ use crate::process_image::{Access, DriveImage, OnShutdown};
 use crate::queue::{NotStopped, Stopping};
 use crate::stop_of_line::stop_of_line;
 
-/// How long the stops wait for a broadcast that goes before them: a transaction that is on the line, the broadcast, and
-/// the time that the drives have to carry it out.
+/// How long the stops wait for the broadcast before them: for a transaction on the line, the broadcast, and the
+/// time that the drives need to carry it out.
 const BROADCAST: Duration = Duration::from_millis(500);
 /// Wait before a stop that was not acknowledged is ordered again.
 const AGAIN: Duration = Duration::from_millis(20);
@@ -25,9 +25,9 @@ const AGAIN: Duration = Duration::from_millis(20);
 /// The stops of a shutdown.
 #[derive(Debug)]
 pub(super) struct Shutdown {
-    /// The request of the shutdown; none once its end is reported.
+    /// The request of the shutdown; `None` once its end was reported.
     stopping: Option<Stopping>,
-    /// The broadcast that goes before all stops, and until when they wait for it.
+    /// The broadcast that goes before all stops, and until when the stops wait for it.
     broadcast: Option<(Exchange, Instant)>,
     stops: Vec<Stop>,
 }
@@ -62,7 +62,7 @@ impl State {
 }
 
 impl Stop {
-    /// Looks at the answer; `now` is when it is ordered again where it failed.
+    /// Checks the answer; a failed stop is ordered again at `now`.
     fn check_answer(&mut self, now: Instant) {
         let State::Ordered(answer) = &mut self.state else {
             return;
@@ -112,7 +112,7 @@ impl Shutdown {
         };
         let over = exchange.poll(&mut Context::from_waker(Waker::noop())).is_ready();
         if over || now >= *until {
-            // Dropping the broadcast withdraws it if it was not sent.
+            // Dropping the broadcast withdraws it if it was not sent yet.
             self.broadcast = None;
         }
         self.broadcast.is_some()
@@ -164,8 +164,8 @@ impl Master {
             shutdown.end(bus);
             return;
         }
-        // Silent drives come last: each of them costs a whole timeout. Without polls a drive that was online before it
-        // went silent counts as online permanently.
+        // Silent drives come last, because each of them costs a whole timeout. Without polls, a drive that was
+        // online before it went silent keeps counting as online.
         let answers = |stop: &Stop| schedule.is_online(stop.drive) && !stop.in_vain;
         let others_first = shutdown.stops.iter().any(|stop| !stop.is_over() && answers(stop));
         for stop in &mut shutdown.stops {
@@ -182,7 +182,7 @@ fn is_to_stop(image: &DriveImage) -> bool {
     image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control
 }
 
-/// The broadcast that stops all drives of the bus, where all of them are to be stopped and one of them answers.
+/// The broadcast that stops all drives of the bus, if all of them are to be stopped and at least one of them answers.
 fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<Exchange> {
     let drives = &bus.image.drives;
     let all = drives

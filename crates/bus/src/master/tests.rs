@@ -51,7 +51,7 @@ struct Registers {
 }
 
 impl Registers {
-    /// The control word is in 2000, the status word in 2100.
+    /// Register 2000 is the control word, register 2100 the status word.
     fn answer(&mut self, pdu: &RequestPdu) -> Ended {
         if self.silent {
             return Ended::Silent;
@@ -79,7 +79,7 @@ impl Registers {
                 count,
             } => {
                 let run = self.holding.get(&2000).is_some_and(|word| word & 1 == 1);
-                // With a fault (bit 3), the simulated motor does not run.
+                // With a fault (bit 3) the simulated motor does not run.
                 let fault = self.holding.get(&2100).map_or(0, |word| word & 8);
                 self.holding.insert(2100, if run && fault == 0 { 3 } else { 1 | fault });
                 let word = |address| self.holding.get(&address).copied().unwrap_or(0);
@@ -123,7 +123,7 @@ struct Rig {
     /// Whether the drives do not receive a broadcast.
     deaf: bool,
     news: Vec<News>,
-    /// All turns that went onto the line.
+    /// All turns that were sent on the line.
     wire: Vec<(Instant, Turn)>,
     now: Instant,
 }
@@ -214,7 +214,7 @@ impl Rig {
         self.master.opened(self.now);
     }
 
-    /// One transaction, or the wait for the next one.
+    /// Runs one transaction, or the wait for the next one.
     fn step(&mut self) {
         let mut news = Vec::new();
         match self.master.next(self.now, &mut news) {
@@ -355,7 +355,7 @@ fn a_lease_ends_with_the_action_though_its_order_waited_longer_than_it() {
     assert!(rig.news.contains(&News::LeaseRanOut(DriveIndex::new(0))));
 }
 
-/// While the port is lost heartbeats are not evaluated; a reload takes them along.
+/// While the port is lost, heartbeats are not evaluated; a reload hands them over.
 #[test]
 fn a_heartbeat_of_an_outage_is_handed_over_with_the_lease() {
     let mut rig = Rig::new(1);
@@ -437,7 +437,7 @@ fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
         }
         longest = longest.max(rig.now - begin);
     }
-    // At most eight stops in a row, then polls for as long as those took.
+    // At most eight stops in a row are sent, then polls for as long as those took.
     assert!(longest < COST * 32, "{longest:?}");
 }
 
@@ -558,7 +558,8 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
 }
 
-/// How an order to the first drive ends that answers its first `times` writes with that exception, and after how many of them.
+/// The outcome of an order if the first drive answers its first `times` writes with this exception, and the number
+/// of writes.
 fn excepted(run: bool, times: u32, exception: Exception) -> (Outcome, usize) {
     let mut rig = Rig::new(2);
     rig.drives[0].holding.insert(2000, u16::from(!run));
@@ -598,7 +599,7 @@ fn exceptions_that_refuse_nothing_end_no_command_as_refused() {
         }
         let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22].map(Exception);
         for refused in refused {
-            // To a drive that does not know function 06 the write is repeated with function 16.
+            // For a drive that does not know function 06, the write is repeated with function 16.
             let writes = if refused == Exception::FUNCTION { 2 } else { 1 };
             assert_eq!(excepted(run, u32::MAX, refused), (Outcome::Exception(refused), writes));
         }
@@ -635,7 +636,7 @@ fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
             "{exception}: it is back"
         );
     }
-    // Whatever else it answers shows that it is there, and only what is about the request splits what is read.
+    // Any other exception shows that the drive is present, and only one about the request itself splits the read.
     for code in (1..=9).map(Exception) {
         let mut rig = Rig::new(1);
         rig.drives[0].to_reads = Some(code);

@@ -1,5 +1,4 @@
-//! Conditions that a transaction may have to wait for: replies that may still come late, N2 sessions, guards of starts,
-//! a drill.
+//! Conditions for which a transaction may have to wait: late replies, N2 sessions, guards of starts, a drill.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -22,14 +21,14 @@ pub(super) struct Waits {
     pub(super) n2_late: N2LateReplies,
     /// Replies that may still arrive from addresses without a configured drive.
     pub(super) strangers: BTreeMap<u8, LateReplies>,
-    /// Which starts may be written; `None` if no drive is guarded.
+    /// Decides which starts may be written; `None` if no drive is guarded.
     pub(super) starts: Option<StartGate>,
     /// A drive to which a drill sends nothing but stops, and until when.
     pub(super) quiet: Option<(DriveIndex, Instant)>,
 }
 
 impl Waits {
-    /// Until when a transaction is blocked, if it is.
+    /// Until when a transaction is blocked; `None` if it is not.
     pub(super) fn blocks(
         &mut self,
         (drive, pdu): (DriveIndex, &RequestPdu),
@@ -50,13 +49,13 @@ impl Waits {
         late.max(self.n2_late.blocks(pdu, now))
     }
 
-    /// Until when a request has to wait, since it would reach a drive that a drill sends nothing.
+    /// Until when a request has to wait because it would reach a drive to which a drill lets nothing be sent.
     pub(super) fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
         let (quiet, until) = self.quiet?;
         (request.drive == quiet).then_some(until)
     }
 
-    /// Whether the drives that a passed-on request reaches are ready: no command has started for any of them.
+    /// Whether the drives that a passed-on request reaches are ready: none of them has a command in progress.
     pub(super) fn may_pass_on(&mut self, command: &Command, drives: &mut PerDrive<DriveState>, now: Instant) -> Ready {
         let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
         if command.reach().filter_map(|drive| drives.get(drive)).any(busy) {

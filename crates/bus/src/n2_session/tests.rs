@@ -90,7 +90,7 @@ fn a_report_that_never_ends() {
     assert_eq!(polls, MOST_POLLS);
 }
 
-/// Two drives that were identified and read.
+/// Two drives that were already identified and read.
 fn two() -> N2Sessions {
     let now = Instant::now();
     let mut sessions = N2Sessions::new([N2Options::DEFAULT, N2Options::DEFAULT]);

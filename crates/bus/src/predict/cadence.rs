@@ -15,9 +15,9 @@ const STEPS: [u64; 17] = [
 const SLOW_STEPS: [u64; 7] = [1000, 2000, 5000, 10_000, 20_000, 30_000, 60_000];
 /// Greatest ratio of a slow cycle to the fast one, unless the slow cycle is the shortest possible.
 const MOST_RATIO: u32 = 10;
-/// `cycle` and `slow_cycle` for that bus: the shortest cadences that leave a fifth of the line free, with the
-/// points that are [read in the fast class where that is possible](super::faster_points). `None` if the line does
-/// not carry the longest ones, or there is nothing to read.
+/// `cycle` and `slow_cycle` for this bus: the shortest cadences that leave a fifth of the line free, with the
+/// points that are [read in the fast class where that is possible](super::faster_points). `None` if the line cannot
+/// carry even the longest ones, or there is nothing to read.
 pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option<(Duration, Duration)> {
     let faster = with_faster_points(drives);
     let drives = faster.as_deref().unwrap_or(drives);

@@ -7,15 +7,16 @@ use crate::codec::wire::Silence;
 use crate::drive::Profile;
 use crate::process_image::{BusSpec, DriveSpec};
 
-/// The drives of a bus with the points `fast_if_carried` of their profiles in the fast class, if the line carries that with
-/// a fifth to spare; for all drives of the bus or for none. `None` also if there is no such point.
+/// The drives of a bus with the points `fast_if_carried` of their profiles in the fast class, if the line carries
+/// that with a fifth to spare; applied to all drives of the bus or to none. `None` also if there are no such
+/// points.
 pub fn faster_points(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option<Vec<DriveSpec>> {
     with_faster_points(drives).filter(|faster| predict(spec, silence, faster).is_comfortable())
 }
 
-/// The drives with these points in the fast class, whatever the line carries.
+/// The drives with these points in the fast class, whether or not the line can carry it.
 pub(super) fn with_faster_points(drives: &[DriveSpec]) -> Option<Vec<DriveSpec>> {
-    // Drives of a family share their changed profile, as they share the original.
+    // Drives of a family share their changed profile, as they shared the original.
     let mut made: Vec<(Arc<Profile>, Arc<Profile>)> = Vec::new();
     let mut faster = drives.to_vec();
     for drive in &mut faster {

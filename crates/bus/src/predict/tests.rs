@@ -86,8 +86,8 @@ fn a_saturated_line_gives_slow_polls_five_percent() {
     let shortage = p.shortage.unwrap();
     assert_eq!(shortage.fast.unwrap().requests, 10);
     assert_eq!(shortage.slow.unwrap().requests, 20);
-    // Three slow requests fit behind the fast ones of a round: 114.375 + 3 * 10.9167 ms = 147.1 ms, and 3 * 10.9167 /
-    // 148 is the share they need. A single drive needs too much: no split helps.
+    // Three slow requests fit after the fast ones of a round: 114.375 + 3 * 10.9167 ms = 147.1 ms, and 3 * 10.9167
+    // / 148 is the share they need. A single drive needs too much, so no split helps.
     let cycle = Duration::from_millis(148);
     assert_eq!(shortage.remedies, [Remedy::Cycle { cycle, baud: None }]);
     assert_eq!(
@@ -100,7 +100,7 @@ fn a_saturated_line_gives_slow_polls_five_percent() {
 
 #[test]
 fn the_highest_baud_is_told_even_when_it_does_not_carry_all() {
-    // At 9600 a drive takes 44.25 ms, at 38400 11.4375 ms.
+    // At 9600 baud a drive takes 44.25 ms, at 38400 baud 11.4375 ms.
     let drives = drives(&profile("[9600, 19200, 38400]", 0), 1);
     let p = predict(&spec(9600, 10, 1000), Silence::Chars, &drives);
     let cycle = |ms, baud| Remedy::Cycle {
@@ -148,7 +148,7 @@ fn a_family_without_bauds_gets_the_usual_ones() {
 
 #[test]
 fn else_the_bus_is_split() {
-    // At 38400 a drive takes 11.4375 ms of 25 ms: two on a bus, seven drives on four buses.
+    // At 38400 baud a drive takes 11.4375 ms of 25 ms: two drives fit on a bus, so seven drives need four buses.
     let drives = drives(&profile("[19200, 38400]", 0), 7);
     let p = predict(&spec(38_400, 25, 1000), Silence::Chars, &drives);
     assert_eq!(
@@ -162,7 +162,7 @@ fn else_the_bus_is_split() {
             .to_string()
             .contains("split the bus into 4 buses")
     );
-    // At 19200 baud one drive takes 22.4 ms: that needs seven buses, at 38400 four.
+    // At 19200 baud one drive takes 22.4 ms, so seven drives need seven buses; at 38400 baud they need four.
     let p = predict(&spec(19_200, 25, 1000), Silence::Chars, &drives);
     let split = Remedy::Split {
         buses: 4,
@@ -243,7 +243,7 @@ fn every_remedy_carries_the_cadences() {
     assert!(tried > 50, "{tried}");
 }
 
-/// Fast and slow cycles, s, that the schedule itself achieves on a line in virtual time.
+/// Fast and slow cycles, s, that the real schedule achieves on a line in virtual time.
 fn scheduled(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> (f64, f64) {
     let requests = predict(spec, silence, drives).requests;
     let cost = |drive: DriveIndex, read: &PlannedRead| {

@@ -1,5 +1,5 @@
-//! The drive of a proof: the worst behaviour of a drive with such a profile. It starts whenever a run command is set
-//! and nothing prevents it, and keeps turning until a stop arrives. Pure.
+//! The drive in a proof: the worst behaviour of a drive with such a profile. It starts whenever a run command is
+//! set and nothing prevents it, and keeps turning until a stop arrives. Pure.
 
 use std::collections::BTreeMap;
 
@@ -15,33 +15,33 @@ pub(super) enum Start {
     PoweredUp,
     /// Stopped by the gateway.
     Stopped,
-    /// Prepared up to the last word of its sequence.
+    /// The drive has received all words of its start sequence except the last.
     Prepared,
     Running {
         reverse: bool,
     },
-    /// A fault came while the motor ran: the run command is still set.
+    /// A fault occurred while the motor ran: the run command is still set.
     FaultedRunning,
     FaultedStopped,
-    /// Stopped by another of its own means: that one of the words of the profile.
+    /// The drive was stopped by another word of the profile, the one with this index.
     StoppedOtherwise(usize),
-    /// The motor ran at the last poll, and a fault came since.
+    /// The motor ran at the last poll, and a fault has occurred since.
     FaultedSince,
-    /// The motor ran at the last poll, and the drive was switched off and on since.
+    /// The motor ran at the last poll, and the drive has been switched off and on since.
     RestartedSince,
-    /// The motor ran at the last poll, and was stopped at the panel since; it starts whenever a command is written while its word
-    /// is a run command.
+    /// The motor ran at the last poll and has been stopped at the panel since; it starts whenever a command is
+    /// written while its word is a run command.
     StoppedSince,
     /// The control word is a run command except for the bits of `always`.
     WithoutAlways,
-    /// Commanded at its panel; the gateway's word is a stop.
+    /// The drive is under panel control; the gateway's word is a stop.
     Local,
-    /// Commanded at its panel; the gateway's word is a run command.
+    /// The drive is under panel control; the gateway's word is a run command.
     LocalRunning,
 }
 
 impl Start {
-    /// Every state of a drive of this profile.
+    /// Every state that a drive of this profile can have.
     pub(super) fn all(control: &Control) -> Vec<Start> {
         let mut all = vec![
             Start::PoweredUp,
@@ -94,7 +94,7 @@ pub(super) struct Drive<'p> {
     words: BTreeMap<(u8, u16), u16>,
     /// Number of steps of the sequence that the drive has taken.
     prepared: usize,
-    /// The direction in which the motor runs: true is reverse.
+    /// The direction in which the motor runs: `true` is reverse; `None` if it does not run.
     pub(super) running: Option<bool>,
     pub(super) fault: bool,
     local: bool,
@@ -105,7 +105,7 @@ fn key(place: ControlItem) -> (u8, u16) {
 }
 
 impl<'p> Drive<'p> {
-    /// A drive in this state; none where the profile cannot be in it.
+    /// A drive in this state; `None` if drives of the profile cannot have it.
     pub(super) fn new(profile: &'p Profile, control: &'p Control, start: Start) -> Option<Drive<'p>> {
         let mut drive = Drive {
             profile,
@@ -190,7 +190,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    /// The word at this place.
+    /// The word in this register.
     pub(super) fn word(&self, place: ControlItem) -> u16 {
         self.words.get(&key(place)).copied().unwrap_or(0)
     }
@@ -247,7 +247,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    /// Takes a word of the sequence, if it is the next one or an earlier one.
+    /// Processes a word of the sequence, if it is the next one or an earlier one.
     fn step(&mut self, place: ControlItem, word: u16) {
         let free = self
             .control
@@ -292,7 +292,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    /// A register: the control word, or a status word as its steps and its motor make it.
+    /// The content of a register: the control word, or a status word that follows from the steps and the motor.
     fn read(&self, place: ControlItem) -> u64 {
         if let Some(word) = self.words.get(&key(place)) {
             return u64::from(*word);

@@ -49,7 +49,7 @@ impl fmt::Display for Frame {
     }
 }
 
-/// The requests that something is to happen to: of a state that is read again and again the first and the last read.
+/// The requests at which events are tried; of a state that is read repeatedly, only the first and the last read.
 pub(super) fn different(frames: &[Frame]) -> Vec<usize> {
     let other = |one: usize, by: Option<usize>| by.and_then(|by| frames.get(by)) != frames.get(one);
     let all = 0..frames.len();

@@ -149,7 +149,7 @@ fn wrong_profiles_are_refused_with_what_is_wrong() {
     assert_eq!(refused(&with(cia)), None);
 }
 
-/// What is not wrong by itself is warned of.
+/// Profiles that are only suspicious are accepted with a warning.
 #[test]
 fn doubtful_profiles_are_taken_with_a_warning() {
     let bit = "run = { bit = 0 }\nstop = { bit = 0, is = 0 }";
@@ -187,13 +187,13 @@ fn doubtful_profiles_are_taken_with_a_warning() {
         }
     }
     for profile in Profiles::built_in().iter() {
-        // Warnings of a profile that ships are not kept: its text is read once more.
+        // Warnings of built-in profiles are not kept, so the text of the profile is parsed again.
         let again = Profile::parse("again.toml", &profile.text, false).unwrap();
         assert!(again.warnings.is_empty(), "{}: {:?}", profile.name, again.warnings);
     }
 }
 
-/// A reset in words is the pulse of its bits.
+/// A reset that is written as words is reported as the pulse of its bits.
 #[test]
 fn a_reset_in_words_is_a_pulse() {
     let reset = |form: &str| {
@@ -210,7 +210,7 @@ fn a_reset_in_words_is_a_pulse() {
     assert_eq!((of_three, of_two), (by_mask, by_mask));
 }
 
-/// A counterexample says what a person needs: state, command, words in hex.
+/// A counterexample contains what a person needs: state, command, words in hex.
 #[test]
 fn a_counterexample_names_state_command_and_words() {
     let control = "run = { bit = 0 }\nstop = { bit = 0, is = 0 }\nfault_reset = { mask = 5, value = 5 }";

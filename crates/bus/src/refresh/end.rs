@@ -1,4 +1,4 @@
-//! Why a refresh ended, in words.
+//! Why a refresh ended, as text.
 
 use std::fmt;
 

@@ -1,4 +1,4 @@
-//! Words and references last written by orders of the gateway. Pure.
+//! Words and references that orders of the gateway wrote last. Pure.
 
 use std::time::Instant;
 
@@ -30,7 +30,7 @@ impl Reference {
     }
 }
 
-/// Words last written by orders of the gateway, as far as the drive acknowledged them.
+/// Words that orders of the gateway wrote last, as far as the drive acknowledged them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Ordered {
     pub(super) does: Option<InForce>,
@@ -41,12 +41,13 @@ pub(super) struct Ordered {
     pub(super) fed: Option<Instant>,
     /// When the reference was written last.
     pub(super) referred: Option<Instant>,
-    /// The drive was seen to tell that reference.
+    /// Whether the drive was seen to report this reference.
     pub(super) tells_reference: bool,
 }
 
 impl Ordered {
-    /// Whether the registers of the reference were read since it was written, and differ from it though they matched before.
+    /// Whether the registers of the reference were read since it was written, and differ from it although they
+    /// matched before.
     pub(super) fn is_foreign(&mut self, reading: &Reading<'_>) -> bool {
         let (Some(reference), Some(referred)) = (self.reference, self.referred) else {
             return false;
@@ -65,8 +66,8 @@ impl Ordered {
         }
     }
 
-    /// The registers of the reference have these values, or were not read. Returns whether they match the written reference, as
-    /// far as the drive reports it.
+    /// Notes that the registers of the reference have these values (empty if not read). Returns whether they match
+    /// the written reference, as far as the drive reports it.
     pub(super) fn matches_written(&mut self, read: &[u16]) -> bool {
         let Some(reference) = self.reference.filter(|r| read.len() == r.words().len()) else {
             return true;
@@ -78,7 +79,7 @@ impl Ordered {
     }
 }
 
-/// Effect of a word at this place on run and stop; none where it has none.
+/// Effect of a word in this register on run and stop; `None` if it has none.
 pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<InForce>> {
     let word = if place == control.at {
         control.without_reset(word)
@@ -91,11 +92,11 @@ pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<O
     if control.is_run(place, word) {
         return Some(Some(InForce::Run));
     }
-    // Behind a word that stops by other means, or that is neither, nothing is repeated.
+    // After a word that stops by other means, or that neither runs nor stops, nothing is repeated.
     (place == control.at || place == control.run_place()).then_some(None)
 }
 
-/// The registers that lie side by side.
+/// The reference in these items, if its registers are adjacent.
 pub(super) fn reference_of(items: &[(u16, u16)]) -> Option<Reference> {
     let (start, _) = *items.first()?;
     let mut words = [0; LONGEST];

@@ -14,7 +14,7 @@ use crate::drive::control::Control;
 enum Stage {
     /// A reference that is not adjacent to the control word.
     Reference,
-    /// The control word of the drive, and the reference adjacent to it.
+    /// The control word of the drive, with the reference in the next registers.
     Own,
     /// The state of the motor is read.
     Look,
@@ -28,7 +28,7 @@ pub(super) struct Round {
     look: StateRead,
 }
 
-/// Whether what the drive has is what was written.
+/// Whether the values in the drive are those that were written.
 enum Fits {
     Yes,
     No,
@@ -37,7 +37,7 @@ enum Fits {
 }
 
 impl Refresh {
-    /// Puts the next round off until this time.
+    /// Postpones the next round until this time.
     pub(crate) fn put_off(&mut self, until: Instant) {
         self.round = None;
         if let Some(going) = &mut self.repeated.going {
@@ -45,12 +45,12 @@ impl Refresh {
         }
     }
 
-    /// Whether a round has started, and its next step must follow at once.
+    /// Whether a round has started, so that its next step must follow at once.
     pub(crate) fn is_under_way(&self) -> bool {
         self.round.is_some()
     }
 
-    /// Lets another transaction go first: the round then reads again what it has read.
+    /// Lets another transaction go first: the round must then repeat its reads.
     pub(crate) fn others_go_first(&mut self, profile: &Profile) {
         if let Some(round) = self.round.as_mut().filter(|round| round.stage != Stage::Reference) {
             round.stage = first_read(profile);
@@ -109,7 +109,7 @@ impl Refresh {
         })
     }
 
-    /// The reference, where it is adjacent to the control word and one request writes both.
+    /// The reference, if it is adjacent to the control word so that one request writes both.
     fn together(&self, profile: &Profile, control: &Control) -> Option<Reference> {
         let at = control.at.address;
         let reference = self.repeated.ordered.reference?;
@@ -145,7 +145,7 @@ impl Refresh {
     /// The drive answered the present step.
     ///
     /// # Errors
-    /// Why the refresh has ended.
+    /// If the refresh must end; contains the reason.
     pub(crate) fn answered(&mut self, profile: &Profile, reply: &Reply, now: Instant) -> Result<(), End> {
         let (Some((every, _)), Some(control)) = (self.settings, profile.control.as_ref()) else {
             return Ok(());
@@ -223,7 +223,7 @@ impl Refresh {
         }
     }
 
-    /// Whether the motor is in the state of the word: then that is written, else nothing this time.
+    /// Whether the motor is in the state that the word requires: only then is the word written.
     fn judge_motor(&mut self, motor: Motor) -> Result<bool, End> {
         let Some(going) = &mut self.repeated.going else {
             return Ok(false);
@@ -237,7 +237,7 @@ impl Refresh {
             }
             (InForce::Run, Motor::Stands) => Err(End::Stands),
             (InForce::Stop, Motor::Runs) if going.seen => Err(End::Starts),
-            // The motor comes down.
+            // The motor is still slowing down after the stop.
             (InForce::Stop, Motor::Runs) => Ok(true),
             (InForce::Stop, Motor::Stands) => {
                 going.seen = true;
@@ -257,7 +257,7 @@ impl Refresh {
         }
     }
 
-    /// The thread was stalled for this time, in which nothing was written.
+    /// Notes that the thread was stalled for this time, during which nothing was written.
     pub(crate) fn after_stall(&mut self, time: Duration, now: Instant) {
         self.round = None;
         if let Some(going) = &mut self.repeated.going {

@@ -1,4 +1,5 @@
-//! Starts, stops, warnings and control places: which changes become events (each one, unless they come too often), and by whom.
+//! Starts, stops, warnings and control places: which changes become events (each one, unless they are too
+//! frequent), and which client caused them.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -12,7 +13,7 @@ const STARTS_WITHIN: Duration = Duration::from_secs(30);
 /// Time from a command to the poll that shows the motor standing.
 const STOPS_WITHIN: Duration = Duration::from_secs(300);
 
-/// Points whose changes are events: what they are when the point comes and goes, in words.
+/// Points whose changes are events, with the texts for their start and end.
 pub(super) const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
     (
         ModelPoint::Running,
@@ -44,7 +45,7 @@ const EVERY: Duration = Duration::from_secs(10);
 pub(super) struct Watched {
     /// Value as last reported; `None` before the first read.
     reported: Option<bool>,
-    /// Value as last read, and when it changed to that.
+    /// The value last read, and when it changed to that.
     seen: Option<(bool, Option<Instant>)>,
     /// Changes since the last report.
     changes: u64,
@@ -64,8 +65,8 @@ pub(super) struct Change {
 }
 
 impl Watched {
-    /// Takes a reading of the bit. The value at the first read is not a change. A bit that changes too often is reported now
-    /// and then, with the number of changes left out, and finally with its value.
+    /// Processes a reading of the bit. The first value read is not a change. A bit that changes too often is
+    /// reported at intervals, with the number of omitted changes, and finally with its value.
     pub(super) fn read(&mut self, value: bool, now: Instant) -> Option<Change> {
         let Some((seen, before)) = self.seen else {
             (self.seen, self.reported) = (Some((value, None)), Some(value));
@@ -198,7 +199,8 @@ mod tests {
     }
 
     proptest! {
-        /// However it flaps: the count of events is bounded, none is lost without being counted, and the last one is true.
+        /// Property for a bit that changes in any way: the number of events is bounded, no change goes uncounted,
+        /// and the last event has the true value.
         #[test]
         fn a_bit_that_flaps_is_bounded_and_told_in_the_end(reads in prop::collection::vec((any::<bool>(), 0u64..3000), 1..2000)) {
             let (mut bit, start) = (Watched::default(), Instant::now());
@@ -218,7 +220,7 @@ mod tests {
             }
             let most = u64::from(BURST) + (now - start).as_secs() / EVERY.as_secs() + 1;
             prop_assert!(reported <= most, "{} of {}", reported, most);
-            // The bit stays as it is.
+            // The bit does not change any more.
             let last = last.unwrap();
             if let Some(change) = bit.read(last, now + 2 * EVERY) {
                 told = Some(change.value);

@@ -43,7 +43,7 @@ impl Report {
         });
     }
 
-    /// Reports a command that was refused at its turn, as other refusals are reported.
+    /// Reports a command that was refused when it was about to be sent, like any other refusal.
     pub(super) fn denied(&self, denied: &Denied, now: Instant) {
         let Denied {
             drive,
@@ -64,7 +64,7 @@ impl Report {
         self.events.publish_refusal(refused, now);
     }
 
-    /// Counts an action of supervision that failed, and reports it if there is a `text`.
+    /// Counts a failed action of supervision, and reports it if there is a `text`.
     pub(super) fn action_failed(&self, index: DriveIndex, text: impl FnOnce(&str) -> Option<String>) {
         let Some(drive) = self.image.drives.get(index) else {
             return;

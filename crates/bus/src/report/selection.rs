@@ -27,7 +27,7 @@ impl Report {
         wanted
     }
 
-    /// Notes that the drive lacks a monitoring register: its process data is then served as it is.
+    /// Notes that the drive has no such monitoring register: its process data is then used as it is.
     pub(super) fn monitor_refused(
         &mut self,
         (index, drive): (DriveIndex, &DriveImage),

@@ -24,7 +24,8 @@ fn options() -> BusOptions {
     }
 }
 
-/// A reader that saw the bus down found values of its drives good (a motor that runs on a bus that is down).
+/// A reader that sees the bus down must find no good values of its drives; a good value would show a motor running
+/// on a bus that is down.
 #[test]
 fn whoever_sees_the_bus_down_sees_every_drive_offline() {
     let image = image(200);
@@ -79,7 +80,7 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
     assert_eq!(down, 2, "another loss is another one");
 }
 
-/// Lets the drive show that fault bit and that code, `ms` after the report began.
+/// Stores this fault bit and this code in the drive's image, `ms` after the report began.
 fn show_fault(report: &mut Report, image: &BusImage, (fault, code): (bool, u16), now: Instant) {
     let profile = &image.drives[0].spec.profile;
     for (point, word) in [

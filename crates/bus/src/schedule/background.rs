@@ -12,24 +12,24 @@ pub(super) struct BackgroundShare {
     balance: [f64; 2],
     /// The longest transaction that was wanted, which limits the saved time.
     longest: Duration,
-    /// By how much transactions took longer than calculated of late: drives are slower than their profiles say.
+    /// By how much recent transactions took longer than calculated, because drives are slower than their profiles state.
     overrun: Duration,
 }
 
-/// Whether a background transaction may go now.
+/// Whether a background transaction may be sent now.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Admission {
-    /// The request goes in idle time: its share pays for any excess over the calculated time.
+    /// The request uses idle time: its share only pays for time beyond the calculated one.
     InIdleTime(Duration),
-    /// The request goes instead of a due poll: its share pays for it.
+    /// The request replaces a due poll: its share pays for it.
     InShare,
     /// The request is not admitted before this time, unless the line rests earlier.
     NotBefore(Instant),
 }
 
 impl BackgroundShare {
-    /// Earns shares from the time of process data, so that they are shares of its rate: the time of commands and slow polls is
-    /// not process data's to give.
+    /// Earns shares from the time of process data, so that they are proportional to it: time of commands and slow
+    /// polls does not count.
     pub(super) fn earn(&mut self, passed: Duration) {
         for (pace, balance) in Pace::ALL.into_iter().zip(&mut self.balance) {
             // Share not used in an hour does not become a burst later.
@@ -49,9 +49,9 @@ impl BackgroundShare {
 }
 
 impl Schedule {
-    /// Whether a transaction of that pace may go at `now`, which takes about `cost`. `idle`: nothing else is due. In
-    /// idle time it does not delay the next round of process data, and goes only where its share owes nothing; instead
-    /// of a poll that is due it goes once its share has earned it.
+    /// Whether a transaction of this pace that takes about `cost` may be sent at `now`. `idle` means that nothing
+    /// else is due. In idle time it must not delay the next round of process data, and is sent only if its share
+    /// has no debt; in place of a due poll it is sent once its share has earned it.
     pub(crate) fn admits_background(&mut self, pace: Pace, cost: Duration, idle: bool, now: Instant) -> Admission {
         let share = &mut self.background;
         let cost = cost + share.overrun;
@@ -85,7 +85,7 @@ impl Schedule {
             Admission::InShare | Admission::NotBefore(_) => took,
         };
         if matches!(admission, Admission::InShare) {
-            // The transaction had the turn of a poll, so polls that waited for that turn wait no longer.
+            // The transaction replaced a poll, so polls count as served once.
             self.share.polled(Duration::ZERO);
         }
         if answered && let Admission::InIdleTime(cost) = admission {
@@ -93,7 +93,7 @@ impl Schedule {
             share.overrun = over.max(share.overrun.mul_f64(0.9));
         }
         if let Some(balance) = share.balance.get_mut(pace as usize) {
-            // There was room for this request, so the next one will find room too.
+            // There was room for this request, so there will be room for the next one too.
             let before = match admission {
                 Admission::InIdleTime(_) => balance.min(0.0),
                 Admission::InShare | Admission::NotBefore(_) => *balance,

@@ -1,4 +1,4 @@
-//! Which poll is due: the grid of fast rounds, the credit of slow polls, probes.
+//! Decides which poll is due: the grid of fast rounds, the credit of slow polls, probes.
 
 use std::time::{Duration, Instant};
 
@@ -7,9 +7,9 @@ use super::{FIRST_SHARE, Poll, RoundStart, Schedule, Turn};
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 
 impl Schedule {
-    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full, idle moments in which
-    /// none of them fits do not help them. The greater share that they have at first is one of the time that commands
-    /// leave: with half of the line for commands, process data would have nothing.
+    /// Slow polls earn their share of all time, including idle time: on a nearly full line, idle moments too short
+    /// for any of them do not help. Their larger share at first counts only the time that commands leave:
+    /// otherwise, with half of the line used by commands, process data would get nothing.
     pub(super) fn earn(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.earned_until);
         self.earned_until = now;
@@ -28,8 +28,8 @@ impl Schedule {
             return;
         }
         self.join_again(now);
-        // The first reads of all drives come before the second ones, so a reply that comes twice meets another drive's
-        // request.
+        // The first reads of all drives come before the second ones, so that a duplicate reply meets a request to
+        // another drive.
         let mut reads: Vec<(usize, DriveIndex, PlannedRead)> = Vec::new();
         for (index, drive) in self
             .drives
@@ -59,13 +59,13 @@ impl Schedule {
         let cycle = self.round_started.map(|before| now.saturating_duration_since(before));
         self.round_started = Some(now);
         self.new_round = Some(RoundStart { at: now, cycle });
-        // The grid is kept whatever delayed this round; rounds that were missed altogether are not caught up.
+        // The grid is kept whatever delayed this round; missed rounds are not made up for.
         let next = self.round_due + self.cadence.fast;
         let missed = now.saturating_duration_since(next).as_nanos() / self.cadence.fast.as_nanos().max(1);
         self.round_due = next + self.cadence.fast * u32::try_from(missed).unwrap_or(0);
     }
 
-    /// Parts of a block that was refused long ago, by mistake perhaps, are read as one again.
+    /// Joins parts of a block that was refused long ago, perhaps by mistake, into one read again.
     fn join_again(&mut self, now: Instant) {
         for drive in &mut self.drives {
             let due = |item: &&Item| item.whole_again.is_some_and(|at| at <= now);
@@ -77,7 +77,7 @@ impl Schedule {
 
     pub(super) fn due_poll(&mut self, now: Instant) -> Option<Poll> {
         self.turn = Turn::Due;
-        // Many offline drives must not keep the others waiting: after one probe without success comes a fast poll.
+        // Many offline drives must not delay the others: a probe without success is followed by a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);
@@ -99,7 +99,7 @@ impl Schedule {
                 probe: false,
             });
         }
-        // In the idle time of a round a slow poll must not delay the next one.
+        // A slow poll in the idle time of a round must not delay the next round.
         let fast_active = self.round_started.is_some();
         slow.filter(|(_, _, cost)| !fast_active || now + *cost <= self.round_due)
             .map(|(_, poll, _)| poll)
@@ -142,8 +142,8 @@ impl Schedule {
     }
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
-        // Points read once when a drive comes online go first: commands in percent depend on its frequencies. The bits of the
-        // status word follow: register 0x8000 is stale until all of them were read.
+        // Points of the class `once` go first when a drive comes online: commands in percent depend on its
+        // frequencies. The bits of the status word follow: register 0x8000 is stale until all of them were read.
         let rank = |drive: &DriveSchedule, due: Instant, item: &Item| {
             let sound = item.failures == 0 && !item.refused;
             let first = item.read.class == PollClass::Once && sound;
@@ -202,7 +202,7 @@ impl Schedule {
     }
 }
 
-/// A due request waits for its turn, not for a time.
+/// Whether a request is not due yet; a due request only waits to be chosen.
 fn is_ahead(due: Instant, now: Instant) -> bool {
     due > now
 }

@@ -11,30 +11,31 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 const DEAD_SHARE: f64 = 0.016;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Every so many probes ask for something else: what the others ask for may be what the drive never answers. The second number
-/// is that of a drive with one read only, of which parts are asked.
+/// One in this number of probes reads something else, because the usual read may be one that the drive never
+/// answers. The second number is for a drive with only one read, of which parts are then read.
 const OTHER_PROBE: (usize, usize) = (3, 2);
-/// When a drive that went away is probed first, whatever that costs: most outages are short. A drive that answers saves up
-/// for it, out of the same share.
+/// Times after a drive went offline at which it is probed at any cost, because most outages are short. The drive
+/// has saved the time for it out of its share while it was online.
 const EARLY_PROBES: [Duration; 3] = [
     Duration::from_millis(500),
     Duration::from_millis(1_000),
     Duration::from_millis(2_000),
 ];
-/// First and longest pause before a request that the drive refused is tried again: a drive that is starting may refuse what
-/// it soon has, one that never has it must not take time from others.
+/// First and longest pause before a refused request is repeated: a drive that is starting may refuse registers that
+/// it soon has, and one that never has them must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
-/// First and longest pause before a request that is not answered, while the drive answers others, is tried again.
+/// First and longest pause before a request is repeated that is not answered while the drive answers others.
 pub(super) const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-/// Pause before the next request that a drive may leave unanswered, as a multiple of the time that the last such request took
-/// on the line: while the silent register is sought, and once the register is known.
+/// Pause before the next request that a drive may leave unanswered, as a multiple of the time that the last such
+/// request took on the line: while the silent register is being located, and once it is known.
 const SOUGHT_PAUSE: u32 = 4;
 const KNOWN_PAUSE: u32 = 50;
 /// How often a register is tried again before it counts as one that the drive never answers.
 const TRIED_AGAIN: u32 = 3;
 
-/// Pause before a read that no manual states is tried: where it failed, and where its reply proved nothing.
+/// First and longest pause before a read that no manual describes is tried again, after it failed or its reply
+/// proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
 /// Time of process data without a failure that shows a healthy line.
@@ -45,14 +46,14 @@ const BUSY_PAUSE: Duration = Duration::from_secs(1);
 #[derive(Debug, Clone)]
 pub(super) struct Item {
     pub(super) read: PlannedRead,
-    /// The read of the plan that this one is a part of.
+    /// The planned read of which this one is a part.
     pub(super) origin: PlannedRead,
     pub(super) due: Instant,
-    /// Put off, because a late reply to another request could pass for its own.
+    /// Whether the read is postponed because a late reply to another request could be mistaken for its own.
     pub(super) postponed: bool,
     pub(super) cost: Duration,
     pub(super) refused: bool,
-    /// The drive answers others and not this one: that does not take it away.
+    /// Whether the drive answers other reads but not this one, which does not make the drive offline.
     pub(super) mute: bool,
     /// Number of refusals in a row.
     pub(super) refusals: u32,
@@ -63,17 +64,17 @@ pub(super) struct Item {
     pub(super) wanted: bool,
     /// Whether the read was never answered so far.
     pub(super) unread: bool,
-    /// Time since which a command changed what the item reads: it is read before the round, so that the command is
+    /// When a command changed the registers of this item; it is then read before the round, so that the command is
     /// confirmed soon.
     pub(super) asked: Option<Instant>,
-    /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
+    /// When the parts of a refused block may be joined again, since it may have been refused by mistake.
     pub(super) whole_again: Option<Instant>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Presence {
     Online,
-    /// Probed again at this time; the pause before it.
+    /// The drive is offline: time of the next probe, and the pause before it.
     Away(Instant, Duration),
 }
 
@@ -82,14 +83,14 @@ pub(super) struct DriveSchedule {
     /// Tries after the first.
     pub(super) retries: u32,
     pub(super) presence: Presence,
-    /// Until when a drill sends the drive nothing.
+    /// Until when a drill lets nothing be sent to the drive.
     pub(super) quiet_until: Option<Instant>,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
     /// Whether the drive answered a session step (Identify, poll of N2) since its last probe.
     pub(super) heard: bool,
-    /// Whether the drive left a command unanswered: a fast poll shows whether it is there, before anything else is
-    /// read.
+    /// Whether the drive left a command unanswered: a fast poll then shows whether it is present, before anything
+    /// else is read.
     pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,
@@ -105,19 +106,19 @@ pub(super) struct DriveSchedule {
     pub(super) behind_state: Vec<PlannedRead>,
     /// Slow reads of the plan that show bits of the status word.
     pub(super) behind_status_word: Vec<PlannedRead>,
-    /// Reads that are longer than a manual states, and those of them that no reply has proved since the drive came online.
+    /// Reads that are longer than a manual describes and that no reply has proved since the drive came online.
     trials: Vec<PlannedRead>,
     pub(super) unproved: Vec<PlannedRead>,
 }
 
-/// The probes of a drive soon after it went away.
+/// The probes of a drive soon after it went offline.
 #[derive(Debug)]
 pub(super) struct EarlyProbes {
-    /// Probes that it may have at any cost: all of them again once it answered for [`SOUND_FOR`].
+    /// Number of probes that the drive may have at any cost; restored completely once it has answered for [`SOUND_FOR`].
     free: usize,
     /// Time on the line that the drive has saved up for more early probes.
     saved: Duration,
-    /// Since when the drive is online, which saves up time.
+    /// Since when the drive has been online, which earns time for probes.
     online_since: Option<Instant>,
     /// When the drive went away, and the number of early probes since.
     outage: Option<(Instant, usize)>,
@@ -140,13 +141,13 @@ impl EarlyProbes {
         (self.online_since, self.outage) = (Some(now), None);
     }
 
-    /// The drive is to be rediscovered: if it does not answer, it goes away then.
+    /// Notes that the drive is to be rediscovered: if it does not answer, it goes offline only then.
     pub(super) fn found_anew(&mut self) {
         self.outage = None;
     }
 
-    /// When the next early probe comes, after a request without success that took the line for `took`; `None` when the
-    /// probes are used up.
+    /// When the next early probe is due, after a request without success that took `took` on the line; `None` when
+    /// the probes are used up.
     fn next(&mut self, now: Instant, took: Duration) -> Option<Instant> {
         if let Some(since) = self.online_since.take() {
             let online = now.saturating_duration_since(since);
@@ -266,8 +267,8 @@ impl DriveSchedule {
         self.items.splice(index..=index, parts.collect::<Vec<_>>());
     }
 
-    /// The drive is away: the one that comes back may be another, so only reads that every drive answers are used
-    /// first.
+    /// Notes that the drive is offline: another drive may return in its place, so only reads that every drive
+    /// answers are used first.
     fn doubt_trials(&mut self, now: Instant) {
         for block in self.trials.clone() {
             let within: Vec<PlannedRead> = self.items.iter().map(|item| item.read).collect();
@@ -293,7 +294,7 @@ impl DriveSchedule {
             return;
         }
         self.presence = if pause.is_zero() {
-            // The transaction on the line at that time, and those before the probe, fit within the longest pause, too.
+            // The transaction then on the line, and those before the probe, must fit within the longest pause as well.
             Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first)
         } else {
             let doubled = doubled(pause);
@@ -302,8 +303,8 @@ impl DriveSchedule {
         };
     }
 
-    /// When a slow read is due. If a read was postponed for long and failed together with process data, the line was to
-    /// blame: it is due once process data came without a fault for a while.
+    /// When a slow read is due. If a read was postponed for long and failed together with process data, the line
+    /// was the cause: it is then due once process data was received without errors for a while.
     pub(super) fn due(&self, item: &Item) -> Instant {
         let Some((failed_at, troubled)) = item.failed_at.zip(self.troubled).filter(|_| item.failures > 0) else {
             return item.due;
@@ -326,8 +327,8 @@ impl DriveSchedule {
         self.unanswered && self.items.iter().any(Item::is_process_data)
     }
 
-    /// Whether the answers to this read show that the drive is present. A read that was split or joined since it was
-    /// queued shows nothing: the reads in its place do.
+    /// Whether the answers to this read show that the drive is present. A read that was split or joined since it
+    /// was queued shows nothing; the reads that replaced it do.
     pub(super) fn shows_presence(&self, read: &PlannedRead) -> bool {
         let Some(item) = self.items.iter().find(|item| item.read == *read) else {
             return false;
@@ -338,8 +339,8 @@ impl DriveSchedule {
         }
     }
 
-    /// What the drive is asked to find out whether it answers: the first read that is not known to be in vain, whose reply may
-    /// also be that to the probe before; every third time another one, parts of that read among them.
+    /// The read that probes whether the drive answers: the first one not known to be unanswered, for which the
+    /// reply to the previous probe also counts; every third time another one, including parts of that read.
     pub(super) fn probe(&self) -> Option<PlannedRead> {
         let (known, mute): (Vec<&Item>, Vec<&Item>) = self.items.iter().partition(|item| !item.mute);
         let mut all = known.into_iter().chain(mute).map(|item| item.read);
@@ -357,9 +358,9 @@ impl DriveSchedule {
         turn.and_then(|turn| others.get(turn).copied()).or(Some(first))
     }
 
-    /// The drive answers other reads, and left this one unanswered in every try. A block is read in halves from now on, until the
-    /// register that silences the drive is found; that register is tried again after a pause that grows.
-    /// `took` is the time of that request on the line.
+    /// Notes that the drive answers other reads but left this one unanswered in every attempt. A block is read in
+    /// halves from now on, until the register that silences the drive is found; that register is tried again after
+    /// growing pauses. `took` is the time of the request on the line.
     pub(super) fn in_vain(&mut self, read: PlannedRead, took: Duration, now: Instant) {
         self.divide(read, now);
         for item in self.items.iter_mut().filter(|item| item.mute) {
@@ -375,7 +376,7 @@ impl DriveSchedule {
     fn divide(&mut self, read: PlannedRead, now: Instant) {
         let retries = self.retries;
         let Some(index) = self.items.iter().position(|item| item.read == read) else {
-            // The block was taken apart meanwhile: any of its parts may be what is not answered.
+            // The block was split meanwhile: any of its parts may be the unanswered one.
             let parts = self
                 .items
                 .iter_mut()
@@ -399,7 +400,7 @@ impl DriveSchedule {
         }
     }
 
-    /// Reads the halves of a block that was not answered instead of it; false where the block cannot be divided.
+    /// Replaces an unanswered block by its halves; false if it cannot be divided.
     fn halve(&mut self, index: usize, now: Instant) -> bool {
         let Some((item, (low, high))) = self
             .items
@@ -409,7 +410,7 @@ impl DriveSchedule {
             return false;
         };
         let (origin, cost) = (item.origin, item.cost);
-        // The whole was tried often enough: each part is tried once.
+        // The whole block was tried often enough, so each half is tried only once.
         let halves = [low, high].map(|half| Item {
             mute: true,
             failures: self.retries,
@@ -420,7 +421,7 @@ impl DriveSchedule {
         true
     }
 
-    /// The drive answered `part` of a block whose whole it does not answer: the part is read by itself.
+    /// Notes that the drive answered `part` of a block that it does not answer as a whole: the part is read separately.
     pub(super) fn set_apart(&mut self, part: PlannedRead, now: Instant) {
         let contains = |item: &Item| {
             item.read.class == part.class && item.read.count > part.count && item.read.covers(part.table, part.start)
@@ -511,7 +512,7 @@ impl DriveSchedule {
     }
 }
 
-/// Parts of a block, larger ones first, by which a drive is asked that answers all of it but for one register.
+/// Parts of a block, larger ones first, used to probe a drive that answers all of the block except one register.
 fn parts(block: PlannedRead) -> Vec<PlannedRead> {
     let halves = |of: &[PlannedRead]| -> Vec<PlannedRead> {
         let halves = of.iter().filter_map(|part| Plan::halves(*part));
@@ -523,7 +524,7 @@ fn parts(block: PlannedRead) -> Vec<PlannedRead> {
     [halved, quarters, eighths].concat()
 }
 
-/// The pause after this one between probes of a drive that stays away.
+/// The pause that follows this one between probes of a drive that stays offline.
 fn doubled(pause: Duration) -> Duration {
     (pause * 2).min(PROBE_PAUSE.1)
 }

@@ -7,7 +7,7 @@ use super::drives::{MUTE_PAUSE, Presence};
 use super::{Change, Poll, Polled, Schedule};
 use crate::drive::{DriveIndex, PollClass};
 
-/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
+/// Garbled answers in a row after which a drive counts as offline: something is present but cannot be read.
 const MOST_GARBLED: u32 = 8;
 
 impl Schedule {
@@ -26,7 +26,7 @@ impl Schedule {
             drive.presence = Presence::Online;
             drive.early.answers_again(now);
             drive.probes = 0;
-            // The drive answers again, but not the read after which it counted as away.
+            // The drive answers again, but not the read whose failure made it offline.
             if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
                 drive.in_vain(vain, Duration::ZERO, now);
                 drive.set_apart(poll.read, now);
@@ -77,7 +77,7 @@ impl Schedule {
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
             drive.probes += usize::from(drive.tried);
-            // A drive that has just answered another request is there: the request is repeated at once.
+            // A drive that has just answered another request is present, so the request is repeated at once.
             if (!drive.tried || drive.heard) && drive.failures <= retries {
                 drive.presence = Presence::Away(now, pause);
                 return Change::None;
@@ -92,7 +92,7 @@ impl Schedule {
         }
         drive.unanswered = true;
         if !drive.shows_presence(&poll.read) {
-            // A request that is never answered must not take the drive away while its process data comes.
+            // A request that is never answered must not make the drive offline while its process data is received.
             let mut in_vain = false;
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
@@ -108,7 +108,7 @@ impl Schedule {
         }
         drive.failures += 1;
         drive.troubled = Some(now);
-        // While it is retried, the drive gets no other request; a damaged reply shows that something is there.
+        // While this request is retried, the drive gets no other request; a damaged reply shows that the drive is present.
         drive.doubted &= drive.failures <= retries && poll.read.class == PollClass::Fast;
         if drive.failures <= retries {
             if poll.read.class == PollClass::Fast {
@@ -125,8 +125,8 @@ impl Schedule {
         Change::Offline
     }
 
-    /// The process data of a drive that did not answer something else is read now, though its round is not due: slow reads
-    /// wait for it.
+    /// Reads the process data of a drive now that did not answer another request, although its round is not due:
+    /// slow reads wait for the result.
     fn ask_whether_it_answers(&mut self, index: DriveIndex, now: Instant) {
         if !self.round.is_empty() {
             return;

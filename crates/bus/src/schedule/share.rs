@@ -1,18 +1,19 @@
 //! The share of commands on a busy line: at most as much time as process data.
 //!
-//! The share holds everything that a command causes: its steps, reads of the drive's own control word, forwarded reads, and
-//! the reads that confirm it. Without that a client that writes often would slow the polls twice.
+//! The share of commands contains everything that a command causes: its steps, reads of the drive's control word,
+//! forwarded reads, and the reads that confirm it. Otherwise a client that writes often would slow down polls
+//! twice.
 
 use std::time::Duration;
 
 use super::COMMANDS_IN_A_ROW;
 use crate::order::Urgency;
 
-/// Time of the line that was taken ahead of those who pay for it.
+/// Time of the line that was used in advance, before the others have paid for it.
 #[derive(Debug, Default)]
 struct Lead {
     time: Duration,
-    /// Time of the last one: eight of it are the lead that a burst may have.
+    /// Duration of the last transaction: a burst may be ahead by eight of these.
     took: Duration,
 }
 
@@ -22,8 +23,8 @@ impl Lead {
         self.took = took;
     }
 
-    /// Transactions that go regardless of room leave none until they are paid, and are not counted beyond that: others
-    /// would wait without limit.
+    /// Adds a transaction that is sent regardless of room. It uses up the room until it is paid for, and is not
+    /// counted beyond that: otherwise the others would wait without limit.
     fn fill(&mut self, took: Duration) {
         let full = (self.time + took).min(COMMANDS_IN_A_ROW * took);
         (self.time, self.took) = (self.time.max(full), took);
@@ -42,7 +43,7 @@ impl Lead {
 pub(super) struct CommandShare {
     /// Time caused by all commands, in excess of process data; counted since polls last had nothing to do.
     all: Lead,
-    /// Time of stops alone: they wait for no other command.
+    /// Time used by stops alone, which wait for no other command.
     stops: Lead,
     /// Commands since the last poll, with the reads that they cause.
     in_a_row: u32,
@@ -71,14 +72,14 @@ impl CommandShare {
         }
     }
 
-    /// Whether a read for a command goes before the next command. One such read shows the effect of all commands before
-    /// it, so waiting ones go first, eight of them.
+    /// Whether a read for a command goes before the next command. One such read shows the effect of all earlier
+    /// commands, so waiting commands go first, up to eight.
     pub(super) fn reads_before_commands(&self, command_waits: bool) -> bool {
         !command_waits || self.unread >= COMMANDS_IN_A_ROW
     }
 
-    /// Whether a read for a command goes before a due poll: two of them never do, and none on top of stops that have all
-    /// their half.
+    /// Whether a read for a command goes before a due poll: never two of them in a row, and none if stops already
+    /// use their half of the line.
     pub(super) fn reads_before_polls(&self) -> bool {
         let room = self.all.has_room() && self.stops.has_room();
         !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && room
@@ -107,7 +108,7 @@ impl CommandShare {
         self.all.time += took;
     }
 
-    /// A poll has ended. `paid` is the time that commands may take for it.
+    /// Notes the end of a poll. `paid` is the time that commands may take for it.
     pub(super) fn polled(&mut self, paid: Duration) {
         self.in_a_row = 0;
         self.stops_in_a_row = 0;

@@ -1,4 +1,4 @@
-//! Cadence and fairness of a line in virtual time; commands, absent drives, and chance have files of their own.
+//! Cadence and fairness of a line in virtual time; tests of commands, absent drives and random cases are in separate files.
 
 use std::collections::BTreeMap;
 
@@ -131,8 +131,8 @@ fn a_saturated_line_is_never_idle_and_fair() {
 
 #[test]
 fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
-    // Two fast polls take 24 of 30 ms, so no slow poll fits after them. A slow poll would take 2.4 % of the line, which
-    // has room.
+    // Two fast polls take 24 of 30 ms, so no slow poll fits after them. A slow poll would take 2.4 % of the line,
+    // which is available.
     let mut rig = PolledLine::new(2, Duration::from_millis(30));
     rig.run(Duration::from_secs(5));
     rig.log.clear();
@@ -144,7 +144,7 @@ fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
 
 #[test]
 fn slow_polls_that_fit_into_idle_time_delay_no_round() {
-    // Six slow polls are due at once each second; two of them fit behind the six fast ones of a round.
+    // Six slow polls are due at once each second; two of them fit after the six fast ones of a round.
     let mut rig = PolledLine::new(6, Duration::from_millis(100));
     rig.run(Duration::from_secs(5));
     let begin = rig.now;

@@ -1,4 +1,4 @@
-//! Rules of the comparison; the whole of it with a drive is in the seeded world.
+//! Rules of the comparison; the whole behaviour with a drive is tested in the seeded world.
 
 use drivegate_testkit::nx;
 
@@ -37,7 +37,7 @@ fn what_a_comparison_shows() {
         "the register is perhaps not there"
     );
     assert_eq!(compare(torque, (350.0, 350.0), 41.0), Verdict::Differs);
-    // Speeding up: the monitoring register lies between what was before and what came after.
+    // The motor speeds up: the monitored value lies between the earlier and the later process data.
     assert_eq!(compare(torque, (10.0, 90.0), 50.0), Verdict::Agrees);
 }
 

@@ -95,7 +95,7 @@ impl SupervisedDrive {
         );
     }
 
-    /// `ms` later the drive shows whether it runs, and its lease is evaluated.
+    /// Lets the drive show `ms` later whether it runs, and evaluates its lease.
     fn look(&mut self, ms: u64, runs: bool) {
         self.now += Duration::from_millis(ms);
         self.shows(ModelPoint::Running, Value::Bool(runs));
@@ -107,7 +107,7 @@ impl SupervisedDrive {
         next_command(&mut self.bus.queue.lock(), Urgency::Read, self.now)
     }
 
-    /// As [`SupervisedDrive::look`]; returns the action that is written then, and the receiver of its answer.
+    /// Evaluates like [`SupervisedDrive::look`]; returns the action written then, and the receiver of its answer.
     fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
         self.look(ms, runs);
         assert!(self.bus.queue.lock().len() <= 1, "one at a time");
@@ -158,7 +158,7 @@ impl SupervisedDrive {
         self.image().spec.clone()
     }
 
-    /// Leases that ran out while the drive ran.
+    /// Number of leases reported to have expired while the drive ran.
     fn reported(&self) -> usize {
         let ran_out = |news: &&News| matches!(news, News::LeaseRanOut(_));
         self.news.iter().filter(ran_out).count()
@@ -235,7 +235,8 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
             command.answer(&failed, rig.now);
             assert!(rig.after(10, true).is_none(), "a pause first");
         }
-        // The action is not repeated even if the drive was seen to stand meanwhile: the cause is unknown.
+        // The action is not repeated, even if the drive was seen standing meanwhile: the cause of the standstill is
+        // unknown.
         let command = rig.after(1_000, false).expect("the action");
         command.answer(&acknowledged(), rig.now);
         for _ in 0..20 {
@@ -257,7 +258,7 @@ fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     assert_eq!(rig.reported(), 1);
 }
 
-/// Writes of a command to a drive that has the run command: the point that takes it, and its value there.
+/// Writes of a command to a drive that has its run command on: the point that is written, and its value.
 fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Value)> {
     let mut run = CommandRun::new(command, profile);
     let (mut words, mut now, mut sets) = (KnownWords::default(), now, Vec::new());
@@ -276,7 +277,7 @@ fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Val
                 count,
                 ..
             } => Reply::Bits(vec![true; usize::from(*count)]),
-            // The run command is set wherever it is, so that a stop has something to take away.
+            // The run command reads as set in every register, so that a stop has something to take away.
             RequestPdu::Read { count, .. } => Reply::Registers(vec![0x0003; usize::from(*count)]),
             RequestPdu::N2(Session::Release { .. }) => Reply::Written,
             write => {
@@ -388,7 +389,7 @@ fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     let command = rig.after(1_000, true).expect("the drive reports its range now");
     command.answer(&acknowledged(), rig.now);
     assert!(rig.after(1_000, true).is_none());
-    // A client that is back has its own reference.
+    // A client that returns has its own reference.
     let mut rig = SupervisedDrive::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
     rig.heartbeat();
     assert!(rig.after(5_000, true).is_none());
@@ -419,7 +420,7 @@ fn an_action_that_is_due_outlives_the_bus() {
         "what was acknowledged last is not due again"
     );
     assert_eq!(rig.reported(), 1);
-    // No action is due for a drive that is only monitored from now on, nor if nothing must be written.
+    // No action is due for a drive that is only monitored from now on, nor if nothing is to be written.
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
         |spec| spec.supervision = None,
@@ -470,7 +471,7 @@ fn a_motor_that_may_start_by_itself_gets_its_action() {
     rig.shows(ModelPoint::Run, Value::Bool(true));
     assert!(rig.after(100, false).is_some(), "it may start by it, or run");
     assert_eq!(rig.reported(), 1);
-    // For a family that does not report its run command, the written one counts.
+    // For a family that does not report its run command, the command that was written counts.
     let profiles = Profiles::built_in();
     for (word, acts) in [(Some(1), true), (Some(0), false), (None, false)] {
         let mut rig = SupervisedDrive::of(profiles.get("eaton-hvx").unwrap(), LeaseAction::Stop);
@@ -528,7 +529,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     assert!(rig.after(4_900, true).is_none());
     assert_eq!(rig.news, [News::RunsUnsupervised(DriveIndex::new(0), Adopted::Yes)]);
     assert_eq!(rig.after(100, true).expect("the stop").urgency(), Urgency::Stop);
-    // A client that commands the drive before it is seen to run has its own lease.
+    // A client that commands the drive before it is seen running has a lease of its own.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     rig.heartbeat();
     assert!(rig.after(100, true).is_none());

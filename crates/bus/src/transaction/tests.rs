@@ -1,4 +1,4 @@
-//! Transactions in Modbus RTU; those in Modbus ASCII, and random ones of both, have files of their own.
+//! Transactions in Modbus RTU; tests of Modbus ASCII, and random ones of both, are in separate files.
 
 use super::*;
 use crate::codec::{Table, rtu};
@@ -138,7 +138,7 @@ fn garbage_ends_the_exchange_once_no_more_of_it_can_come() {
     };
     assert!(until - now < char_time * 5, "a whole reply came: {:?}", until - now);
     assert_eq!(transaction.on_time(until), corrupt("check code is wrong"));
-    // An impossible function, and the rest of the reply is still on the line.
+    // The function is impossible, and the rest of the reply is still on the line.
     let mut transaction = start(&request, &frame, now);
     let Step::Wait(until) = transaction.on_bytes(now, &[1, 0x83, 0x99, 0x99, 0x99]) else {
         panic!("it ends at once")

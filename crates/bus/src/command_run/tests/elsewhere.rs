@@ -1,8 +1,8 @@
-//! A run bit that was taken away behind the gateway's back is not brought back by a command that does not name it.
+//! A run bit that another source took away is not restored by a command that does not contain it.
 
 use super::*;
 
-/// A drive whose word the gateway knows from the time when it ran.
+/// A drive whose word the gateway knows from a time when it ran.
 fn bench(word: u16) -> ObedientDrive {
     let mut bench = ObedientDrive::new(word);
     bench.running = true;
@@ -22,7 +22,7 @@ fn the_word_is_read_before_a_run_bit_that_is_not_named_is_written() {
         assert!(asks(&sends(&bench, &mut command)));
         assert_eq!(bench.run(&mut command), [(0, 2000, written)], "{has}");
     }
-    // Nothing here could start the motor, so no read is needed.
+    // No word in these cases could start the motor, so no read is needed.
     let mut bench = bench(0);
     bench.words.learn(Table::Holding, 2000, 0);
     assert_eq!(sends(&bench, &mut reverse(&bench)), word(2));
@@ -113,7 +113,7 @@ fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
     assert_eq!(command.failed(&word(2), Outcome::TimedOut, 1), Some(Outcome::TimedOut));
 }
 
-/// The end of a pulse is sent whatever happens; without a look at the motor it carries no run bit.
+/// The end of a pulse is always sent; without a read of the motor state it contains no run bit.
 #[test]
 fn no_read_stands_in_the_way_of_the_end_of_a_pulse() {
     #[derive(Debug, Clone, Copy)]

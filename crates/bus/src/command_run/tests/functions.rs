@@ -4,7 +4,7 @@ use super::*;
 
 const SETTINGS: u16 = 299;
 
-/// A drive that knows only these functions of writes; it records its requests, as function and value.
+/// A drive that knows only these write functions; it records its requests as function and value.
 struct Drive {
     knows: &'static [u8],
     word: u16,
@@ -87,7 +87,7 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
     let run = stop(&bench);
     let (asked, _) = drive.carries_out(&mut bench, run);
     assert!(matches!(asked.last(), Some((16, word)) if word & 1 == 0), "{asked:?}");
-    // Another drive in its place takes function 06 again.
+    // After another drive has replaced it, function 06 works again.
     let mut drive = Drive::new(&[6]);
     let run = stop(&bench);
     let (asked, outcome) = drive.carries_out(&mut bench, run);
@@ -133,7 +133,7 @@ fn settings(more: &str) -> ObedientDrive {
     let point =
         format!("[[point]]\nname = \"restarts\"\nat = \"holding {SETTINGS}.2\"\nclass = \"once\"\nwrite = true\n");
     bench.profile = profile(&format!("{more}\n{point}"));
-    // The known value is from when the drive came online.
+    // The known value dates from when the drive came online.
     bench.words.learn(Table::Holding, SETTINGS, 0x0001);
     bench
 }
@@ -152,7 +152,7 @@ fn a_settings_register_is_read_before_one_bit_of_it_is_written() {
     let reply = drive.answer(&read.pdu);
     assert_eq!(run.answered(&read, reply, &mut bench.words), None);
     assert!(run.is_checked(), "the write goes next on the line");
-    // Another request went first: the register is read again.
+    // Another request was sent first, so the register is read again.
     run.others_go_first();
     drive.word = 0x0230;
     let (asked, outcome) = drive.carries_out(&mut bench, run);
@@ -162,7 +162,7 @@ fn a_settings_register_is_read_before_one_bit_of_it_is_written() {
     drive.word = 0x0004;
     let run = sets(&bench, 0.0);
     assert_eq!(drive.carries_out(&mut bench, run).0, [(3, 0x0004), (6, 0)]);
-    // Other bits of the control word come from the known word.
+    // The other bits of the control word come from the known word.
     bench.words.learn(Table::Holding, 2000, 0x0100);
     let run = bench.begin(&[("run", 1.0)], Urgency::Command).0;
     assert_eq!(drive.carries_out(&mut bench, run).0, [(6, 0x0101)]);
@@ -194,7 +194,7 @@ fn a_drive_with_function_22_changes_the_bit_itself() {
     assert_eq!((asked, outcome.is_ok()), (vec![(22, 0x0134)], true));
     let run = sets(&bench, 0.0);
     assert_eq!(drive.carries_out(&mut bench, run).0, [(22, 0x0130)]);
-    // A drive that turns out not to have function 22.
+    // A drive that does not have function 22 although its profile says so.
     let (mut bench, mut drive) = (settings("ranges = { mask_write = true }"), Drive::new(&[6]));
     drive.word = 0x0130;
     for on in [1.0, 0.0] {

@@ -1,5 +1,5 @@
-//! An order that does not say whether the motor is to run looks at it before it writes a run command from memory: every family that
-//! is commanded, stopped or restarted behind the gateway's back.
+//! An order that does not say whether the motor is to run reads the motor state before it writes a remembered run
+//! command: checked for every family whose drive is commanded, stopped or restarted by another source.
 
 use super::super::control::Made;
 use super::*;
@@ -7,20 +7,19 @@ use crate::drive::control::{Control, ControlItem, OwnWord, Run};
 use crate::drive::{Derived, PointIndex, Raw, Source};
 use crate::order::{Arrival, Window, written};
 
-/// Events at a drive since its last poll, when its motor ran by a word of the gateway.
+/// What happened at a drive since its last poll, when its motor ran by a word of the gateway.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Since {
-    /// The motor runs on.
+    /// Nothing: the motor still runs.
     Nothing,
     /// The motor was stopped at the panel, and the control word is unchanged.
     Stopped,
-    /// The drive has lost its control word.
+    /// The drive restarted and lost its control word.
     Restarted,
     Faulted,
 }
 
-/// A drive of any family: it answers status reads with the state of its motor, and runs whenever its word is a run
-/// command.
+/// A drive of any family: answers status reads with the state of its motor, and runs whenever its word is a run command.
 struct AnyDrive<'p> {
     profile: &'p Profile,
     control: &'p Control,
@@ -42,7 +41,7 @@ impl<'p> AnyDrive<'p> {
         }
     }
 
-    /// The word of a run command forward, and its place.
+    /// The word for running forward, and its register.
     fn run_word(&self) -> (ControlItem, u16) {
         let run = self.control.runs()[0];
         let word = run.applied(self.control.always.applied(0));
@@ -66,7 +65,7 @@ impl<'p> AnyDrive<'p> {
         panic!("{raw:?} is never {on}");
     }
 
-    /// Makes the status say so.
+    /// Sets the status of the drive to this state.
     fn shows(&mut self, point: ModelPoint, on: bool) {
         let Some(index) = self.profile.model_index(point) else {
             return;
@@ -122,10 +121,10 @@ impl<'p> AnyDrive<'p> {
     }
 }
 
-/// The words that started a motor, each with its place.
+/// The words that started a motor, each with its register.
 type Started = Vec<(u16, u16)>;
 
-/// Runs the order against the drive, as far as it was polled before all this.
+/// Runs the order against the drive, whose state was polled before the events.
 fn carries_out(
     profile: &Arc<Profile>,
     since: Since,
@@ -247,14 +246,14 @@ fn a_motor_that_is_seen_to_run_is_turned() {
                 "{}: {outcome:?}",
                 profile.name
             );
-            // On N2 a value that the drive already has is not written.
+            // On N2, a value that the drive already has is not written.
             let is_there = reverse == 0.0 && written.is_empty();
             assert!(written.len() == 1 || is_there, "{}: {written:x?}", profile.name);
         }
     }
 }
 
-/// The next start has the direction that waits, in every form in which families encode it.
+/// The next start uses the kept direction, in every form in which families encode it.
 #[test]
 fn the_next_start_has_the_direction_that_was_kept() {
     for profile in families() {
@@ -310,7 +309,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
     }
 }
 
-/// After a lost look, or one that the drive refuses, the order is not sent, and the outcome reports that.
+/// If the reads before an order are lost or refused, the order is not sent, and the outcome reports that.
 #[test]
 fn an_order_whose_look_is_lost_is_not_sent() {
     let mut bench = ObedientDrive::new(1);
@@ -338,7 +337,7 @@ fn an_order_whose_look_is_lost_is_not_sent() {
     }
 }
 
-/// After another transaction between the look and the write, the look is repeated.
+/// If another transaction comes between the reads and the write, the reads are repeated.
 #[test]
 fn nothing_goes_between_the_look_and_the_write() {
     let mut bench = ObedientDrive::new(1);

@@ -53,7 +53,7 @@ fn what_the_drive_has_is_read_and_not_written() {
     assert_eq!(sends(&bench, &mut command), read(Table::Holding, 2));
     let has = Reply::Registers(HALF.to_vec());
     assert_eq!(command.answered(&read(Table::Holding, 2), has, &mut bench.words), None);
-    // Neither the override nor the release is sent.
+    // Neither the override nor its release is sent.
     let next = command.next(&bench.words, &bench.profile, false, bench.now);
     assert_eq!(next, Next::Done);
     assert_eq!(command.success(), Outcome::Acknowledged(Reply::Written));
@@ -64,7 +64,7 @@ fn what_was_read_earlier_lets_write_and_leaves_nothing_out() {
     let mut bench = bench();
     changed(&mut bench);
     assert_eq!(sends(&bench, &mut reference(&bench)), override_ao());
-    // The drive had the value at the last read, but may have another one by now: it is read again.
+    // The drive had the value at the last read but may have another one by now, so it is read again.
     bench.words.learn(Table::Holding, 0, HALF[0]);
     for (has, next) in [(HALF[0], Next::Done), (0x429A, Next::Send(override_ao()))] {
         let mut command = reference(&bench);
@@ -132,7 +132,7 @@ fn a_stop_is_never_left_out() {
         let (mut stop, _answer) = bench.begin(&[("run", 0.0)], urgency);
         assert_eq!(sends(&bench, &mut stop), coil(0, false));
     }
-    // A start is left out, where the drive reports that it has the run command.
+    // A start is left out if the drive reports that it already has the run command.
     for (has, next) in [(true, Next::Done), (false, Next::Send(coil(0, true)))] {
         bench.words.learn(Table::Coil, 0, 1);
         let (mut start, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);

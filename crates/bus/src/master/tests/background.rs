@@ -1,4 +1,4 @@
-//! Background exchanges: what they take of the line, and what they never do.
+//! Background transactions: their share of the line, and what they must never do.
 
 use super::*;
 use crate::drive::DriveIndex;
@@ -27,7 +27,7 @@ impl Rig {
         answer
     }
 
-    /// Runs while each client sends its next request as soon as it has its answer.
+    /// Runs while each client sends its next request as soon as it has an answer.
     fn run_asking(&mut self, time: Duration, clients: &[(&str, Pace)]) {
         let end = self.now + time;
         let mut waiting: Vec<Option<Receiver<Answer>>> = clients.iter().map(|_| None).collect();
@@ -98,7 +98,7 @@ fn a_busy_line_loses_no_more_process_data_than_the_share_says() {
 fn time_that_is_left_over_is_used_and_no_round_is_late_by_that() {
     let cycle = Duration::from_millis(100);
     let mut rig = Rig::at(1, "vacon-nx", Protocol::ModbusRtu, cycle);
-    // The first transactions show that this drive takes longer than its profile states.
+    // The first transactions show that this drive is slower than its profile states.
     rig.run_asking(Duration::from_secs(10), &[("params", Pace::Slow)]);
     let from = rig.wire.len();
     let late = rig.late_rounds(cycle, &[]);
@@ -127,7 +127,7 @@ fn a_drive_that_is_silent_to_a_request_delays_no_more_than_the_share() {
             silent += 1;
             answer = rig.ask(0, "params", Pace::Slow);
         }
-        // Only background requests find the drive silent.
+        // Only background requests notice that the drive is silent.
         let mut news = Vec::new();
         rig.drives[0].silent = match rig.master.next(rig.now, &mut news) {
             Ok(turn) => is_background(&turn),
@@ -170,7 +170,7 @@ fn a_stop_waits_for_the_exchange_on_the_line_only() {
         }
         longest
     };
-    // The rig is between two exchanges when the stop comes, so waiting requests cost the stop nothing.
+    // The rig is between two transactions when the stop arrives, so waiting requests do not delay the stop.
     assert_eq!(longest(6), longest(0));
 }
 

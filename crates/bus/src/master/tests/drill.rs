@@ -1,4 +1,4 @@
-//! A drill on the line: what a drive is sent meanwhile, and what counts as proven.
+//! A drill on the line: what is sent to a drive meanwhile, and what counts as proven.
 
 use super::*;
 use crate::event::EventKind;
@@ -24,7 +24,7 @@ fn plant(rig: &Rig) -> (Plant, Drills) {
 /// Drills the first of two drives; `meanwhile` is called with the report of each step.
 fn drill(kind: Kind, mut meanwhile: impl FnMut(&mut Rig, &DrillReport)) -> (Rig, DrillReport) {
     let mut rig = Rig::new(2);
-    // The drive takes orders from the fieldbus, and turns at 10 % when it turns.
+    // The drive accepts orders from the fieldbus, and turns at 10 % when it runs.
     rig.drives[0].holding.extend([(2101, 1 << 13), (2102, 1000)]);
     rig.run(Duration::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
@@ -93,7 +93,7 @@ enum Meanwhile {
     Lost,
     /// The process is stalled.
     Pause,
-    /// The task that looks at drills stands still, and the bus goes on.
+    /// The task that evaluates drills is stalled, and the bus continues.
     PauseOfDrills,
 }
 
@@ -164,7 +164,7 @@ fn what_was_not_read_in_time_is_not_proven() {
 
 #[test]
 fn a_standstill_counts_from_when_it_was_seen() {
-    // The motor goes on for a second after its stop, as one that is braked does.
+    // The motor turns for another second after its stop, like a braked motor.
     let mut began = None;
     let (_, report) = drill(Kind::Order, |rig, report| {
         if says(report, "a stop command") {
@@ -176,7 +176,7 @@ fn a_standstill_counts_from_when_it_was_seen() {
     assert_eq!(report.state, DrillState::Passed, "{report:#?}");
     let took = report.steps[0].took_ms.unwrap();
     assert!((1_000..1_200).contains(&took), "{took} ms");
-    // The motor stands just in time, and the reply that would have shown that is lost.
+    // The motor stops just in time, and the reply that would have shown it is lost.
     let mut began = None;
     let (_, report) = drill(Kind::Order, |rig, report| {
         if says(report, "a stop command") {
@@ -187,7 +187,7 @@ fn a_standstill_counts_from_when_it_was_seen() {
         }
     });
     assert_eq!(report.state, DrillState::NotProven, "{report:#?}");
-    // A motor that was seen to turn after the limit has failed the drill.
+    // A motor that was seen turning after the limit has failed the drill.
     let mut began = None;
     let (_, report) = drill(Kind::Order, |rig, report| {
         if says(report, "a stop command") {
@@ -262,7 +262,7 @@ fn time(seconds: u64) -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_secs(1_800_000_000 + seconds)
 }
 
-/// Evaluates the drill for this span; returns whether it is still in progress.
+/// Evaluates the drill for this time; returns whether it is still in progress.
 fn look(rig: &mut Rig, (plant, drills): &(Plant, Drills), at: SystemTime, span: Duration) -> bool {
     let until = rig.now + span;
     let mut goes_on = true;
@@ -320,7 +320,7 @@ fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
         plant.1.kept(generation, rig.now);
         look(&mut rig, &plant, time(1), Duration::from_secs(1));
         assert!(rig.runs(0));
-        // The process that comes up after the one that was killed.
+        // The process that starts after the killed one.
         let plant = self::plant(&rig);
         plant.1.restore(saved);
         let mut events = plant.0.events.subscribe();

@@ -1,4 +1,4 @@
-//! A drive of any family, by its profile: it runs and stops by its words, and shows that in its states.
+//! A drive of any family, simulated from its profile: it runs and stops by its words, and shows that in its states.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -50,7 +50,7 @@ impl FamilyDrive {
         }
     }
 
-    /// Shows a state; does nothing if the profile has no such point.
+    /// Shows this state; does nothing if the profile has no such point.
     pub(super) fn show(&mut self, point: ModelPoint, on: bool) {
         let profile = self.profile.clone();
         match profile.model_point(point).map(|point| &point.source) {
@@ -73,13 +73,13 @@ impl FamilyDrive {
                     *word & !(1 << bit)
                 };
             }
-            // Any low byte other than 0 has this meaning.
+            // Any low byte other than 0 has this meaning, so 1 is used.
             (Form::Bits { first: 0, .. }, Some(_)) => *word = u16::from(on),
             _ => panic!("{raw:?}"),
         }
     }
 
-    /// The motor turns.
+    /// The motor turns from now on.
     pub(super) fn run(&mut self) {
         self.runs = true;
         self.show(ModelPoint::Ready, true);
@@ -93,7 +93,7 @@ impl FamilyDrive {
         self.show(ModelPoint::Ready, true);
     }
 
-    /// The mains were off: the motor stands, and the words are gone.
+    /// The mains were switched off and on: the motor stands, and the words are lost.
     pub(super) fn power_cycle(&mut self) {
         *self = FamilyDrive::new(&self.profile.clone());
     }

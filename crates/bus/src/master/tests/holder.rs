@@ -116,7 +116,7 @@ fn advisory_sends_all_and_counts() {
         clients.collect::<Vec<_>>()
     };
     assert_eq!(clients(&rig), ["op", "cloud"]);
-    // Once a client and minute.
+    // The log has one line per client and minute.
     for (wait, expected) in [(1, vec![]), (60, vec!["op", "cloud"])] {
         rig.run(Time::from_secs(wait));
         for name in ["plc", "op", "cloud", "op", "cloud"] {
@@ -179,7 +179,7 @@ fn what_has_begun_goes_no_further_when_a_hold_is_broken() {
 fn the_turn_is_judged_again() {
     let (mut rig, plant) = guarded(1, Mode::Exclusive);
     let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
-    // Before its turn a reload removes the client, and another one takes the drive.
+    // Before the command is sent, a reload removes the client, and another one takes the drive.
     let rules = rig.bus.queue.lock().gate.rules().cloned().unwrap();
     let mut fewer = Rules::clone(&rules);
     fewer.principals.retain(|principal| &*principal.name != "plc");
@@ -267,7 +267,7 @@ fn nothing_starts_when_local_control_ends() {
         "free",
         "a stop of the gateway's own reserves nothing"
     );
-    // The local control is found at a start of the gateway, so nothing is written.
+    // Local control is already active when the gateway starts, so nothing is written.
     let mut rig = Rig::new(1);
     rig.drives[0].holding.insert(2000, 1);
     let rules = plant.buses[0].queue.lock().gate.rules().cloned();

@@ -1,4 +1,4 @@
-//! Replies that may come late.
+//! Late replies: requests whose replies could be confused wait.
 
 use super::*;
 
@@ -21,7 +21,7 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     let sent = writes(&rig, 0);
     assert_eq!(sent.len(), 2);
     assert!(sent[0] < given_up + COST * 2, "it waits for nobody");
-    // A drive answers in order: once each has answered something else, no late one is to come.
+    // A drive answers in order: once each has answered another request, no late reply can arrive.
     let asked = |of: usize| {
         let between = |at: &Instant| *at > sent[0] && *at < sent[1];
         rig.wire.iter().any(|(at, turn)| turn.drive == of && between(at))
@@ -31,7 +31,7 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
 }
 
-/// A reply that an adapter or a repeater sends twice may come damaged first and sound afterwards.
+/// A reply that an adapter or a repeater sends twice may arrive damaged first and intact afterwards.
 #[test]
 fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
     for (mangled, expected) in [(true, true), (false, false)] {
@@ -84,7 +84,7 @@ fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() 
     assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
 }
 
-/// The end of a turn without a reply that is believed.
+/// The end of a turn without an accepted reply.
 fn no_reply(rig: &mut Rig, doubted: bool) -> TurnEnd {
     let began = rig.now;
     rig.now += TIMEOUT;
@@ -115,8 +115,8 @@ fn fail(rig: &mut Rig, doubted: bool) {
     rig.news.append(&mut news);
 }
 
-/// The reply of a drive that was just switched on may be too early for the configured baud rate: the request is repeated at
-/// once, not after the pause between two probes.
+/// The reply of a drive that was just switched on may be too early for the configured baud rate: the request is
+/// repeated at once, not after the pause between two probes.
 #[test]
 fn a_probe_whose_reply_was_not_believed_is_repeated_at_once() {
     for (doubted, soon) in [(true, true), (false, false)] {
@@ -128,7 +128,8 @@ fn a_probe_whose_reply_was_not_believed_is_repeated_at_once() {
     }
 }
 
-/// Replies that come sooner than the baud rate allows take no drive away while they are not believed yet; silence does.
+/// Replies that arrive sooner than the baud rate allows do not make a drive offline while they are not accepted
+/// yet; silence does.
 #[test]
 fn replies_that_are_not_believed_take_no_drive_away() {
     for (doubted, gone) in [(true, false), (false, true)] {

@@ -1,4 +1,4 @@
-//! The thread of the bus stands still, and goes on.
+//! The thread of the bus is stalled and then continues.
 
 use super::*;
 use crate::order::{Arrival, Connection, Interruption, Window};
@@ -34,7 +34,7 @@ impl Rig {
         }
     }
 
-    /// Ends the turn at this time, after a stall of the thread or not; returns the news.
+    /// Ends the turn at this time, with or without a stall of the thread; returns the news.
     fn ends(&mut self, turn: &Turn, ended: Ended, (at, stood): (Instant, bool)) -> Vec<News> {
         let (began, mut news) = (self.now, Vec::new());
         self.now = self.now.max(at);

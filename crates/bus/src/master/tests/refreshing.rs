@@ -98,7 +98,7 @@ impl Plant {
         assert!(!self.drive().runs, "{}", self.name);
     }
 
-    /// The refreshes of the next `seconds` seconds, each with its time and with the turn right before it.
+    /// The refreshes of the next `seconds` seconds, each with its time and the turn right before it.
     fn refreshes(&mut self, seconds: u64) -> Vec<(Instant, RequestPdu, Turn)> {
         let from = self.rig.wire.len();
         self.rig.run(Duration::from_secs(seconds));
@@ -175,7 +175,7 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
         }
         let counted = plant.rig.bus.image.drives[0].refresh_writes();
         assert_eq!(counted, refreshes.len() as u64, "{name}");
-        // After a stop the word of the stop is refreshed.
+        // After a stop, the word of the stop is refreshed.
         plant.stops();
         let stop = plant.drive().word();
         let refreshes = plant.refreshes(10);
@@ -198,7 +198,7 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
     }
 }
 
-/// A client that sets references faster than the status is read keeps no drive from its word.
+/// A client that sets references faster than the status is read must not prevent the refresh of the control word.
 #[test]
 fn references_without_end_do_not_hold_up_the_word() {
     for (name, _) in FAMILIES.into_iter().filter(|(_, by_word)| *by_word) {
@@ -253,7 +253,7 @@ fn a_refresh_ends_for_good_with_everything_that_contradicts_it() {
             assert!(plant.rig.bus.image.drives[0].is_refreshing(), "{name} {event}");
             happens(&mut plant);
             plant.assert_ended(event);
-            // Once the cause is gone, too.
+            // The refresh stays off after the cause has disappeared, too.
             plant.drive().show(ModelPoint::Fault, false);
             plant.drive().show(ModelPoint::Remote, true);
             assert!(
@@ -290,7 +290,8 @@ fn from_the_acceptance_of_a_stop_no_run_word_is_repeated() {
     }
 }
 
-/// A drill ends what was repeated before, feeds the motor that it has started, and is silent when it tries the timeout.
+/// A drill ends an earlier refresh, keeps the drive's timeout from acting while its motor runs, and goes silent
+/// when it tests that timeout.
 #[test]
 fn a_drill_feeds_the_timeout_until_it_tries_it() {
     for (name, _) in FAMILIES {
@@ -331,7 +332,7 @@ fn another_masters_word_and_reference_stay() {
         if !control.is_read() || !by_word || control.own_word == crate::drive::control::OwnWord::Shadow {
             continue;
         }
-        // A bit that nothing gives a meaning, and the other direction.
+        // Bits without a defined meaning, and the bit for the other direction.
         for bit in [0x0100u16, 0x0800, 0x0002] {
             let foreign = plant.drive().word() ^ bit;
             if control.is_stop(control.at, foreign) {
@@ -366,7 +367,7 @@ fn a_short_outage_suspends_a_refresh_and_it_goes_on_by_what_the_drive_shows() {
     }
 }
 
-/// Lets the thread of the bus stand still for `ms` milliseconds.
+/// Stalls the thread of the bus for `ms` milliseconds.
 fn stands_still(rig: &mut Rig, ms: u64) {
     let began = rig.now;
     rig.now += Duration::from_millis(ms);
@@ -374,7 +375,8 @@ fn stands_still(rig: &mut Rig, ms: u64) {
         .after_stall(crate::stalls::Stall::new(began, rig.now), rig.now);
 }
 
-/// Values read in a round no longer hold when the port was lost, or the thread was stalled, before its write.
+/// Values read in a round are no longer valid if the port was lost, or the thread was stalled, before the write of
+/// the round.
 #[test]
 fn a_round_that_was_interrupted_reads_again_before_it_writes() {
     type Event = fn(&mut Rig);

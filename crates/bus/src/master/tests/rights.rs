@@ -1,4 +1,4 @@
-//! A reload takes the right of a client away: what it has given goes no further, but for stops.
+//! A reload takes the right of a client away: its orders are not continued, except stops.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -63,7 +63,7 @@ const BOTH: &[(ModelPoint, Value)] = &[
 ];
 const RESET: &[(ModelPoint, Value)] = &[(ModelPoint::FaultReset, Value::Bool(true))];
 
-/// When the right goes: before the order is accepted, while it waits, or after its first write.
+/// When the right is removed: before the order is accepted, while it waits, or after its first write.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Goes {
     Before,
@@ -130,7 +130,7 @@ fn an_order_without_its_right_goes_no_further_and_an_accepted_stop_does() {
     }
 }
 
-/// A turn is chosen, the line has to be silent before it, and the right goes in between.
+/// A turn is chosen and waits for silence on the line; the right is removed in between.
 #[test]
 fn what_was_chosen_is_not_sent_without_its_right() {
     let (mut rig, plant) = rig();
@@ -170,7 +170,7 @@ fn outcome(exchange: &mut Exchange) -> Option<&'static str> {
     }
 }
 
-/// Unchecked requests of a tool: to a drive, to all of them, to an address at which none is configured.
+/// Unchecked requests of a tool: to one drive, to all drives, and to an address without a configured drive.
 #[test]
 fn what_is_passed_on_for_a_tool_needs_its_right_at_its_turn() {
     let run = RequestPdu::write_register(2000, 1);

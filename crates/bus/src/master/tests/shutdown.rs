@@ -19,7 +19,7 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
     assert_eq!(running, [7]);
     let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
     assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
-    // All other drives are stopped before the silent one gets further tries.
+    // All other drives are stopped before the silent one gets further attempts.
     let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
         let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
         rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
@@ -55,10 +55,10 @@ fn one_broadcast_stops_the_line_before_each_drive_has_its_own_stop() {
         let (broadcast, single) = shutdown_of(&mut rig);
         assert!(broadcast.expect("one broadcast") <= COST, "{broadcast:?}");
         assert!(single > broadcast.unwrap() && single <= Duration::from_millis(500));
-        // A broadcast is not acknowledged, so each drive still gets its own stop.
+        // A broadcast is not acknowledged, so each drive still gets a separate stop.
         assert!((0..20).all(|drive| !rig.runs(drive)));
     }
-    // A drive that is to run on, or that may not be commanded, rules out the broadcast for all.
+    // One drive that must keep running, or must not be commanded, rules out the broadcast.
     let hold = |spec: DriveSpec| DriveSpec {
         on_shutdown: if spec.address == 4 {
             OnShutdown::LeaveRunning

@@ -4,7 +4,7 @@ use super::*;
 use crate::plant::Plant;
 use drivegate_core::stop_all::{Scope, StopAll, StopOrder, StopReport, Stopped, WAIT, not_standing};
 
-/// A plant of that bus alone.
+/// A plant that consists of this bus only.
 fn plant(rig: &Rig) -> Plant {
     rig.bus.image.update_health(|health| health.up = true);
     Plant {
@@ -77,8 +77,7 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
     }
 }
 
-/// Each drive has either its previous word, which is known, or the word of the broadcast: the stop is the same with
-/// both.
+/// Each drive has either its previous word, which is known, or the word of the broadcast; the stop is equal for both.
 #[test]
 fn a_stop_behind_the_broadcast_reads_no_word_that_was_known() {
     let mut rig = running(3);
@@ -185,7 +184,7 @@ fn a_second_order_joins_stops_that_wait_and_sends_those_that_were_acknowledged_a
 fn a_motor_that_runs_down_is_told_as_stopping() {
     let mut rig = running(2);
     let (plant, stop_all) = (plant(&rig), StopAll::default());
-    // The output is at 12 Hz, whatever the control word is.
+    // The output is at 12 Hz whatever the control word is.
     rig.drives[1].holding.insert(2103, 1200);
     let mut order = order(&rig, &plant, &stop_all, &Scope::Gateway);
     let report = answered(&mut rig, &plant, &stop_all, &mut order);

@@ -1,4 +1,4 @@
-//! Times of one drive that are not those of its bus.
+//! Times of one drive that differ from those of its bus.
 
 use super::*;
 use crate::process_image::Timing;
@@ -9,7 +9,7 @@ const SLOW: Timing = Timing {
     retries: Some(4),
 };
 
-/// A rig whose second drive has times of its own.
+/// A rig whose second drive has its own times.
 fn rig() -> Rig {
     Rig::with(2, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
         DriveSpec {

@@ -1,8 +1,8 @@
-//! Profiles with one fault put into them by script: nearly all must be refused.
+//! Profiles with one fault inserted by the test: nearly all must be refused.
 
 use super::*;
 
-/// A change of a `[control]`; none where it has nothing to change.
+/// A change of a `[control]` section; `None` if the section has nothing to change.
 type Fault = fn(&mut Control) -> Option<()>;
 
 fn run_of(control: &mut Control) -> Option<&mut Setting> {
@@ -13,7 +13,7 @@ fn run_of(control: &mut Control) -> Option<&mut Setting> {
     }
 }
 
-/// The reset, where it is written to the same place as the run command.
+/// The reset, if it is written to the same register as the run command.
 fn reset_of(control: &mut Control) -> Option<(Setting, &mut Setting)> {
     let run = *run_of(control)?;
     let reset = control.fault_reset.as_mut()?;

@@ -1,4 +1,4 @@
-//! Buses of chance: nothing starves, and everybody has his share.
+//! Random buses: nothing starves, and every drive and class gets its share.
 
 use std::collections::VecDeque;
 
@@ -6,14 +6,14 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// A bus with its drives, what its exchanges cost, who is dead, and how hard it is commanded.
+/// A random bus: its drives, the cost of transactions, which drives are dead, and how often commands are sent.
 #[derive(Debug, Clone)]
 struct Case {
     plans: Vec<Vec<(u8, u16)>>,
     cost_ms: u64,
     cycle_ms: u64,
     dead: Vec<bool>,
-    /// A command arrives so often; `None` never.
+    /// Interval of commands; `None` means never.
     every_ms: Option<u64>,
     seed: u64,
 }
@@ -85,7 +85,7 @@ impl Seen {
                 self.slow_time += took;
                 self.longest(key, PollClass::Slow, gap);
             }
-            // On a line full of commands the start takes long, so first reads are counted apart.
+            // On a line full of commands the start takes long, so first reads are counted separately.
             _ => self.slow_time += took,
         }
     }
@@ -239,7 +239,8 @@ proptest! {
         let of = |class: PollClass| plans.iter().enumerate().filter(|(d, _)| alive(*d))
             .map(|(_, plan)| plan.reads.iter().filter(|r| r.class == class).count()).sum::<usize>() as u32;
         let dearest = Duration::from_millis(case.cost_ms) + Duration::from_micros(300) * 12;
-        // A round with its slow polls, eight commands and eight stops before each poll, a probe behind each fast poll.
+        // The longest possible round: slow polls, eight commands and eight stops before each poll, a probe after
+        // each fast poll.
         let commands = if case.every_ms.is_some() { 17 } else { 1 };
         let dead = case.dead.iter().filter(|dead| **dead).count() as u32;
         let fast = of(PollClass::Fast);
@@ -256,18 +257,18 @@ proptest! {
                 prop_assert!(seen.slow_longest.contains_key(&(drive, read.start)), "{drive} {read:?} is never read");
             }
         }
-        // All fast polls alike: as often as one another, but for the round that is going on.
+        // All fast polls are read equally often, apart from the round in progress.
         let counts: Vec<usize> = seen.fast_counts.values().copied().collect();
         if let (Some(least), Some(most)) = (counts.iter().min(), counts.iter().max()) {
             prop_assert!(most - least <= 2, "{counts:?}");
         }
-        // At 5 % of the line, each slow poll has its turn; otherwise, each is read every second.
+        // With 5 % of the line, each slow poll is served in this time; otherwise, each is read every second.
         let slow_work = dearest * (of(PollClass::Slow) + of(PollClass::Once));
         let slow_bound = SLOW + (slow_work.mul_f64(1.0 / SLOW_SHARE) + bound) * 2;
         for (key, longest) in &seen.slow_longest {
             prop_assert!(*longest <= slow_bound, "slow poll {key:?} waited {longest:?}, bound {slow_bound:?}");
         }
-        // Each slow poll was read each second, or all of them had their share.
+        // Each slow poll was read each second, or all of them together got their share.
         let late = seen.slow_longest.values().any(|longest| *longest > SLOW * 2 + bound);
         let share = seen.slow_time.as_secs_f64() / seen.elapsed.as_secs_f64();
         prop_assert!(!late || share > SLOW_SHARE * 0.8, "slow share {share}");

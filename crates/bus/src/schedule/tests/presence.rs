@@ -5,7 +5,7 @@ use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 
 impl PolledLine {
-    /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. Returns the changes.
+    /// Lets the schedule choose polls for `time`; every poll takes `COST` and is answered by `answer`. Returns the changes.
     fn answer(&mut self, time: Duration, mut answer: impl FnMut(&Poll, Instant) -> Polled) -> Vec<Change> {
         let (end, mut changes) = (self.now + time, Vec::new());
         while self.now < end {
@@ -45,7 +45,7 @@ fn dead_drives_cost_two_percent_each() {
     let ratio = total(&some) / total(&all);
     assert!(ratio >= 0.94, "{ratio}");
     assert_eq!(some.offline, [2, 5, 9], "reported once each");
-    // The drive comes back within ten seconds, and its once class is read again.
+    // The drive returns within ten seconds, and its class `once` is read again.
     some.dead.clear();
     some.log.clear();
     some.run(Duration::from_secs(14));
@@ -284,7 +284,7 @@ fn a_command_in_vain_is_as_good_as_a_probe() {
     assert!(probed_after(false).unwrap() < Duration::from_millis(150));
     let after = probed_after(true).unwrap();
     assert!((COST * 10..COST * 15).contains(&after), "{after:?}");
-    // An answering drive does not go away by a failed command.
+    // A failed command does not make an answering drive offline.
     let mut rig = PolledLine::new(1, Duration::from_millis(10));
     rig.run(Duration::from_secs(1));
     rig.schedule.probed_in_vain(DriveIndex::new(0), COST * 10, rig.now);
@@ -369,8 +369,8 @@ fn what_a_bad_line_swallowed_is_due_once_process_data_was_sound_for_a_while() {
     assert_eq!(drive.due(&answered), now + 60 * second);
 }
 
-/// Every family that reads bits of the status word with the slow points: the word is whole before anything else is read that
-/// no command needs.
+/// Every family that reads bits of the status word with the slow points: the word is complete before any other slow
+/// read, except those that commands need.
 #[test]
 fn the_bits_of_the_status_word_come_before_other_slow_reads() {
     let mut families = 0;

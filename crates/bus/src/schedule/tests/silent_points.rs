@@ -4,7 +4,7 @@ use super::*;
 use crate::drive::DriveIndex;
 use crate::drive::profile::Profiles;
 
-/// A drive that never answers reads that cover `address`: its polls, and how often it went away and came back.
+/// A drive that never answers reads that cover `address`: its polls, and how often it went offline and returned.
 struct Silent {
     rig: PolledLine,
     of: (Table, u16),
@@ -49,7 +49,7 @@ impl Silent {
         }
     }
 
-    /// Runs for that time: that time, and how much of it requests without a reply took.
+    /// Runs for this time; returns the time, and the part of it that unanswered requests took.
     fn in_vain_of(&mut self, time: Duration) -> (Duration, Duration) {
         self.asked.clear();
         self.run(time);
@@ -159,7 +159,7 @@ fn a_register_in_a_slow_block_is_found() {
     assert!(vain * 50 <= all, "{vain:?} of {all:?}");
 }
 
-/// For each family, whatever one point of its process data is never answered.
+/// For each family, the test lets any one point of its process data stay unanswered.
 #[test]
 fn of_every_family_any_point_may_keep_silent() {
     for profile in Profiles::built_in().iter() {

@@ -16,7 +16,7 @@ enum Does {
     KeepsSilent,
 }
 
-/// The reads of a CX in the last second of half a minute, and how often it went away.
+/// The reads of a CX in the last second of half a minute, and how often it went offline.
 fn half_a_minute(does: Does) -> (Vec<u16>, u32) {
     let cx = profile("vacon-cx");
     let plan = Plan::of(&cx);

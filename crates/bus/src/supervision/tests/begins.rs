@@ -74,7 +74,7 @@ fn a_read_that_an_order_needs_first_has_reached_the_wire() {
 
 #[test]
 fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
-    // Started, and ended before anything of it was sent.
+    // The order was started, and ended before any part of it was sent.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     let _answer = rig.order();
     rig.begin();
@@ -87,7 +87,7 @@ fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
     rig.bus.queue.lock().remove(rig.now, &Outcome::Expired, |_| true);
     rig.look(10, false);
     assert_eq!(rig.drive.supervision.lease(), Lease::default());
-    // The gateway's own order.
+    // An order of the gateway itself starts no lease.
     let mut rig = SupervisedDrive::new(LeaseAction::SpeedReference(20.0));
     rig.heartbeat();
     rig.look(5_000, true);

@@ -1,4 +1,4 @@
-//! Whatever a client does and when: the action comes when it falls silent, and only then.
+//! Whatever a client does at whatever time: the action is written when the client goes silent, and only then.
 
 use drivegate_testkit::next_command;
 use proptest::prelude::*;
@@ -34,7 +34,7 @@ struct Client {
     heard: Option<Instant>,
     /// The action was acknowledged since.
     acted: bool,
-    /// Until when the waiting and the started command hold the lease; whether the latter is on the wire.
+    /// Until when the waiting and the started command keep the lease alive, and whether the started one is on the wire.
     queued: Option<Instant>,
     begun: Option<(Instant, bool)>,
 }

@@ -26,7 +26,7 @@ fn a_heartbeat_takes_back_an_action_that_waits() {
 fn an_answer_of_an_earlier_lease_does_not_stand_for_the_action_of_the_next() {
     let mut rig = ran_out();
     let action = rig.take().expect("the stop");
-    // The action is on the wire when the heartbeat comes.
+    // The action is already on the wire when the heartbeat arrives.
     rig.heartbeat();
     rig.look(10, true);
     action.answer(&acknowledged(), rig.now);

@@ -1,4 +1,4 @@
-//! A client that is back, while the action of its lease is due or on its way.
+//! A client that returns while the action of its lease is due or on its way.
 
 use super::*;
 

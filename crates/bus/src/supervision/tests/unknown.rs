@@ -1,4 +1,4 @@
-//! Drives that do not say whether they run, and what their registers say of a response of their own.
+//! Drives that do not report whether they run, and what their registers show of a response of their own.
 
 use super::*;
 use crate::drive::DriveIndex;
@@ -73,7 +73,8 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     assert_eq!(rig.news, []);
     online(&rig);
     assert!(rig.after(10, true).is_some());
-    // The wait has a limit: if the drive answers but this is not read again, the lease acts when it expires.
+    // The wait is limited: if the drive answers but its running state is not read again, the action follows when
+    // the lease expires.
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();
@@ -88,7 +89,7 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
             News::LeaseRanOut(DriveIndex::new(0))
         ]
     );
-    // Only the time in which the drive answers counts; it may go away and come back.
+    // Only time in which the drive answers counts; the drive may go offline and return.
     let mut rig = cx();
     rig.look(0, true);
     rig.heartbeat();
@@ -106,7 +107,7 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
         }
     }
     assert!(answered >= Duration::from_millis(1_800), "{answered:?}");
-    // A drive that does not answer at all keeps its lease as well, though it refused before.
+    // A drive that does not answer at all keeps its lease too, although it refused the point before.
     let mut rig = cx();
     rig.refuses_running();
     rig.image().update(|s| s.link = Link::Offline(SystemTime::now()));

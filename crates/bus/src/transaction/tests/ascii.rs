@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// A read of two registers in Modbus ASCII, its frame and its reply.
+/// A read of two registers in Modbus ASCII with its frame and its reply.
 pub(super) fn in_ascii() -> (Request, Vec<u8>, &'static [u8]) {
     let pdu = RequestPdu::read(Table::Holding, 0x20, 2);
     let request = Request::new(1, pdu);
@@ -44,7 +44,7 @@ fn an_ascii_reply_is_found_behind_noise_foreign_frames_and_broken_ones() {
             assert_eq!(step, truth, "{:?} by {chunk}", String::from_utf8_lossy(before));
         }
     }
-    // An exception behind a broken frame is not accepted, as it is short.
+    // An exception after a broken frame is not accepted, because it is short.
     let mut transaction = start_ascii(&request, &frame, now, false);
     let bytes = b":01030400050000F4\r\n:0183027A\r\n";
     assert!(matches!(transaction.on_bytes(now, bytes), Step::Wait(_)));
@@ -75,7 +75,7 @@ fn a_broken_ascii_reply_says_why_and_does_not_wait_for_the_deadline() {
         assert_eq!(transaction.on_time(until), Step::Done(Ended::Corrupt(why)));
         assert!(transaction.is_mangled_reply(), "it begins as the reply does");
     }
-    // A frame that starts again has its full time, whatever came before it.
+    // A frame that starts again has its full time, whatever arrived before it.
     let mut transaction = start_ascii(&request, &frame, now, false);
     assert!(matches!(transaction.on_bytes(now, b":!"), Step::Wait(until) if until < deadline));
     assert_eq!(transaction.on_bytes(now, b":01"), Step::Wait(deadline));

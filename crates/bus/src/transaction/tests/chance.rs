@@ -1,10 +1,10 @@
-//! Replies that faults changed, cut or repeated: only the truth is believed.
+//! Replies that were changed, cut or repeated by faults: only the true reply is accepted.
 
 use super::ascii::{in_ascii, start_ascii};
 use super::*;
 use proptest::prelude::*;
 
-/// A reply that a fault has changed on its way.
+/// A reply that a fault has changed on the line.
 fn mutated() -> impl Strategy<Value = Vec<u8>> {
     let truth = reply(0x4711);
     let len = truth.len();

@@ -10,7 +10,7 @@ fn state(start: u16) -> RequestPdu {
     RequestPdu::read(Table::DiscreteInput, start, 1)
 }
 
-/// An exchange that begins while the reply to the read of a state may still come.
+/// A transaction that begins while the late reply to the read of a state may still arrive.
 fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
     let request = Request::new(1, pdu);
     let mut frame = Vec::new();
