@@ -70,7 +70,7 @@ pub(super) enum OrderEnd {
     Action,
     /// The drive refused a step of the order.
     Refused,
-    /// It is unknown which part of the order the drive accepted.
+    /// The part of the order that the drive accepted is unknown.
     Unknown,
     /// An order of the gateway itself was sent to the drive.
     Other,

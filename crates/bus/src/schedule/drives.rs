@@ -34,8 +34,7 @@ const KNOWN_PAUSE: u32 = 50;
 /// How often a register is tried again before it counts as one that the drive never answers.
 const TRIED_AGAIN: u32 = 3;
 
-/// First and longest pause before a read that no manual describes is tried again, after it failed or its reply
-/// proved nothing.
+/// Pause before a read that no manual describes is tried again: after a failure, and after a reply that proved nothing.
 pub(crate) const TRIAL_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(20));
 
 /// Time of process data without a failure that shows a healthy line.
