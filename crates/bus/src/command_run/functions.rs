@@ -51,7 +51,7 @@ impl TakenFunctions {
     }
 }
 
-/// The same write of one item by the other function; `None` for any other request.
+/// A write of the same item by the other function; `None` for any other request.
 pub(super) fn other_function(pdu: &RequestPdu) -> Option<RequestPdu> {
     match pdu {
         RequestPdu::WriteRegister { address, value } => Some(RequestPdu::WriteRegisters {
