@@ -1,14 +1,15 @@
 //! Operates a drive of the demo: starts, ramps, reverses, stops, and now and then trips it.
 //!
-//! The autopilot is pure and reproducible: the seed fixes what happens when. Like another master on the fieldbus it
-//! acts through control word and reference, until the drive is commanded over the bus; then it stops for good.
+//! The autopilot of a simulated drive, pure and reproducible: the seed determines what happens when. Like another
+//! master on the fieldbus it acts through control word and reference, until the drive is commanded over the bus;
+//! then it stops for good.
 
 use super::SimTime;
 use super::model::{Command, Model};
 use super::random::Random;
 use std::time::Duration;
 
-/// What the autopilot does next.
+/// The next action of the autopilot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Next {
     Start,

@@ -1,4 +1,4 @@
-//! Where a master reaches the simulated line: a pseudo-terminal, a real serial port, or a TCP port.
+//! The endpoint by which a master reaches the simulated line: a pseudo-terminal, a real serial port, or a network port.
 
 use crate::codec::{LineFormat, Parity};
 use crate::line::Pty;
@@ -16,7 +16,7 @@ mod network;
 
 use network::Network;
 
-/// Where a master reaches the line.
+/// The kind of endpoint by which a master reaches the line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum EndpointOptions {
     /// A pseudo-terminal, with a symbolic link that keeps its name.
@@ -29,17 +29,17 @@ pub enum EndpointOptions {
         /// Path of the port's device.
         path: PathBuf,
     },
-    /// Raw serial-over-TCP, as a serial device server gives it. One master at a time.
+    /// Raw serial over TCP, as a serial device server provides it. One master at a time.
     Tcp {
         /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
     },
-    /// Modbus TCP, as a drive with Ethernet on board speaks it. One client at a time.
+    /// Modbus TCP, as used by a drive with Ethernet on board. One client at a time.
     ModbusTcp {
         /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
     },
-    /// Each datagram carries one frame of the line.
+    /// UDP: each datagram carries one frame of the line.
     Udp {
         /// Address to listen on; port 0 takes a free port.
         listen: SocketAddr,
@@ -120,10 +120,10 @@ impl Endpoint {
         }
     }
 
-    /// Receives bytes from the master; returns 0 if there are none now.
+    /// Receives bytes from the master; returns 0 if there are none.
     ///
     /// # Errors
-    /// The port is gone.
+    /// If the port no longer exists.
     pub(super) fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
             Endpoint::Pty(pty) => no_wait(pty.read(buffer)),
@@ -154,7 +154,7 @@ impl Endpoint {
     /// Hands bytes to the master; returns how many bytes the master accepted.
     ///
     /// # Errors
-    /// The port is gone.
+    /// If the port no longer exists.
     pub(super) fn send(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
             Endpoint::Pty(pty) => no_wait(pty.write(bytes)),
@@ -210,7 +210,7 @@ fn no_wait(result: io::Result<usize>) -> io::Result<usize> {
     }
 }
 
-/// A serial port in raw mode with that format, for this process alone.
+/// Opens a serial port in raw mode with this format, exclusively for this process.
 fn open_port(path: &Path, format: &LineFormat) -> io::Result<File> {
     let flags = rustix::fs::OFlags::NOCTTY | rustix::fs::OFlags::NONBLOCK;
     let file = OpenOptions::new()

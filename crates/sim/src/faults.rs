@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
 
-/// In what a foreign reply differs from the true one. Its data differs, its check code is right.
+/// In what a foreign reply differs from the true one. The data always differs; the check code is valid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Foreign {
     /// The reply comes from another drive.
@@ -20,7 +20,7 @@ pub enum Foreign {
     Function,
     /// A reply of another length.
     Length,
-    /// Only the data of the reply is foreign.
+    /// Only the data of the reply differs from the true one.
     Data,
 }
 
@@ -29,23 +29,23 @@ pub enum Foreign {
 pub enum Fault {
     /// The drive does not hear the request.
     Deaf,
-    /// The drive acts, but its reply is lost.
+    /// The drive carries out the request, but its reply is lost.
     Drop,
-    /// Only the first characters of the reply arrive.
+    /// Only the first characters of the reply arrive at the master.
     Truncate,
     /// A bit of the reply is wrong.
     Corrupt,
-    /// The reply comes twice.
+    /// The reply arrives twice.
     Double,
     /// The reply comes later by that much.
     Late(Duration),
-    /// A foreign reply comes instead of the true one.
+    /// A foreign reply arrives instead of the true one.
     Foreign(Foreign),
-    /// A foreign reply comes first, the true one after 3.5 characters.
+    /// A foreign reply arrives first, and the true one 3.5 characters later.
     Stray(Foreign),
-    /// The master hears its own request before the reply.
+    /// The master receives its own request before the reply.
     Echo,
-    /// The master hears its own request, but the drive does not.
+    /// The master receives its own request, but the drive does not.
     DeafEcho,
     /// Noise runs into the beginning of the reply.
     NoiseBefore,
@@ -55,25 +55,25 @@ pub enum Fault {
     Split,
     /// The drive refuses the request with this exception code and does not act.
     Exception(u8),
-    /// The first character of the reply is lost: the adapter turns to receiving too late.
+    /// The first character of the reply is lost: the adapter switches to receiving too late.
     ReplyStart,
-    /// The last character of the request is lost: the adapter turns to receiving too early.
+    /// The last character of the request is lost: the adapter switches to receiving too early.
     CutRequest,
     /// The last character of the request is lost, and the adapter echoes what it sends.
     CutEcho,
-    /// A zero comes directly before the reply: the line floats until the drive takes it.
+    /// A zero byte arrives directly before the reply: the line floats until the drive takes it over.
     ZeroBefore,
     /// A stray character comes after the reply, while no device sends.
     IdleNoise,
-    /// Another drive has the same address, and its reply begins somewhat later.
+    /// Another drive has the same address, and its reply begins slightly later.
     Twin,
-    /// The drive does not hear a request that begins so soon behind a reply.
+    /// The drive does not receive a request that begins too soon after a reply.
     NeedsPause(Duration),
-    /// The character of the reply is damaged that is on the line at the peak of the mains, whose frequency is this, Hz.
+    /// The mains damage the character of the reply that is on the line at their peak; the value is their frequency, Hz.
     Mains(u8),
 }
 
-/// Every fault by its name as an argument; a fault that takes a value has its usual one.
+/// Every fault with its name as an argument; a fault that takes a value has its usual one.
 const NAMED: [(&str, Fault); 27] = [
     ("deaf", Fault::Deaf),
     ("drop", Fault::Drop),
@@ -104,7 +104,7 @@ const NAMED: [(&str, Fault); 27] = [
     ("mains:50", Fault::Mains(50)),
 ];
 
-/// Every name of a fault in text, for messages.
+/// All names of faults as text, for messages.
 pub fn names() -> String {
     NAMED.map(|(name, _)| name).join(", ")
 }
@@ -148,7 +148,7 @@ fn exception_code(text: &str) -> Result<u8, String> {
         .ok_or_else(|| format!("`{text}` is not an exception code; write 1 to 255, such as exception:4"))
 }
 
-/// Faults with their probability: `drop=0.01,late:50ms=0.02`.
+/// Faults with their probabilities: `drop=0.01,late:50ms=0.02`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Rates(Vec<(Fault, f64)>);
 
@@ -176,7 +176,7 @@ impl FromStr for Rates {
     }
 }
 
-/// Which request meets which fault.
+/// Which requests are affected by which fault.
 #[derive(Debug, Clone)]
 pub struct FaultPlan {
     rates: Rates,
@@ -234,7 +234,7 @@ impl FaultPlan {
         self
     }
 
-    /// Adds a second plan, used where this one has no fault.
+    /// Adds a second plan, used for requests without a fault in this one.
     #[must_use]
     pub fn and(mut self, other: FaultPlan) -> FaultPlan {
         self.other = Some(Box::new(other));
@@ -248,7 +248,7 @@ impl FaultPlan {
         self
     }
 
-    /// Drops random and scripted faults but keeps the refusals: a drive goes on refusing what it refused.
+    /// Removes random and scripted faults but keeps the refusals: a drive continues to refuse the same registers.
     #[must_use]
     pub fn without_faults(self) -> FaultPlan {
         FaultPlan {
@@ -257,7 +257,7 @@ impl FaultPlan {
         }
     }
 
-    /// Whether the drive at `address` refuses a request because of the registers that it reads.
+    /// Whether the drive at `address` refuses a request because it reads certain registers.
     pub fn refuses(&self, address: u8, request: &RequestPdu) -> bool {
         let RequestPdu::Read { table, start, count } = request else {
             return false;

@@ -1,4 +1,5 @@
-//! How a drive finds a master's frames among the characters on its line, and how it frames its replies, by protocol.
+//! How a simulated drive finds a master's frames among the characters on its line, and how it frames its replies,
+//! for each protocol.
 //!
 //! | | a frame begins | it is over | silence before it |
 //! |---|---|---|---|
@@ -10,11 +11,10 @@ use std::time::Duration;
 
 use crate::codec::{Protocol, ascii, rtu};
 
-/// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1); N2 is given the
-/// same.
+/// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1), also used for N2.
 pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
-/// Whether the character begins a frame, regardless of the characters before it.
+/// Whether the character begins a frame, regardless of the preceding characters.
 pub(crate) fn begins(protocol: Protocol, character: u8) -> bool {
     match protocol {
         Protocol::ModbusRtu => false,
@@ -32,7 +32,7 @@ pub(crate) fn ends(protocol: Protocol, character: u8) -> bool {
     }
 }
 
-/// The characters in pieces, none of which belongs to two frames.
+/// The characters in pieces, each of which belongs to one frame only.
 pub(crate) fn pieces(protocol: Protocol, characters: &[u8]) -> impl Iterator<Item = &[u8]> {
     characters.chunk_by(move |&last, &next| !ends(protocol, last) && !begins(protocol, next))
 }
@@ -45,8 +45,8 @@ pub(crate) fn kept(protocol: Protocol) -> usize {
     }
 }
 
-/// Address and request of a sound Modbus frame; the request's function with the exception that refuses it when its PDU
-/// is wrong.
+/// Address and request of a valid Modbus frame; if its PDU is invalid, the function of the request with the
+/// exception that refuses it.
 pub(crate) fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> {
     match protocol {
         Protocol::ModbusRtu => rtu::decode_request(frame),
@@ -64,8 +64,8 @@ pub(crate) fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// Address and function of a frame that is whole but for its check code. A Modbus RTU frame has nothing else by which it
-/// could be whole.
+/// Address and function of a frame that is complete except for a wrong check code. In Modbus RTU only the check
+/// code shows that a frame is complete.
 pub(crate) fn damaged(protocol: Protocol, frame: &[u8]) -> Option<(u8, u8)> {
     match protocol {
         Protocol::ModbusAscii => {

@@ -1,9 +1,9 @@
-//! The simulated two-wire line: which character is on it when, silence, collisions. Pure; the time is an argument.
+//! The simulated two-wire line: which character is on it at which time, silence, collisions. Pure; the time is an argument.
 //!
-//! A master on a pseudo-terminal writes a whole frame in no time. Here the frame takes as long as it would on the wire:
-//! its first character begins when the bytes were read, or right after the characters before them. A frame is over when
-//! its protocol says so (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the drive takes its
-//! turnaround, then its reply begins.
+//! A master on a pseudo-terminal writes a whole frame at once. Here the frame takes as long as on a real wire: its
+//! first character begins when the bytes were read, or right after the preceding characters. The protocol decides
+//! when a frame is complete (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the turnaround of
+//! the drive passes, and its reply begins.
 //!
 //! A strict drive, as drives of the field do, does not hear a Modbus RTU request that begins before 3.5 characters of
 //! silence.
@@ -20,10 +20,10 @@ use std::time::Duration;
 /// How the bytes of a reply reach the master.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// All at the end of the last character: a master that ends a reply by its length sees no difference.
+    /// All bytes at the end of the last character: a master that ends a reply by its length notices no difference.
     Whole,
-    /// In chunks of this number of characters, as a UART empties its FIFO (14 of 16 is usual); 1 delivers them one by
-    /// one.
+    /// Chunks of this number of characters, as a UART empties its FIFO (14 of 16 is usual); with 1, each byte is
+    /// delivered separately.
     Chunks(u8),
     /// Whole, at the next multiple of this time: the latency timer of a USB adapter.
     Steps(Duration),
@@ -32,9 +32,9 @@ pub enum Delivery {
 /// The connection between the simulated drives and the master.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wire {
-    /// A port without a baud rate of its own: the time on the wire is simulated.
+    /// A port without a baud rate: the time on the wire is simulated.
     Simulated,
-    /// A real UART: bytes were on the wire when they arrive, and go onto it when they are written.
+    /// A real UART: received bytes have already been on the wire, and bytes go onto it when they are written.
     Real,
     /// No time on the wire, no silence to keep: as fast as the programs are.
     Instant,
@@ -47,8 +47,8 @@ pub struct LineRules {
     pub protocol: Protocol,
     /// Baud and character format.
     pub format: LineFormat,
-    /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and the
-    /// reply. A drive whose manual states a time of its own uses that.
+    /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and
+    /// the reply. A drive whose manual states another time uses that one.
     pub turnaround: Duration,
     /// Whether drives ignore a request that comes too early; such a request is counted in any case.
     pub strict: bool,
@@ -77,11 +77,11 @@ impl LineRules {
     }
 }
 
-/// Where the time on the wire is not known, a Modbus RTU frame that stays a fragment is over after that time.
+/// Time after which an incomplete Modbus RTU frame ends, if the time on the wire is unknown.
 const FRAGMENT: Duration = Duration::from_millis(20);
 /// Share of the silence before a request that may be missing.
 const TOLERANCE: f64 = 0.03;
-/// Bursts that may wait for delivery; late replies beyond that are lost.
+/// Most bursts that wait for delivery; late replies beyond that are lost.
 const MOST_OUTGOING: usize = 64;
 
 /// How the start of a request relates to the traffic before it.
@@ -103,7 +103,7 @@ struct Incoming {
     ended: bool,
 }
 
-/// Characters of a drive that are on the wire or wait for it.
+/// Characters of a drive that are on the wire or waiting for it.
 #[derive(Debug)]
 struct Outgoing {
     start: SimTime,
@@ -118,11 +118,11 @@ struct Outgoing {
 pub struct Wake {
     /// Time of the wake-up.
     pub at: SimTime,
-    /// Whether bytes are due at that time, so that every microsecond counts.
+    /// Whether bytes are due at this time, so that every microsecond counts.
     pub delivery: bool,
 }
 
-/// A request that a drive acted upon, whatever became of its reply on the line.
+/// A request that a drive carried out, whatever happened to its reply on the line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Act {
     /// When the last character of the request had arrived.
@@ -141,20 +141,20 @@ pub struct HalfDuplex {
     faults: FaultPlan,
     incoming: Option<Incoming>,
     outgoing: Vec<Outgoing>,
-    /// Until when each drive is busy sending its replies, by address.
+    /// Until when each drive is still sending its replies, by address.
     said_until: BTreeMap<u8, SimTime>,
     /// End of the last frame that the master sent or could expect.
     last_end: Option<SimTime>,
-    /// End of the last reply that the master could expect; it may be in the future.
+    /// End of the last reply that the master could foresee; may be in the future.
     reply_end: Option<SimTime>,
     /// Time from the last reply to the request received last.
     pause_before: Duration,
-    /// End of the last characters that fault injection sent; it may be in the future.
+    /// End of the last characters sent by fault injection; may be in the future.
     provoked_end: Option<SimTime>,
     statistics: Statistics,
     lateness: Lateness,
     transcript: Transcript,
-    /// Actions of the drives since the last [`HalfDuplex::take_acts`]; `None` until its first call.
+    /// Requests carried out since the last [`HalfDuplex::take_acts`]; `None` until its first call.
     acts: Option<Vec<Act>>,
 }
 
@@ -214,7 +214,7 @@ impl HalfDuplex {
         self.statistics.bytes_lost += bytes as u64;
     }
 
-    /// Frames recorded so far.
+    /// The frames recorded so far.
     pub fn transcript(&self) -> &Transcript {
         &self.transcript
     }
@@ -224,7 +224,7 @@ impl HalfDuplex {
         self.transcript = Transcript::new(limit);
     }
 
-    /// Cuts the line: all characters on it are lost.
+    /// Interrupts the line: all characters on it are lost.
     pub fn cut(&mut self) {
         self.incoming = None;
         self.outgoing.clear();
@@ -265,7 +265,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Characters that belong to one frame and begin at `at` or right after those before them; their end is returned.
+    /// Processes characters of one frame that begin at `at` or right after the previous ones; returns their end.
     fn on_piece(&mut self, piece: &[u8], at: SimTime) -> SimTime {
         let protocol = self.rules.protocol;
         let fresh = piece.first().is_some_and(|&first| framing::begins(protocol, first));
@@ -312,7 +312,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Ends the master's frame if it is complete by `now`.
+    /// Ends the master's frame if that is complete by `now`.
     pub fn on_time(&mut self, now: SimTime) {
         if let Some(frame) = self.incoming.take_if(|frame| Self::is_over(frame, &self.rules, now)) {
             self.finish(&frame);
@@ -349,8 +349,8 @@ impl HalfDuplex {
         now >= frame.end + Self::end_after(frame, rules)
     }
 
-    /// Pause after which a frame is over, unless a character ended it. Drivers and adapters of real ports deliver bytes with pauses, and an
-    /// instant line knows no time, so there a frame that is not yet whole is waited for.
+    /// Pause after which a frame ends, unless a character ended it. Drivers and adapters of real ports deliver
+    /// bytes with pauses, and an instant line has no time, so an incomplete frame is waited for there.
     fn end_after(frame: &Incoming, rules: &LineRules) -> Duration {
         if rules.protocol != Protocol::ModbusRtu {
             return if frame.ended {
@@ -369,7 +369,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Spoils the rest of a reply, because two senders transmit at once.
+    /// Damages the rest of a reply, because two senders transmit at the same time.
     fn spoil(&mut self, from: SimTime) {
         let format = self.rules.format;
         for burst in self.outgoing.iter_mut().filter(|burst| burst.kind != Kind::Provoked) {
@@ -382,7 +382,7 @@ impl HalfDuplex {
         }
     }
 
-    /// The drives hear a frame that was over at `now`.
+    /// Lets the drives receive a frame that ended at `now`.
     fn hear(&mut self, frame: &Incoming, now: SimTime) {
         match self.slaves.hear(self.rules.protocol, &frame.bytes, now) {
             FrameMeaning::BadFrame => self.statistics.bad_crc += 1,
@@ -464,7 +464,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Puts a reply onto the wire, changed by a fault if there is one.
+    /// Sends a reply on the wire, changed by the fault if there is one.
     fn respond(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, reply: Vec<u8>, now: SimTime) {
         let gap = match self.rules.wire {
             Wire::Instant => Duration::ZERO,
@@ -474,14 +474,15 @@ impl HalfDuplex {
         self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
         let own = self.slaves.drive(asked.address).and_then(|drive| drive.turnaround());
         let mut at = now + own.unwrap_or(self.rules.turnaround);
-        // A drive answers in order, so its pending replies go first. On N2 the master relies on that; with Modbus late
-        // replies overtake each other, which is harder for the master than what a drive does.
+        // A drive answers in order, so its pending replies go first. On N2 the master relies on that; with Modbus
+        // late replies may overtake each other, which is harder for the master than the behaviour of a real drive.
         if self.rules.protocol == Protocol::N2 {
             at = at.max(self.said_until.get(&asked.address).copied().unwrap_or_default());
         }
         for burst in bursts {
             if burst.kind == Kind::Echo {
-                // On a real wire the echo cannot come earlier: only now is known that this request meets the fault.
+                // On a real wire the echo cannot begin earlier, because only now is it known that the fault affects
+                // this request.
                 let start = if self.rules.wire == Wire::Real {
                     now
                 } else {
@@ -499,7 +500,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Puts a burst onto the wire at `start`; returns the end of the burst.
+    /// Sends a burst on the wire at `start`; returns the end of the burst.
     fn send(&mut self, start: SimTime, burst: Burst) -> SimTime {
         let end = start + self.chars(burst.bytes.len());
         match burst.kind {
@@ -531,8 +532,8 @@ impl HalfDuplex {
         end
     }
 
-    /// When the next chunk of a burst is due: at the end of its last character, or, when a real UART sends it, at the
-    /// beginning of its first.
+    /// When the next chunk of a burst is due: at the end of its last character or, if a real UART sends it, at the
+    /// start of its first.
     fn due(&self, burst: &Outgoing) -> SimTime {
         let due = match self.rules.wire {
             Wire::Real => burst.start + self.chars(burst.sent),
@@ -544,7 +545,7 @@ impl HalfDuplex {
         }
     }
 
-    /// Appends the next bytes that are due by `now` to `out` and returns when they were due.
+    /// Appends the next bytes that are due by `now` to `out`; returns when they were due.
     pub fn take_due(&mut self, now: SimTime, out: &mut Vec<u8>) -> Option<SimTime> {
         let (index, due) = self
             .outgoing
@@ -566,7 +567,7 @@ impl HalfDuplex {
         Some(due)
     }
 
-    /// When the line needs attention next; `None` while it is idle.
+    /// When the line must be serviced next; `None` while it is idle.
     pub fn wake(&self) -> Option<Wake> {
         let over = |frame: &Incoming| frame.end + Self::end_after(frame, &self.rules);
         let frame = self.incoming.as_ref().map(|frame| Wake {

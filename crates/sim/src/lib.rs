@@ -15,8 +15,8 @@
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
 //! - [`broker`]: a small MQTT broker for the demo and for tests.
 //!
-//! Everything but [`wire`], its endpoints, the measuring rod and the broker is pure and takes the time as an argument,
-//! so the same requests at the same times give the same bytes.
+//! All modules except [`wire`], its endpoints, the lateness statistics and the broker are pure and take the time as
+//! an argument, so equal requests at equal times give equal bytes.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! The interface of a simulated drive for line, board, autopilot and tests, whatever its model.
+//! The interface of a simulated drive of any model, for line, board, autopilot and tests.
 
 use super::SimTime;
 use super::motor::{Load, Motor};
@@ -15,7 +15,7 @@ pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
 /// A drive that was not advanced for longer skips the rest of the time.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
-/// Output and reference closer than this count as reached, Hz: below what a register can show.
+/// Difference of output and reference in Hz below which the reference counts as reached: less than a register can show.
 pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 
 /// Run, direction and speed from any source that commands a drive.
@@ -45,7 +45,7 @@ pub struct DriveState {
     pub remote: bool,
 }
 
-/// The parts that every drive has, whatever its model.
+/// The parts that every simulated drive has, whatever its model.
 #[derive(Debug, Clone)]
 pub(crate) struct Body {
     pub(super) motor: Motor,
@@ -73,8 +73,8 @@ impl Body {
         self.motor.fed && self.latch.fault() == 0
     }
 
-    /// The direction that the motor turns in; at rest, the one that a running drive is about to turn it in, by the
-    /// frequency that it aims at.
+    /// Whether the motor turns in reverse; at rest, whether a running drive is about to turn it in reverse, from
+    /// its target frequency.
     pub(super) fn turns_reverse(&self, target: f64) -> bool {
         let shaft = self.motor.shaft;
         shaft < 0.0 || (shaft == 0.0 && self.running && target < 0.0)
@@ -91,12 +91,12 @@ impl Body {
 
 /// A simulated drive with its Modbus board.
 ///
-/// Pure: the time is an argument and never runs backwards. No method panics, whatever it is given.
+/// Pure: the time is an argument and never goes back. No method panics for any argument.
 pub(crate) trait Model: fmt::Debug {
     /// The parts that the drive has in common with all models.
     fn body(&self) -> &Body;
 
-    /// The common parts, to change them.
+    /// The common parts of the drive, mutable.
     fn body_mut(&mut self) -> &mut Body;
 
     /// Advances the drive by one update period, which ends at `now`.
@@ -108,7 +108,7 @@ pub(crate) trait Model: fmt::Debug {
     /// Whether the drive would run on a run command.
     fn ready(&self) -> bool;
 
-    /// Frequency that it aims at by the command that holds, Hz, negative for counterclockwise.
+    /// Target frequency by the command in force, Hz, negative for counterclockwise.
     fn target(&self) -> f64;
 
     /// Whether the drive obeys the bus.
@@ -128,10 +128,10 @@ pub(crate) trait Model: fmt::Debug {
         }
     }
 
-    /// The reply to a request to this drive that came whole at `now`; `None` for silence.
+    /// The reply to a request to this drive that was complete at `now`; `None` for silence.
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply>;
 
-    /// The exception for a valid frame to this drive whose PDU the protocol does not know, where a plain slave returns
+    /// The answer to a valid frame to this drive whose PDU the protocol does not know, where a plain slave returns
     /// `exception`; `None` for silence.
     fn malformed(&mut self, _pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
         self.message_received(now);
@@ -141,16 +141,16 @@ pub(crate) trait Model: fmt::Debug {
     /// A request to all drives.
     fn broadcast(&mut self, request: &RequestPdu, now: SimTime);
 
-    /// A valid message to this drive or to all was on the bus.
+    /// Notes a valid message on the bus to this drive or to all drives.
     fn message_received(&mut self, _now: SimTime) {}
 
-    /// A valid frame was on the line, for any address. Called before the frame is acted upon.
+    /// Notes a valid frame on the line to any address. Called before the frame takes effect.
     fn bus_message(&mut self) {}
 
     /// A frame with a wrong check code was on the line.
     fn bus_error(&mut self) {}
 
-    /// The answer to a frame to this drive whose check code is wrong; `None` for silence.
+    /// The answer to a frame to this drive with a wrong check code; `None` for silence.
     fn check_error(&self) -> Option<Exception> {
         None
     }
@@ -165,10 +165,10 @@ pub(crate) trait Model: fmt::Debug {
         self.body_mut().powered = false;
     }
 
-    /// Switches the supply on again: commands are 0, faults are gone, parameters are as they were kept.
+    /// Switches the supply on again: commands are 0, faults are cleared, parameters have their stored values.
     fn power_on(&mut self, now: SimTime);
 
-    /// Trips the drive with a fault as its registers show it; 0 does nothing, and so does a second fault.
+    /// Trips the drive with this fault, coded as in its registers; 0 does nothing, and a second fault is ignored.
     fn trip(&mut self, fault: u16) {
         self.body_mut().trip(fault);
     }
@@ -176,7 +176,7 @@ pub(crate) trait Model: fmt::Debug {
     /// Writes over the bus into parameters, by PDU address.
     fn parameter_writes(&self) -> BTreeMap<u16, Writes>;
 
-    /// Gives its parameters random values that it would take, but that it obeys the same commands as before.
+    /// Gives its parameters random valid values, but keeps where it takes commands from.
     fn fill_parameters(&mut self, random: &mut Random);
 
     /// Faults that occur now and then, for the autopilot.
@@ -188,11 +188,11 @@ pub(crate) trait Model: fmt::Debug {
     /// Pulls the fault reset bit of the bus up or down.
     fn set_reset(&mut self, on: bool);
 
-    /// Gives the drive to the bus, or to panel or terminals.
+    /// Gives control of the drive to the bus, or to panel or terminals.
     fn set_remote(&mut self, on: bool);
 
-    /// Brings it into the mode in which it takes all parameters, and does not run, or out of it. Drives without such a mode
-    /// stay as they are.
+    /// Switches the mode in which the drive accepts all parameters and does not run. Drives without such a mode do
+    /// not change.
     fn set_programming(&mut self, _on: bool) {}
 
     /// State of the drive as seen from outside.
@@ -219,7 +219,7 @@ pub enum Beyond {
 }
 
 impl Beyond {
-    /// Checks that a message may hold this number of items.
+    /// Checks that a message may contain this number of items.
     ///
     /// # Errors
     /// The exception for none and for too many.
@@ -245,7 +245,7 @@ impl ReadOnly {
     /// The outcome of such a write.
     ///
     /// # Errors
-    /// Exception 02 unless it is ignored.
+    /// Exception 02, unless such accesses are ignored.
     pub fn outcome(self) -> Result<(), Exception> {
         match self {
             ReadOnly::Exception => Err(Exception::ADDRESS),
@@ -280,8 +280,8 @@ impl Steps {
     }
 }
 
-/// The fault of a drive and what it takes to run again: the run command has to be seen off without a fault before it
-/// is obeyed (reference/drives.md 9.24).
+/// The fault of a drive, and the condition for running again: the run command must be seen off without a fault
+/// before it is obeyed (reference/drives.md 9.24).
 #[derive(Debug, Clone)]
 pub(super) struct Latch {
     fault: u16,

@@ -1,6 +1,6 @@
 //! The motor behind every simulated drive: ramps, shaft, load, heat (reference/drives.md, section 10).
 
-/// The motor's plate and the drive's ramps, from the parameters of whichever drive it is.
+/// The motor's nameplate data and the drive's ramps, from the parameters of any drive model.
 #[derive(Debug, Clone, Copy)]
 pub struct Ratings {
     /// Maximum frequency, to which the ramp times belong, Hz.
@@ -30,7 +30,7 @@ pub struct Load {
     pub base_torque: f64,
     /// Torque at nominal frequency, % of nominal; it grows with the square of the speed, as pumps and fans do.
     pub full_torque: f64,
-    /// Torque that turns the masses when the motor reaches its nominal frequency in one second, % of nominal.
+    /// Torque that accelerates the load to nominal frequency in one second, % of nominal.
     pub inertia: f64,
     /// Supply, V; the DC link has 1.35 times as much.
     pub mains: f64,
@@ -54,7 +54,7 @@ impl Default for Load {
 const HEATSINK: (f64, f64) = (38.0, 180.0);
 /// Calculated heat of the motor at nominal current, %, and its time constant, s.
 const MOTOR_HEAT: (f64, f64) = (82.0, 900.0);
-/// Time in which a coasting motor comes down from nominal frequency, s.
+/// Time in which a coasting motor slows down from nominal frequency, s.
 const COAST_TIME: f64 = 8.0;
 /// Sag of the DC link at nominal power, V.
 const DC_SAG: f64 = 6.0;
@@ -64,7 +64,7 @@ const DC_SAG: f64 = 6.0;
 pub(crate) enum Feed {
     /// The inverter does not feed the motor, which coasts or stands.
     Off,
-    /// The inverter turns the motor towards this frequency, Hz; a negative one is counterclockwise.
+    /// The inverter drives the motor towards this frequency, Hz; negative is counterclockwise.
     To(f64),
 }
 
@@ -98,7 +98,7 @@ impl Motor {
         }
     }
 
-    /// Switches the inverter off at once; the shaft goes on turning.
+    /// Switches the inverter off at once; the shaft keeps turning.
     pub(crate) fn release(&mut self) {
         self.fed = false;
         self.output = 0.0;
@@ -114,7 +114,7 @@ impl Motor {
             }
             Feed::To(target) => {
                 if !self.fed {
-                    // Started on a turning motor: the inverter picks it up at the speed it has.
+                    // If the motor is already turning, the inverter catches it at its present speed.
                     self.fed = true;
                     self.output = self.shaft;
                 }

@@ -1,4 +1,4 @@
-//! Parameters with their ranges, as any simulated drive keeps them, and a record of what was written over the bus.
+//! Parameters of a simulated drive of any model with their ranges, and a record of the writes received over the bus.
 
 use std::collections::BTreeMap;
 
@@ -16,7 +16,7 @@ pub(crate) struct Parameter {
     pub value: u16,
 }
 
-/// Why a parameter cannot be written.
+/// Why a parameter was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refused {
     /// No parameter has this key.
@@ -47,8 +47,8 @@ pub(crate) struct ParameterSet {
 }
 
 impl ParameterSet {
-    /// A set of parameters from (key, minimum, maximum, default); keys may come in any order, the first of equal ones
-    /// counts.
+    /// A set of parameters from (key, minimum, maximum, default); keys may come in any order, and the first of
+    /// equal ones is used.
     pub(crate) fn new(parameters: impl IntoIterator<Item = (u16, u16, u16, u16)>) -> ParameterSet {
         let mut all: Vec<Parameter> = parameters
             .into_iter()
@@ -80,7 +80,7 @@ impl ParameterSet {
         self.find(key).ok().and_then(|at| self.all.get(at)).map(|p| p.value)
     }
 
-    /// The value of a parameter that every drive of the model has; 0 when it has not.
+    /// The value of a parameter that every drive of the model has; 0 if it is missing.
     pub(crate) fn number(&self, key: u16) -> u16 {
         self.get(key).unwrap_or(0)
     }
@@ -88,7 +88,7 @@ impl ParameterSet {
     /// Whether `value` may be written.
     ///
     /// # Errors
-    /// No such parameter, or a value outside its range or beyond that of a parameter that limits it.
+    /// If there is no such parameter, or the value is outside its range or beyond a parameter that limits it.
     pub(crate) fn check(&self, key: u16, value: u16) -> Result<(), Refused> {
         let at = self.find(key)?;
         let inside = self.all.get(at).is_some_and(|p| (p.min..=p.max).contains(&value));
@@ -132,17 +132,17 @@ impl ParameterSet {
         self.writes.entry(key).or_default().kept += 1;
     }
 
-    /// Writes that came over the bus, by key.
+    /// Writes received over the bus, by key.
     pub(crate) fn writes(&self) -> &BTreeMap<u16, Writes> {
         &self.writes
     }
 
-    /// Takes over the values of a set with the same parameters.
+    /// Copies the values of a set with equal parameters.
     pub(crate) fn take_values(&mut self, other: &ParameterSet) {
         self.all.clone_from(&other.all);
     }
 
-    /// Gives all parameters but `spared` random values that the drive could have come to by writes.
+    /// Gives all parameters except `spared` random values that writes could have set.
     pub(crate) fn fill(&mut self, random: &mut Random, spared: &[u16]) {
         for p in self.all.iter_mut().filter(|p| !spared.contains(&p.key)) {
             // Inside the range of a register.
@@ -158,7 +158,7 @@ impl ParameterSet {
         }
     }
 
-    /// All parameters by ascending key.
+    /// All parameters in ascending order of their keys.
     pub(crate) fn iter(&self) -> impl Iterator<Item = &Parameter> {
         self.all.iter()
     }

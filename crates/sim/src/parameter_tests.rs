@@ -23,7 +23,7 @@ const FORCED: Wishes = Wishes {
     force: true,
 };
 
-/// A drive of one family that is alone on its line.
+/// A single drive of one family on a line.
 struct DriveOnLine {
     profile: Arc<Profile>,
     slaves: Slaves,
@@ -96,7 +96,7 @@ impl DriveOnLine {
         })
     }
 
-    /// Carries out the plan; checks that the drive takes all values and saves them.
+    /// Carries out the plan; checks that the drive accepts and saves all values.
     fn carry_out(&mut self, plan: &Plan) {
         for write in &plan.writes {
             assert_eq!(
@@ -116,7 +116,7 @@ impl DriveOnLine {
 /// The families with parameters, and the addresses of the parameters in their simulated drives.
 fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
-    // Profiles of one application are left out: they have the parameters of their base.
+    // Profiles of a single application are left out: they have the parameters of their base.
     let all = all
         .iter()
         .filter(|profile| profile.base.is_none() && !profile.parameters.is_empty());
@@ -169,7 +169,7 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
     for (profile, known) in families() {
         let mut rig = DriveOnLine::new(&profile);
         let file = rig.read(known.clone());
-        // The counters are read one after the other, and count themselves.
+        // The counters are read one after the other, and count these reads too.
         let (received, own) = (known.len() + 1, known.len() + 4);
         let of = format!("{received} messages received, 0 damaged, {own} to this drive");
         match profile.counts_messages {
@@ -178,8 +178,8 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
         }
         assert_eq!(ParameterFile::parse(&file.text()), Ok(file.clone()), "{}", profile.name);
 
-        // A drive may refuse function 08, or stop answering after its last parameter; the reading is complete in both
-        // cases.
+        // A drive may refuse function 08, or stop answering after its last parameter; the reading is complete in
+        // both cases.
         for end in [Outcome::Exception(Exception(1)), Outcome::TimedOut] {
             let mut reading = Reading::new(profile.clone(), known.clone());
             let mut last = 0;

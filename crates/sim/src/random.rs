@@ -35,7 +35,7 @@ impl Random {
         range.start() + self.bits() % span.max(1)
     }
 
-    /// True with this probability.
+    /// Returns true with this probability.
     pub fn chance(&mut self, probability: f64) -> bool {
         self.unit() < probability
     }

@@ -17,7 +17,7 @@ use std::time::Duration;
 
 pub use super::parameter_set::Writes;
 
-/// Missed actions of an autopilot that lie longer back are passed over.
+/// Missed actions of an autopilot that are older than this are skipped.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
 /// Options of one drive on a simulated line.
@@ -27,7 +27,7 @@ pub struct DriveOptions {
     pub address: u8,
     /// Model of the drive.
     pub model: ModelOptions,
-    /// Seed of an autopilot that runs it until a master writes to it; `None` leaves it to the masters.
+    /// Seed of an autopilot that operates the drive until a master writes to it; `None` leaves it to the masters.
     pub autopilot: Option<u64>,
 }
 
@@ -48,7 +48,7 @@ impl ModelOptions {
     /// Names of models that [`ModelOptions::by_name`] knows.
     pub const NAMES: [&'static str; 5] = ["nx", "svx", "hvx", "cx", "teco"];
 
-    /// The model that a profile names in its key `simulator`, with its default options.
+    /// The model with this name in the key `simulator` of a profile, with its default options.
     pub fn by_name(name: &str) -> Option<ModelOptions> {
         Some(match name {
             "nx" => ModelOptions::Nx(NxOptions::vacon()),
@@ -60,8 +60,8 @@ impl ModelOptions {
         })
     }
 
-    /// The drive that a profile describes: the model that it names, else what its points and its `[control]` say. `None` for what is
-    /// not simulated.
+    /// The drive that a profile describes: the model that it names, otherwise one derived from its points and
+    /// `[control]`. `None` if the profile cannot be simulated.
     pub fn of_profile(profile: &Arc<Profile>) -> Option<ModelOptions> {
         let named = profile.simulator.as_deref().and_then(ModelOptions::by_name);
         let by_profile =
@@ -69,7 +69,7 @@ impl ModelOptions {
         named.or_else(by_profile)
     }
 
-    /// Gives the drive the simulator's own register that trips a fault, or takes it away.
+    /// Adds or removes the simulator's own register that trips a fault.
     pub fn set_trip_register(&mut self, on: bool) {
         match self {
             ModelOptions::Nx(nx) => nx.trip_register = on,
@@ -79,7 +79,7 @@ impl ModelOptions {
         }
     }
 
-    /// PDU address of the holding register that trips a fault when it is switched on; no real drive has it.
+    /// PDU address of the simulator's own holding register that trips a fault; no real drive has it.
     pub fn trip_address(&self) -> u16 {
         match self {
             ModelOptions::Nx(_) => NxOptions::TRIP_ADDRESS,
@@ -199,7 +199,7 @@ impl SimulatedDrive {
         self.alive && self.model.get().powered()
     }
 
-    /// Takes the drive off the line (the drive keeps running) or puts it back.
+    /// Disconnects the drive from the line (the drive keeps running) or connects it again.
     pub fn set_alive(&mut self, alive: bool) {
         self.alive = alive;
     }
@@ -209,13 +209,13 @@ impl SimulatedDrive {
         self.turnaround
     }
 
-    /// A valid message to this drive or to all was on the line.
+    /// Notes a valid message on the line to this drive or to all drives.
     pub fn message_received(&mut self, now: SimTime) {
         self.advance(now);
         self.model.get_mut().message_received(now);
     }
 
-    /// A valid frame was on the line, for any address. Call it before the frame is acted upon.
+    /// Notes a valid frame on the line to any address. Must be called before the frame takes effect.
     pub(crate) fn bus_message(&mut self) {
         self.model.get_mut().bus_message();
     }
@@ -242,7 +242,7 @@ impl SimulatedDrive {
         self.model.get_mut().malformed(pdu, exception, now)
     }
 
-    /// The answer to a frame to it whose check code is wrong; `None` when the drive stays silent.
+    /// The answer to a frame to this drive with a wrong check code; `None` if the drive stays silent.
     pub(crate) fn check_error(&self) -> Option<Exception> {
         self.model.get().check_error()
     }
@@ -256,7 +256,7 @@ impl SimulatedDrive {
         self.model.get_mut().broadcast(request, now);
     }
 
-    /// Trips the drive with a fault as its registers show it; 0 does nothing.
+    /// Trips the drive with this fault, coded as in its registers; 0 does nothing.
     pub fn trip(&mut self, fault: u16) {
         self.model.get_mut().trip(fault);
     }
@@ -276,8 +276,8 @@ impl SimulatedDrive {
         self.model.get_mut().set_remote(on);
     }
 
-    /// Brings it into the mode in which it takes all parameters, and does not run, or out of it: PRGM and DRIVE of a TECO. The
-    /// others have no such modes.
+    /// Switches the mode in which the drive accepts all parameters and does not run: PRGM and DRIVE of a TECO.
+    /// Other drives have no such modes.
     pub fn set_programming(&mut self, on: bool) {
         self.model.get_mut().set_programming(on);
     }
@@ -303,17 +303,17 @@ impl SimulatedDrive {
         self.model.get().state()
     }
 
-    /// Writes over the bus into the drive's parameters since it was created, by PDU address.
+    /// Writes over the bus to the drive's parameters since it was created, by PDU address.
     pub fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
         self.model.get().parameter_writes()
     }
 
-    /// Gives its parameters random values of that seed that it would take; where it takes its commands from stays.
+    /// Gives its parameters random valid values from this seed; the control place does not change.
     pub fn fill_parameters(&mut self, seed: u64) {
         self.model.get_mut().fill_parameters(&mut Random::new(seed));
     }
 
-    /// The drive of the Vacon NX family that it is, if it is one.
+    /// The drive as one of the Vacon NX family; `None` if it is another model.
     pub fn as_nx(&mut self) -> Option<&mut NxDrive> {
         match &mut self.model {
             AnyModel::Nx(drive) => Some(drive),

@@ -20,9 +20,9 @@ const BROADCAST: u8 = 0;
 pub enum FrameMeaning {
     /// The check code is wrong, or the bytes are no frame at all.
     BadFrame,
-    /// No drive with this address is on the line, or the drive is dead.
+    /// No drive with this address is on the line, or it is switched off.
     Nobody(u8),
-    /// A broadcast, acted upon.
+    /// A broadcast, which the drives carried out.
     Broadcast,
     /// A request to this drive.
     Request(Asked),
@@ -41,9 +41,9 @@ pub struct Asked {
     pub function: u8,
     /// The request, or the exception that a plain slave answers to the PDU.
     pub request: Result<RequestPdu, Exception>,
-    /// The command on an N2 line, or the code of its refusal.
+    /// The command on an N2 line, or the error code that refuses it.
     pub command: Option<Result<Command, u8>>,
-    /// The PDU in the frame, if it is not a valid request.
+    /// The PDU of the frame if it is not a valid request.
     pub malformed: Vec<u8>,
 }
 
@@ -149,8 +149,8 @@ impl Slaves {
         })
     }
 
-    /// A damaged frame, answered by drives that report check errors. No manual specifies the address of such an answer:
-    /// it carries the address and function that were received, and a broadcast gets none.
+    /// The answer to a damaged frame by drives that report check errors. No manual specifies the address of such an
+    /// answer: it carries the received address and function, and a broadcast gets none.
     fn hear_damaged(&self, protocol: Protocol, frame: &[u8]) -> Option<FrameMeaning> {
         let (address, function) = framing::damaged(protocol, frame)?;
         let drive = self.drives.get(&address).filter(|drive| drive.answers())?;
@@ -183,7 +183,7 @@ impl Slaves {
         })
     }
 
-    /// Lets the drive carry out the request and appends the frame of its reply to `out`. Nothing is appended when the
+    /// Lets the drive carry out the request and appends the frame of its reply to `out`. Nothing is appended if the
     /// drive stays silent.
     pub fn answer(&mut self, asked: &Asked, now: SimTime, out: &mut Vec<u8>) {
         let Some(drive) = self.drives.get_mut(&asked.address) else {
@@ -275,7 +275,7 @@ mod tests {
         out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
     }
 
-    /// Worked frames of reference/drives.md 7.1 and 7.4, in an order in which the drive comes to their states.
+    /// Worked frames of reference/drives.md 7.1 and 7.4, in an order in which the drive reaches their states.
     #[test]
     fn worked_frames() {
         let mut line = line();
@@ -416,8 +416,8 @@ mod tests {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
             assert_eq!(heard, FrameMeaning::BadFrame, "{protocol:?} {address}");
         }
-        // The check code is verified first (reference/drives.md 5.6), so a message that lacks a byte fails there. Bytes that are
-        // no frame get no reply.
+        // The check code is verified first (reference/drives.md 5.6), so a message that lacks a byte fails there.
+        // Bytes that are not a frame get no reply.
         let whole = damaged(ascii, 1, &read);
         let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());
         assert!(matches!(

@@ -1,4 +1,4 @@
-//! What happened on a simulated line: counters, lateness of the simulator itself, and a transcript of frames.
+//! Statistics of a simulated line: counters, lateness of the simulator itself, and a transcript of frames.
 
 use super::SimTime;
 use std::collections::VecDeque;
@@ -22,7 +22,7 @@ pub struct Statistics {
     pub silence_violations: u64,
     /// Requests that began while a reply was due or on the line.
     pub collisions: u64,
-    /// Requests that met a frame which fault injection put there (late, doubled, noise): not the master's doing.
+    /// Requests that collided with a frame from fault injection (late, doubled, noise), which is not the master's fault.
     pub provoked_overlaps: u64,
     /// Faults injected.
     pub faults: u64,

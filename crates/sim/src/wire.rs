@@ -1,7 +1,8 @@
 //! The simulated line as a thread behind a port, with true wire timing.
 //!
-//! Each line has one thread, which owns the port. The thread sleeps in `ppoll` until bytes come or the next character
-//! is due, with the timer slack of the kernel switched off, and busy-waits for the last microseconds before a delivery.
+//! Each simulated line has one thread, which owns the port. The thread sleeps in `ppoll` until bytes arrive or the
+//! next character is due, with the timer slack of the kernel switched off, and busy-waits for the last microseconds
+//! before a delivery.
 
 use super::SimTime;
 use super::endpoint::{Endpoint, EndpointOptions};
@@ -25,10 +26,10 @@ use std::time::{Duration, Instant};
 pub struct SimulatedBusOptions {
     /// Name for messages and for the thread.
     pub name: String,
-    /// Where a master reaches the simulated line.
+    /// The endpoint by which a master reaches the simulated line.
     pub endpoint: EndpointOptions,
-    /// Behaviour of the line. On a real serial port the wire keeps the time, whatever `wire` says, and silence is
-    /// counted but not enforced: drivers and adapters hand bytes over late.
+    /// Behaviour of the line. On a real serial port the hardware determines the times, whatever `wire` says, and
+    /// silence is counted but not enforced: drivers and adapters deliver bytes late.
     pub rules: LineRules,
     pub drives: Vec<DriveOptions>,
     /// Options of the drives' boards, if the drives speak N2.
@@ -59,9 +60,10 @@ impl SimulatedBusOptions {
 const SPIN: Duration = Duration::from_micros(80);
 /// Period at which the drives of an idle line are advanced.
 const IDLE: Duration = Duration::from_millis(100);
-/// A line without traffic for that time may have been left by its master; the port is settled, and again so often.
+/// Time without traffic after which the master may have left the line; the port is then settled, and again at this
+/// interval.
 const SETTLE_AFTER: Duration = Duration::from_secs(1);
-/// A port that went away is tried again so often.
+/// Interval of attempts to open a lost port again.
 const REOPEN: Duration = Duration::from_secs(1);
 /// Longest wait for the thread of the line to carry out an action.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -131,7 +133,7 @@ impl Shared {
     }
 }
 
-/// A running simulated line; dropping it ends the thread and takes the port away.
+/// A running simulated line; dropping it ends the thread and removes the port.
 #[derive(Debug)]
 pub struct SimulatedBus {
     shared: Arc<Shared>,
@@ -216,7 +218,7 @@ impl SimulatedBus {
     }
 
     /// Description of the line in one row: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`, with the protocol
-    /// where it is not Modbus RTU.
+    /// unless it is Modbus RTU.
     pub fn description(&self) -> String {
         let (addresses, format, protocol) = {
             let mut line = self.shared.line();
@@ -281,12 +283,12 @@ impl SimulatedBus {
         })
     }
 
-    /// Takes a drive off the line or puts it back; returns false if no drive has the address.
+    /// Disconnects a drive from the line or connects it again; returns false if no drive has the address.
     pub fn set_alive(&self, address: u8, alive: bool) -> bool {
         self.with_drive(address, |drive, _| drive.set_alive(alive)).is_some()
     }
 
-    /// The adapter is unplugged: path and link are gone when this returns, and a master's open port fails.
+    /// Simulates an unplugged adapter: path and link no longer exist when this returns, and a master's open port fails.
     pub fn vanish(&self) {
         self.shared.want(Wanted::Absent);
         drop(self.shared.wait_for(|found| !matches!(found, Found::Present(_))));
@@ -336,7 +338,7 @@ fn ranges(addresses: &[u8]) -> String {
 struct Runner<F> {
     shared: Arc<Shared>,
     open: F,
-    /// Last traffic, or the last time that the port was settled.
+    /// Time of the last traffic, or when the port was last settled.
     settled: SimTime,
 }
 
@@ -390,7 +392,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
         let _ = rustix::io::read(&self.shared.bell, &mut [0u8; 8]);
     }
 
-    /// Sends what is due, waits for what comes next, and takes what came.
+    /// Sends what is due, waits for the next event, and receives what has arrived.
     fn turn(&mut self, port: &mut Endpoint) -> io::Result<()> {
         port.connect();
         self.deliver(port)?;

@@ -1,5 +1,5 @@
-//! One client's connection: bytes in, packets through, bytes out. One task handles both directions, so that a client
-//! that only writes cannot block one that only reads.
+//! The connection of one client: bytes in, packets through, bytes out. One task handles both directions, so that a
+//! client that only writes cannot block one that only reads.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -15,12 +15,12 @@ use super::packet::{self, Connect, Fault, Incoming, Qos, Version, fault, reason}
 use super::state::Leave;
 use super::{CONNECT_LIMIT, FAREWELL_LIMIT, MAX_INFLIGHT, STALL_LIMIT, Shared};
 
-/// Bytes read at once.
+/// Most bytes read at once.
 const READ_BYTES: usize = 16 * 1024;
 /// Bytes to send above which nothing is read and no message is taken from the queue.
 const OUTPUT_BYTES: usize = 64 * 1024;
 
-/// Why a connection ends.
+/// Why the connection of a client ends.
 enum End {
     /// The client's DISCONNECT.
     Left { with_will: bool },
@@ -32,7 +32,7 @@ enum End {
 
 /// Serves `stream` until the connection ends or the broker stops.
 pub(super) async fn serve(shared: &Shared, mut stream: TcpStream, peer: SocketAddr) {
-    // Small packets should be sent at once; if this option fails, they are only later.
+    // Small packets should be sent at once; if this option fails, they are only sent later.
     let _ = stream.set_nodelay(true);
     let mut input = Vec::new();
     let connect = tokio::select! {
@@ -90,7 +90,8 @@ async fn farewell(stream: &mut TcpStream, bytes: &[u8]) {
     .await;
 }
 
-/// A client after its CONNECT. However its task ends, even by a panic, dropping it detaches it from the state.
+/// A client after its CONNECT. However its task ends, even by a panic, dropping this value detaches the client from
+/// the state.
 struct Client<'a> {
     shared: &'a Shared,
     number: u64,
@@ -141,7 +142,7 @@ impl<'a> Client<'a> {
             window: connect.receive_maximum.min(MAX_INFLIGHT),
             inflight: BTreeSet::new(),
             last_pkid: 0,
-            // One and a half keep-alive periods (3.1.1 section 3.1.2.10).
+            // The client may be silent for one and a half keep-alive periods (3.1.1 section 3.1.2.10).
             silence: connect.keep_alive * 3 / 2,
             input,
             output: Vec::new(),
@@ -164,12 +165,12 @@ impl<'a> Client<'a> {
             }
         }
         let last_words = std::mem::take(&mut self.output);
-        // The state is released before the connection closes, so that a peer that sees the close finds it done.
+        // The state is released before the connection closes, so that a peer that sees the close finds the cleanup done.
         drop(self);
         farewell(&mut stream, &last_words).await;
     }
 
-    /// Works until there is a reason to end. No branch loses anything when another one wins.
+    /// Serves the client until there is a reason to end. No branch of the select loses data when another one completes.
     async fn exchange(
         &mut self,
         mut reader: impl AsyncRead + Unpin,
@@ -269,7 +270,7 @@ impl<'a> Client<'a> {
         }
     }
 
-    /// A packet identifier that is in no use; far fewer than there are can be under way.
+    /// A packet identifier that is not in use; far fewer than exist can be in use at a time.
     fn free_pkid(&mut self) -> u16 {
         loop {
             self.last_pkid = self.last_pkid.checked_add(1).unwrap_or(1);

@@ -1,14 +1,14 @@
 //! A small MQTT broker inside the process, **for the demo only, never for production**: no authentication, no TLS, and
 //! everything is kept in memory. In service, and in the tests of the gateway, the broker is a real one such as mosquitto.
 //!
-//! The broker serves MQTT 3.1.1 and 5.0 side by side: QoS 0 and 1, retained messages, wills, wildcards, the options of a
-//! v5 subscription, keep alive, and take-over by a client with the same id. Response topic, correlation data, content
-//! type, payload format and user properties reach the subscribers as they came; message expiry counts down. Not served,
-//! and reported so to v5 clients: QoS 2 (a subscription is granted QoS 1), sessions that outlive their connection, topic
-//! aliases, subscription identifiers, shared subscriptions.
+//! The broker serves MQTT 3.1.1 and 5.0 together: QoS 0 and 1, retained messages, wills, wildcards, the options of
+//! a v5 subscription, keep alive, and take-over by a client with the same id. Response topic, correlation data,
+//! content type, payload format and user properties reach the subscribers unchanged; message expiry counts down.
+//! Not supported, and reported so to v5 clients: QoS 2 (a subscription is granted QoS 1), sessions that outlive
+//! their connection, topic aliases, subscription identifiers, shared subscriptions.
 //!
-//! Everything is bounded, see the constants. A client that does not take its messages, or accepts no byte for
-//! `STALL_LIMIT`, loses its connection. A malformed packet closes the connection that it came from and nothing else.
+//! Everything in the broker is bounded, see the constants. A client that does not take its messages, or accepts no
+//! byte for `STALL_LIMIT`, loses its connection. A malformed packet closes only the connection that it came from.
 
 mod connection;
 mod packet;
@@ -36,7 +36,8 @@ const MAX_PACKET_BYTES: usize = 256 * 1024;
 const MAX_CLIENT_ID_BYTES: usize = 256;
 /// Most subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 64;
-/// Most retained messages. A further message is passed on but not kept, nor is the message that it would replace.
+/// Most retained messages. A further message is passed on but not retained, and the message that it would replace
+/// is deleted.
 const MAX_RETAINED_MESSAGES: usize = 5_000;
 /// All retained messages together, bytes.
 const MAX_RETAINED_BYTES: usize = 8 * 1024 * 1024;
@@ -50,12 +51,12 @@ const MAX_INFLIGHT: usize = 64;
 const CONNECT_LIMIT: Duration = Duration::from_secs(5);
 /// Time for which a client may accept no byte while there is something to send.
 const STALL_LIMIT: Duration = Duration::from_secs(10);
-/// Time that the last words to a client may take.
+/// Time limit for sending the last packet to a client.
 const FAREWELL_LIMIT: Duration = Duration::from_millis(50);
 /// Pause after a failed accept, so that a lack of descriptors does not spin.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// A running broker. It ends with [`Broker::stop`], with its token, or when it is dropped.
+/// A running broker. It ends by [`Broker::stop`], by its token, or when this value is dropped.
 #[derive(Debug)]
 pub struct Broker {
     address: SocketAddr,
@@ -63,7 +64,7 @@ pub struct Broker {
     stop: DropGuard,
 }
 
-/// What the tasks of the broker share.
+/// The state that the tasks of the broker share.
 #[derive(Debug)]
 struct Shared {
     state: Mutex<State>,
@@ -73,15 +74,16 @@ struct Shared {
 }
 
 impl Shared {
-    /// A panic while the lock was held leaves state that is whole: every change is made of steps that each keep it so.
+    /// Locks the state. A panic while the lock was held leaves consistent state: each step of a change leaves it
+    /// consistent.
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Broker {
-    /// Listens on `listen` and serves until `cancel`, within the runtime of the caller. Port 0 takes a free one, see
-    /// [`Broker::local_addr`].
+    /// Listens on `listen` and serves until `cancel`, within the runtime of the caller. Port 0 takes a free port,
+    /// see [`Broker::local_addr`].
     ///
     /// # Errors
     /// The address cannot be bound: take another port.

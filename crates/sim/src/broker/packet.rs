@@ -1,5 +1,5 @@
-//! MQTT packets as bytes, of 3.1.1 and 5.0 alike: both versions are read into the same types. Pure; whatever comes in, a
-//! reader returns a [`Fault`] and never panics.
+//! MQTT packets as bytes, for 3.1.1 and 5.0: both versions are read into common types. Pure; for any input a reader
+//! returns a [`Fault`] instead of panicking.
 //!
 //! Section numbers are those of the MQTT 5.0 specification.
 
@@ -38,7 +38,7 @@ pub(super) mod reason {
     pub(crate) const SUBSCRIPTION_IDS_NOT_SUPPORTED: u8 = 0xA1;
 }
 
-/// Identifiers of properties (section 2.2.2.2) that are named here; those left out are lists below.
+/// Identifiers of properties (section 2.2.2.2) that the code uses by name; all others are in the lists below.
 mod property {
     pub(crate) const MESSAGE_EXPIRY: u8 = 2;
     pub(crate) const RESPONSE_TOPIC: u8 = 8;
@@ -58,7 +58,7 @@ mod property {
     pub(crate) const OF_CONNECT: &[u8] = &[17, 21, 22, 23, 25, 33, 34, USER, 39];
     /// Properties of a message: payload format, expiry, content type, response topic, correlation data, topic alias.
     pub(crate) const OF_PUBLISH: &[u8] = &[1, 2, 3, 8, 9, 35, USER];
-    /// Properties of a will: those of a message, with the will delay in place of the topic alias.
+    /// Properties of a will: those of a message, with the will delay instead of the topic alias.
     pub(crate) const OF_WILL: &[u8] = &[1, 2, 3, 8, 9, 24, USER];
     /// Properties that subscribers get as the publisher sent them.
     pub(crate) const FORWARDED: &[u8] = &[1, 3, 8, 9, USER];
@@ -113,18 +113,18 @@ pub(super) struct Message {
     pub(super) retain: bool,
     /// Encoded properties, which subscribers receive unchanged.
     pub(super) properties: Vec<u8>,
-    /// Time after `published` in which the message may be delivered.
+    /// Time after `published` within which the message may be delivered.
     pub(super) lifetime: Option<Duration>,
     pub(super) published: Instant,
 }
 
 impl Message {
-    /// Bytes that it counts for in a bound; the constant is what the type and an entry in a queue take.
+    /// Bytes that the message counts for in a limit; the constant covers the type itself and an entry in a queue.
     pub(super) fn weight(&self) -> usize {
         192 + self.topic.len() + self.payload.len() + self.properties.len()
     }
 
-    /// Time in which it may still be delivered; `None` without a limit, zero when it is over.
+    /// Remaining time in which the message may be delivered; `None` without a limit, zero when it has expired.
     fn left(&self, now: Instant) -> Option<Duration> {
         let age = now.saturating_duration_since(self.published);
         self.lifetime.map(|lifetime| lifetime.saturating_sub(age))
@@ -144,13 +144,13 @@ pub(super) struct Connect {
     pub(super) client_id: String,
     /// Zero: no supervision.
     pub(super) keep_alive: Duration,
-    /// Most QoS 1 messages that the client accepts without having acknowledged them.
+    /// Most unacknowledged QoS 1 messages that the client accepts.
     pub(super) receive_maximum: usize,
     /// Largest packet that the client takes, bytes.
     pub(super) max_packet: usize,
     /// Published when the connection ends without a good-bye.
     pub(super) will: Option<Message>,
-    /// Reason code for the CONNACK of a well-formed CONNECT that asks for something not served.
+    /// Reason code of the CONNACK for a valid CONNECT that requests an unsupported feature.
     pub(super) refused: Option<u8>,
 }
 
@@ -159,11 +159,11 @@ pub(super) struct Connect {
 pub(super) struct Subscription {
     pub(super) filter: String,
     pub(super) qos: Qos,
-    /// The client's own messages are left out.
+    /// Whether the client's own messages are left out.
     pub(super) no_local: bool,
     /// Whether messages keep the retain flag that they were published with.
     pub(super) retain_as_published: bool,
-    /// Retained messages are sent: 0 at each subscription, 1 if it is new, 2 never.
+    /// When retained messages are sent: 0 at each subscription, 1 if the subscription is new, 2 never.
     pub(super) retain_handling: u8,
 }
 
@@ -182,7 +182,7 @@ pub(super) enum Incoming {
     },
 }
 
-/// Length of the packet at the start of `bytes`, as soon as the whole of it is there.
+/// Length of the packet at the start of `bytes`, once all of it has arrived.
 ///
 /// # Errors
 /// A malformed length, or more than [`MAX_PACKET_BYTES`].
@@ -205,7 +205,7 @@ pub(super) fn packet_length(bytes: &[u8]) -> Result<Option<usize>, Fault> {
 /// Reads the first packet of a connection.
 ///
 /// # Errors
-/// [`reason::UNSUPPORTED_VERSION`] for a protocol level that is not served; others for what is not a valid CONNECT.
+/// [`reason::UNSUPPORTED_VERSION`] for an unsupported protocol level; other codes for an invalid CONNECT.
 pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault> {
     let (first, mut body) = open(packet)?;
     if first != 0x10 {
@@ -243,7 +243,7 @@ pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault
     } else {
         None
     };
-    // The demo has no accounts: name and password are read over.
+    // The demo has no accounts: name and password are skipped.
     if has(7) {
         body.text()?;
     }
@@ -251,7 +251,7 @@ pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault
         body.binary()?;
     }
     body.end()?;
-    // 3.1.1 section 3.1.3.1: a client without an id cannot ask for a session to come back to.
+    // A client without an id cannot request a lasting session (3.1.1 section 3.1.3.1).
     let nameless = client_id.is_empty() && version == Version::V311 && !has(1);
     let refused = if properties.has(property::AUTHENTICATION_METHOD) {
         Some(reason::BAD_AUTHENTICATION_METHOD)
@@ -356,7 +356,7 @@ fn message(
     })
 }
 
-/// First byte and body of a whole packet.
+/// First byte and body of a complete packet.
 fn open(packet: &[u8]) -> Result<(u8, Reader<'_>), Fault> {
     let mut reader = Reader(packet);
     let first = reader.u8()?;

@@ -1,6 +1,6 @@
 //! The broker without its sockets: clients, subscriptions, retained messages, wills. No clock and no I/O.
 //!
-//! A client is known for as long as it is connected: no session outlives its connection.
+//! A client is known only while it is connected: no session outlives its connection.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio::sync::{Notify, oneshot};
 use super::packet::{Fault, Message, Qos, Subscription, reason};
 use super::{MAX_QUEUE_BYTES, MAX_QUEUE_MESSAGES, MAX_RETAINED_BYTES, MAX_RETAINED_MESSAGES, MAX_SUBSCRIPTIONS, topic};
 
-/// All state of the broker.
+/// All state of the broker, without its sockets.
 #[derive(Debug, Default)]
 pub(super) struct State {
     /// The clients by the number of their connection.
@@ -30,7 +30,7 @@ struct Client {
     queue_bytes: usize,
     /// Notified when the client has something to send.
     wake: Arc<Notify>,
-    /// Ends the connection, once.
+    /// Channel that ends the connection; usable once.
     end: Option<oneshot::Sender<Fault>>,
 }
 
@@ -47,13 +47,13 @@ pub(super) struct Delivery {
 pub(super) enum Leave {
     /// The client sent a DISCONNECT, so no will is published.
     Clean,
-    /// The connection ended in any other way, so the will is published.
+    /// The connection ended without a DISCONNECT, so the will is published.
     Lost,
 }
 
 impl State {
-    /// Takes in the client `id` on the connection of that number; an earlier connection of the same client ends, and its
-    /// will is published.
+    /// Adds the client `id` on the connection with this number; an earlier connection of the same client ends, and
+    /// its will is published.
     pub(super) fn attach(
         &mut self,
         number: u64,
@@ -95,7 +95,7 @@ impl State {
         }
     }
 
-    /// Retains and passes on a message; false when there was no room to retain it.
+    /// Retains and passes on a message; returns false if there was no room to retain it.
     pub(super) fn publish(&mut self, publisher: u64, message: Message, now: Instant) -> bool {
         let message = Arc::new(message);
         let kept = !message.retain || self.retain(&message, now);
@@ -105,7 +105,8 @@ impl State {
         kept
     }
 
-    /// Sets, replaces or, without payload, deletes the retained message of a topic; false when there is no room for it.
+    /// Sets, replaces or, without payload, deletes the retained message of a topic; returns false if there is no
+    /// room for it.
     fn retain(&mut self, message: &Arc<Message>, now: Instant) -> bool {
         if let Some(old) = self.retained.remove(&message.topic) {
             self.retained_bytes -= old.weight();
@@ -167,7 +168,8 @@ impl State {
         filters.iter().map(|filter| client.unsubscribe(filter)).collect()
     }
 
-    /// The next message for a client, a QoS 1 message only where `acknowledged` are wanted; those behind it wait.
+    /// The next message for a client; a QoS 1 message only if `acknowledged` ones may be sent, otherwise it waits
+    /// with those behind it.
     pub(super) fn take(&mut self, number: u64, acknowledged: bool, now: Instant) -> Option<Delivery> {
         let client = self.clients.get_mut(&number)?;
         loop {
@@ -216,8 +218,8 @@ impl Client {
         }
     }
 
-    /// Queues `message` if it is subscribed to: once, at the highest QoS of all subscriptions that match. `own`: the
-    /// client published it.
+    /// Queues `message` if the client has subscribed to it: once, at the highest QoS of all matching subscriptions.
+    /// `own` means that the client published it.
     fn offer(&mut self, message: &Arc<Message>, own: bool) {
         let matches = |subscription: &&Subscription| {
             !(own && subscription.no_local) && topic::matches(&message.topic, &subscription.filter)
@@ -234,8 +236,8 @@ impl Client {
         });
     }
 
-    /// Gives a message to a client; a client that does not take its messages loses its connection, so that nothing is
-    /// dropped silently.
+    /// Queues a message for a client; a client that does not take its messages loses its connection, so that no
+    /// message is dropped silently.
     fn push(&mut self, delivery: Delivery) {
         let bytes = self.queue_bytes + delivery.message.weight();
         if self.queue.len() >= MAX_QUEUE_MESSAGES || bytes > MAX_QUEUE_BYTES {
@@ -317,8 +319,8 @@ mod tests {
         }
         state.publish(1, message("t/1", b"x"), now);
         assert_eq!(waiting(&mut state, 1), [seen("t/1", b"x", false)]);
-        // A message that matches two filters arrives once, with the retain flag as published if one of the filters asks
-        // for that.
+        // A message that matches two filters arrives once, with the retain flag as published if one of the filters
+        // requests that.
         let as_published = Subscription {
             retain_as_published: true,
             retain_handling: 2,

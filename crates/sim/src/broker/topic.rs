@@ -1,14 +1,14 @@
 //! Topic names and topic filters (MQTT 5.0 section 4.7; the same in 3.1.1).
 //!
-//! Own functions, because the library's `matches` refuses every `$` topic, panics on a topic that
-//! starts with a character of more than one byte, and its `valid_topic` takes an empty name.
+//! These functions replace those of the library, whose `matches` refuses every `$` topic and panics on a topic that
+//! starts with a character of more than one byte, and whose `valid_topic` accepts an empty name.
 
 /// Whether `name` can be published to: not empty, no wildcard, no null character.
 pub(super) fn is_name(name: &str) -> bool {
     !name.is_empty() && !name.contains(['+', '#', '\0'])
 }
 
-/// Whether `filter` can be subscribed to: a wildcard stands alone in its level, `#` in the last.
+/// Whether `filter` is a valid subscription: a wildcard is alone in its level, and `#` only in the last level.
 pub(super) fn is_filter(filter: &str) -> bool {
     if filter.is_empty() || filter.contains('\0') {
         return false;
@@ -36,7 +36,7 @@ pub(super) fn matches(name: &str, filter: &str) -> bool {
     let mut names = name.split('/');
     for level in filter.split('/') {
         match (level, names.next()) {
-            // `a/#` matches `a` itself too, so this case comes before the check for a missing level.
+            // `a/#` also matches `a` itself, so this case comes before the check for a missing level.
             ("#", _) => return true,
             ("+", Some(_)) => {}
             (level, Some(name)) if level == name => {}

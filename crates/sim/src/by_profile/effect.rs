@@ -1,4 +1,4 @@
-//! How a drive reacts to the words written to it, by `[control]` of its profile: for drives without hand-written words.
+//! How a drive without hand-written words reacts to the words written to it, according to `[control]` of its profile.
 
 use super::reactions::{Known, MotorEffect, WordEffect};
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
@@ -41,7 +41,7 @@ pub(super) fn effect_of(control: &Control, known: &Known<'_>, place: ControlItem
     WordEffect { does, resets, word }
 }
 
-/// The farthest step of the sequence whose word that is and whose turn it can be.
+/// The last step of the sequence that has this word and can come next.
 fn next_step(control: &Control, position: usize, place: ControlItem, word: u16) -> Option<usize> {
     let Run::Steps(steps) = &control.run else {
         return None;
@@ -60,13 +60,13 @@ fn next_step(control: &Control, position: usize, place: ControlItem, word: u16) 
         .max()
 }
 
-/// Whether a write to this place can start the motor or reverse it.
+/// Whether a write to this register can start the motor or reverse it.
 fn concerns_run(control: &Control, place: ControlItem) -> bool {
     let mut of_run = control.runs().into_iter().chain(control.reverse);
     of_run.any(|setting| place_of(&setting, control) == place)
 }
 
-/// All places that take commands.
+/// All registers that take commands.
 pub(super) fn places(control: &Control) -> Vec<ControlItem> {
     let steps: &[Step] = match &control.run {
         Run::Steps(steps) => steps,
@@ -80,7 +80,7 @@ pub(super) fn places(control: &Control) -> Vec<ControlItem> {
         .collect()
 }
 
-/// Whether the run command acts only at the moment when it is written.
+/// Whether the run command only acts at the moment when it is written.
 pub(super) fn acts_once(control: &Control) -> bool {
     control.runs().iter().all(|setting| setting.once)
 }

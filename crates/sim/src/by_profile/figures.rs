@@ -1,4 +1,4 @@
-//! What the points of a drive of any profile show.
+//! The values of the points of a simulated drive of any profile.
 
 use std::collections::BTreeMap;
 
@@ -24,7 +24,7 @@ impl ProfileDrive {
         self.body.motor.power(&self.ratings) / 100.0 * NOMINAL_POWER
     }
 
-    /// Values that no motor changes: as given, else such as the unit has them.
+    /// Fills in values that do not depend on the motor: given values, otherwise plausible ones for the unit.
     pub(super) fn fill_in(&mut self) {
         let profile = self.profile();
         for parameter in &profile.parameters.named {
@@ -43,7 +43,7 @@ impl ProfileDrive {
                 },
             );
         }
-        // Points with a scale or a factor in another register come after that register.
+        // Points with a scale or a factor in another register are set after that register.
         let (scaled, plain): (Vec<PointIndex>, Vec<PointIndex>) = profile
             .points
             .indexes()
@@ -101,7 +101,7 @@ impl ProfileDrive {
         self.put(raw, &parts);
     }
 
-    /// The value of a point as its registers hold it now.
+    /// The value of a point from the present content of its registers.
     fn value_of(&self, profile: &Profile, index: PointIndex) -> Option<Value> {
         let raw = raw_of(profile, index)?;
         let words: Option<Vec<u16>> = raw
@@ -149,7 +149,7 @@ impl ProfileDrive {
             known.contains(key) || part.mask & !figure == 0
         };
         let wishes = self.wishes(&profile, is_decided, now);
-        // Nothing of earlier states stays in a register.
+        // Clears the bits of all states first, so that no earlier state remains in a register.
         for (key, part) in wishes.iter().flat_map(|wish| wish.any.iter().flatten()) {
             if !known.contains(key) && !self.is_place(*key) {
                 let mask = part.mask & !figures.get(key).copied().unwrap_or(0);
@@ -163,7 +163,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether that is a place of the commands that reads back what was written there.
+    /// Whether a register takes commands and reads back what was written to it.
     fn is_place(&self, (table, address): Key) -> bool {
         let holds = |control: &Control| {
             let places = super::effect::places(control);
@@ -175,7 +175,7 @@ impl ProfileDrive {
         self.control.as_ref().is_some_and(holds)
     }
 
-    /// The status words of a family that is known by hand, but for bits that were given: where they are.
+    /// Sets the status words of a family with hand-written words, except for bits that were given; returns their places.
     fn show_status(&mut self, profile: &Profile, now: SimTime) -> Vec<Key> {
         let Some(family) = self.family else {
             return Vec::new();
@@ -278,7 +278,7 @@ impl ProfileDrive {
         }
     }
 
-    /// The states that registers are to show in bits that are not decided yet, the ones that count most first.
+    /// The states that registers must show in bits that are not determined yet, the most important ones first.
     fn wishes(&self, profile: &Profile, is_decided: impl Fn(&(Key, Part)) -> bool, now: SimTime) -> Vec<Wish> {
         let mut wishes: Vec<(u8, Wish)> = Vec::new();
         for (index, point) in profile.points.enumerate() {
@@ -305,7 +305,7 @@ impl ProfileDrive {
         wishes.into_iter().map(|(_, wish)| wish).collect()
     }
 
-    /// The states of the start sequence: the one that it has come to, and none that it has not.
+    /// The states of the start sequence: the reached one must show, later ones must not.
     fn sequence(&self, profile: &Profile, now: SimTime) -> Vec<(u8, Wish)> {
         let Some(Run::Steps(steps)) = self.control.as_ref().map(|control| &control.run) else {
             return Vec::new();
@@ -319,7 +319,7 @@ impl ProfileDrive {
                 return None;
             };
             let is = step + 1 == position;
-            // A step that is behind it may still show.
+            // A step that was passed may still show.
             if step < position && !is {
                 return None;
             }
@@ -339,7 +339,7 @@ impl ProfileDrive {
         let fault = self.body.latch.fault() != 0;
         Some(match point.model {
             Some(ModelPoint::Fault) => (1, fault),
-            // Before it runs, so that it runs in that direction.
+            // The direction is shown before the motor runs.
             Some(ModelPoint::Reversed) => (2, self.body.turns_reverse(target)),
             Some(ModelPoint::Running) => (3, running),
             Some(ModelPoint::Remote) => (4, self.remote),

@@ -1,5 +1,6 @@
-//! A drive or meter of any profile. Its registers come from the points of the profile; its reaction to the control word comes from
-//! the hand-written [`words`] where the family is known, else from `[control]` ([`said`]). Pure.
+//! A simulated drive or meter of any profile. Its registers come from the points of the profile; its reaction to
+//! the control word comes from the hand-written [`words`] if the family is known, otherwise from `[control]`
+//! ([`said`]). Pure.
 
 mod effect;
 mod figures;
@@ -25,11 +26,12 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, Run, Until};
 use crate::drive::{Bound, ModelPoint, PointIndex, Profile, Source, Value};
 
-/// Time that a drive takes to come to the next state of its start sequence.
+/// Time that a drive takes to reach the next state of its start sequence.
 const SETTLE: Duration = Duration::from_millis(30);
 /// Maximum frequency where the profile does not say one, Hz.
 const MAXIMUM: f64 = 50.0;
-/// Where a fault can be caused, and next to it panel control: the first pair that the profile does not have.
+/// Registers for causing a fault, each followed by one for panel control: the first pair that is not in the profile
+/// is used.
 const TRIP_ADDRESSES: [u16; 3] = [9998, 19_998, 29_998];
 
 /// Options of a drive of any profile.
@@ -37,7 +39,8 @@ const TRIP_ADDRESSES: [u16; 3] = [9998, 19_998, 29_998];
 pub struct ProfileOptions {
     /// Profile of the drive.
     pub profile: Arc<Profile>,
-    /// The registers that no real drive has are there: a fault code trips, and 1 behind it gives the drive to its panel.
+    /// Whether the simulator's own registers exist: a fault code trips the drive, and 1 in the register after it
+    /// switches to panel control.
     pub trip_register: bool,
     /// Time before a reply; with `None` the line decides.
     pub turnaround: Option<Duration>,
@@ -45,7 +48,7 @@ pub struct ProfileOptions {
     pub values: BTreeMap<PointIndex, Given>,
 }
 
-/// The value of a point as given.
+/// The given value of a point.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Given {
     /// A number in the unit of the point; 1 is true.
@@ -64,15 +67,14 @@ impl ProfileOptions {
         }
     }
 
-    /// Whether drives of the profile can be simulated: not those of an N2 board, and not those whose `simulator` is an unknown
-    /// name.
+    /// Whether drives of the profile can be simulated: not with an N2 board, and not if `simulator` is an unknown name.
     pub fn can_simulate(profile: &Profile) -> bool {
         let named = profile.simulator.as_deref();
         let known = named.is_none_or(|name| name == BY_CONTROL || FAMILIES.iter().any(|family| family.name == name));
         known && !profile.protocols.contains(&crate::codec::Protocol::N2)
     }
 
-    /// PDU address of the holding register that trips it; the next one gives it to its panel.
+    /// PDU address of the holding register that trips the drive; the next one switches to panel control.
     pub fn trip_address(&self) -> u16 {
         let is_free = |address: &u16| {
             let ranges = &self.profile.ranges;
@@ -87,7 +89,7 @@ impl ProfileOptions {
     }
 }
 
-/// `simulator` of a profile whose drive follows `[control]` although its base family has hand-written words.
+/// Value of `simulator` in a profile whose drive follows `[control]` although its base family has hand-written words.
 const BY_CONTROL: &str = "control";
 
 /// A simulated drive of any profile.
@@ -102,7 +104,7 @@ pub struct ProfileDrive {
     body: Body,
     /// The control word that counted last.
     word: u16,
-    /// How many words of the start sequence the drive has received, and when its status shows that.
+    /// Number of words of the start sequence that the drive has received, and when its status shows that.
     position: usize,
     shows_at: SimTime,
     /// The run command that holds: in reverse or not.
@@ -168,7 +170,7 @@ impl ProfileDrive {
         }
     }
 
-    /// A value that was written to a place that may take commands.
+    /// Processes a value that was written to a register that may take commands.
     fn apply_word(&mut self, place: ControlItem, word: u16, now: SimTime) {
         let Some(control) = self.control.clone() else {
             return;
@@ -212,7 +214,7 @@ impl ProfileDrive {
         );
         if told.resets && self.body.latch.fault() != 0 {
             self.body.latch.reset();
-            // Other drives must first see the run command switched off.
+            // Other drives must see the run command switched off first.
             if restarts || self.run.is_none() {
                 self.body.latch.obeys(false);
             }
@@ -241,13 +243,13 @@ impl ProfileDrive {
         }
     }
 
-    /// Whether a run command acts only at the moment when it is written.
+    /// Whether a run command only acts at the moment when it is written.
     fn acts_once(&self) -> bool {
         let said = || self.control.as_ref().is_some_and(effect::acts_once);
         self.family.map_or_else(said, |family| family.acts_once)
     }
 
-    /// Moves the drive to another state of the start sequence; a state that it is in already takes no time.
+    /// Moves the drive to another state of the start sequence; staying in the same state takes no time.
     fn come_to(&mut self, position: usize, now: SimTime) {
         if self.position < position {
             let step = position.saturating_sub(1);
@@ -277,14 +279,14 @@ impl ProfileDrive {
         self.body.latch.obeys(false);
     }
 
-    /// Stops the motor from elsewhere than the bus: the drive does not run by the previous word, although the word
-    /// still reads back.
+    /// Stops the motor by another source than the bus: the drive no longer runs by the previous word, although the
+    /// word still reads back.
     fn stand(&mut self) {
         self.halt();
         self.word = 0;
     }
 
-    /// The reference with its sign, Hz.
+    /// The reference in Hz, with its sign.
     fn reference(&self) -> f64 {
         let hertz = |model: ModelPoint, factor: f64| self.commanded(model).map(|value| value * factor);
         let frequency = hertz(ModelPoint::FrequencyReference, 1.0);
@@ -306,7 +308,7 @@ impl ProfileDrive {
         raw.decode(&words?, point.kind()).map(Value::as_f64)
     }
 
-    /// Gives the drive to its panel, which stops the motor, or back to the bus, which must command it again.
+    /// Switches the drive to panel control, which stops the motor, or back to the bus, which must command it again.
     fn give_to_bus(&mut self, on: bool) {
         if self.remote != on {
             (self.remote, self.position) = (on, 0);

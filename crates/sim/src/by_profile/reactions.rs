@@ -1,4 +1,4 @@
-//! How the families react to the words written to them, by hand from their manuals: no profile is read here.
+//! How the families react to the words written to them, written by hand from their manuals without using the profiles.
 
 use super::status::{self, Shows, Words};
 use crate::codec::Table;
@@ -6,9 +6,9 @@ use crate::codec::Table;
 /// Effect of a word on the motor and the start sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum MotorEffect {
-    /// The drive goes on as before.
+    /// The word changes nothing.
     Nothing,
-    /// The drive has come to this position in its start sequence; the motor is not fed.
+    /// The drive has reached this position in its start sequence; the motor is not powered.
     Prepares(usize),
     Runs {
         /// Whether the motor runs in reverse, without regard to the sign of the reference.
@@ -28,11 +28,11 @@ pub(super) struct WordEffect {
     pub(super) does: MotorEffect,
     /// Whether the word resets a fault, before anything else.
     pub(super) resets: bool,
-    /// The word that counts from now on.
+    /// The word that is in force from now on.
     pub(super) word: u16,
 }
 
-/// State of the drive that decides what a word does.
+/// State of the drive that determines the effect of a word.
 #[derive(Clone, Copy)]
 pub(super) struct Known<'d> {
     /// The word that counted last.
@@ -46,7 +46,7 @@ pub(super) struct Known<'d> {
     pub(super) at: &'d dyn Fn(Table, u16) -> u16,
 }
 
-/// A family that is known by hand.
+/// A family with hand-written words.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Family {
     /// Name in profiles.
@@ -55,11 +55,11 @@ pub(super) struct Family {
     pub(super) word: fn(&Known<'_>, u16) -> WordEffect,
     /// Effect of another register or coil.
     pub(super) other: fn(Table, u16, u16) -> Option<WordEffect>,
-    /// Words act once, when they are written, and are not kept as a standing command.
+    /// Whether words act once, when they are written, and do not stay as a command.
     pub(super) acts_once: bool,
     /// A reset while a run command stands starts the motor.
     pub(super) restarts_on_reset: bool,
-    /// The status words, all bits of them.
+    /// The status words of the family with all their bits.
     pub(super) status: fn(&Shows) -> Words,
 }
 
@@ -110,7 +110,7 @@ pub(super) const FAMILIES: [Family; 16] = [
         restarts_on_reset: true,
         ..family("vacon-10", vacon, status::vacon)
     },
-    // States of a Hitachi are coils, each a point of its own.
+    // The states of a Hitachi are coils, each a separate point.
     Family {
         other: hitachi_coils,
         ..family("hitachi", hitachi, |_| Vec::new())
@@ -137,7 +137,7 @@ fn runs(reverse: bool) -> MotorEffect {
     MotorEffect::Runs { reverse }
 }
 
-/// Two bits for two directions; both together are no run command.
+/// Two bits for two directions; both together are not a run command.
 fn pair(bits: u16) -> MotorEffect {
     match bits {
         1 => runs(false),
@@ -169,7 +169,7 @@ fn profidrive(known: &Known<'_>, word: u16) -> WordEffect {
     off_words(known, word, is(word, 0x0800))
 }
 
-/// Without bit 10 a word is ignored; bits 2 to 5 off brake, coast, stop quickly and freeze.
+/// Danfoss: without bit 10 a word is ignored; bits 2 to 5 at 0 brake, coast, stop quickly and freeze.
 fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
     if !is(word, 0x0400) {
         return effect(MotorEffect::Nothing, false, known.before);
@@ -184,7 +184,7 @@ fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
     effect(does, rises(known, word, 0x0080), word)
 }
 
-/// 6 shutdown, 7 switch on, 15 enable operation, each from the state before it.
+/// CiA 402: 6 is shutdown, 7 switch on, 15 enable operation, each accepted only from the previous state.
 fn cia402(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word & 0x000F {
         _ if known.faulted => MotorEffect::Coasts,
@@ -208,7 +208,7 @@ fn yaskawa(known: &Known<'_>, word: u16) -> WordEffect {
     effect(does, rises(known, word, 0x0008) && !any(word, 3), word)
 }
 
-/// Bits 1 and 0 run (10) or stop (01), bits 5 and 4 say the direction; 0 does nothing.
+/// Delta: bits 1 and 0 run (10) or stop (01), bits 5 and 4 set the direction; 0 does nothing.
 fn delta(known: &Known<'_>, word: u16) -> WordEffect {
     let reverse = match word >> 4 & 3 {
         1 => false,

@@ -1,4 +1,4 @@
-//! The four tables of a drive of any profile: which addresses there are, and what is read and written.
+//! The four tables of a simulated drive of any profile: which addresses exist, and what is read and written.
 
 use std::collections::BTreeMap;
 
@@ -13,12 +13,12 @@ use crate::drive::identify::{PRODUCT, VENDOR};
 use crate::drive::profile::Part;
 use crate::drive::{Point, Profile, Value};
 
-/// Registers and bits by their address; what is not among them does not exist.
+/// Registers and bits by address; addresses not in the map do not exist.
 #[derive(Debug, Clone)]
 pub(super) struct Registers(BTreeMap<Key, u16>);
 
 impl Registers {
-    /// All registers that the profile names, at 0.
+    /// All registers that the profile uses, set to 0.
     pub(super) fn new(profile: &Profile, control: Option<&Control>) -> Registers {
         let mut all = BTreeMap::new();
         for range in profile.ranges.iter().filter(|range| range.holes) {
@@ -55,7 +55,7 @@ impl Registers {
         }
     }
 
-    /// Takes over what a drive keeps without supply: settings, but no commands.
+    /// Copies what a drive keeps without supply: settings, but no commands.
     pub(super) fn keep_settings(&mut self, from: &Registers, profile: &Profile, control: Option<&Control>) {
         let places = control.map(effect::places).unwrap_or_default();
         let is_place = |key: Key| places.iter().any(|place| (place.table, place.address) == key);
@@ -227,7 +227,7 @@ impl ProfileDrive {
     }
 }
 
-/// Whether a setting does not take these values: outside its range, or not one of those that it lists. References are limited by
+/// Whether a setting refuses these values because they are outside its range or its list. References are limited by
 /// the drive instead.
 fn refuses(point: &Point, items: &[(Key, u16)]) -> bool {
     let Some(raw) = point.raw().filter(|_| point.write && point.model.is_none()) else {

@@ -1,4 +1,4 @@
-//! The status words of the families, by hand from their manuals: no profile is read here.
+//! The status words of the families, written by hand from their manuals without using the profiles.
 
 use super::reactions::is;
 use crate::drive::profile::Part;
@@ -13,7 +13,7 @@ pub(super) struct Shows {
     pub(super) commanded: bool,
     /// The direction that was ordered last.
     pub(super) ordered_reverse: bool,
-    /// The direction in which the motor turns, or is about to.
+    /// The direction in which the motor turns, or is about to turn.
     pub(super) turns_reverse: bool,
     pub(super) at_reference: bool,
     pub(super) standing: bool,
@@ -50,17 +50,18 @@ impl Shows {
     }
 }
 
-/// Holding registers by their PDU address, and what is in them.
+/// Holding registers by PDU address, with the parts of their content.
 pub(super) type Words = Vec<(u16, Part)>;
 
-/// All bits of a register, as those that are on.
+/// All bits of a register, with whether each is on.
 fn word(address: u16, bits: &[(u8, bool)]) -> Words {
     let on = bits.iter().filter(|(_, on)| *on);
     let value = on.fold(0, |word, (bit, _)| word | 1u16 << bit);
     vec![(address, Part { mask: u16::MAX, value })]
 }
 
-/// Bits 0 ready to switch on, 1 ready, 2 operation, 3 fault, 4 and 5 OFF2 and OFF3 inactive, 6 switching on inhibited, 9 remote.
+/// The bits that many families share: 0 ready to switch on, 1 ready, 2 operation, 3 fault, 4 and 5 OFF2 and OFF3
+/// inactive, 6 switching on inhibited, 9 remote.
 fn off_bits(shows: &Shows) -> Vec<(u8, bool)> {
     let ready = shows.position > 0 && shows.ready();
     vec![
@@ -149,8 +150,8 @@ pub(super) fn yaskawa(shows: &Shows) -> Words {
     [state, status].concat()
 }
 
-/// 0x2101: bits 1 and 0 00 stopped, 01 stopping, 11 running; 4 the direction that was ordered, 3 the one that it turns in; 10 run
-/// commands come from the bus.
+/// Status of a Delta at 0x2101: bits 1 and 0 are 00 stopped, 01 stopping, 11 running; bit 4 is the ordered
+/// direction, bit 3 the actual one; bit 10 means that run commands come from the bus.
 pub(super) fn delta(shows: &Shows) -> Words {
     let turns = if shows.standing {
         shows.ordered_reverse

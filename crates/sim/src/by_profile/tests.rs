@@ -1,4 +1,4 @@
-//! Families by hand: their words from the figures of the manuals, not from their profiles.
+//! Families tested by hand: their words come from the manuals, not from their profiles.
 
 use drivegate_testkit::Order::{Single, Word};
 use drivegate_testkit::{Family, Order, families, number, orders, rows};
@@ -67,14 +67,14 @@ impl ProfiledDrive {
 struct Case {
     family: Family,
     reset: Vec<Order>,
-    /// The status register while it runs forward: address, bits that count and what they are, from the manuals.
+    /// The status register while the motor runs forward: address, relevant bits, and their values, from the manuals.
     runs: [u16; 3],
     fault: [u16; 3],
-    /// Orders that start nothing when each is given alone at standstill.
+    /// Orders that must not start the motor when each is given alone at standstill.
     idle: Vec<Order>,
 }
 
-/// Profile, reset, status register while it runs and with a fault, words that start nothing.
+/// Columns: profile, reset, status register while running and with a fault, words that start nothing.
 const CASES: &str = "\
 abb-acs550         | 0=0x47E,0x4FE,0x47E         | 3 0x000F 0x0007      | 3 0x000C 0x0008      | 0=0x47F,0x1,0x477,0x4FF,0x7F,0x4FE
 abb-acs580         | 0=0x47E,0x4FE,0x47E         | 3 0x000F 0x0007      | 3 0x000C 0x0008      | 0=0x47F,0x1
@@ -95,7 +95,7 @@ ls-g100            | 5=8                         | 13 0x000E 0x0002     | 13 0x0
 teco-f510          | 0x2501=0,8,0                | 0x2520 0x000B 0x0001 | 0x2520 0x0009 0x0008 | 0x2501=2,8,0x10
 vacon-10           | 2000=0,4,0                  | 2100 0x000E 0x0002   | 2100 0x000A 0x0008   | 2000=2,4";
 
-/// All cases, in the order of [`families`].
+/// All cases in the order of [`families`].
 fn cases() -> Vec<Case> {
     let register = |text: &str| -> [u16; 3] {
         let numbers: Vec<u16> = text.split_whitespace().map(number).collect();
@@ -167,7 +167,7 @@ fn words_that_start_nothing() {
             rig.wait(1000);
             assert!(!rig.drive.state().running, "{}: {order:?}", case.family.profile);
         }
-        // Without the first word of the start sequence, a drive does not run.
+        // Without the first word of the start sequence, a drive must not run.
         if case.family.start.len() > 1 && case.family.profile != "hitachi-wj200" {
             let mut rig = ProfiledDrive::named(case.family.profile);
             rig.send(&case.family.reference);
@@ -204,7 +204,8 @@ fn faults_are_reset_and_start_nothing() {
     }
 }
 
-/// Fuji and Vacon 10: a reset with a run command that stands starts the motor; with others the command has to come anew.
+/// Fuji and Vacon 10: a reset while the run command is on starts the motor; with other families the command must be
+/// given again.
 #[test]
 fn a_reset_with_a_run_command() {
     for (name, orders, starts) in [
@@ -224,7 +225,7 @@ fn a_reset_with_a_run_command() {
     }
 }
 
-/// The panel: the motor stops, the bus is not obeyed, and a command that came meanwhile does not start it afterwards.
+/// Panel control: the motor stops, the bus is ignored, and a command written meanwhile does not start the motor afterwards.
 #[test]
 fn a_drive_at_its_panel_does_not_obey_the_bus() {
     for case in &cases() {
@@ -263,7 +264,7 @@ fn a_motor_that_comes_down() {
     assert_eq!(rig.register(Table::Holding, 0x2101) & 3, 0);
 }
 
-/// Every profile without a simulator of its own answers each of its points and nothing else, and as its limits say.
+/// Every profile without a dedicated simulator answers for each of its points and for nothing else, within its limits.
 #[test]
 fn every_profile_answers_its_points() {
     let profiles = Profiles::built_in();
@@ -363,7 +364,7 @@ fn any_bench() -> impl Strategy<Value = (Arc<Profile>, Vec<(RequestPdu, u64)>)> 
 }
 
 proptest! {
-    /// Any request gets a reply that fits it, and the motor turns only while there is no fault.
+    /// Property for any requests: each gets a matching reply, and the motor turns only while there is no fault.
     #[test]
     fn every_reply_fits_its_request((profile, requests) in any_bench()) {
         let mut rig = ProfiledDrive::of(&profile);
@@ -415,7 +416,7 @@ fn a_profile_of_ones_own() {
     assert_ne!(status(&mut rig), 0x21, "that takes a while");
     rig.wait(30);
     assert_eq!(status(&mut rig), 0x21);
-    // The second step ends by time, so these writes come too early.
+    // The second step needs time to complete, so these writes come too early.
     rig.send(&[Single(0, 0x0407), Single(0, 0x040F)]);
     assert!(!rig.drive.state().running);
     rig.wait(200);
@@ -438,7 +439,7 @@ fn a_profile_of_ones_own() {
     assert!(!rig.drive.state().running);
 }
 
-/// A meter: values as given, settings within their range, texts, a scale in another register.
+/// A meter has the given values, settings within their range, texts, and a scale in another register.
 #[test]
 fn a_meter_holds_what_it_was_given() {
     let text = format!(
@@ -470,7 +471,7 @@ fn a_meter_holds_what_it_was_given() {
     assert_eq!(write(Word(9, 2)), Reply::Written);
 }
 
-/// The state of a point of the common model as the registers of a drive show it; none where the family lacks it.
+/// The state of a point of the common model as the registers of a drive show it; `None` if the family lacks it.
 fn shown(rig: &mut ProfiledDrive, profile: &Profile, point: ModelPoint) -> Option<bool> {
     let mut value = |index: PointIndex| {
         let of = profile.points.get(index).unwrap();
@@ -501,11 +502,11 @@ fn every_family_shows_each_state_and_no_other() {
         let check = |rig: &mut ProfiledDrive, when: &str, expected: [bool; 8]| {
             for (point, expected) in ModelPoint::STATUS_WORD.into_iter().zip(expected) {
                 let found = shown(rig, &profile, point);
-                // Some families are ready only while they stand.
+                // Some families are ready only while the motor stands.
                 let moving = point == ModelPoint::Ready && !["stopped", "tripped"].contains(&when);
                 // WEG belongs to the bus with the first word.
                 let early = point == ModelPoint::Remote && when == "switched on";
-                // Running is bits 0 to 2 of ABB, and OFF1 takes bit 1 away at once.
+                // For ABB, running means bits 0 to 2, and OFF1 clears bit 1 at once.
                 let off = name.starts_with("abb") && when == "coming down" && point == ModelPoint::Running;
                 let right = found.is_none_or(|found| found == expected) || moving || early || off;
                 assert!(right, "{name}, {when}: {} is {found:?}", point.name());
@@ -539,7 +540,7 @@ fn every_family_shows_each_state_and_no_other() {
     }
 }
 
-/// A last step that waits for a state comes to it, a state under a mask is shown shifted, and of two directions one.
+/// A last step that waits for a state reaches it, a masked state is shown shifted, and of two directions only one is shown.
 #[test]
 fn states_of_a_profile_of_ones_own() {
     let text = format!(

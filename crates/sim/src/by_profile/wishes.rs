@@ -11,23 +11,23 @@ pub(super) type Key = (Table, u16);
 /// Bits in registers, all of which make one state.
 pub(super) type Bits = Vec<(Key, Part)>;
 
-/// A state, which any of these bits make, is to be so or not.
+/// A state that any of these bits represent must be on, or off.
 #[derive(Debug, Clone)]
 pub(super) struct Wish {
     pub(super) any: Vec<Bits>,
     pub(super) want: bool,
 }
 
-/// Most nodes of a search; no profile has this number of states in one register.
+/// Most nodes of a search for bits; no profile has that many states in one register.
 const MOST_TRIES: usize = 4000;
-/// Ways to keep a state from being so that are followed.
+/// Most ways to keep a state off that the search follows.
 const MOST_WAYS: usize = 24;
 
 /// Bits whose values are decided.
 type Fixed = BTreeMap<Key, Part>;
 
-/// Bits that fulfil the wishes, the first ones before later ones that contradict them; where there is a choice the bits stay as
-/// they are in `base`.
+/// Bits that satisfy the wishes; an earlier wish takes precedence over later ones that contradict it. Bits with a
+/// free choice keep their value from `base`.
 pub(super) fn fulfilled(wishes: &[Wish], base: impl Fn(Key) -> u16) -> Fixed {
     let mut fixed = Fixed::new();
     let mut taken: Vec<&Wish> = Vec::new();
@@ -56,7 +56,7 @@ fn search(fixed: &Fixed, wishes: &[&Wish], base: &impl Fn(Key) -> u16, tries: &m
     all.find_map(|way| search(&way, rest, base, tries))
 }
 
-/// Every way to fulfil a wish beside what is decided, those first that change least of `base`.
+/// Every way to satisfy a wish in addition to what is fixed, those that change least of `base` first.
 fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
     match wish.want {
         true => {
@@ -91,7 +91,7 @@ fn with(fixed: &Fixed, bits: &Bits) -> Option<Fixed> {
     Some(next)
 }
 
-/// Ways in which at least one of these bits is the other way.
+/// Ways in which at least one of these bits has the opposite value.
 fn without(fixed: &Fixed, bits: &Bits) -> Vec<Fixed> {
     if with(fixed, bits).is_none() {
         return vec![fixed.clone()];
@@ -134,7 +134,7 @@ mod tests {
         fulfilled(&wishes, |_| 0).get(&WORD).map_or(0, |part| part.value)
     }
 
-    /// Words of a CiA 402 drive and of an ABB drive, by hand.
+    /// Status words of a CiA 402 drive and of an ABB drive, worked out by hand.
     #[test]
     fn words_show_all_states_at_once() {
         let ready: &[(u16, u16)] = &[(0x6F, 0x21), (0x6F, 0x23), (0x4F, 0x40)];
@@ -152,7 +152,7 @@ mod tests {
         let runs = word(&[(false, fault), (true, running), (true, ready), (true, remote)]);
         assert_eq!(runs, 0x227, "not ready at once: the first ones count");
         assert_eq!(word(&[(true, fault), (false, running), (true, remote)]), 0x208);
-        // The stopped one may not look ready, running or stopping.
+        // A stopped drive must not look ready, running or stopping.
         assert_eq!(
             word(&[(false, &[(3, 3)]), (false, &[(3, 1)]), (true, &[(0x400, 0x400)])]),
             0x400

@@ -56,7 +56,7 @@ impl Diagnostics {
         *self = Diagnostics::default();
     }
 
-    /// Carries out the subfunction; `None` for the one that is not answered.
+    /// Carries out the subfunction; `None` for the one without an answer.
     pub(super) fn serve(&mut self, subfunction: u16, data: u16) -> Option<Reply> {
         if Self::is_reinitialise(subfunction, data) {
             self.reinitialise();

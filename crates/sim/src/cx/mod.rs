@@ -1,6 +1,7 @@
-//! A Vacon CX, CXL or CXS drive with its Modbus board, as reference/drives.md sections 4 and 10 describe it.
+//! A simulated Vacon CX, CXL or CXS drive with its Modbus board, as described in reference/drives.md sections 4 and 10.
 //!
-//! Pure: the time is an argument. A lost master changes nothing, because the manual describes no supervision of the bus.
+//! Pure: the time is an argument. Loss of the master changes nothing, because the manual describes no supervision
+//! of the bus.
 
 mod diagnostics;
 mod options;
@@ -184,7 +185,7 @@ impl CxDrive {
         reply
     }
 
-    /// In Listen Only Mode nothing is answered, and nothing but function 08/0001 is acted upon.
+    /// Listen Only Mode: no request is answered, and only function 08/0001 has an effect.
     fn listen(&mut self, request: Option<&RequestPdu>) {
         match request {
             Some(&RequestPdu::Diagnostics { subfunction, data }) if Diagnostics::is_reinitialise(subfunction, data) => {

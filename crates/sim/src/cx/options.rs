@@ -102,8 +102,7 @@ pub struct CxOptions {
     pub time_step: f64,
     /// Whether the fieldbus is the active control source at first.
     pub fieldbus: bool,
-    /// Parameters to start with: (group, number) and value; those that a drive does not have or not allow are passed
-    /// over.
+    /// Initial parameters: (group, number) and value; those that a drive does not have or does not allow are skipped.
     pub parameters: Vec<((u16, u16), u16)>,
     /// Whether PDU 9999 is a holding register of the simulator: writing a number trips the drive with that fault. No
     /// real drive has this register.
@@ -111,7 +110,7 @@ pub struct CxOptions {
 }
 
 impl CxOptions {
-    /// PDU address of the simulator's own trip register: the last address of group 0, which has no parameter.
+    /// PDU address of the simulator's own trip register: the last address of group 0, at which there is no parameter.
     pub const TRIP_ADDRESS: u16 = 9999;
 }
 

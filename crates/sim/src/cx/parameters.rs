@@ -1,7 +1,7 @@
 //! Parameters of the simulated CX by their address (reference/drives.md 4.3).
 //!
-//! The manual names Par 0.1, 1.1, 1.2 and 3.2 only. The others, their ranges and defaults are plausible values of the
-//! drive's applications, so that there is something to read and the motor has a plate.
+//! The manual names only Par 0.1, 1.1, 1.2 and 3.2. The others, their ranges and defaults are plausible values of
+//! the drive's applications, so that there are parameters to read and the motor has nameplate data.
 
 use std::collections::BTreeMap;
 
@@ -60,7 +60,7 @@ const TABLE: [(u16, u16, u16, u16, u16); 28] = [
 /// cos phi of the motor, which no parameter holds.
 const COS_PHI: f64 = 0.85;
 
-/// All parameters of one drive by address. Parameters survive a power cycle.
+/// All parameters of one drive by address, which survive a power cycle.
 #[derive(Debug, Clone)]
 pub(super) struct Parameters {
     set: ParameterSet,
@@ -93,12 +93,13 @@ impl Parameters {
     /// Sets a parameter, not over the bus.
     ///
     /// # Errors
-    /// No such parameter, or a value outside its range; the minimum frequency may not exceed the maximum. Nothing is set then.
+    /// If there is no such parameter, or the value is outside its range or would put the minimum frequency above
+    /// the maximum. No value is set then.
     pub(super) fn set(&mut self, address: u16, value: u16) -> Result<(), Refused> {
         self.set.set(address, value)
     }
 
-    /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
+    /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
     ///
     /// # Errors
     /// The errors of [`Parameters::set`].
@@ -108,7 +109,7 @@ impl Parameters {
         Ok(())
     }
 
-    /// Writes that came over the bus, by address.
+    /// Writes received over the bus, by address.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         self.set.writes().clone()
     }

@@ -117,7 +117,7 @@ impl CxDrive {
             9 => unsigned((totals.trip_hours / step).floor()),
             10 => unsigned((totals.energy * 1000.0).floor()),
             11 => unsigned((totals.trip_energy * 1000.0).floor()),
-            // Terminals with nothing connected.
+            // These terminals have nothing connected.
             12..=15 => 0,
             16 => bit(self.ready(), 1) | bit(self.body.shows_running(), 2) | bit(self.body.latch.fault() != 0, 4),
             17 => PROGRAM,

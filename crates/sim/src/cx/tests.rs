@@ -80,7 +80,7 @@ fn exchange(drive: &mut CxDrive, frame: &str, now: SimTime) -> String {
     out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
 }
 
-/// Worked frames of reference/drives.md 7.2 and 7.4, in an order in which a drive with a 29.6 A motor comes to their states.
+/// Worked frames of reference/drives.md 7.2 and 7.4, in an order in which a drive with a 29.6 A motor reaches their states.
 #[test]
 fn worked_frames() {
     let mut drive = CxDrive::new(
@@ -353,7 +353,7 @@ fn counters_of_the_board() {
     rig.drive
         .broadcast(&RequestPdu::WriteCoil { address: 0, on: false }, now);
     rig.drive.malformed(&[0x07], Exception::FUNCTION, now);
-    // Four messages to this drive; each of the reads counts itself.
+    // There were four messages to this drive; each read of the counter counts itself.
     assert_eq!(value(rig.diagnose(0x000B, 0)), 3);
     assert_eq!(value(rig.diagnose(0x000C, 0)), 3);
     assert_eq!(value(rig.diagnose(0x000D, 0)), 2);

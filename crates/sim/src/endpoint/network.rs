@@ -106,7 +106,7 @@ impl Network {
             .collect()
     }
 
-    /// Connects to the server if this endpoint dials and has no connection.
+    /// Connects to the server, if this endpoint is the one that dials and has no connection.
     pub(crate) fn connect(&mut self) {
         if let Way::Dial {
             server,
@@ -121,7 +121,7 @@ impl Network {
         }
     }
 
-    /// Receives the next frame of the master, or bytes of it if the way has no frames; returns 0 if there are none now.
+    /// Receives the next frame of the master, or bytes of it if the transport has no frames; returns 0 if there are none.
     pub(crate) fn receive(&mut self, buffer: &mut [u8]) -> usize {
         match &mut self.way {
             Way::ModbusTcp { listener, client, id } => {
@@ -129,12 +129,13 @@ impl Network {
                     && stream.set_nonblocking(true).is_ok()
                     && stream.set_nodelay(true).is_ok()
                 {
-                    // A client that connects again has lost its former connection.
+                    // A client that connects again has lost its previous connection.
                     (*client, self.received) = (Some(stream), Vec::new());
                 }
                 let count = super::receive_from(client, buffer);
                 self.received.extend(buffer.iter().take(count));
-                // Requests that queued up while the process stood still were given up by the master: the last one is answered.
+                // Requests that queued up while the process was stalled were given up by the master, so only the
+                // last one is answered.
                 let mut last = None;
                 while let Some(next) = take_adu(&mut self.received) {
                     last = Some(next);
@@ -156,7 +157,7 @@ impl Network {
         }
     }
 
-    /// Hands bytes of the line to the master: whole frames where the way has frames.
+    /// Sends bytes of the line to the master: complete frames if the transport has frames.
     pub(crate) fn send(&mut self, bytes: &[u8]) -> usize {
         if let Way::Dial { stream, .. } = &mut self.way {
             let Some(open) = stream else { return 0 };
@@ -179,7 +180,7 @@ impl Network {
             }
             Way::Udp { socket, client } => {
                 if let Some(client) = client {
-                    // Lost as on any network.
+                    // A datagram may be lost, as on any network.
                     let _ = socket.send_to(&self.answered, *client);
                 }
             }

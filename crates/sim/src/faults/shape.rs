@@ -1,4 +1,4 @@
-//! The bytes that come over the line under a fault.
+//! The bytes on the line when a fault occurs.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use crate::framing;
 use crate::random::Random;
 
 impl FaultPlan {
-    /// The bytes that come over the line for `reply` to `request` under a fault, in order.
+    /// The bytes that appear on the line for `reply` to `request` under a fault, in order.
     pub fn shape(
         &mut self,
         fault: Option<Fault>,
@@ -28,7 +28,7 @@ impl FaultPlan {
             ..burst(bytes)
         };
         match fault {
-            // Which character the mains hit is known on the line only.
+            // The character that the mains hit is only determined on the line.
             None | Some(Fault::Exception(_) | Fault::Mains(_)) => vec![burst(reply)],
             Some(Fault::Deaf | Fault::Drop | Fault::CutRequest | Fault::NeedsPause(_)) => Vec::new(),
             Some(Fault::Truncate) => vec![burst(cut(reply, random))],
@@ -90,9 +90,9 @@ pub enum Kind {
     Regular,
     /// The regular reply, delivered character by character.
     Split,
-    /// The master cannot expect it: a request that meets it is not the master's doing.
+    /// The master cannot foresee this burst: a request that collides with it is not the master's fault.
     Provoked,
-    /// The burst comes together with the request, not after it.
+    /// The burst appears together with the request, not after it.
     Echo,
 }
 
@@ -107,7 +107,7 @@ pub struct Burst {
     pub kind: Kind,
 }
 
-/// Two replies at once: while both drives send, a low bit of either wins, and the later reply is received to its end.
+/// Two simultaneous replies: while both drives send, a low bit of either wins, and the later reply is received to its end.
 fn twin(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<Vec<u8>> {
     let later = match foreign(Foreign::Data, protocol, &reply) {
         // N2 replies carry no address, so the second reply equals the first.
@@ -133,7 +133,7 @@ fn cut(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     reply
 }
 
-/// Corrupts a reply so that it is not a valid frame, not even another one.
+/// Corrupts a reply so that it is not a valid frame of any kind.
 fn corrupt(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     match protocol {
         Protocol::ModbusRtu | Protocol::N2 => flip(reply, random),
@@ -169,7 +169,7 @@ fn noise(random: &mut Random) -> Vec<u8> {
     (0..random.within(1..=3)).map(|_| random.byte()).collect()
 }
 
-/// A sound frame that does not answer the request; its data is changed so that it proves itself when believed.
+/// A valid frame that does not answer the request; its data is changed so that a test notices if a master accepts it.
 pub(super) fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
     let Some((address, mut pdu)) = protocol.open_frame(reply) else {
         return Vec::new();
@@ -186,7 +186,7 @@ pub(super) fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8
                 // answer.
                 *function = if *function & 0x7F == 3 { 4 } else { 3 };
             }
-            // Whatever it was, it becomes a reply of one register unless it has registers already.
+            // A reply without registers becomes a reply of one register.
             if !registers {
                 pdu.truncate(1);
                 pdu.extend_from_slice(&[2, 0x55, 0x55]);

@@ -22,7 +22,7 @@ fn line(rules: LineRules, faults: FaultPlan) -> HalfDuplex {
     HalfDuplex::new(rules, Slaves::new(drives, SimTime::ZERO), faults, Transcript::new(100))
 }
 
-/// Lets the line run to `until`: (due, bytes) of each delivery.
+/// Lets the line run to `until`; returns (due, bytes) of each delivery.
 fn run(line: &mut HalfDuplex, until: SimTime) -> Vec<(SimTime, Vec<u8>)> {
     let mut seen = Vec::new();
     while let Some(wake) = line.wake().filter(|wake| wake.at <= until) {
@@ -36,7 +36,7 @@ fn run(line: &mut HalfDuplex, until: SimTime) -> Vec<(SimTime, Vec<u8>)> {
     seen
 }
 
-/// From the read of a request to the end of its reply: 8 + 3.5 + 27 characters and the turnaround.
+/// Time from the read of a request to the end of its reply: 8 + 3.5 + 27 characters and the turnaround.
 fn exchange_time(format: &LineFormat) -> Duration {
     format.chars(8) + format.silence_chars() + us(500) + format.chars(REPLY_CHARS)
 }
@@ -284,7 +284,7 @@ fn an_ascii_reply_begins_a_turnaround_after_the_line_feed() {
     assert_eq!((s.requests, s.silence_violations, s.bad_crc), (2, 0, 0));
 }
 
-/// A TECO that answers a wrong check code does so after its usual time; the request counts as a bad frame.
+/// A TECO that answers a wrong check code does so after its usual turnaround; the request counts as a bad frame.
 #[test]
 fn an_answer_to_a_wrong_check_code_takes_its_time_too() {
     let rules = ascii_rules();
@@ -368,7 +368,7 @@ proptest! {
     }
 }
 
-/// reference/drives.md 5.1: the card answers 15 ms after a message, whatever the line's rules have for others.
+/// The card answers 15 ms after a message (reference/drives.md 5.1), whatever turnaround the line has for other drives.
 #[test]
 fn a_drive_takes_its_own_turnaround() {
     let format = LineFormat::new(19_200, "7N2").unwrap();

@@ -1,10 +1,10 @@
-//! Which register or bit of the simulated drive stands behind each object of its N2 board: reference/drives.md 6.6 and 6.7.
+//! Register or bit of the simulated drive for each object of its N2 board: reference/drives.md 6.6 and 6.7.
 
 use crate::codec::Table;
 use crate::codec::n2::Region;
 use crate::simulated_drive::ModelOptions;
 
-/// Where the value of an object comes from, and where an override is written.
+/// Source of an object's value, and destination of an override.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Backing {
     /// A signed register; the value of one count.
@@ -13,11 +13,11 @@ pub enum Backing {
     Unsigned(Table, u16, f64),
     /// A bit of a register.
     Bit(Table, u16, u8),
-    /// The model has no such value: always the same.
+    /// A constant, because the model has no such value.
     Fixed(f32),
 }
 
-/// One object of a board.
+/// One object of an N2 board.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Entry {
     /// Region of the object.
@@ -32,7 +32,7 @@ pub struct Entry {
 /// Reaction of a board to an override beyond the limits of the parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Beyond {
-    /// Acknowledges it and takes the limit, if the value fits the variable (Vacon, Eaton).
+    /// Acknowledges the value and uses the limit instead, if the value fits the variable (Vacon, Eaton).
     Clamp,
     Refuse,
 }
@@ -40,9 +40,10 @@ pub enum Beyond {
 /// The objects of a family's N2 board, and how the board behaves.
 #[derive(Debug, Clone, Copy)]
 pub struct Map {
-    /// All objects of the board.
+    /// All objects of the N2 board.
     pub entries: &'static [Entry],
-    /// Whether an override of AI, BI or ADI changes what the bus sees until a release; otherwise both do nothing.
+    /// Whether an override of AI, BI or ADI changes what the bus reads until a release; otherwise override and
+    /// release do nothing.
     pub overrides_inputs: bool,
     /// AI have alarm and warning limits.
     pub has_limits: bool,
@@ -87,7 +88,7 @@ const fn limited(number: u8, place: Backing, low: f64, high: f64) -> Entry {
     }
 }
 
-/// Bits of a status word as BI `first`, `first` + 1, … and of a control word as BO.
+/// Bits of a status word as BI `first`, `first` + 1, …, and of a control word as BO.
 macro_rules! nx_entries {
     ($($more:expr,)*) => {
         &[
@@ -184,7 +185,7 @@ pub(crate) const HVX: Map = Map {
 /// A family without N2.
 pub(crate) const NONE: Map = Map { entries: &[], ..NX };
 
-/// TECO 7300PA with its PA-C card: the column "Modbus" of the tables.
+/// TECO 7300PA with its PA-C card, from the column "Modbus" of the tables.
 pub(crate) const TECO: Map = Map {
     entries: &[
         entry(Ai, 1, Unsigned(HOLDING, 0x0023, 0.01)),

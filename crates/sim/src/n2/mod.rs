@@ -1,8 +1,8 @@
 //! The N2 board of a simulated drive: it waits for Identify, has objects with attributes, reports changes and takes
 //! overrides (n2.md; reference/drives.md 6.2 to 6.7). Pure: the time is an argument.
 //!
-//! The drive behind the board gets requests as over Modbus, see [`maps`]. Behaviour that no manual specifies is an
-//! option or an entry of [`crate::codec::n2::assumptions`].
+//! The drive behind the N2 board gets requests as over Modbus, see [`maps`]. Behaviour that no manual specifies is
+//! an option or an entry of [`crate::codec::n2::assumptions`].
 
 pub(crate) mod maps;
 #[cfg(test)]
@@ -20,7 +20,7 @@ use crate::codec::n2::command::{CHECKSUM, DATA, LONGEST_REPORT, RESTARTED, SIZE,
 use crate::codec::n2::{Answer, Command, Object, Region};
 use crate::codec::{Exception, Reply, RequestPdu};
 
-/// Without a poll for that time a drive takes itself for alone (reference/drives.md 6.5).
+/// Time without a poll after which a drive considers itself disconnected (reference/drives.md 6.5).
 pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,7 +61,7 @@ pub struct Board {
     waiting: bool,
     /// Attributes set over the bus: configuration bytes, limits and times, by object and attribute.
     attributes: BTreeMap<(Object, u8), Vec<u8>>,
-    /// Overridden objects, with the values that they were given.
+    /// Overridden objects with the given values.
     overridden: BTreeMap<Object, Vec<u8>>,
     /// Status of the objects as last reported.
     reported: BTreeMap<Object, u8>,
@@ -101,15 +101,15 @@ impl Board {
         };
     }
 
-    /// Tells the board how often the drive, which feeds it, was switched on again so far.
+    /// Informs the board how often the drive, which supplies it, was switched on again so far.
     pub fn fed(&mut self, power_cycles: u32, now: SimTime) {
         if std::mem::replace(&mut self.power_cycles, power_cycles) != power_cycles {
             self.restart(now);
         }
     }
 
-    /// Appends the answer to a command to `out`; `Err` is the code that the frame itself causes. Nothing is appended if
-    /// the drive stays silent.
+    /// Appends the answer to a command to `out`; `Err` is the error code of an invalid frame. Nothing is appended
+    /// if the drive stays silent.
     pub fn answer(&mut self, command: &Result<Command, u8>, now: SimTime, model: Model<'_>, out: &mut Vec<u8>) {
         if self.map.stands_alone && now.saturating_sub(self.polled) > ALONE {
             self.overridden.clear();
@@ -250,7 +250,7 @@ impl Board {
     }
 
     fn float(&self, entry: &Entry, object: Object, model: Model<'_>) -> Option<f32> {
-        // An AO always shows the drive's parameter; an AI what the bus overrode it with.
+        // An AO always shows the drive's parameter; an AI shows the value with which the bus has overridden it.
         let given = self.overridden.get(&object).filter(|_| object.region == Region::Ai);
         match given.map(|data| <[u8; 4]>::try_from(data.as_slice())) {
             Some(Ok(bytes)) => Some(f32::from_be_bytes(bytes)),
@@ -304,7 +304,7 @@ impl Board {
             Backing::Bit(..) | Backing::Fixed(_) => return Err(TYPE),
         };
         if !(least..=most).contains(&(value / scale).round()) {
-            // Too large for the drive's variable, or no number.
+            // The value is too large for the drive's variable, or not a number.
             return Err(DATA);
         }
         let value = match (entry.limits, self.map.beyond) {
@@ -319,7 +319,7 @@ impl Board {
         store(address, count, model)
     }
 
-    /// All AI, AO, BI and BO, as after each Identify, whatever of it was reported before.
+    /// Reports all AI, AO, BI and BO, as after each Identify, even if they were reported before.
     fn full_report(&mut self, model: Model<'_>) {
         self.reports.clear();
         self.has_sent_reports = false;

@@ -56,7 +56,7 @@ impl NxWithBoard {
     }
 }
 
-/// The script of reference/drives.md 6.8, in an order in which the drive comes to its states.
+/// The script of reference/drives.md 6.8, in an order in which the drive reaches its states.
 #[test]
 fn the_frames_of_the_reference() {
     let mut rig = NxWithBoard::new(&maps::NX);
@@ -108,7 +108,7 @@ fn reports_come_in_pieces_until_they_are_acknowledged() {
         "what was sent before is not what is acknowledged"
     );
     while rig.ask("0105") != "A" {}
-    // BI 2 reports its changes once its reports are switched on.
+    // BI 2 reports its changes after its reports are switched on.
     assert_eq!(rig.ask("0121020101"), "A");
     assert_eq!(rig.ask("0122020101"), "A");
     rig.ask("0104");

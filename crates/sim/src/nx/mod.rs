@@ -1,8 +1,9 @@
-//! A Vacon NX, Eaton SVX or Eaton HVX drive with its OPTC2 or OPTC8 board, as reference/drives.md section 3 and 10 describe it.
+//! A simulated Vacon NX, Eaton SVX or Eaton HVX drive with its OPTC2 or OPTC8 board, as described in
+//! reference/drives.md sections 3 and 10.
 //!
-//! Pure: the time is an argument, and the drive works in steps of 10 ms, its update period. At each step it takes over
-//! the process data in and refreshes the process data out, so a bit that a master sets and clears within one step is
-//! never seen, as on the real drive.
+//! Pure: the time is an argument, and the drive works in steps of 10 ms, its update period. At each step it takes
+//! over the process data in and updates the process data out, so a bit that a master sets and clears within one
+//! step has no effect, as on the real drive.
 
 #[cfg(test)]
 mod eaton_tests;
@@ -67,7 +68,7 @@ pub mod status_word {
     pub const FLUX_READY: u16 = 1 << 7;
     /// Torque control's speed limit is **not** active.
     pub const NO_SPEED_LIMIT: u16 = 1 << 8;
-    /// Encoder sees counterclockwise.
+    /// The encoder detects counterclockwise rotation.
     pub const ENCODER_REVERSE: u16 = 1 << 9;
     /// Undervoltage fast stop is **not** active.
     pub const NO_UNDERVOLTAGE_STOP: u16 = 1 << 10;
@@ -82,7 +83,7 @@ pub mod status_word {
 /// Fault code: fieldbus fault (reference/drives.md 3.11).
 pub const FIELDBUS_FAULT: u16 = 53;
 
-/// Place from which a drive takes its commands.
+/// Control place from which a drive takes its commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ControlPlace {
     /// I/O terminals.
@@ -144,7 +145,7 @@ pub struct NxDrive {
     warning: bool,
     lost_master: bool,
     interlock: bool,
-    /// The hand-off-auto switch of an HVX stands at off.
+    /// Whether the hand-off-auto switch of an HVX is at off.
     switched_off: bool,
     busy_until: SimTime,
     heard: Option<SimTime>,
@@ -199,12 +200,12 @@ impl NxDrive {
         self.settings = self.parameters.settings();
     }
 
-    /// Commands from panel and terminals; obeyed while one of them is the control place.
+    /// Sets the commands from panel and terminals, which are obeyed while one of them is the control place.
     pub fn set_local(&mut self, command: Command) {
         self.local = command;
     }
 
-    /// Turns the hand-off-auto switch of an HVX to off, or away from it to where the control place stands.
+    /// Turns the hand-off-auto switch of an HVX to off, or to the position of the control place.
     pub fn set_switched_off(&mut self, off: bool) {
         self.switched_off = off;
     }
@@ -256,7 +257,7 @@ impl NxDrive {
         }
     }
 
-    /// Takes the process data in over; the control word counts only while fieldbus is the control place.
+    /// Takes over the process data in; the control word is only obeyed while the fieldbus is the control place.
     fn take_over(&mut self) -> Command {
         let word = self.input(0);
         let risen = word & !self.last_control;
@@ -268,17 +269,17 @@ impl NxDrive {
         self.held()
     }
 
-    /// A control word bit that only the HVX has, while the control word counts.
+    /// A control word bit that only the HVX has, while the control word is obeyed.
     fn hvac(&self, mask: u16) -> bool {
         self.options.hvac_control && self.settings.place == ControlPlace::Fieldbus && self.last_control & mask != 0
     }
 
-    /// The motor is on the mains, so the inverter is off. An interlock opens the bypass too.
+    /// Whether the motor runs on the mains, so that the inverter is off. An interlock opens the bypass too.
     fn bypassed(&self) -> bool {
         self.hvac(control_word::BYPASS) && !self.interlock
     }
 
-    /// Fire mode runs the motor at the maximum frequency, whatever run bit and reference say.
+    /// Whether fire mode runs the motor at the maximum frequency, regardless of run bit and reference.
     fn fire_mode(&self) -> bool {
         self.hvac(control_word::FIRE_MODE)
     }
@@ -332,7 +333,7 @@ impl Model for NxDrive {
         let free = !self.interlock && !self.switched_off && !self.bypassed();
         self.body.running = self.body.latch.obeys(command.run) && free;
         let target = self.frequency(command);
-        // A ramped stop keeps the inverter on until the motor stands.
+        // A ramped stop keeps the inverter on until the motor has stopped.
         let ramping_down = self.body.motor.fed
             && self.body.motor.output != 0.0
             && if self.body.latch.fault() == 0 {

@@ -10,7 +10,7 @@ pub enum Values {
     /// Values of the simulated motor.
     Physical,
     /// `tag` in the high byte, the low byte of the register's PDU address in the low byte: proves in a test that a
-    /// value came from that register of that drive.
+    /// value came from this register of this drive.
     Tagged(u8),
 }
 
@@ -54,20 +54,20 @@ pub struct NxOptions {
     pub hole: Hole,
     /// Writes to read-only registers.
     pub read_only: ReadOnly,
-    /// Silence on the bus that counts as a lost master; zero switches the supervision off. The board's parameter 5.
+    /// Silence on the bus that counts as loss of the master; zero switches the supervision off. Parameter 5 of the board.
     pub timeout: Duration,
-    /// Which status bits the drive shows.
+    /// Which status bits the drive has.
     pub status: StatusBits,
     /// How the speed reference is to be read.
     pub reference: SpeedReference,
     /// Hz that one count of the output frequency is, 0.01 or 0.1 (reference/drives.md 9.1).
     pub frequency_step: f64,
-    /// Whether the control word has the bits of the HVX: bypass (3), pass-through to RO1, RO2 and DO1 (10 to 12) and
-    /// fire mode (13). Other drives only pass them on to the application.
+    /// Whether the control word has the bits of the HVX: bypass (3), pass-through to RO1, RO2 and DO1 (10 to 12)
+    /// and fire mode (13). Other drives only pass these bits on to the application.
     pub hvac_control: bool,
     /// Content of the read-only registers.
     pub values: Values,
-    /// Parameters to start with: ID and value; those that a drive does not have or not allow are passed over.
+    /// Initial parameters: ID and value; those that a drive does not have or does not allow are skipped.
     pub parameters: Vec<(u16, u16)>,
     /// Whether ID 1999 (PDU 1998) is a register of the simulator: writing a number trips the drive with that fault. No
     /// real drive has this register.

@@ -37,12 +37,12 @@ pub const STOP_FUNCTION: u16 = 506;
 pub const FIELDBUS_FAULT_RESPONSE: u16 = 733;
 /// ID of P2.7.23, the response to a slot fault, with the values of P2.7.22.
 pub const SLOT_FAULT_RESPONSE: u16 = 734;
-/// First ID of the eight selectors of process data out.
+/// First ID of the eight selectors for process data out.
 pub const OUT_SELECTION: u16 = 852;
 /// Items of process data out 1 to 8 by default (reference/drives.md 3.8): IDs 1 to 7, then the active fault.
 const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
 
-/// All parameters of one drive by ID. Parameters survive a power cycle.
+/// All parameters of one drive by ID, which survive a power cycle.
 #[derive(Debug, Clone)]
 pub struct Parameters(ParameterSet);
 
@@ -91,12 +91,13 @@ impl Parameters {
     /// Sets a parameter, not over the bus.
     ///
     /// # Errors
-    /// Unknown ID, or a value outside the range; the minimum frequency may not exceed the maximum. Nothing is set then.
+    /// If the ID is unknown, or the value is outside its range or would put the minimum frequency above the
+    /// maximum. No value is set then.
     pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
         self.0.set(id, value)
     }
 
-    /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
+    /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
     ///
     /// # Errors
     /// The errors of [`Parameters::set`].
@@ -106,7 +107,7 @@ impl Parameters {
         Ok(())
     }
 
-    /// Writes that came over the bus, by PDU address.
+    /// Writes received over the bus, by PDU address.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         let writes = self.0.writes().iter();
         writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
@@ -150,7 +151,7 @@ impl Parameters {
 /// How the drive stops the motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StopFunction {
-    /// Lets the motor coast to a stop.
+    /// The motor coasts to a stop.
     Coast,
     /// Slows the motor down with the deceleration time.
     Ramp,
@@ -163,7 +164,7 @@ pub struct Settings {
     pub minimum: f64,
     /// Ratings of the motor and its ramps.
     pub motor: Ratings,
-    /// Place from which the drive takes its commands.
+    /// Control place from which the drive takes its commands.
     pub place: ControlPlace,
     /// How the drive stops its motor.
     pub stop: StopFunction,

@@ -161,7 +161,7 @@ impl NxDrive {
         Ok(())
     }
 
-    /// Takes either all values of a message or none.
+    /// Accepts either all values of a message or none.
     fn write_process(&mut self, first: u16, values: &[u16]) -> Result<(), Exception> {
         let at = usize::from(first) - 2001;
         if at + values.len() > PROCESS_DATA {
@@ -231,7 +231,7 @@ impl NxDrive {
         }
     }
 
-    /// An item that a selector of process data out may name: an actual value or a parameter.
+    /// An item that a selector of process data out may select: an actual value or a parameter.
     fn item(&self, id: u16) -> u16 {
         self.actual_value(id).or_else(|| self.parameters.get(id)).unwrap_or(0)
     }
@@ -245,7 +245,7 @@ impl NxDrive {
         );
         let (share, whole) = match self.options.reference.base {
             Base::Maximum => (output.abs(), maximum),
-            // Below the minimum frequency, no reference exists for comparison.
+            // Below the minimum frequency there is no reference to compare with.
             Base::Band => ((output.abs() - minimum).max(0.0), maximum - minimum),
         };
         if whole > 0.0 {

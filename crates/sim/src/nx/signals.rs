@@ -24,18 +24,18 @@ enum Signal {
     Interlocked,
     NotInterlocked,
     Place(ControlPlace),
-    /// Hand-off-auto switch: auto.
+    /// The hand-off-auto switch is at auto.
     Auto,
-    /// Hand-off-auto switch: not off.
+    /// The hand-off-auto switch is not at off.
     HoaOn,
 }
 
-/// Which status bits a drive shows.
+/// Which status bits a drive has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StatusBits {
     /// All bits of the Vacon NX: 0x0541 when idle and healthy (reference/drives.md 3.6, 3.7).
     Full,
-    /// Only the status bits that all drives of the family share, as the worked frames of reference/drives.md print them.
+    /// Only the status bits that all drives of the family share, as in the worked frames of reference/drives.md.
     Common,
     /// Eaton SVX: the shared bits, and nothing in the general status word; 0x0001 when idle and healthy.
     Svx,
@@ -81,7 +81,7 @@ const HVX_GENERAL: Layout = &[
 ];
 
 impl StatusBits {
-    /// Bits of the status word beyond the shared ones, and bits of the general status word.
+    /// Bits of the status word in addition to the shared ones, and bits of the general status word.
     fn layouts(self) -> (Layout, Layout) {
         match self {
             StatusBits::Full => (VACON, VACON_GENERAL),

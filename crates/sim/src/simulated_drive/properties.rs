@@ -14,7 +14,7 @@ fn name() -> impl Strategy<Value = &'static str> {
     prop::sample::select(ModelOptions::NAMES.to_vec())
 }
 
-/// Addresses near those that mean something to one of the models, and any others.
+/// Addresses near the meaningful ones of a model, and any others.
 fn address() -> impl Strategy<Value = u16> {
     prop_oneof![
         0..0x48u16,

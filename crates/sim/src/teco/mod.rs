@@ -1,7 +1,7 @@
-//! A TECO 7300PA drive with its PA-C card, as reference/drives.md sections 5 and 10 describe it.
+//! A simulated TECO 7300PA drive with its PA-C card, as described in reference/drives.md sections 5 and 10.
 //!
-//! Pure: the time is an argument. Cn-31 supervises the link between the drive and its card only, which never fails here,
-//! so a lost bus master changes nothing: the motor goes on as it was last commanded.
+//! Pure: the time is an argument. Cn-31 only supervises the link between the drive and its card, which never fails
+//! here, so loss of the bus master changes nothing: the motor continues by its last command.
 
 mod options;
 mod parameters;
@@ -47,7 +47,7 @@ pub(crate) mod fault {
     pub(crate) const MOTOR_OVERLOAD: u16 = 1 << 9;
     /// Undervoltage or power loss.
     pub(crate) const POWER: u16 = 1 << 12;
-    /// All bits with a meaning.
+    /// All bits that have a meaning.
     pub(crate) const ALL: u16 =
         OVERCURRENT | OVERVOLTAGE | INVERTER_OVERLOAD | OVERHEAT | EXTERNAL | CONTROL_CIRCUIT | MOTOR_OVERLOAD | POWER;
 }
@@ -147,7 +147,7 @@ impl TecoDrive {
         }
     }
 
-    /// Whether the commands tell the motor to turn in reverse.
+    /// Whether the present command turns the motor in reverse.
     fn is_told_to_reverse(&self) -> bool {
         match self.run_from_bus() {
             true => self.control.operation & operation::REVERSE != 0,

@@ -13,14 +13,15 @@ pub enum Mode {
     Drive,
 }
 
-/// How a register holds the four digits of an Sn value such as 1100; the manual does not say (reference/drives.md 5.8).
+/// How a register stores the four digits of an Sn value such as 1100, which the manual does not state
+/// (reference/drives.md 5.8).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Digits {
-    /// As bits of a number, the first digit the most significant: 1100 is 0x000C.
+    /// The digits are bits of a number, the first digit the most significant: 1100 is 0x000C.
     Bits,
-    /// As a decimal number: 1100 is 1100.
+    /// The digits are a decimal number: 1100 is 1100.
     Decimal,
-    /// As hexadecimal digits: 1100 is 0x1100.
+    /// The digits are hexadecimal: 1100 is 0x1100.
     Hexadecimal,
 }
 
@@ -78,18 +79,18 @@ pub struct TecoOptions {
     pub detection_levels: DetectionLevels,
     /// Writes to monitor registers.
     pub read_only: ReadOnly,
-    /// Registers of parameters that may not be written over the bus (error 21H). The manual has the rule and no list.
+    /// Registers of parameters that cannot be written over the bus (error 21H). The manual mentions them without a list.
     pub locked: Vec<u16>,
-    /// Parameters in the EEPROM at first: register and value; those that a drive does not have or not allow are passed
-    /// over.
+    /// Initial parameters in the EEPROM: register and value; those that a drive does not have or does not allow are
+    /// skipped.
     pub parameters: Vec<(u16, u16)>,
-    /// Time between a message and its answer; with `None` the line decides.
+    /// Time between a message and its answer; `None` uses the turnaround of the line.
     pub turnaround: Option<Duration>,
     /// Whether a request with a wrong check code is answered by error 00H. The manual's error table has that code; the
     /// text next to it, and everything else about messages, describes no answer (reference/drives.md 9.8).
     pub answer_check_error: bool,
-    /// Makes 09FFH a register of the simulator: writing a fault mask as 0021H shows it trips the drive. No real drive has
-    /// it.
+    /// Makes 09FFH a register of the simulator: writing a fault mask as in 0021H trips the drive. No real drive has
+    /// this register.
     pub trip_register: bool,
 }
 

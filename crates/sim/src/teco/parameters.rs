@@ -1,7 +1,7 @@
 //! Parameters of the simulated TECO 7300PA by register (reference/drives.md 5.8): which exist, and their images in RAM and EEPROM.
 //!
-//! Ranges are those of the N2 map (reference/drives.md 6.7), where it has one. Defaults that the manual does not state are plausible
-//! values for a small 440 V drive.
+//! Ranges are those of the N2 map (reference/drives.md 6.7), where it has them. Defaults that the manual does not
+//! state are plausible values for a small 440 V drive.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ struct Group {
     reserved: &'static [u16],
 }
 
-/// Sn, Cn, On, An, Bn. Sn begins at xx01H, the others at xx00H.
+/// The groups Sn, Cn, On, An and Bn. Sn begins at xx01H, the others at xx00H.
 const GROUPS: [Group; 5] = [
     Group {
         first: 0x0101,
@@ -55,7 +55,7 @@ const GROUPS: [Group; 5] = [
     },
 ];
 
-/// On-20 to On-24 are not saved.
+/// Registers of On-20 to On-24, which are not saved.
 const NOT_SAVED: std::ops::RangeInclusive<u16> = 0x0313..=0x0317;
 
 pub(super) const SN_08: u16 = 0x0108;
@@ -91,8 +91,8 @@ pub(super) mod function {
     pub(in super::super) const BASEBLOCK: u16 = 7;
 }
 
-/// Parameters whose range or default is known or matters here: (register, minimum, maximum, default). All others take
-/// any value and begin with 0.
+/// Parameters whose range or default is known or matters here: (register, minimum, maximum, default). All others
+/// accept any value and start at 0.
 const KNOWN: [(u16, u16, u16, u16); 52] = [
     (SN_15, 0, 15, function::STEP_1),
     (0x0110, 0, 15, function::STEP_2),
@@ -151,8 +151,8 @@ const KNOWN: [(u16, u16, u16, u16); 52] = [
 /// PID differential time, 0.01 s.
 const BN_16: (u16, u16, u16, u16) = (0x050F, 0, 100, 0);
 
-/// Upper and lower bounds by their names, Cn-14 and Cn-15, Cn-23 and Cn-24, Cn-45 and Cn-47, Cn-46 and Cn-48. No manual says
-/// that the drive refuses values that cross; this is assumed.
+/// Pairs of upper and lower bounds according to their names: Cn-14 and Cn-15, Cn-23 and Cn-24, Cn-45 and Cn-47,
+/// Cn-46 and Cn-48. No manual says that the drive refuses values that cross; this is assumed.
 const LIMITS: [(u16, u16); 4] = [(CN_14, CN_14 + 1), (0x0216, 0x0217), (0x022C, 0x022E), (0x022D, 0x022F)];
 
 /// cos phi of the motor, which no parameter holds.
@@ -167,7 +167,7 @@ pub(super) struct RegisterKind {
     pub(super) reserved: bool,
 }
 
-/// Properties of the register, if it belongs to the parameters.
+/// Properties of the register, if it belongs to a parameter.
 pub(super) fn place(register: u16) -> Option<RegisterKind> {
     GROUPS
         .iter()
@@ -233,7 +233,7 @@ impl Parameters {
         self.ram.write(register, value, fed)
     }
 
-    /// Copies RAM to EEPROM, but for On-20 to On-24.
+    /// Copies RAM to EEPROM, except On-20 to On-24.
     pub(super) fn save(&mut self) {
         self.copy();
         let keys: Vec<u16> = self.ram.iter().map(|parameter| parameter.key).collect();
@@ -260,7 +260,7 @@ impl Parameters {
         self.ram.take_values(&self.eeprom);
     }
 
-    /// Writes that came over the bus, by register.
+    /// Writes received over the bus, by register.
     pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
         self.ram.writes().clone()
     }
@@ -280,7 +280,7 @@ impl Parameters {
             deceleration: self.tenths(BN_02),
             voltage: self.tenths(CN_03),
             frequency,
-            // Four poles without slip: no parameter holds a speed.
+            // A motor with four poles and no slip is assumed, because no parameter contains a speed.
             speed: 30.0 * frequency,
             current: self.tenths(CN_09),
             cos_phi: COS_PHI,

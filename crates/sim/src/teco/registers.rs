@@ -11,7 +11,7 @@ const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
 const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
 pub(super) const CHECK_ERROR: Exception = Exception(0x00);
-/// 21H: value out of range, or a parameter that may not be written over the bus.
+/// Error 21H: value out of range, or a parameter that cannot be written over the bus.
 const DATA_ERROR: Exception = Exception(0x21);
 /// 22H: Sn, Cn or On written in DRIVE mode, or saving while the drive runs.
 const WRITE_ERROR: Exception = Exception(0x22);
@@ -144,7 +144,7 @@ impl TecoDrive {
         }
     }
 
-    /// Takes either all values of a message or none.
+    /// Accepts either all values of a message or none.
     fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
         let count = u16::try_from(values.len()).map_err(|_| Exception::VALUE)?;
         let addresses = span(start, count)?;

@@ -77,8 +77,8 @@ fn exchange(drive: &mut TecoDrive, frame: &str, now: SimTime) -> String {
     format!(":{}", digits.concat())
 }
 
-/// Worked frames of reference/drives.md 7.3 and 7.4, in an order in which the drive comes to their states. The outputs are in the
-/// hands of 0009H, as the status reply of the reference shows them off.
+/// Worked frames of reference/drives.md 7.3 and 7.4, in an order in which the drive reaches their states. Register
+/// 0009H controls the outputs, since the status reply of the reference shows them off.
 #[test]
 fn worked_frames() {
     let mut drive = TecoDrive::new(

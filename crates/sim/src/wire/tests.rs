@@ -1,4 +1,4 @@
-//! The line behind its ports, in real time; nothing here depends on how late the machine is.
+//! The line with its ports, tested in real time; no test depends on how slow the machine is.
 
 use super::super::faults::Fault;
 use super::super::half_duplex::Delivery;
@@ -13,7 +13,7 @@ use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-/// Read of the status word of drive 1, and the reply of an idle drive.
+/// A read of the status word of drive 1, and the reply of an idle drive.
 const ASK: [u8; 8] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x01, 0xC7, 0xA4];
 const REPLY: [u8; 7] = [0x01, 0x03, 0x02, 0x05, 0x41, 0x7B, 0x24];
 

@@ -106,7 +106,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// Reason code and properties, which v5 may leave out from the end and 3.1.1 does not have.
+    /// Reason code and properties; v5 may omit trailing ones, and 3.1.1 has neither.
     pub(super) fn reason(&mut self, version: Version, allowed: &[u8]) -> Result<u8, Fault> {
         if version == Version::V311 || self.0.is_empty() {
             return Ok(reason::SUCCESS);

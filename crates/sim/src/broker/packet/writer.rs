@@ -8,7 +8,7 @@ use super::{Message, Qos, Version, property, reason};
 /// CONNACK with that reason code; an acceptance lists what the broker does not serve (section 3.2.2.3).
 pub(in super::super) fn connack(version: Version, reason: u8, assigned: Option<&str>) -> Vec<u8> {
     if version == Version::V311 {
-        // See table 3.1 of MQTT 3.1.1; a reason without a code there becomes "server unavailable".
+        // Return codes of table 3.1 in MQTT 3.1.1; a reason without a code there becomes "server unavailable".
         let code = match reason {
             reason::SUCCESS => 0,
             reason::CLIENT_ID_NOT_VALID => 2,
@@ -44,7 +44,7 @@ pub(in super::super) fn publish(version: Version, message: &Message, retain: boo
     if version == Version::V5 {
         let mut section = Vec::new();
         if let Some(left) = message.left(now) {
-            // The time is rounded up, so that a message is not delivered with 0 before it expires.
+            // The time is rounded up, so that no message is delivered with expiry 0 before it expires.
             let seconds = left.as_secs() + u64::from(left.subsec_nanos() > 0);
             section.push(property::MESSAGE_EXPIRY);
             section.extend(u32::try_from(seconds).unwrap_or(u32::MAX).to_be_bytes());
@@ -56,7 +56,7 @@ pub(in super::super) fn publish(version: Version, message: &Message, retain: boo
     packet(first, &[&prefixed(&message.topic), id, &properties, &message.payload])
 }
 
-/// First bytes of the acknowledgements.
+/// First byte of each kind of acknowledgement.
 pub(in super::super) const PUBACK: u8 = 0x40;
 pub(in super::super) const SUBACK: u8 = 0x90;
 pub(in super::super) const UNSUBACK: u8 = 0xB0;
@@ -77,7 +77,7 @@ pub(in super::super) fn acknowledge(version: Version, first: u8, pkid: u16, code
 
 pub(in super::super) const PINGRESP: [u8; 2] = [0xD0, 0];
 
-/// DISCONNECT; 3.1.1 has none from the broker. The library of the gateway reads none without a property section.
+/// A DISCONNECT; in 3.1.1 the broker sends none. The gateway's MQTT library cannot read one without a property section.
 pub(in super::super) fn disconnect(version: Version, reason: u8) -> Vec<u8> {
     match version {
         Version::V311 => Vec::new(),
@@ -106,7 +106,7 @@ pub(super) fn variable(mut value: usize) -> Vec<u8> {
     }
 }
 
-/// Text preceded by its length; the broker writes no text longer than what a client sent.
+/// Text preceded by its length; the broker writes no text longer than those received from clients.
 fn prefixed(text: &str) -> Vec<u8> {
     let mut bytes = (text.len() as u16).to_be_bytes().to_vec();
     bytes.extend_from_slice(text.as_bytes());
