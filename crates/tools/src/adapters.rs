@@ -1,4 +1,4 @@
-//! The serial adapters of this machine, by the names that they keep.
+//! The serial adapters of this machine, with their persistent names.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ pub(super) struct Adapter {
     pub(super) device: Option<String>,
 }
 
-/// The serial ports of this machine: those with persistent names first, then the others that have hardware behind them.
+/// The serial ports of this machine: those with persistent names first, then others with real hardware.
 pub(super) fn adapters() -> Vec<Adapter> {
     listed(Path::new("/dev"), Path::new("/sys/class/tty"))
 }
@@ -43,7 +43,7 @@ fn listed(dev: &Path, tty: &Path) -> Vec<Adapter> {
     found
 }
 
-/// The persistent name of a serial device, if it has one; else the path as it is.
+/// The persistent name of a serial device; without one, the path unchanged.
 pub(super) fn persistent_name(port: &str) -> String {
     persistent_in(Path::new("/dev"), port)
 }
@@ -59,7 +59,7 @@ fn persistent_in(dev: &Path, port: &str) -> String {
     link.map_or_else(|| port.to_string(), |(link, _)| link.display().to_string())
 }
 
-/// Links in `serial/by-id`, each with the device that it leads to.
+/// Links in `serial/by-id`, each with the device that it points to.
 fn persistent_names(dev: &Path) -> Vec<(PathBuf, PathBuf)> {
     let directory = dev.join("serial/by-id");
     let links = names(&directory).into_iter().map(|name| directory.join(name));

@@ -16,9 +16,9 @@ pub(super) const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
 /// Largest manifest, bytes.
 const MOST_MANIFEST: u64 = 64 << 20;
-/// Most members of an archive.
+/// Most files in an archive.
 const MOST_MEMBERS: usize = 100_000;
-/// Most bytes of all members together.
+/// Most bytes of all files together.
 const MOST_BYTES: u64 = 8 << 30;
 
 /// The manifest of an archive.
@@ -36,13 +36,13 @@ pub(super) struct Manifest {
     pub(super) config: PathBuf,
     /// State directory when the archive was made.
     pub(super) state_dir: PathBuf,
-    /// The members in their order; the first one is the configuration.
+    /// The archive members in order; the first one is the configuration.
     pub(super) members: Vec<Member>,
     /// Directories of profiles, `config/…`, which may be empty.
     pub(super) directories: Vec<String>,
     /// Files that belong to the gateway and are not in the archive.
     pub(super) left_out: Vec<LeftOut>,
-    /// The recordings that existed; the archive itself does not contain them.
+    /// The recordings that existed at the backup; the archive itself does not contain them.
     pub(super) recordings: Vec<serde_json::Value>,
 }
 
@@ -62,18 +62,18 @@ pub(super) struct Member {
 /// A file that is not in the archive.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct LeftOut {
-    /// Path of what was left out.
+    /// Path of the file that was left out.
     pub(super) path: PathBuf,
-    /// Why the file was left out.
+    /// Why the file was left out of the backup.
     pub(super) why: String,
 }
 
 /// The directories of members.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Root {
-    /// Below the directory of the configuration.
+    /// Files below the directory of the configuration.
     Config,
-    /// Below the directory of the state.
+    /// Files below the state directory.
     State,
 }
 
@@ -85,7 +85,7 @@ impl Root {
         }
     }
 
-    /// The name of the member for the file at `path` below the directory, if it can have one.
+    /// Name of the archive member for the file at `path` below the directory; `None` if the path has no valid name.
     pub(super) fn member(self, path: &Path) -> Option<String> {
         let parts = path.components().filter(|part| *part != Component::CurDir);
         let path: PathBuf = parts.collect();
@@ -94,7 +94,7 @@ impl Root {
     }
 }
 
-/// Where the member `name` belongs.
+/// The directory and path to which the member `name` belongs.
 ///
 /// # Errors
 /// The name leads elsewhere.
@@ -115,7 +115,7 @@ pub(super) fn place(name: &str) -> Result<(Root, PathBuf), String> {
     Ok((root, path))
 }
 
-/// The content of a file that is being put into an archive, whose size and hash are known.
+/// The content of a file that is being archived, whose size and hash are known.
 pub(super) struct Content<R> {
     pub(super) member: Member,
     pub(super) reader: R,
@@ -124,8 +124,8 @@ pub(super) struct Content<R> {
 /// Writes an archive: first the manifest, then each member as the manifest lists it.
 ///
 /// # Errors
-/// The archive cannot be written, a file no longer matches its member in the manifest, or [`read`] would refuse the
-/// archive.
+/// If the archive cannot be written, a file no longer matches its entry in the manifest, or [`read`] would refuse
+/// the archive.
 pub(super) fn write<R: Read>(
     to: impl Write,
     manifest: &Manifest,
@@ -158,19 +158,19 @@ fn header(name: &str, bytes: u64, mode: u32) -> io::Result<Header> {
     Ok(header)
 }
 
-/// Reads an archive, which may be hostile: `take` gets each member with its content, which it must read to the end.
-/// Members that the manifest does not name, other kinds than files, names that lead elsewhere and wrong contents are
+/// Reads an archive, which may be hostile: `take` gets each member with its content, and must read it to the end.
+/// Members missing in the manifest, other kinds than files, names that point elsewhere and wrong contents are
 /// errors.
 ///
 /// # Errors
-/// The archive is damaged or not a backup: the defect; `take` has already received the members before it.
+/// If the archive is damaged or not a backup; contains the defect. `take` has already received the members before it.
 pub(super) fn read(
     from: impl Read,
     mut take: impl FnMut(&Member, Root, &Path, &mut dyn Read) -> io::Result<()>,
 ) -> Result<Manifest, String> {
     let broken = |error: io::Error| format!("it is not an archive, or damaged: {error}");
     let mut archive = Archive::new(from);
-    // Raw: extensions of the format, such as endless names, are members, and refused as such.
+    // The raw entries are read, so that extensions of the format, such as endless names, appear as members and are refused.
     let mut entries = archive.entries().map_err(broken)?.raw(true);
     let first = entries.next().ok_or("it is empty")?.map_err(broken)?;
     if first.path_bytes().as_ref() != MANIFEST.as_bytes() || first.size() > MOST_MANIFEST {
@@ -206,7 +206,7 @@ pub(super) fn read(
     }
 }
 
-/// Parses a manifest, and checks that it can be the manifest of a backup.
+/// Parses a manifest and checks that it is plausible for a backup.
 fn parse(json: &[u8]) -> Result<Manifest, String> {
     #[derive(Deserialize)]
     struct Version {

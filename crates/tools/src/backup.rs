@@ -75,7 +75,7 @@ impl Sources {
         let shown = |error: io::Error| io::Error::new(error.kind(), format!("cannot read {}: {error}", path.display()));
         let file = File::open(&path).map_err(shown)?;
         let metadata = file.metadata()?;
-        // A file that grows, such as the audit, counts as long as it is now.
+        // A file that grows, such as the audit, is archived with its present length.
         let mut hashed = Hashed::new(io::Read::take(file, metadata.len()));
         io::copy(&mut hashed, &mut io::sink()).map_err(shown)?;
         let (bytes, sha256) = hashed.finish();
@@ -103,7 +103,7 @@ fn collect(config: &Path, settings: &Settings, with_keys: bool) -> io::Result<So
             Err(_) => sources.leave_out(path, "it is outside the directory of the configuration"),
         }
     }
-    // The state directory may be that of the configuration; what was decided above stands.
+    // The state directory may also be the directory of the configuration, so files handled above are skipped.
     let mut decided: Vec<PathBuf> = named.iter().map(|file| real(&file.path)).collect();
     decided.push(real(&settings.recordings.dir));
     state(&settings.state_dir, Path::new(""), &decided, &mut sources)?;
@@ -130,7 +130,7 @@ fn real(path: &Path) -> PathBuf {
         .unwrap_or_else(|_| path.to_path_buf())
 }
 
-/// The files in `dir`/`below` and in the directories there, except those that are `decided` already.
+/// Adds the files in `dir`/`below` and its subdirectories, except those that are `decided` already.
 fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -> io::Result<()> {
     let here = dir.join(below);
     let shown = |error: io::Error| io::Error::new(error.kind(), format!("cannot read {}: {error}", here.display()));
@@ -163,7 +163,7 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
     Ok(())
 }
 
-/// Locks, what is being written, and what a restore unpacks.
+/// Whether a file is temporary: a lock, a file being written, or one that a restore is unpacking.
 fn is_transient(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     name.starts_with(UNPACKED)
@@ -197,7 +197,7 @@ fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
     }
 }
 
-/// Writes the archive under a temporary name and renames it, so that only complete ones exist.
+/// Writes the archive under a temporary name and renames it, so that only complete archives exist.
 fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
     if fs::symlink_metadata(file).is_ok() {
         return Err(io::Error::other("the file exists already: name another, or remove it"));
@@ -303,7 +303,7 @@ mod tests {
         }
         fs::write(at("audit.jsonl"), "x").unwrap();
         fs::write(at("state/audit.jsonl"), "x").unwrap();
-        // Kept in the state directory, though written in another way.
+        // A link into the state directory: the file is named differently but must be archived.
         std::os::unix::fs::symlink(at("state"), at("link")).unwrap();
         let kept = [
             "audit.jsonl",

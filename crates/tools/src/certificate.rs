@@ -108,7 +108,7 @@ impl Made {
         params.is_ca = IsCa::ExplicitNoCa;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
-        // The clock of the browser may be behind.
+        // The certificate is valid from yesterday, because the clock of the browser may be behind.
         let (from, until) = (now - DAY, now + DAY * u32::from(days));
         let at = |(year, month, day)| rcgen::date_time_ymd(year, month, day);
         params.not_before = at(date(from)?);

@@ -141,7 +141,7 @@ fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
     orphans.map(problem).collect()
 }
 
-/// Where drills are configured: the drives whose stops no drill has proven, or not lately.
+/// Warns about drives with drills whose stops were not proven by a drill, or not recently.
 fn unproven_stops(settings: &Settings) -> Option<Problem> {
     let options = settings.drill?;
     let path = settings.state_dir.join(DRILLS);
@@ -188,7 +188,7 @@ fn json(loaded: &Loaded) -> String {
         memory_bytes: memory.as_ref().map(|(settings, memory)| memory.total(settings)),
         buses: buses.collect(),
     };
-    // Only maps whose keys are not strings can fail, and the report has no such maps.
+    // Serializing can only fail for maps whose keys are not strings, which the report does not contain.
     serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
 }
 
@@ -217,7 +217,7 @@ fn bus_report<'a>(bus: &'a BusSettings, memory: &BusMemory) -> Bus<'a> {
     }
 }
 
-/// The drives that may be commanded; to the others every write is refused.
+/// The drives that may be commanded; for all others every write is refused.
 fn commanded(bus: &BusSettings) -> impl Iterator<Item = &DriveSpec> {
     bus.drives.iter().filter(|drive| drive.access == Access::Control)
 }
@@ -236,7 +236,7 @@ fn refused(drive: &DriveSpec) -> impl Iterator<Item = Refused<'_>> {
 const NAMED: usize = 4;
 
 /// Values that raw writes may not set, one line for the drives that have them in common; empty without Modbus TCP,
-/// which is the only way for raw writes.
+/// the only interface for raw writes.
 fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
     let mut alike: Vec<(&DriveSpec, Vec<&str>)> = Vec::new();
     for drive in commanded(bus).filter(|_| settings.modbus_tcp.is_some()) {
@@ -373,7 +373,7 @@ fn bus_text(bus: &BusSettings, settings: &Settings, memory: &str) -> String {
     text + &summary(bus, &prediction) + memory + &slots(bus, settings) + &raw_writes(bus, settings) + &functions(bus)
 }
 
-/// The functions by which drives that may be commanded are written where they are not the usual ones.
+/// The write functions of drives that may be commanded, where they differ from the usual ones.
 fn functions(bus: &BusSettings) -> String {
     let line = |drive: &DriveSpec| {
         let notes = drive.profile.functions.notes();
@@ -402,7 +402,7 @@ fn bacnet(settings: &Settings) -> String {
     )
 }
 
-/// Where tools reach the line, with one line for each slot.
+/// Where tools can connect to the line, one line of text for each slot.
 fn slots(bus: &BusSettings, settings: &Settings) -> String {
     let all = settings.slots.iter().flat_map(|slots| &slots.slots);
     let of_bus = all.filter(|slot| slot.bus == bus.spec.name);
@@ -497,7 +497,7 @@ fn reaches(reach: Reach) -> String {
     format!("; they reach back {} (many drives share the memory)", spans.join(", "))
 }
 
-/// Duration of the stops at shutdown; empty if there are none.
+/// Duration of the stops at shutdown, as text; empty if there are none.
 fn shutdown(bus: &BusSettings) -> String {
     let time = bus.shutdown_time();
     if time.drives == 0 {

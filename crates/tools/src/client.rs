@@ -1,4 +1,5 @@
-//! The client of all commands that ask a gateway: HTTP over its local socket, over the network, or within the process.
+//! The client of all commands that send requests to a gateway: HTTP over its local socket, over the network, or
+//! within the process.
 
 mod door;
 mod events;
@@ -32,7 +33,7 @@ const TRIES: u32 = 5;
 /// Pause before the next attempt.
 const PAUSE: Duration = Duration::from_millis(200);
 
-/// Why a gateway sent nothing; the messages say what, where and what to do.
+/// Why a gateway sent no reply; the messages contain problem, place and remedy.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ClientError {
     /// No gateway listens there, or the connection is blocked.
@@ -63,7 +64,7 @@ pub(crate) enum ClientError {
         "the gateway ended the stream{1}; {0}; it was stopped, or a reload removed the bus: start it and try again"
     )]
     Ended(String, String),
-    /// Nothing was received for too long.
+    /// No data was received within the time limit.
     #[error("the gateway stopped responding; {0}; check the gateway and the network, then try again")]
     Silent(String),
 }
@@ -74,7 +75,7 @@ impl From<ClientError> for String {
     }
 }
 
-/// Why no gateway was found at the sockets.
+/// Why no gateway was found at the local sockets.
 #[derive(Debug, Default)]
 pub(crate) struct NotFound {
     /// Sockets that cannot be opened.
@@ -111,7 +112,7 @@ impl NotFound {
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     doors: Vec<Door>,
-    /// `None`: whichever answers.
+    /// The expected gateway; `None` accepts any.
     expected: Option<Expected>,
     /// The configuration, for messages.
     file: Option<PathBuf>,

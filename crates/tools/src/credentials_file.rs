@@ -1,4 +1,4 @@
-//! The files of tokens and users: one line for each, whose first word is its name.
+//! The files of tokens and users: one line for each entry, which begins with its name.
 
 use std::fs::{File, Metadata, OpenOptions, Permissions, TryLockError, metadata, read_to_string, remove_file, rename};
 use std::io::{self, Write};
@@ -12,7 +12,7 @@ use crate::north::http::{Credential, Credentials};
 
 /// Time that another program may take to change the file.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Time between two looks at whether the other program has finished.
+/// Interval of checks whether another program has finished its change.
 const AGAIN: Duration = Duration::from_millis(20);
 
 /// A kind of credential that is kept in a file.
@@ -81,7 +81,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// Removes that of a name.
     ///
     /// # Errors
-    /// If the name does not exist, or what is wrong with the file.
+    /// If the name does not exist, or the file is invalid.
     pub(super) fn remove(&self, name: &str) -> Result<(), String> {
         let (shown, kind) = (self.path.display(), C::KIND);
         self.change(|text| match parsed::<C>(&self.path, text)?.named(name) {
@@ -92,12 +92,13 @@ impl<C: Filed> CredentialsFile<C> {
         })
     }
 
-    /// Changes its text; a file that there is not yet has none. Others who change it wait meanwhile, so that no change is lost.
+    /// Changes the text of the file; a missing file has empty text. Other programs that change it wait meanwhile,
+    /// so that no change is lost.
     ///
     /// # Errors
     /// The error of `change`, or of the system; the file is unchanged.
     fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
-        // A symbolic link stays a link: the file that it leads to is changed.
+        // A symbolic link is kept: the file that it points to is changed.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());
         let _lock = self.lock(&file)?;
         let text = match self.path.exists() {
@@ -131,8 +132,8 @@ impl<C: Filed> CredentialsFile<C> {
         }
     }
 
-    /// Replaces the file as a whole, so that a gateway that reloads meanwhile reads the old one or the new one. Owner, group
-    /// and permissions stay: they are what lets the gateway read it.
+    /// Replaces the file as a whole, so that a gateway that reloads at this moment reads the old or the new one.
+    /// Owner, group and permissions are kept, so that the gateway can still read it.
     fn write(&self, path: &Path, text: &str) -> Result<(), String> {
         let (what, shown) = (C::FILE, self.path.display());
         let failed = |error: io::Error| format!("cannot write the {what} file: {error}; {shown}; check the directory");
@@ -172,7 +173,7 @@ impl<C: Filed> CredentialsFile<C> {
     }
 }
 
-/// Gives a file owner, group and permissions of an old one.
+/// Gives a file the owner, group and permissions of the old one.
 fn like(file: &File, old: &Metadata) -> io::Result<()> {
     let new = file.metadata()?;
     if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
@@ -196,7 +197,7 @@ fn with_line(text: &str, line: &str) -> String {
     format!("{text}{end}{line}\n")
 }
 
-/// A text in which another line, or none, takes the place of that of a name.
+/// The text with the line of this name replaced by another line, or removed.
 fn replaced(text: &str, name: &str, by: Option<&str>) -> String {
     let line = |line| match str::split_whitespace(line).next() == Some(name) {
         true => by,
@@ -267,7 +268,7 @@ mod tests {
         );
     }
 
-    /// Another group than that of new files, which this process may give away.
+    /// A group other than that of new files, which this process may assign.
     fn other_group() -> Option<u32> {
         let own = rustix::process::getegid().as_raw();
         if rustix::process::geteuid().is_root() {

@@ -55,7 +55,7 @@ struct DemoLine {
     drives: &'static [(&'static str, &'static str)],
 }
 
-/// Every protocol, every family of the reference.
+/// The lines of the demo, which cover every protocol and every family of the reference.
 const LINES: [DemoLine; 5] = [
     DemoLine {
         name: "line1",
@@ -77,7 +77,7 @@ const LINES: [DemoLine; 5] = [
         name: "line3",
         protocol: Protocol::ModbusRtu,
         baud: 19_200,
-        // The character format of a Vacon CX; the other drives accept it.
+        // The character format of a Vacon CX, which the other drives accept.
         format: "8N2",
         cadence: ["250ms", "2s"],
         drives: &[
@@ -143,7 +143,7 @@ async fn demo(args: &Args) -> Result<(), String> {
     };
     let cancel = CancellationToken::new();
     let mut started = start(&place, &cancel).await;
-    // Another program may take a port between the check and the use of the port.
+    // Another program may take a port between its check and its use.
     for _ in 0..4 {
         if started.is_err() {
             started = start(&place, &cancel).await;
@@ -159,7 +159,7 @@ async fn demo(args: &Args) -> Result<(), String> {
         written.write(&configuration(&place, &sides))?;
     }
     println!("{}", welcome::text(&place, &sides));
-    // Without a handler Ctrl-C ends the process anyway.
+    // Without a handler, Ctrl-C ends the process anyway.
     let _ = tokio::signal::ctrl_c().await;
     println!("\nStopping the demo.");
     daemon.stop().await;
@@ -172,7 +172,7 @@ async fn demo(args: &Args) -> Result<(), String> {
     Ok(())
 }
 
-/// The directory of a demo that leaves nothing.
+/// The temporary directory of a demo that leaves no files.
 fn temporary() -> PathBuf {
     std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id()))
 }
@@ -240,7 +240,7 @@ async fn start(place: &DemoPlace, cancel: &CancellationToken) -> Result<(Daemon,
             Ok(daemon) => return Ok((daemon, broker, sides)),
             Err(error) => error,
         };
-        // Another program may have taken a port since the port was found free.
+        // Another program may have taken a port since it was found free.
         match failed.address_in_use() {
             Some(taken) if taken == sides.modbus => modbus = taken.port().saturating_add(1),
             Some(taken) if taken == sides.http => http = taken.port().saturating_add(1),
@@ -303,7 +303,7 @@ pub(super) fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     free_of(what, wanted, |address| TcpListener::bind(address).is_ok())
 }
 
-/// The first port from `wanted` on, on loopback, that is free.
+/// The first free port on loopback, from `wanted` upward.
 fn free_of(what: &str, wanted: u16, is_free: impl Fn(SocketAddr) -> bool) -> Result<SocketAddr, String> {
     for port in wanted..wanted.saturating_add(100) {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
@@ -359,7 +359,7 @@ fn configuration(place: &DemoPlace, sides: &Sides) -> String {
     let users = place.login.file.display().to_string();
     text += &format!("\n[http]\nlisten = \"{http}\"\ncommands = true\nusers_file = {users:?}\n");
     let user = Login::USER;
-    // Advisory: holders are shown, and nobody is refused.
+    // In advisory mode holders are shown, and no client is refused.
     text += "\n[authority]\nmode = \"advisory\"\n";
     text + &format!("\n[[authority.principal]]\nname = \"{user}\"\nrank = \"operator\"\nhttp_user = \"{user}\"\n")
 }

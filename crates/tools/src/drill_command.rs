@@ -169,7 +169,7 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         () = interrupted() => String::new(),
     };
     if typed.trim() != armed.drive {
-        // Ends the armed drill at once; without this it would end after a minute.
+        // Ends the armed drill at once; otherwise it would end after a minute.
         let ended = asked::<DrillReport>(&client, &Asked::delete(path(&armed.id))).await;
         ended.map_err(|why| format!("{why}; nothing was started"))?;
         return Err("the name was not typed; nothing was started".to_string());
@@ -221,11 +221,11 @@ async fn line(prompt: &str) -> Result<String, String> {
     let mut stderr = std::io::stderr();
     // An error is ignored: an operator who cannot see the prompt types nothing.
     let _ = write!(stderr, "{}", printable::lines(prompt)).and_then(|()| stderr.flush());
-    // A thread of its own: it is not waited for when the command ends.
+    // A separate thread reads the input, because the command must not wait for it at its end.
     let (sender, typed) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         let mut line = String::new();
-        // After Ctrl-C the receiver is gone, and the line is dropped.
+        // After Ctrl-C the receiver no longer exists, and the line is dropped.
         let _ = sender.send(std::io::stdin().read_line(&mut line).map(|_| line));
     });
     let read = typed.await.map_err(|error| error.to_string())?;

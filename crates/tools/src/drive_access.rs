@@ -1,8 +1,8 @@
-//! The common part of commands about one drive: finding the drive and its gateway.
+//! The common part of commands for one drive: finds the drive and its gateway.
 //!
-//! A running gateway owns the line, so a command sends its request to it, at its local socket or by `--url`; only where
-//! none runs does the command start the gateway's own bus in this process and send the request there. The same routes
-//! answer either way, so the answers are the same.
+//! A running gateway owns the line, so a command sends its request to the gateway, at its local socket or by
+//! `--url`. Only if no gateway runs does the command start the gateway's own bus in this process and send the
+//! request there. Both ways use the same routes, so the answers are equal.
 
 mod conversation;
 mod direct;
@@ -33,7 +33,7 @@ pub(super) struct OneDrive {
 }
 
 impl OneDrive {
-    /// The drive and its gateway.
+    /// Finds the drive and its gateway.
     pub(super) fn target(&self) -> Result<Target, Failure> {
         target(&self.gateway, &self.name)
     }
@@ -65,7 +65,7 @@ pub(super) enum Way {
     Direct,
 }
 
-/// The drive; it is looked up in the configuration unless the gateway is named by its address.
+/// Finds the drive in the configuration, unless the gateway is given by its address.
 pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> {
     let drive_name = drive.to_string();
     if let Some(client) = gateway.network() {
@@ -102,7 +102,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> 
 }
 
 impl Target {
-    /// The profile of the drive, if this command knows it.
+    /// The profile of the drive; `None` if this command does not know it.
     pub(super) fn profile(&self) -> Option<&Arc<Profile>> {
         self.configured.as_ref().map(|configured| &configured.spec.profile)
     }
@@ -115,7 +115,7 @@ impl Target {
     /// Sends the request to the running gateway.
     ///
     /// # Errors
-    /// There is no reply: the reason, as a message.
+    /// If there is no reply; contains the reason as a message.
     pub(super) fn ask_gateway(&self, asked: &Asked) -> Result<Reply, String> {
         super::runtime()?
             .block_on(self.client.ask(asked))
@@ -128,11 +128,11 @@ impl Target {
             })
     }
 
-    /// Sends the request to the running gateway or, where there is none, to a gateway's parts in this process, once the
-    /// bus has read the values that the request `needs`.
+    /// Sends the request to the running gateway or, if there is none, to a gateway's parts in this process, after
+    /// the bus has read the values that the request `needs`.
     ///
     /// # Errors
-    /// There is no reply: the reason, as a message.
+    /// If there is no reply; contains the reason as a message.
     pub(super) fn ask(&self, asked: &Asked, needs: Needs<'_>) -> Result<(Reply, Way), String> {
         super::runtime()?.block_on(async {
             let (conversation, reply) = Conversation::begin(self, asked, needs).await?;
@@ -146,7 +146,7 @@ impl Target {
 /// Index of the point of that name.
 ///
 /// # Errors
-/// The message if the profile has no such point.
+/// If the profile has no such point; contains the message.
 pub(super) fn point(profile: &Profile, name: &str) -> Result<PointIndex, String> {
     profile.point_index(name).ok_or_else(|| {
         let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {
@@ -161,12 +161,12 @@ pub(super) fn point(profile: &Profile, name: &str) -> Result<PointIndex, String>
 }
 
 impl Configured {
-    /// Why no gateway was found, for the message when the port cannot be opened either.
+    /// Why no gateway was found, to be reported if the port cannot be opened either.
     ///
     /// # Errors
-    /// A gateway may run although its socket cannot be opened, so the line must not be tried.
+    /// If a gateway may be running although its socket cannot be opened: the line must not be used then.
     fn not_found(&self, missed: &NotFound, doors: &[Door]) -> Result<String, String> {
-        // A serial port is locked by its owner; with a device server there would be two masters on the line.
+        // A serial port is locked by its owner, but a device server would allow two masters on the line.
         if !missed.closed.is_empty() && self.bus.spec.port.contains("://") {
             return Err(format!(
                 "{}; bus `{}`; use sudo, or join the group of the socket",

@@ -1,4 +1,4 @@
-//! Why a command ends early.
+//! The ways in which a command fails.
 
 use std::process::ExitCode;
 
@@ -6,19 +6,19 @@ use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::document::Problem;
 use crate::north::http::messages::ErrorReply;
 
-/// How a command ends: an exit code, or why it could not do what it should.
+/// How a command ends: an exit code, or why it failed.
 pub(super) type Outcome = Result<ExitCode, Failure>;
 
-/// Why a command ends early.
+/// Why a command failed.
 #[derive(Debug)]
 pub(super) enum Failure {
-    /// Work failed: the error, its place and the remedy.
+    /// The work failed: contains the error, its place and the remedy.
     Failed(String),
     /// The command line is wrong: the error and the remedy.
     Misused(String),
     /// A configuration or a profile has these problems.
     Invalid(Vec<Problem>),
-    /// Already reported.
+    /// The error was already reported; contains the exit code.
     Reported(u8),
 }
 
@@ -46,7 +46,7 @@ impl Failure {
     }
 }
 
-/// With `json` a refusal is a document on stdout too, besides its message on stderr.
+/// With `json`, a refusal is also printed as a document on stdout, besides its message on stderr.
 pub(super) fn documented(json: bool, outcome: Outcome) -> Outcome {
     if let (true, Err(Failure::Failed(why) | Failure::Misused(why))) = (json, &outcome) {
         report::json(&ErrorReply::new(why));

@@ -61,7 +61,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     })
 }
 
-/// The gateway's reply, parsed and as it was sent.
+/// The gateway's reply: parsed, and as it was sent.
 async fn hold(args: &Args) -> Result<(Hold, Json), String> {
     let path = format!("/api/v1/drives/{}/hold", encoded(&args.drive));
     let asked = match &args.action {

@@ -1,7 +1,7 @@
 //! The command line, one file a command.
 //!
-//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> Outcome`, and a
-//! line in `commands!` below.
+//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> Outcome`, and a line in
+//! `commands!` below.
 
 mod adapters;
 mod addresses;
@@ -88,7 +88,7 @@ use crate::drive::profile::Profiles;
 pub const EXIT_FAILED: u8 = 1;
 /// Exit code of a wrong command line, the same as clap's.
 pub const EXIT_USAGE: u8 = 2;
-/// Exit code of input data that cannot be read as what it should be (sysexits EX_DATAERR).
+/// Exit code for input data that is not valid (sysexits EX_DATAERR).
 pub const EXIT_DATA: u8 = 65;
 /// Exit code of a bad configuration (sysexits EX_CONFIG).
 pub const EXIT_CONFIG: u8 = 78;

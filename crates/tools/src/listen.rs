@@ -22,7 +22,7 @@ use crate::line::{Lost, Receiver, Woken};
 
 /// Time for each setting while the right one is looked for.
 const DWELL: Duration = Duration::from_secs(3);
-/// Rounds over all settings.
+/// Rounds of listening over all settings.
 const ROUNDS: u32 = 2;
 /// Longest single wait for bytes.
 const LOOK: Duration = Duration::from_millis(20);
@@ -219,7 +219,7 @@ impl Ear<'_> {
         Ok((survey, n2))
     }
 
-    /// Gives what is received to `take`, until that is content or the time has ended.
+    /// Passes received bytes to `take`, until that has enough or the time has ended.
     fn hear(
         &self,
         format: &LineFormat,

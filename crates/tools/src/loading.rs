@@ -1,5 +1,5 @@
-//! Reads the configuration with its profiles, certificates and secrets on a thread of its own: a file that cannot be read,
-//! such as a pipe or one on a share that does not respond, holds up neither signals nor the watchdog.
+//! Reads the configuration with its profiles, certificates and secrets on a separate thread: a file that cannot be
+//! read, such as a pipe or one on a share that does not respond, must delay neither signals nor the watchdog.
 
 use std::io;
 use std::path::Path;
@@ -53,7 +53,7 @@ impl Loading {
         let (sender, loaded) = oneshot::channel();
         let path = path.to_path_buf();
         let read = move || {
-            // After the time limit the receiver is gone.
+            // After the time limit the receiver no longer exists, so an error is ignored.
             let _ = sender.send(Settings::load_proved(&path, config::environment()));
             drop(reader);
         };
@@ -117,7 +117,7 @@ impl Loads {
         Ok(())
     }
 
-    /// The configuration when it is read, never if none is being read; cancel safe.
+    /// The configuration as soon as it was read; waits for ever if none is being read. Cancel safe.
     pub(super) async fn loaded(&mut self) -> Result<Loaded, NotLoaded> {
         let Some(loading) = &mut self.loading else {
             return std::future::pending().await;

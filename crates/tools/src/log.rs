@@ -29,7 +29,7 @@ const AUDIT_LINES: Level = Level::INFO;
 /// and counted.
 const WAITING: usize = 4096;
 
-/// The log of a running program; buffered lines are written when it is dropped.
+/// The log of a running program; buffered lines are written when this handle is dropped.
 #[derive(Debug)]
 pub(super) struct LogHandle {
     filter: reload::Handle<EnvFilter, Registry>,
@@ -56,7 +56,7 @@ impl LogHandle {
     }
 }
 
-/// Two ways to standard error, so that no other line can take the room of commands that were sent to a drive.
+/// Two queues to standard error, so that no other line can displace those about commands that were sent to a drive.
 struct Ways {
     sent: NonBlocking,
     others: NonBlocking,
@@ -77,8 +77,8 @@ impl<'w> MakeWriter<'w> for Ways {
     }
 }
 
-/// Starts logging to standard error, on threads of its own: a reader that stalls (a full pipe, a hanging collector) must
-/// not delay a stop.
+/// Starts logging to standard error on separate threads: a reader that stalls (a full pipe, a hanging collector)
+/// must not delay a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
     let takes_entries = matches!(settings.format, LogFormat::Auto | LogFormat::Journal);
     let journal = Journald::of_stderr().filter(|_| takes_entries);
@@ -106,7 +106,7 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
     }
 }
 
-/// Starts logging for a one-shot command: synchronously, so that log lines and output keep their order.
+/// Starts logging for a short-lived command: synchronously, so that log lines and output keep their order.
 pub(super) fn start_in_order(settings: &LogSettings) {
     subscribe(
         &settings.level,

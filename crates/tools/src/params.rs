@@ -223,11 +223,11 @@ impl StatusLine {
             return;
         }
         self.shown = true;
-        // A terminal that is gone shows nothing.
+        // If the terminal no longer exists, the error is ignored.
         let _ = write!(stderr, "\r\x1b[K{text}");
     }
 
-    /// Whether a line is due off a terminal: what has ended within a minute needs none.
+    /// Whether a progress line is due when output is not a terminal: work that ends within a minute needs none.
     fn is_due(&mut self, now: Instant) -> bool {
         let said = *self.said.get_or_insert(now);
         let due = now.saturating_duration_since(said) >= SAID_EVERY;
@@ -269,7 +269,7 @@ fn read_written(path: &Path) -> Result<ParameterFile, Failure> {
     Ok(read_file(path).map_err(|why| format!("{why}; name a file that `params read` wrote"))?)
 }
 
-/// A file where there is one, else the drive of that name, which is read.
+/// A parameter file if one exists at this path, otherwise the parameters read from the drive with this name.
 fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, Failure> {
     match Path::new(of).is_file() {
         true => read_written(Path::new(of)),

@@ -1,11 +1,10 @@
-//! The one place where text from outside (topics, names, fault texts, file contents, messages of other machines) is made
-//! harmless: what a terminal would obey, what would begin a line of its own and what would show text in another order
-//! becomes visible.
+//! Makes text from outside harmless (topics, names, fault texts, file contents, messages of other machines):
+//! characters that a terminal would obey, that would begin another line or that would reorder text become visible.
 
 use std::fmt::Write;
 
-/// Whether a character changes how the text around it looks: control characters, bidirectional controls, line separators,
-/// invisible ones.
+/// Whether a character changes the appearance of the text around it: control characters, bidirectional controls,
+/// line separators, invisible ones.
 fn is_unsafe(c: char) -> bool {
     c.is_control()
         || matches!(
@@ -22,8 +21,8 @@ fn is_unsafe(c: char) -> bool {
         )
 }
 
-/// A line or a part of one, with `\n` and `\u001b` instead of such characters. In a line of JSON these characters can
-/// only be within strings, where the escapes mean the same.
+/// A line or a part of one, with `\n` and `\u001b` in place of such characters. In a line of JSON these characters
+/// can only be inside strings, where the escapes have the same meaning.
 pub(super) fn line(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
@@ -43,7 +42,7 @@ pub(super) fn line(text: &str) -> String {
     out
 }
 
-/// Lines that are meant as such, with their tabs; the rest as in [`line()`].
+/// Text of several intended lines, with their tabs; the rest is treated as in [`line()`].
 pub(super) fn lines(text: &str) -> String {
     let safe = |part: &str| part.split('\t').map(line).collect::<Vec<_>>().join("\t");
     text.split('\n').map(safe).collect::<Vec<_>>().join("\n")

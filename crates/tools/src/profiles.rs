@@ -363,7 +363,7 @@ fn points(profile: &Profile) -> String {
     report::lines(&table)
 }
 
-/// Notes on a point: where its commands go, how they are written, its texts, its note.
+/// Remarks on a point: where its commands are written, how they are written, its texts, its note.
 fn remarks(profile: &Profile, point: &Point) -> String {
     let mut parts = Vec::new();
     if let Some(target) = point.write_to {

@@ -61,7 +61,7 @@ fn print(args: &Args, rows: &[PointValue]) -> Outcome {
     Ok(printed)
 }
 
-/// The reason why no point has a value, if all of several points have the same one: it is printed once.
+/// The reason why no point has a value, if several points all share it: it is then printed once.
 fn only_reason(rows: &[PointValue]) -> Option<&str> {
     let (first, others) = rows.split_first().filter(|(_, others)| !others.is_empty())?;
     let same = |row: &PointValue| !row.is_good() && row.why == first.why;

@@ -20,7 +20,7 @@ use crate::queue::CommandQueue;
 
 /// Largest capture that is read.
 const MOST_BYTES: u64 = 1 << 30;
-/// Time that goes by behind the last packet, so that its transaction has ended.
+/// Time that passes after the last packet, so that its transaction can end.
 const AFTERWARDS: Duration = Duration::from_millis(200);
 /// Longest step of virtual time.
 const STEP: Duration = Duration::from_millis(100);
@@ -139,7 +139,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
     let first = packets.first().map_or(Duration::ZERO, |packet| packet.at);
     let mut now = Duration::ZERO;
     for packet in packets {
-        // For a request, the capture has the time when it was given to the port, so its time on the wire is added.
+        // For a request, the capture has the time when the port accepted it, so the wire time is added.
         let wire = if packet.sent {
             bus.spec.format.chars(packet.bytes.len())
         } else {
@@ -157,7 +157,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
 }
 
 impl Player {
-    /// Advances the time from `now` to `until`; time never goes back, whatever the capture says.
+    /// Advances the time from `now` to `until`; the time never goes back, whatever the capture contains.
     fn wait(&mut self, now: &mut Duration, until: Duration) {
         while *now < until {
             let wake = self

@@ -94,7 +94,7 @@ fn line(kind: &str, message: &str) {
     let _ = writeln!(io::stderr().lock(), "{priority}{kind}: {}", printable::line(message));
 }
 
-/// Width of a terminal that does not tell its width, in columns.
+/// Width of a terminal that does not report its width, in columns.
 const USUAL_WIDTH: u16 = 80;
 
 /// A table without a frame, as wide as the terminal at most.
@@ -103,7 +103,7 @@ pub(super) fn table<T: AsRef<str>>(header: impl IntoIterator<Item = T>) -> TextT
     table.load_preset(presets::NOTHING);
     table.set_style(TableComponent::HeaderLines, '─');
     table.set_content_arrangement(ContentArrangement::Dynamic);
-    // Consoles on a serial line, and terminals that were never given a size, say that they have no columns.
+    // Serial consoles, and terminals whose size was never set, report zero columns.
     if table.width() == Some(0) {
         table.set_width(USUAL_WIDTH);
     }

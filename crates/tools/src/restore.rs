@@ -1,5 +1,5 @@
-//! `drivegate restore`: sets a gateway up again from a backup. All is unpacked aside and the configuration checked before
-//! anything is put in place.
+//! `drivegate restore`: sets a gateway up again from a backup. All files are unpacked separately, and the
+//! configuration is checked, before anything is put in place.
 
 mod staging;
 
@@ -76,7 +76,7 @@ fn restore(args: &Args) -> Result<String, Failure> {
     }
     let loaded = check(&staging, name, &manifest, base)?;
     let Some(settings) = &loaded.settings else {
-        // The configuration is checked as if it were in its place already.
+        // The configuration is checked as if it were already in its place.
         let [aside, base] = [staging.of(Root::Config), base].map(|dir| dir.display().to_string());
         let errors = loaded
             .errors

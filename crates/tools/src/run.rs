@@ -40,8 +40,8 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 fn run_from(path: &Path) -> io::Result<ExitCode> {
-    // The handlers come before the first thread and before any file is read: a signal in the first milliseconds must not
-    // kill, and a file that cannot be read must not hold up a stop.
+    // The signal handlers are installed before the first thread and before any file is read: a signal in the first
+    // milliseconds must not kill the process, and an unreadable file must not delay a stop.
     let starting = Builder::new_current_thread().enable_all().build()?;
     let mut early = Signals::within(&starting)?;
     let Some(loaded) = starting.block_on(load(path, &mut early))? else {
@@ -101,7 +101,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
     ExitCode::SUCCESS
 }
 
-/// Notifies systemd, if it started this process.
+/// Notifies systemd if it started this process.
 fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::debug!(target: "drivegate::cli::run", "cannot notify systemd: {error}");

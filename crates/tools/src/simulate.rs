@@ -213,10 +213,10 @@ pub(super) enum Speed {
     Max,
 }
 
-/// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
+/// The endpoint that replaces a bus's `port`: a link in place of the device, or a listener.
 ///
 /// # Errors
-/// An address that is none of this machine; `rfc2217://`, which is not simulated.
+/// If the address does not belong to this machine, or is `rfc2217://`, which is not simulated.
 fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
     let Some((scheme, address)) = port.split_once("://") else {
         return Ok(EndpointOptions::Pty {
@@ -249,7 +249,7 @@ fn parse_listen(text: &str) -> Result<SocketAddr, String> {
         .ok_or_else(|| format!("`{text}` is not an address to listen on; write host:port, such as 127.0.0.1:4001"))
 }
 
-/// The simulated lines of a configuration file, each in the place of its bus's port.
+/// The simulated lines of a configuration file, each in place of the port of its bus.
 fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, Failure> {
     let loaded = Settings::load(file, config::environment());
     report::problems(&loaded);
@@ -370,7 +370,7 @@ impl Args {
         })
     }
 
-    /// The profile of that name, or that file.
+    /// The profile with this name, or in this file.
     fn profile_of(&self, known: &Profiles, problems: Vec<Problem>) -> Result<Arc<Profile>, String> {
         let all = |problems: Vec<Problem>| {
             let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();

@@ -58,7 +58,7 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
     }
 }
 
-/// A line for each drive; first come the drives that are not proven to stand.
+/// One line of text for each drive; drives that are not proven to stand come first.
 fn shown(stopped: &StopReport) -> String {
     let (standing, others): (Vec<_>, Vec<_>) = stopped
         .drives

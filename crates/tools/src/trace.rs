@@ -295,7 +295,7 @@ fn line(frame: &Frame, with_bus: bool, colours: bool) -> String {
     };
     let drive = printable::line(frame.drive.as_deref().unwrap_or("-"));
     let mut meaning = vec![];
-    // For an exception, meaning and verdict are equal, so only one of them is printed.
+    // For an exception, decoded text and verdict are equal, so only one of them is printed.
     if frame.decode != frame.verdict {
         meaning.push(printable::line(&frame.decode));
     }

@@ -72,7 +72,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     if file.path.exists() {
-        // This is checked before the password prompt.
+        // The file is checked before the password prompt.
         file.list()?;
     }
     let user =
@@ -145,7 +145,7 @@ impl Hidden {
 
 impl Drop for Hidden {
     fn drop(&mut self) {
-        // If the terminal is gone, nothing else can be done.
+        // If the terminal no longer exists, nothing else can be done.
         let _ = tcsetattr(io::stdin(), OptionalActions::Flush, &self.0);
     }
 }

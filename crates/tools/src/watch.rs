@@ -91,7 +91,7 @@ async fn document(client: &Client) -> Result<Value, String> {
     Ok(json!({ "buses": buses, "drives": drives }))
 }
 
-/// A JSON line, also where there is no answer.
+/// A line of JSON, also if there is no answer.
 fn json_line(document: Result<Value, String>) -> Vec<u8> {
     let document = document.unwrap_or_else(|why| json!({ "error": why }));
     format!("{document}\n").into_bytes()

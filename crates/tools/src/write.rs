@@ -94,7 +94,7 @@ fn write(args: &Args, printed: &mut bool) -> Outcome {
     let Some(mistake) = mistake else {
         return send(&settings);
     };
-    // A stop is carried out whatever else is wrong.
+    // A stop is carried out even if other settings are invalid.
     settings.retain(|setting| setting.point == ModelPoint::Run.name());
     if !settings.is_empty() && settings.iter().all(|setting| setting.value == false) {
         send(&settings)?;
@@ -109,7 +109,7 @@ fn parse(profile: Option<&Profile>, text: &str) -> Result<Setting, String> {
     })?;
     let (name, value) = (name.trim(), value.trim());
     match profile {
-        // Without a profile here the gateway checks the point.
+        // Without a profile here, the gateway checks the point.
         None => Ok(Setting {
             point: name.to_string(),
             value: serde_json::from_str(value)
@@ -139,7 +139,7 @@ fn of_profile(profile: &Profile, name: &str, text: &str) -> Result<Setting, Stri
         .map(|meaning| format!(" ({meaning})"))
         .unwrap_or_default();
     let shown = format!("{}={value}{meaning} {}", point.name, point.unit);
-    // The text of an enumeration is left to the gateway, whose profile knows the code for it.
+    // The text of an enumeration is passed to the gateway, whose profile knows its code.
     let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text);
     Ok(Setting {
         point: point.name.clone(),
@@ -180,10 +180,10 @@ fn wanted_number(text: &str) -> String {
     }
 }
 
-/// The reply as the gateway sent it, and in words: what was acknowledged, or why the command failed.
+/// The reply as the gateway sent it, and as text: what was acknowledged, or why the command failed.
 ///
 /// # Errors
-/// If there is no reply, or the reply is not one to a command.
+/// If there is no reply, or the reply does not belong to a command.
 fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String, String>), String> {
     let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
     let what = format!("{} {}", target.drive, shown.join(" "));

@@ -1,4 +1,4 @@
-//! Hostile archives are refused, and a sound one comes back as it was.
+//! Hostile archives are refused, and a valid one is restored unchanged.
 
 use super::*;
 
@@ -31,7 +31,7 @@ fn manifest(members: Vec<Member>) -> Manifest {
 
 const CONFIG: (&str, &[u8]) = ("config/drivegate.toml", b"[gateway]\n");
 
-/// An archive with this manifest and these members, whether or not they match.
+/// An archive with this manifest and these members, which need not match.
 fn archive(manifest: &Manifest, members: &[(&str, &[u8], EntryType)]) -> Vec<u8> {
     let mut builder = Builder::new(Vec::new());
     let json = serde_json::to_vec(manifest).unwrap();

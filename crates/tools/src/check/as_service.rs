@@ -1,5 +1,5 @@
-//! Whether the user of the systemd service could read the files of a configuration: by their permission bits, those of
-//! the directories on the way, and the groups of the unit.
+//! Checks whether the user of the systemd service can read the files of a configuration: by their permission bits,
+//! those of the directories on the way, and the groups of the unit.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -26,7 +26,7 @@ const TEMPORARY: [&str; 2] = ["/tmp", "/var/tmp"];
 /// User and groups of the service that reads the files.
 #[derive(Debug, PartialEq, Eq)]
 struct Service {
-    /// The user; `None` for one that exists only while the service runs, and owns nothing.
+    /// The user; `None` for a dynamic user that exists only while the service runs and owns nothing.
     user: Option<u32>,
     groups: BTreeSet<u32>,
     /// Directories whose files the service does not see.
@@ -58,7 +58,7 @@ impl Service {
         Service::parse(&text, &read("/etc/passwd"), &read("/etc/group"))
     }
 
-    /// From what `systemctl show` prints; without a loaded unit, as the shipped one is.
+    /// Parses the output of `systemctl show`; if no unit is loaded, the shipped unit is assumed.
     fn parse(unit: &str, passwd: &str, group: &str) -> Service {
         let value = |key: &str| {
             let mut lines = unit.lines().filter_map(|line| line.split_once('='));
@@ -104,7 +104,7 @@ impl Service {
         }
     }
 
-    /// Whether the service has this permission; a capability of root is not counted, the unit has none.
+    /// Whether the service has this permission; capabilities of root do not count, because the unit has none.
     fn may(&self, node: Node, wanted: u32) -> bool {
         let shift = match () {
             () if self.user == Some(node.user) => 6,
@@ -142,7 +142,7 @@ pub(super) fn problems(path: &Path) -> Vec<Problem> {
 }
 
 fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem> {
-    // A file that does not exist is reported where it is read.
+    // A missing file is reported by the code that reads it.
     let whole = file.path.canonicalize().ok()?;
     let shown = |finding| Some(Problem::of_file(config.display().to_string(), &file.key, finding));
     if let Some(dir) = service.hidden.iter().find(|dir| whole.starts_with(dir)) {

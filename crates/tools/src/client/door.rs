@@ -1,4 +1,4 @@
-//! A way to reach a gateway, and the connection through it.
+//! The ways to reach a gateway, and the connection over them.
 
 use std::fmt;
 use std::io;
@@ -15,7 +15,7 @@ use super::{ClientError, Url};
 use crate::north::http::{InProcess, basic_authorization};
 use crate::north::{GATEWAY, client_tls, explain};
 
-/// Remedy for a failed handshake that suggests none itself.
+/// Remedy for a failed TLS handshake whose error suggests none.
 const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
 
 /// A way to reach a gateway.
@@ -25,11 +25,11 @@ pub(crate) enum Door {
     Network(Network),
     /// The local socket of the gateway.
     Socket(PathBuf),
-    /// The parts of one in this process.
+    /// A gateway's parts in this process.
     InProcess(Arc<InProcess>),
 }
 
-/// An HTTP server, with the CA and the token for it.
+/// An HTTP server on the network, with the CA and the token for it.
 #[derive(Debug, Clone)]
 pub(crate) struct Network {
     pub(crate) url: Url,
@@ -46,9 +46,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 /// Reason why a connection was not made.
 #[derive(Debug)]
 pub(super) enum NotConnected {
-    /// No gateway listens there.
+    /// No gateway listens at this address.
     Nobody,
-    /// A gateway may be there; the text tells why it was not reached.
+    /// A gateway may exist there; the text says why it was not reached.
     Because(String),
     /// The error is final: no other way is tried.
     Final(ClientError),

@@ -54,7 +54,7 @@ impl EventStream {
     /// The next event. Cancel safe.
     ///
     /// # Errors
-    /// If the stream has ended.
+    /// If the event stream has ended.
     pub(crate) async fn next(&mut self) -> Result<StreamEvent, ClientError> {
         loop {
             if let Some(event) = self.parser.take() {

@@ -1,4 +1,4 @@
-//! A request and its reply.
+//! A request to the gateway and its reply.
 
 use std::fmt;
 use std::future::poll_fn;
@@ -20,10 +20,10 @@ use crate::north::http::messages::{EXPECT, ErrorReply, Expected};
 
 /// Largest reply, bytes: enough for some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;
-/// Time for the reply to a request that only shows what is known.
+/// Time limit for the reply to a request that only shows present values.
 const SHOWN_WITHIN: Duration = Duration::from_secs(10);
-/// Time for any other reply: a command may wait for its turn and its confirmation, a read for a slow line, a reload for its
-/// files.
+/// Time limit for any other reply: a command may wait for its turn and its confirmation, a read for a slow line, a
+/// reload for its files.
 const DONE_WITHIN: Duration = Duration::from_secs(40);
 
 /// A request.
@@ -36,12 +36,12 @@ pub(crate) struct Asked {
     pub(super) within: Duration,
     /// The remedy if the reply is lost.
     lost: &'static str,
-    /// What to do if the request is refused, unless the status tells that.
+    /// Remedy if the request is refused, unless the status already gives one.
     refused: &'static str,
 }
 
 impl Asked {
-    /// A GET of a view of values that the gateway has already: answered at once, so with a short time limit.
+    /// A GET of values that the gateway already has: it is answered at once, so the time limit is short.
     pub(crate) fn view(path: impl Into<String>) -> Asked {
         Asked {
             within: SHOWN_WITHIN,
@@ -81,7 +81,7 @@ impl Asked {
         Asked { lost, ..self }
     }
 
-    /// Sets what to do if the request is refused, unless the status tells that.
+    /// Sets the remedy if the request is refused, unless the status already gives one.
     pub(crate) fn if_refused(self, refused: &'static str) -> Asked {
         Asked { refused, ..self }
     }
@@ -96,7 +96,7 @@ impl Asked {
 pub(super) struct Opened {
     pub(super) status: StatusCode,
     pub(super) headers: HeaderMap,
-    /// Where the reply comes from.
+    /// Where the reply comes from, for messages.
     pub(super) place: String,
     over_network: bool,
     body: Incoming,
@@ -126,7 +126,7 @@ impl Opened {
         let (prefix, authority) = door.base();
         let mut request = Request::new(asked.body.clone());
         *request.method_mut() = asked.method.clone();
-        // All parts of the path were checked, or are percent-encoded.
+        // All parts of the path were validated or percent-encoded before.
         *request.uri_mut() = format!("{prefix}{}", asked.path).parse().unwrap_or_default();
         let headers = request.headers_mut();
         let expected = expected.map(|expected| {
@@ -231,7 +231,7 @@ impl Reply {
         }
     }
 
-    /// The document of a reply of any status, if it is such a one.
+    /// The document of a reply with any status; `None` if its body is of another type.
     pub(crate) fn parsed<T: DeserializeOwned>(&self) -> Option<T> {
         serde_json::from_slice(&self.text).ok()
     }

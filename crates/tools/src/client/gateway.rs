@@ -61,7 +61,7 @@ impl Gateway {
         }
     }
 
-    /// A client that only looks: of whichever gateway is found, unless one is named.
+    /// A client that only reads values: from any gateway that is found, unless one is specified.
     ///
     /// # Errors It cannot be reached in any way.
     pub(crate) fn viewer(&self) -> Result<Client, String> {
@@ -80,8 +80,7 @@ impl Gateway {
 }
 
 impl Client {
-    /// A client of the gateway that runs with this configuration: through its local socket, or where that is off by
-    /// HTTP.
+    /// A client of the gateway that runs with this configuration: through its local socket or, if that is off, by HTTP.
     ///
     /// # Errors It cannot be reached in any way.
     pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
@@ -107,7 +106,7 @@ impl Client {
     }
 }
 
-/// Where the HTTP server of a configuration listens.
+/// The URL of the HTTP server of a configuration.
 fn http_of(config: &Path) -> Result<Url, String> {
     let shown = config.display();
     let settings = Settings::load(config, environment()).settings;
@@ -126,7 +125,7 @@ fn http_of(config: &Path) -> Result<Url, String> {
     format!("http://{}", from_here(http.listen)).parse()
 }
 
-/// The address by which a client on this machine reaches it.
+/// The address by which a client on this machine reaches the server.
 fn from_here(listen: SocketAddr) -> SocketAddr {
     let address = match listen {
         SocketAddr::V4(at) if at.ip().is_unspecified() => Ipv4Addr::LOCALHOST.into(),

@@ -42,7 +42,7 @@ impl FromStr for Url {
     }
 }
 
-/// The address that was probably meant: with a scheme, and with the usual port where none was given.
+/// The address that was probably meant: with a scheme, and with the default port if none was given.
 fn meant(text: &str) -> String {
     let host = text.rsplit("//").next().unwrap_or_default();
     let plain = host

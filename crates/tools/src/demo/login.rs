@@ -1,4 +1,4 @@
-//! The login of the demo: a user of its page, whose password is made anew at each start and is good on this machine only.
+//! The login of the demo: a user of its page whose password is created at each start and is only valid on this machine.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use crate::north::http::{Scope, Token, User};
 /// Characters of the password.
 const LENGTH: usize = 12;
 
-/// The user who may command the demo's drives from its page.
+/// The user who may command the drives of the demo from its page.
 #[derive(Debug)]
 pub(super) struct Login {
     /// The password.

@@ -30,7 +30,7 @@ Ctrl-C ends the demo.",
     )
 }
 
-/// Three steps to a start from the page.
+/// Instructions for a start from the page in a few steps.
 fn page(place: &DemoPlace, sides: &Sides) -> String {
     let (http, bacnet, password) = (sides.http, sides.bacnet, &place.login.password);
     format!(

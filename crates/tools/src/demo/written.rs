@@ -13,7 +13,7 @@ pub(super) struct Written {
 }
 
 impl Written {
-    /// The directory, which is made; nothing in it is replaced but what another demo wrote.
+    /// Creates the directory; only files of another demo are replaced in it.
     ///
     /// # Errors
     /// The directory cannot be made, or has a configuration that is not a demo's.
@@ -52,7 +52,7 @@ impl Written {
         self.dir.join("drivegate.sock")
     }
 
-    /// The directory itself.
+    /// The path of the directory.
     pub(super) fn dir(&self) -> &Path {
         &self.dir
     }

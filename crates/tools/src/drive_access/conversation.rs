@@ -12,10 +12,10 @@ pub(super) struct Conversation {
 }
 
 impl Conversation {
-    /// Sends the first request to the gateway or, where there is none, opens the port; returns the reply.
+    /// Sends the first request to the gateway or, if there is none, opens the port; returns the reply.
     ///
     /// # Errors
-    /// Why no conversation begins, as a message.
+    /// If no connection is possible; contains the reason as a message.
     pub(super) async fn begin(
         target: &Target,
         asked: &Asked,
@@ -49,7 +49,7 @@ impl Conversation {
     /// A further request.
     ///
     /// # Errors
-    /// There is no reply: the reason, as a message.
+    /// If there is no reply; contains the reason as a message.
     pub(super) async fn ask(&self, asked: &Asked) -> Result<Reply, String> {
         self.client.ask(asked).await.map_err(|error| match error {
             ClientError::NotFound(_) => "the gateway is gone; the local socket; start it and try again".to_string(),

@@ -1,4 +1,4 @@
-//! Without a gateway: the command opens the port itself and is the master for a moment.
+//! Access without a gateway: the command opens the port itself and is the master for a short time.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -36,11 +36,11 @@ pub(crate) enum Needs<'n> {
     Points(&'n [String]),
     /// The points into which commands of the named points are translated: all polled points, if a command is derived.
     Commands(&'n [String]),
-    /// The identification of the drive, for its parameters.
+    /// The identification of the drive, needed for its parameters.
     Identification,
 }
 
-/// A bus that belongs to this command, with the one drive.
+/// A bus that only this command uses, with the one drive.
 pub(super) struct Direct {
     daemon: Daemon,
     drive: DriveHandle,
@@ -58,7 +58,7 @@ impl Direct {
             // No process data is shown, so the cycle may be slow.
             bus.spec.cycle = RESTFUL.max(bus.spec.cycle);
         }
-        // The drive keeps what was commanded when this process ends.
+        // The drive keeps its last command when this process ends.
         spec.on_shutdown = OnShutdown::LeaveRunning;
         spec.supervision = None;
         let name = spec.name.clone();

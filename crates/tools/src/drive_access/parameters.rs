@@ -1,5 +1,5 @@
-//! Readings and restores of parameters: started, then polled until they have ended, through the gateway or on a bus of
-//! the command.
+//! Readings and restores of parameters: started, then polled until they have ended, through the gateway or on a bus
+//! of the command.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ impl Target {
     /// Reads all parameters of the drive; the text of the file. `progress` gets how far it is.
     ///
     /// # Errors
-    /// Why the parameters are not read, as a message.
+    /// If the parameters cannot be read; contains the reason as a message.
     pub(crate) fn read_parameters(
         &self,
         how: ReadParameters,
@@ -56,11 +56,11 @@ impl Target {
     }
 
     /// Starts an action on a restore of the drive, or without one only follows the restore, and waits until it has
-    /// ended; a prepared restore is carried out if `agreed` returns true. `progress` gets each state. Returns the last
-    /// known state.
+    /// ended; a prepared restore is carried out if `agreed` returns true. `progress` gets each state. Returns the
+    /// last known state.
     ///
     /// # Errors
-    /// The restore could not be started, or is no longer known: the reason, as a message.
+    /// If the restore could not be started, or is no longer known; contains the reason as a message.
     pub(crate) fn restore_parameters(
         &self,
         act: Option<RestoreAct>,

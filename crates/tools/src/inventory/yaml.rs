@@ -1,10 +1,10 @@
-//! TOML as YAML that readers of 1.1 and 1.2 understand alike: strings always quoted, numbers with all that marks them.
+//! Writes TOML as YAML that YAML 1.1 and 1.2 parse alike: strings always quoted, numbers with all their marks.
 
 use std::fmt::Write;
 
 use toml::{Table, Value};
 
-/// Words that YAML 1.1 reads as something other than a string.
+/// Words that YAML 1.1 parses as something other than a string.
 const WORDS: [&str; 9] = ["y", "n", "yes", "no", "on", "off", "true", "false", "null"];
 
 /// The value, a table, as a document.
@@ -49,7 +49,8 @@ fn mapping(text: &mut String, table: &Table, depth: usize) {
     }
 }
 
-/// Whether the value stands on the line of its key: all but lists and tables with something in them, and lists of scalars.
+/// Whether the value is written on the line of its key: all except non-empty lists and tables, but including lists
+/// of scalars.
 fn is_inline(value: &Value) -> bool {
     match value {
         Value::Table(table) => table.is_empty(),

@@ -13,9 +13,9 @@ use tracing::field::{Field, Visit};
 use crate::printable;
 
 const SOCKET: &str = "/run/systemd/journal/socket";
-/// Fields that journald has under names of its own.
+/// Fields that journald provides under names of its own.
 const OWN_FIELDS: [&str; 4] = ["MESSAGE", "PRIORITY", "SYSLOG_IDENTIFIER", "TARGET"];
-/// Longest entry, bytes; a datagram has no more than the send buffer of its socket, 200 KiB.
+/// Longest entry, bytes; a datagram cannot exceed the send buffer of its socket, 200 KiB.
 const LONGEST: usize = 64 << 10;
 
 /// The socket of the journal.
@@ -42,7 +42,7 @@ pub(crate) fn reads_stderr() -> bool {
 }
 
 impl Write for Journald {
-    /// Sends one entry. While journald is being restarted, it goes to standard error, which journald reads afterwards.
+    /// Sends one entry. While journald is being restarted, the entry goes to standard error, which journald reads later.
     fn write(&mut self, entry: &[u8]) -> io::Result<usize> {
         let sent = self.0.send(entry).or_else(|_| {
             self.0.connect(SOCKET)?;

@@ -1,4 +1,4 @@
-//! A log line is one line of plain text, whatever its fields hold; warnings of libraries are limited.
+//! Writes a log line as one line of plain text, whatever its fields contain; warnings of libraries are limited.
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write};
@@ -16,9 +16,9 @@ use crate::printable;
 
 /// Shortest time between two lines of one kind that a library logs.
 const INTERVAL: Duration = Duration::from_secs(60);
-/// Kinds that are distinguished; they are places in sources, so this is never reached.
+/// Most kinds of lines that are distinguished; they are places in the source code, so this is never reached.
 const KINDS: usize = 1024;
-/// Own targets begin with this.
+/// Start of the targets of our own log lines.
 const OWN: &str = "drivegate";
 
 /// The form of a log line.
@@ -57,7 +57,7 @@ where
     N: for<'a> FormatFields<'a> + 'static,
 {
     fn format_event(&self, context: &FmtContext<'_, S, N>, mut writer: Writer<'_>, event: &Event<'_>) -> fmt::Result {
-        // Records of the `log` crate have their target and place in fields.
+        // Records of the `log` crate have their target and source position in fields.
         let normalized = event.normalized_metadata();
         let metadata = normalized.as_ref().unwrap_or_else(|| event.metadata());
         let mut libraries = self.libraries.lock().unwrap_or_else(PoisonError::into_inner);
@@ -95,7 +95,7 @@ where
 }
 
 impl LogLine {
-    /// The part before the fields: for the journal the priority, which it reads, and no time, which it adds.
+    /// Writes the part before the fields: for the journal the priority, which it reads, and no time, which it adds.
     fn head(&self, metadata: &Metadata<'_>, writer: &mut Writer<'_>) -> fmt::Result {
         let colour = match *metadata.level() {
             Level::ERROR => 31,
@@ -137,7 +137,7 @@ type Kind = (String, Option<u32>);
 struct Libraries(BTreeMap<Kind, (Instant, u64)>);
 
 impl Libraries {
-    /// `None` if the line must not be logged now, otherwise the number of lines of its kind left out before it.
+    /// The number of lines of this kind left out before this one; `None` if this line must be left out too.
     fn permit(&mut self, metadata: &Metadata<'_>, now: Instant) -> Option<u64> {
         let target = metadata.target();
         if target.starts_with(OWN) || target == AUDIT || *metadata.level() > Level::WARN {

@@ -19,7 +19,7 @@ pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
     Some(listing::devices(&settings.gateway, options, buses))
 }
 
-/// Prints the objects, and writes the tables if they are wanted.
+/// Prints the objects, and writes the tables if they were requested.
 pub(super) fn run(settings: &Settings, csv: bool, ede: Option<&Path>) -> Outcome {
     let Some(devices) = devices(settings) else {
         let why = "no BACnet objects; --bacnet; add [bacnet] to the configuration";

@@ -24,7 +24,7 @@ pub(super) struct Row {
     pub(super) unit: String,
     pub(super) not_available: &'static str,
     pub(super) access: &'static str,
-    /// Where the value comes from, or where a write goes.
+    /// Source of the value, or destination of a write.
     pub(super) source: String,
     pub(super) note: String,
 }
@@ -69,14 +69,15 @@ impl Row {
     }
 }
 
-/// The registers of one unit, where clients see them: the blocks of the common model, then the drive's own.
+/// The registers of one unit at their addresses for clients: the blocks of the common model, then the drive's own
+/// registers.
 pub(super) fn drive_rows(drive: &DriveHandle, access: Access, registers: Registers) -> Vec<Row> {
     let spec = &drive.image.spec;
     let (profile, plan, raw_writes) = (&spec.profile, &drive.image.plan, &spec.raw_writes);
     let entries = BLOCKS
         .into_iter()
         .flatten()
-        // Without [authority], the entry of the hold does not exist.
+        // Without [authority] there is no register for the hold.
         .filter(|entry| entry.content != Content::Hold || drive.has_authority())
         .filter_map(|entry| Some((entry, registers.of_model(entry.address)?)))
         .map(|(entry, address)| Row {
@@ -89,7 +90,7 @@ pub(super) fn drive_rows(drive: &DriveHandle, access: Access, registers: Registe
         .iter()
         .filter(|p| !p.hidden)
         .filter_map(|p| Some((p, p.raw()?)))
-        // Other addresses are hidden by the common model.
+        // Other addresses are hidden behind the common model.
         .filter(|(_, raw)| raw.table.is_bits() || registers.shows_the_drives(raw.address, raw.form.items()))
         .collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
@@ -192,7 +193,7 @@ fn point_note<'n>(profile: &Profile, point: ModelPoint, note: &'n str) -> &'n st
     }
 }
 
-/// The place that a point of the model is read from, or the points that it is made of.
+/// The register that a point of the model is read from, or the points that it is derived from.
 fn point_source(profile: &Profile, plan: &Plan, point: ModelPoint) -> String {
     let Some(point) = profile.model_point(point) else {
         return "none".to_string();
@@ -227,7 +228,7 @@ fn polled(plan: &Plan, point: &Point, raw: &Raw) -> String {
     }
 }
 
-/// Whether a raw write may set the point alone.
+/// Whether a raw write may set this point alone.
 fn is_written_raw(profile: &Profile, raw_writes: &RawWrites, raw: &Raw) -> bool {
     has_writable_range(profile, raw) && raw_writes.refused(profile, raw.table, raw.addresses()).is_none()
 }
@@ -302,7 +303,7 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes:
     }
 }
 
-/// The registers of the gateway itself, for the buses that are `shown`, all without a choice.
+/// The registers of the gateway itself, for the buses that are `shown`; `None` shows all.
 pub(super) fn gateway_rows(plant: &Plant, shown: Option<&[String]>) -> Vec<Row> {
     let is_shown = |bus: &BusHandle| shown.is_none_or(|names| names.contains(&bus.image.spec.name));
     let buses = (0u16..).zip(&plant.buses).filter(|(_, bus)| is_shown(bus));
@@ -319,7 +320,7 @@ pub(super) fn gateway_rows(plant: &Plant, shown: Option<&[String]>) -> Vec<Row> 
                 kind: register.form.name().to_string(),
                 scale: register.scale.to_string(),
                 unit: register.unit.to_string(),
-                // Figures that take time to measure; counts and states are known at once.
+                // Only measured figures can be unavailable; counts and states are known at once.
                 not_available: if !register.unit.is_empty() {
                     register.form.not_available()
                 } else {

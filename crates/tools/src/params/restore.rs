@@ -95,7 +95,7 @@ fn write(gateway: &Gateway, file: &ParameterFile, drive: &str, how: &How) -> Out
     carry(gateway, drive, Some(act), how)
 }
 
-/// The file without what is as text, which the gateway has itself.
+/// The file without its text notes, which the gateway has itself.
 fn without_notes(file: &ParameterFile) -> ParameterFile {
     let bare = |(id, entry): (&Id, &Entry)| {
         let value = entry.value.clone().map_err(|_| String::new());
@@ -180,7 +180,7 @@ fn plan_text(prepared: &Restore) -> String {
 /// Whether what is prepared is to be written.
 ///
 /// # Errors
-/// Why it is not; without a message where only the plan was wanted.
+/// If the restore is not confirmed; without a message if only the plan was requested.
 fn agrees(drive: &str, how: &How) -> Result<(), Failure> {
     if how.dry_run {
         return Err(Failure::Reported(0));

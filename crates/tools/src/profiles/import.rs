@@ -101,7 +101,7 @@ pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
     Ok(text)
 }
 
-/// Lines of the list, each with its cells; empty lines are left out.
+/// Lines of the list with their cells; empty lines are left out.
 fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
     let text = text.trim_start_matches('\u{feff}');
     let first = text.lines().next().unwrap_or_default();
@@ -122,7 +122,7 @@ struct Row {
     toml: String,
 }
 
-/// Key, what is wrong, what to do.
+/// A mistake in a list: key, problem, remedy.
 type Mistake = (&'static str, String, String);
 
 fn mistake(key: &'static str, what: impl Into<String>, remedy: &str) -> Mistake {
@@ -189,7 +189,7 @@ fn point(cells: &BTreeMap<&str, &str>, names: &mut BTreeSet<String>) -> Result<R
     })
 }
 
-/// The points that a cell names, as this list calls them: one, or several with `*` or `+` between them.
+/// The point names in a cell, as this list writes them: one, or several with `*` or `+` between them.
 fn names_in(text: &str) -> String {
     let names: Vec<String> = text.split(['*', '+']).map(|name| quoted(&words(name, '_'))).collect();
     match names.as_slice() {

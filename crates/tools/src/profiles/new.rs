@@ -3,7 +3,7 @@
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, Profile};
 
-/// A profile over another one, with what may differ as remarks.
+/// The text of a profile based on another one, with possible changes as remarks.
 pub(super) fn over(name: &str, base: &Profile) -> String {
     let mut text = format!(
         "# {}\n# Only what differs from `{}`; `drivegate profiles show {}` has all of it.\nname = \"{name}\"\nbase = \"{}\"\n",
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
     use crate::drive::profile::Profiles;
 
-    /// The printed text is a valid profile, also with its commented lines switched on.
+    /// The printed text is a valid profile, also with its commented lines enabled.
     #[test]
     fn every_beginning_is_a_profile() {
         let read = |text: &str| Profile::parse("p.toml", text, false);

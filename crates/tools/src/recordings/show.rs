@@ -11,7 +11,7 @@ use crate::{printable, report};
 
 /// Samples that are shown before and after the trigger.
 const SHOWN: (usize, usize) = (8, 6);
-/// Points that are shown, if they were read.
+/// Points that are shown if they were read.
 const POINTS: [&str; 8] = [
     "fault",
     "fault_code",

@@ -1,4 +1,4 @@
-//! Where a backup is unpacked before it is put in place: a directory next to each destination, always removed.
+//! Where a backup is unpacked before it is put in place: a directory next to each destination, which is always removed.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read};
@@ -7,7 +7,7 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::archive::Root;
 
-/// First part of the name of the directory.
+/// First part of the name of the temporary directory.
 pub(crate) const UNPACKED: &str = ".restore-";
 
 /// The unpacked files.
@@ -15,9 +15,9 @@ pub(crate) const UNPACKED: &str = ".restore-";
 pub(super) struct Staging {
     config: Destination,
     state: Destination,
-    /// In the order of the archive; the configuration is the first.
+    /// The files in the order of the archive; the configuration is the first.
     files: Vec<(Root, PathBuf)>,
-    /// Below the directory of the configuration.
+    /// New directories below the directory of the configuration.
     directories: Vec<PathBuf>,
 }
 
@@ -25,7 +25,7 @@ pub(super) struct Staging {
 struct Destination {
     /// The destination.
     to: PathBuf,
-    /// Where the archive is unpacked: in the destination, or in the existing part of its path.
+    /// Directory in which the archive is unpacked: inside the destination, or inside the existing part of its path.
     aside: PathBuf,
     /// Whether the destination did not exist before.
     is_new: bool,
@@ -52,10 +52,10 @@ impl Destination {
 
 impl Drop for Destination {
     fn drop(&mut self) {
-        // An error is ignored: the name of the remaining directory shows where it comes from.
+        // An error is ignored: the name of the remaining directory shows its origin.
         let _ = fs::remove_dir_all(&self.aside);
         if self.is_new {
-            // A new directory is removed only if it is empty, so if nothing was put in place.
+            // A new directory is removed only if it is empty, that is, if nothing was put in place.
             let _ = fs::remove_dir(&self.to);
         }
     }
@@ -82,7 +82,7 @@ impl Staging {
         }
     }
 
-    /// Where the files of `root` are unpacked.
+    /// The directory in which the files of `root` are unpacked.
     pub(super) fn of(&self, root: Root) -> &Path {
         &self.place_of(root).aside
     }
@@ -116,7 +116,7 @@ impl Staging {
         Ok(())
     }
 
-    /// Lets the unpacked configuration have a file that is at `path` already, for the check.
+    /// Makes a file that already exists at `path` available to the unpacked configuration, for the check.
     ///
     /// # Errors
     /// The link cannot be made.
@@ -140,10 +140,11 @@ impl Staging {
         all.filter(|path| fs::symlink_metadata(path).is_ok()).collect()
     }
 
-    /// Puts everything in place, the configuration last; the files get the owner of their directory. What is in place.
+    /// Puts everything in place, the configuration last; the files get the owner of their directory. Returns the
+    /// files that are in place.
     ///
     /// # Errors
-    /// A file cannot be put in place: its name, and the files in place already.
+    /// If a file cannot be put in place: contains its name, and the files already in place.
     pub(super) fn place(&self) -> Result<Vec<PathBuf>, String> {
         for path in &self.directories {
             let failed = |error: io::Error| format!("cannot create {}: {error}", path.display());
@@ -173,16 +174,16 @@ impl Staging {
     }
 }
 
-/// Gives a file or directory the owner of the directory that it is for.
+/// Gives a file or directory the owner of the directory in which it will be placed.
 fn give(path: &Path, directory: &Path) -> io::Result<()> {
     let owner = fs::metadata(directory)?;
-    // Only root may change the owner; without root all files are the user's own, so an error is ignored.
+    // Only root may change the owner; without root all files belong to the user anyway, so an error is ignored.
     let _ = chown(path, Some(owner.uid()), Some(owner.gid()));
     Ok(())
 }
 
-/// The directory of the file `path` below `root`, created if necessary, with the owner of the one it is in. A link on the way
-/// is not followed.
+/// The directory of the file `path` below `root`, created if necessary with the owner of its parent. A symbolic
+/// link on the way is not followed.
 fn directory_of(root: &Path, path: &Path) -> io::Result<PathBuf> {
     let mut directory = root.to_path_buf();
     for part in path.parent().into_iter().flat_map(Path::components) {

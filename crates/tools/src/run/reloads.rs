@@ -1,4 +1,4 @@
-//! Reloads: one at a time, each answered to the requester for it.
+//! Reloads of the configuration: one at a time, each answered to its requester.
 
 use std::path::Path;
 
@@ -48,7 +48,7 @@ impl Reloads<'_> {
         }
     }
 
-    /// The configuration when it is read, never if none is being read; cancel safe.
+    /// The configuration as soon as it was read; waits for ever if none is being read. Cancel safe.
     pub(super) async fn loaded(&mut self) -> Result<Loaded, NotLoaded> {
         self.loads.loaded().await
     }
@@ -58,7 +58,7 @@ impl Reloads<'_> {
         watch.reloaded(&outcome);
         let [current, next] = &mut self.waiting;
         for order in current.drain(..) {
-            // The client that requested the reload may be gone.
+            // The client that requested the reload may have disconnected.
             let _ = order.answer.send(outcome.clone());
         }
         std::mem::swap(current, next);

@@ -18,7 +18,7 @@ use crate::printable;
 /// Longest status in characters, for one line of `systemctl status`.
 const LONGEST_STATUS: usize = 300;
 
-/// Serves the watchdog and keeps the status of the service.
+/// Serves the systemd watchdog and updates the status of the service.
 #[derive(Debug)]
 pub(super) struct Watch<'l> {
     log: &'l LogHandle,

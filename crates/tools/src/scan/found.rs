@@ -12,7 +12,7 @@ pub(crate) struct Found {
     pub(crate) setting: Setting,
     /// Address of the drive.
     pub(crate) address: u8,
-    /// Profiles that match its answers; none, one, or some that cannot be distinguished by reading.
+    /// Profiles that match its answers: none, one, or several that cannot be distinguished by reading.
     pub(crate) profiles: Vec<String>,
     /// The command line or a person named the profile.
     pub(crate) chosen: bool,
@@ -20,7 +20,7 @@ pub(crate) struct Found {
     pub(crate) nameplate: String,
     /// Reads that tell families apart and got no answer: neither values nor a refusal.
     pub(crate) unanswered: usize,
-    /// Time that it takes to begin a reply, the median; absent if it gave no values.
+    /// Median of the time until the drive begins a reply; `None` if it returned no values.
     pub(crate) turnaround: Option<Duration>,
 }
 

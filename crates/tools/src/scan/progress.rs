@@ -22,7 +22,7 @@ pub(super) struct Progress {
     done: usize,
     /// Time of all remaining steps if no drive replies.
     patience: Duration,
-    /// Time that each of the last steps took, and the longest that it could have taken.
+    /// Time that each of the last steps took, and the longest time that it could have taken.
     steps: VecDeque<(Duration, Duration)>,
     begun: Instant,
     shown: Option<Instant>,

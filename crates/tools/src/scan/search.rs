@@ -1,4 +1,4 @@
-//! Looks for drives on a line: one request to each address, then the reads that tell families apart. Only reads.
+//! Searches for drives on a line: one request to each address, then the reads that distinguish families. Only reads.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::IsTerminal;
@@ -91,7 +91,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Listens for `time` before anything is sent: whether there is another master on the line.
+    /// Listens for `time` before anything is sent, to detect another master on the line.
     ///
     /// # Errors
     /// The port cannot be opened, or was lost.
@@ -112,7 +112,7 @@ impl<'a> Search<'a> {
     /// Tries all settings, in order; the progress is shown meanwhile.
     ///
     /// # Errors
-    /// The port cannot be opened, or was lost; what was found until then is kept.
+    /// If the port cannot be opened, or was lost; drives found until then are kept.
     pub(crate) fn run(&mut self, settings: &[Setting], extent: Extent) -> Result<(), String> {
         let parts = parts(self.options, settings, extent == Extent::Exhaustive);
         let outcome = self.all(parts, extent);
@@ -322,8 +322,9 @@ impl<'a> Search<'a> {
         Ok(found)
     }
 
-    /// Drives that count in longer characters than the format that they answered at ignore some of the requests. If the
-    /// family has another usual format and all drives answer at it, that is the one of the line.
+    /// Settles the format of the line. Drives that expect longer characters than the format at which they answered
+    /// ignore some of the requests. If the family has another usual format and all drives answer with it, that is
+    /// the format of the line.
     fn settle_format(&mut self) -> Result<(), String> {
         let Some(setting) = self.found.first().map(|found| found.setting) else {
             return Ok(());
@@ -396,7 +397,7 @@ fn better_format(profiles: &Profiles, format: LineFormat, found: &[Found]) -> Op
     };
     let families: Vec<Arc<Profile>> = found.iter().flat_map(known).collect();
     let lists = |profile: &Profile, format: &String| profile.formats.is_empty() || profile.formats.contains(format);
-    // A drive that counts with one stop bit is content with two, and not the other way round.
+    // A drive set to one stop bit accepts two, but not the reverse.
     let (shorter, longer) = (format.characters(), format.characters().replace("N1", "N2"));
     let is_other = |profile: &&Arc<Profile>| {
         !lists(profile, &shorter) || shorter != longer && profile.formats.first() == Some(&longer)

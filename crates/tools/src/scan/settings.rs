@@ -1,4 +1,4 @@
-//! Which settings of the line a search tries, in which order. Pure.
+//! Which settings of the line a search tries, and in which order. Pure.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -26,14 +26,14 @@ const LIKELY: [(u32, &str); 7] = [
 ];
 /// Bauds of Modbus ASCII tried by default: all that the switches of the TECO 7300PA can set, the factory setting first.
 const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
-/// Baud that is assumed behind a raw device server, which sets up its line itself: the highest that such lines usually have,
-/// because a reply that comes later than the wire needs is accepted, one that comes earlier is not.
+/// Baud rate assumed for a raw device server, which sets up its line itself: the highest usual one, because a reply
+/// later than the wire needs is accepted, and an earlier one is not.
 const ASSUMED_BAUD: u32 = 38_400;
 /// All baud rates of the built-in profiles, and the rates of faster devices.
 const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Addresses that are tried first with all settings: most lines have a drive among them.
 const LIKELY_ADDRESSES: u8 = 10;
-/// Up to this many addresses are tried in one go.
+/// Up to this number of addresses are tried in one pass.
 const FEW_ADDRESSES: usize = 32;
 
 /// What is to be tried.
@@ -238,8 +238,8 @@ fn bauds(protocol: Protocol, wanted: &[String], by_server: bool) -> Result<Vec<u
     wanted.iter().map(one).collect()
 }
 
-/// The usual formats: the factory settings of the drives, then those with parity. Behind a raw device server, which sets up its
-/// line itself, one will do.
+/// The usual formats: the factory settings of the drives, then those with parity. For a raw device server, which
+/// sets up its line itself, one is enough.
 fn formats(protocol: Protocol, wanted: &[String], by_server: bool) -> Vec<String> {
     let named = |texts: &[&str]| texts.iter().map(ToString::to_string).collect();
     match protocol {

@@ -1,4 +1,5 @@
-//! The configuration of what `scan`, `try` or `listen` found: it passes `check`, and the line carries it. Pure.
+//! The configuration of the drives that `scan`, `try` or `listen` found: it passes `check`, and the line can carry
+//! it. Pure.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -12,7 +13,7 @@ use crate::document::format_duration;
 use crate::drive::profile::Profiles;
 use crate::process_image::DriveSpec;
 
-/// Where the status page is.
+/// Address of the status page.
 const HTTP: &str = "127.0.0.1:9488";
 
 /// The parts of a configuration snippet.
@@ -31,7 +32,7 @@ pub(crate) struct Snippet<'a> {
     pub(crate) mode: Mode,
 }
 
-/// A port as a configuration names it: a configuration is read from its own directory.
+/// The absolute path of a port, since relative paths in a configuration start at its own directory.
 pub(crate) fn absolute(port: &str) -> String {
     if port.contains("://") {
         return port.to_string();
@@ -107,7 +108,7 @@ impl Snippet<'_> {
         text
     }
 
-    /// The unit of a drive with address 255, which cannot be its unit: unit 255 is the gateway itself.
+    /// The unit id of a drive with address 255, which cannot be its unit id: unit 255 is the gateway itself.
     fn unit_of(&self, drive: &Found) -> Option<u8> {
         let taken = |unit: &u8| self.found.iter().any(|other| other.address == *unit);
         (1..=254)

@@ -9,7 +9,7 @@ use crate::drive::Step;
 use crate::drive::commissioning::{Shared, gather};
 use crate::drive::profile::{Profile, Profiles};
 
-/// Bytes that come of switching the port on, or are single disturbances.
+/// Number of bytes that may result from switching the port on, or from single disturbances.
 const FEW_BYTES: usize = 8;
 
 /// Error and remedy if bytes came before anything was sent.
@@ -24,7 +24,7 @@ pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> 
     })
 }
 
-/// Why probably no drive answered, and what to do.
+/// The probable reason why no drive answered, and the remedy.
 pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     let requests = heard.requests;
     if let Some(told) = told_by_shape(heard) {
@@ -69,7 +69,7 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
     )
 }
 
-/// The fault that the shape of the received bytes shows, if it shows one.
+/// The fault indicated by the form of the received bytes, if there is one.
 fn told_by_shape(heard: &Heard) -> Option<String> {
     let Heard {
         start_lost,
@@ -99,7 +99,7 @@ fn told_by_shape(heard: &Heard) -> Option<String> {
     (count >= 2).then(|| format!("{seen}: {}; {}", cause.meaning(), cause.remedy()))
 }
 
-/// A remark on a line on which drives answered but invalid bytes came too.
+/// A remark on a line on which drives answered but invalid bytes were received too.
 pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     if let Some(told) = told_by_shape(heard) {
         return Some(told);
@@ -112,8 +112,7 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
     ))
 }
 
-/// Where to look at the drives: for the families of the manuals whose protocol was tried; the other families would fill
-/// pages.
+/// What to check at the drives: for the families with manuals whose protocol was tried; all families would fill pages.
 pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Profiles) -> String {
     let speaks = |profile: &&Profile| tried.iter().any(|one| profile.protocols.contains(&one.protocol));
     // Profiles with a base have the lines of their base.

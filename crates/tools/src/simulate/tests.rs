@@ -165,7 +165,7 @@ fn every_built_in_profile_can_be_simulated() {
     assert_eq!(line("").rules.format.to_string(), "38400 8N1");
 }
 
-/// A profile of the user: by its file, by a directory, with values; and what is wrong with them.
+/// A user profile: by its file, by a directory, with values; and errors in each.
 #[test]
 fn profiles_of_the_user_are_simulated() {
     let directory = tempfile::tempdir().unwrap();

@@ -1,8 +1,8 @@
 //! Captures for Wireshark: the classic pcap format, link type `RTAC_SERIAL`.
 //!
-//! Each packet is a serial line's event with its direction, which the Modbus frame alone does not show; its payload is
-//! decoded as Modbus RTU by `rtacser.data,mbrtu`. The other choice, a `USER` link type, has no direction and shows
-//! nothing until it is set up.
+//! Each packet is an event of a serial line with its direction, which the Modbus frame alone does not show; its
+//! payload is decoded as Modbus RTU by `rtacser.data,mbrtu`. The alternative, a `USER` link type, has no direction
+//! and shows nothing until it is configured.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -31,7 +31,7 @@ impl Capture<File> {
     /// Creates the file; an existing file is emptied.
     ///
     /// # Errors
-    /// If the file cannot be written.
+    /// If the file cannot be created or written.
     pub(super) fn create(path: &Path) -> io::Result<Capture<File>> {
         Capture::new(File::create(path)?)
     }
@@ -55,7 +55,7 @@ impl<W: Write> Capture<W> {
     /// Adds a frame.
     ///
     /// # Errors
-    /// If the file cannot be written.
+    /// If the frame cannot be written to the file.
     pub(super) fn frame(&mut self, time: SystemTime, direction: Direction, bytes: &[u8]) -> io::Result<()> {
         let event = match direction {
             Direction::Request => SENT,
@@ -65,10 +65,10 @@ impl<W: Write> Capture<W> {
         self.packet(time, event, bytes)
     }
 
-    /// Notes that frames are missing here.
+    /// Notes in the capture that frames are missing at this place.
     ///
     /// # Errors
-    /// If the file cannot be written.
+    /// If the note cannot be written to the file.
     pub(super) fn lost(&mut self, time: SystemTime) -> io::Result<()> {
         self.packet(time, LOST, &[])
     }
@@ -88,14 +88,14 @@ impl<W: Write> Capture<W> {
         packet.extend(micros.to_be_bytes());
         packet.extend([event, 0, 0, 0]); // event, control lines, footer
         packet.extend_from_slice(bytes);
-        // In one piece: the buffer spills between packets only, so the file can be read at any time.
+        // Written in one piece: the buffer is flushed only between packets, so the file can be read at any time.
         self.out.write_all(&packet)
     }
 
     /// Writes what was added to the file.
     ///
     /// # Errors
-    /// If the file cannot be written.
+    /// If the buffered packets cannot be written to the file.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

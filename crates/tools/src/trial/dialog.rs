@@ -1,4 +1,4 @@
-//! Questions on the terminal.
+//! Questions to the user on the terminal.
 
 use std::io::{self, BufRead, IsTerminal, Write};
 use std::path::Path;
@@ -86,7 +86,7 @@ impl Keyboard {
 /// Lists the adapters and asks which one to use; `None` after a signal.
 ///
 /// # Errors
-/// There is no adapter, or no terminal for the question.
+/// If there is no adapter, or no terminal for the question.
 pub(super) fn choose_port(stop: &Stop, keyboard: &Keyboard) -> Result<Option<String>, Failure> {
     let found = adapters();
     if found.is_empty() {

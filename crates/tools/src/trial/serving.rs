@@ -63,7 +63,7 @@ async fn start(mut settings: Settings) -> Result<Daemon, String> {
         let address = demo::free_port("the status page", port)?;
         settings.http = Some(http::Options::listening_on(address));
         match Daemon::start(settings.clone()).await {
-            // Another program has taken the port since the port was found free.
+            // Another program has taken the port since it was found free.
             Err(error) if error.address_in_use().is_some() => port = address.port().saturating_add(1),
             started => return started.map_err(|error| error.to_string()),
         }
@@ -138,7 +138,7 @@ fn offer(
     Ok(())
 }
 
-/// The file that an answer names; `None` where none is wanted. A yes or a no names no file.
+/// The file named in an answer; `None` if no file is wanted. Yes or no is not a file name.
 fn wanted_file(answer: &str) -> Option<PathBuf> {
     match answer.to_lowercase().as_str() {
         "" | "n" | "no" | "nein" => None,
