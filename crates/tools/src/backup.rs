@@ -303,7 +303,7 @@ mod tests {
         }
         fs::write(at("audit.jsonl"), "x").unwrap();
         fs::write(at("state/audit.jsonl"), "x").unwrap();
-        // A link into the state directory: the file is named differently but must be archived.
+        // Paths through this link name files of the state directory in another way.
         std::os::unix::fs::symlink(at("state"), at("link")).unwrap();
         let kept = [
             "audit.jsonl",

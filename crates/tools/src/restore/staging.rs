@@ -17,7 +17,7 @@ pub(super) struct Staging {
     state: Destination,
     /// The files in the order of the archive; the configuration is the first.
     files: Vec<(Root, PathBuf)>,
-    /// New directories below the directory of the configuration.
+    /// Directories of the archive, below the directory of the configuration.
     directories: Vec<PathBuf>,
 }
 
