@@ -84,7 +84,7 @@ impl Accepts {
     }
 }
 
-/// Reads a message; `None` if the bytes are no message.
+/// Decodes a message; `None` if the bytes are not a valid message.
 pub fn decode(bytes: &[u8]) -> Option<Apdu<'_>> {
     let (first, rest) = bytes.split_first()?;
     let flag = |bit: u8| first >> bit & 1 == 1;

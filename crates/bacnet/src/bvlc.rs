@@ -2,7 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 
-/// First octet of every datagram.
+/// First octet of every BACnet/IP datagram.
 const BACNET_IP: u8 = 0x81;
 
 /// A datagram.
@@ -24,7 +24,7 @@ pub enum Bvlc<'a> {
     DeleteForeign(SocketAddrV4),
     /// A message of a foreign device to all hosts of this network.
     Distribute(&'a [u8]),
-    /// Any other request that only a BBMD serves, with the code that refuses it.
+    /// A request that only a BBMD could serve, with the code that refuses it.
     ForBbmd(u16),
 }
 
@@ -35,7 +35,7 @@ pub const NO_DELETION: u16 = 0x0050;
 /// Result code: the distribution of a broadcast is refused (J.2.1).
 pub const NO_DISTRIBUTION: u16 = 0x0060;
 
-/// Reads a datagram; `None` where it is none of BACnet/IP, or of no valid length.
+/// Decodes a datagram; `None` if it is not BACnet/IP or has an invalid length.
 pub fn decode(bytes: &[u8]) -> Option<Bvlc<'_>> {
     let [BACNET_IP, function, high, low, rest @ ..] = bytes else {
         return None;
@@ -110,7 +110,7 @@ pub fn forwarded(origin: SocketAddrV4, npdu: &[u8]) -> Vec<u8> {
     datagram(0x04, &[&octets(origin)[..], npdu].concat())
 }
 
-/// The foreign devices: address, the time for which each registered, and what is left of it, seconds.
+/// The reply with the foreign devices: address, registered time and remaining time, in seconds.
 pub fn foreign_devices(all: impl Iterator<Item = (SocketAddrV4, u16, u16)>) -> Vec<u8> {
     let entry = |(host, time, left): (SocketAddrV4, u16, u16)| {
         [&octets(host)[..], &time.to_be_bytes(), &left.to_be_bytes()].concat()

@@ -1,8 +1,9 @@
-//! A BACnet/IP server without sockets, threads or a clock: datagrams go in with the time, datagrams come out.
+//! A BACnet/IP server without sockets, threads or a clock: datagrams and the time are arguments, datagrams are results.
 //!
-//! [`Server`] shows a device of its own and, behind a virtual network for which it is the router, any number of further ones. What
-//! they show comes from an [`Application`]; what clients write is handed out as a [`Job`] and answered only when the application
-//! reports how the write ended, so that an acknowledgement can mean that something happened.
+//! [`Server`] represents a device of its own and, behind a virtual network for which it is the router, any number
+//! of further ones. Their values come from an [`Application`]; writes of clients are given to it as [`Job`]s and
+//! answered only when the application reports their result, so that an acknowledgement means that the write took
+//! effect.
 //!
 //! | module | what it is |
 //! |---|---|
@@ -12,7 +13,7 @@
 //! | `object` | what a device is made of, and its properties |
 //! | `server` | network, transactions, subscriptions, limits |
 //!
-//! Every table is bounded, also for each client; no input panics.
+//! Every table is bounded, in total and for each client; no input causes a panic.
 
 #![warn(missing_docs)]
 #![forbid(unsafe_code)]

@@ -10,7 +10,7 @@ const HOPS: u8 = 0xFF;
 /// A message of the network layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Npdu<'a> {
-    /// Destination network and station, with the hops left; `None` for this network.
+    /// Destination network and station with the remaining hops; `None` for this network.
     pub to: Option<(u16, Mac, u8)>,
     /// Network and station that sent the message; `None` if the host itself sent it.
     pub from: Option<(u16, Mac)>,
@@ -51,7 +51,7 @@ fn address(bytes: &[u8], may_be_all: bool) -> Option<((u16, Mac), &[u8])> {
     Some(((network, Mac::new(mac)?), rest))
 }
 
-/// Reads a message; `None` if the bytes are no message.
+/// Decodes a message; `None` if the bytes are not a valid message.
 pub fn decode(bytes: &[u8]) -> Option<Npdu<'_>> {
     let [1, control, rest @ ..] = bytes else {
         return None;

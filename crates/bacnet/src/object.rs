@@ -14,7 +14,7 @@ pub(crate) use properties::{Context, Environment, Port, cov_value, list, propert
 pub struct Device {
     /// Instance number of the device, 0..=4194302, unique in the network.
     pub instance: u32,
-    /// Station of the device on the virtual network; none: the device of the host itself.
+    /// Station of the device on the virtual network; `None` for the device of the host itself.
     pub station: Option<Mac>,
     /// Name of the device, unique in the network.
     pub name: String,
@@ -105,7 +105,7 @@ pub enum Reliability {
     CommunicationFailure = 12,
 }
 
-/// A value, with its time and quality.
+/// A value with its time and quality.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// The last value; `None` if no value was ever read.
@@ -124,7 +124,7 @@ pub enum ValueSource {
     None,
     /// A client.
     Address(Address),
-    /// A device by its instance.
+    /// A device given by its instance.
     Device(u32),
 }
 
@@ -133,7 +133,7 @@ pub enum ValueSource {
 pub struct Slot {
     /// The commanded value at this priority.
     pub value: Datum,
-    /// Who wrote the value.
+    /// The client that wrote the value.
     pub source: ValueSource,
     /// When the slot was written.
     pub at: DateTime,
@@ -190,7 +190,7 @@ impl Device {
         &self.objects
     }
 
-    /// The place of an object.
+    /// The index of an object in its device.
     pub fn find(&self, id: ObjectId) -> Option<usize> {
         self.by_id.get(&id).copied()
     }
@@ -215,7 +215,7 @@ impl Device {
             .map(|object| object.id)
     }
 
-    /// A number that is another one when the objects are others.
+    /// A number that changes when the list of objects changes.
     pub(crate) fn revision(&self) -> u32 {
         self.revision
     }

@@ -34,7 +34,7 @@ pub mod unconfirmed {
 /// Unconfirmed services that the server only sends are not listed.
 pub const SUPPORTED: [usize; 11] = [5, 12, 14, 15, 16, 17, 32, 33, 34, 36, 38];
 
-/// A property, or one element of it.
+/// A property, or one element of an array property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PropertyRef {
     /// The property.
@@ -76,7 +76,7 @@ pub fn who_is(data: &[u8]) -> Read<Range> {
     Ok(range)
 }
 
-/// What a Who-Has message searches for.
+/// The object that a Who-Has message searches for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Sought {
     /// An object with this identifier.
@@ -206,7 +206,7 @@ pub fn write_property_multiple(data: &[u8]) -> Read<Vec<WriteItem>> {
     }
 }
 
-/// The content between the tags of that context, if it is one primitive value.
+/// The content between the tags of this context, if it is one primitive value.
 fn value(reader: &mut Reader<'_>, number: u8) -> Read<Option<Data>> {
     reader.open(number)?;
     let mut values = Vec::new();
@@ -242,7 +242,7 @@ pub struct Subscribe {
     pub object: ObjectId,
     /// Whether notifications are confirmed, and the lifetime in seconds, 0 without end; `None` ends the subscription.
     pub terms: Option<(bool, u32)>,
-    /// For SubscribeCOVProperty: the property and the increment.
+    /// Property and increment, for SubscribeCOVProperty.
     pub property: Option<(PropertyRef, Option<f32>)>,
 }
 
@@ -298,7 +298,7 @@ pub fn subscribe_cov_property(data: &[u8]) -> Read<Subscribe> {
 /// The request of DeviceCommunicationControl.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Control {
-    /// Minutes; none: without end.
+    /// Duration in minutes; `None` means without end.
     pub minutes: Option<u32>,
     /// 0 enable, 1 disable, 2 disable initiation.
     pub wanted: u32,

@@ -167,7 +167,7 @@ errors! {
     OPTIONAL_FUNCTIONALITY_NOT_SUPPORTED Services 45,
 }
 
-/// Why a request is not understood.
+/// Why a request cannot be parsed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Reject {
@@ -205,7 +205,7 @@ impl Mac {
     /// The address that means all stations.
     pub const ALL: Mac = Mac { len: 0, octets: [0; 8] };
 
-    /// A MAC address of these octets; none where there are more than eight.
+    /// A MAC address with these octets; `None` if there are more than eight.
     pub fn new(octets: &[u8]) -> Option<Mac> {
         let mut mac = Mac::ALL;
         mac.octets.get_mut(..octets.len())?.copy_from_slice(octets);
@@ -219,7 +219,7 @@ impl Mac {
     }
 }
 
-/// Where a message comes from or goes to: a host of this network, or a station behind a router at that host.
+/// Sender or destination of a message: a host of this network, or a station behind a router at that host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Address {
     /// The host.
@@ -239,7 +239,7 @@ impl Address {
         *self.host.ip()
     }
 
-    /// Network and station behind the host, in words; empty for the host itself.
+    /// Network and station behind the host, as text; empty for the host itself.
     pub fn remote_text(&self) -> String {
         let text = self.to_string();
         text.split_once(' ').map_or(String::new(), |(_, rest)| rest.to_string())
@@ -299,7 +299,7 @@ pub struct DateTime {
 }
 
 impl DateTime {
-    /// A time of which no part is known.
+    /// A time of which every part is unspecified.
     pub const UNSPECIFIED: DateTime = DateTime {
         date: [0xFF; 4],
         time: [0xFF; 4],
@@ -342,7 +342,7 @@ impl DateTime {
 /// A primitive value that a client writes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Data {
-    /// Gives a slot back.
+    /// NULL, which releases a slot of a priority array.
     Null,
     /// BOOLEAN.
     Bool(bool),

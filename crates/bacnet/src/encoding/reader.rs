@@ -6,7 +6,7 @@ use crate::types::{Data, ObjectId, PropertyId, Reject};
 /// A tag as read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tag {
-    /// A primitive value with its application tag and its length; for BOOLEAN the second number is the value.
+    /// A primitive value with its application tag and its length; for BOOLEAN the second number is the value itself.
     App(u8, usize),
     /// A primitive value with its context tag and its length.
     Context(u8, usize),
@@ -19,7 +19,7 @@ pub enum Tag {
 /// The result of reading.
 pub type Read<T> = Result<T, Reject>;
 
-/// Reads tagged values; everything out of place is an error that says how the request is rejected.
+/// Reads tagged values; anything unexpected is an error that states how the request is rejected.
 #[derive(Debug, Clone)]
 pub struct Reader<'a> {
     bytes: &'a [u8],
@@ -31,7 +31,7 @@ impl<'a> Reader<'a> {
         Reader { bytes }
     }
 
-    /// Whether nothing is left.
+    /// Whether no bytes are left.
     pub fn is_empty(&self) -> bool {
         self.bytes.is_empty()
     }
@@ -39,7 +39,7 @@ impl<'a> Reader<'a> {
     /// An error unless nothing is left.
     ///
     /// # Errors
-    /// If bytes are left.
+    /// If bytes are left over.
     pub fn end(&self) -> Read<()> {
         match self.is_empty() {
             true => Ok(()),
@@ -50,7 +50,7 @@ impl<'a> Reader<'a> {
     /// Takes the next `len` octets.
     ///
     /// # Errors
-    /// There are fewer.
+    /// If fewer octets are left.
     pub fn take(&mut self, len: usize) -> Read<&'a [u8]> {
         let (head, rest) = self
             .bytes
@@ -69,7 +69,7 @@ impl<'a> Reader<'a> {
     /// The next tag, which stays.
     ///
     /// # Errors
-    /// If no tag is left.
+    /// If there is no further tag.
     pub fn peek(&self) -> Read<Tag> {
         self.clone().tag()
     }
@@ -77,7 +77,7 @@ impl<'a> Reader<'a> {
     /// Reads the next tag; the value of the tag follows.
     ///
     /// # Errors
-    /// If no tag is left, or the next one is not valid.
+    /// If there is no further tag, or the next one is invalid.
     pub fn tag(&mut self) -> Read<Tag> {
         let first = self.octet()?;
         let number = match first >> 4 {
@@ -124,7 +124,7 @@ impl<'a> Reader<'a> {
     /// Opens a constructed value.
     ///
     /// # Errors
-    /// If another tag comes next.
+    /// If the next tag is another one.
     pub fn open(&mut self, number: u8) -> Read<()> {
         self.exactly(Tag::Open(number))
     }
@@ -132,7 +132,7 @@ impl<'a> Reader<'a> {
     /// Reads the closing tag with this number.
     ///
     /// # Errors
-    /// If another tag comes next.
+    /// If the next tag is another one.
     pub fn close(&mut self, number: u8) -> Read<()> {
         self.exactly(Tag::Close(number))
     }
@@ -147,7 +147,7 @@ impl<'a> Reader<'a> {
     /// The octets of a primitive value in that context.
     ///
     /// # Errors
-    /// If another tag comes next.
+    /// If the next tag is another one.
     pub fn context(&mut self, number: u8) -> Read<&'a [u8]> {
         if self.is_empty() {
             return Err(Reject::MissingRequiredParameter);
@@ -173,12 +173,12 @@ impl<'a> Reader<'a> {
     /// Unsigned of at most 32 bits in a context.
     ///
     /// # Errors
-    /// If another tag or value comes next.
+    /// If the next tag or value is another one.
     pub fn context_u32(&mut self, number: u8) -> Read<u32> {
         u32_of(self.context(number)?)
     }
 
-    /// The unsigned value with this context tag, where it comes next.
+    /// The unsigned value with this context tag, if it is the next one.
     ///
     /// # Errors
     /// The encoding is not valid, or the number exceeds 32 bits.
@@ -202,7 +202,7 @@ impl<'a> Reader<'a> {
     /// BACnetObjectIdentifier in a context.
     ///
     /// # Errors
-    /// If another tag or length comes next.
+    /// If the next tag or length is another one.
     pub fn context_object(&mut self, number: u8) -> Read<ObjectId> {
         let bytes: [u8; 4] = self
             .context(number)?
@@ -214,7 +214,7 @@ impl<'a> Reader<'a> {
     /// Property identifier in a context.
     ///
     /// # Errors
-    /// If another tag or value comes next.
+    /// If the next tag or value is another one.
     pub fn context_property(&mut self, number: u8) -> Read<PropertyId> {
         self.context_u32(number).map(PropertyId)
     }
@@ -231,7 +231,7 @@ impl<'a> Reader<'a> {
         Ok(Some(f32::from_be_bytes(bytes)))
     }
 
-    /// A primitive value with its application tag; `None` where a constructed one, or one of a context, comes.
+    /// A primitive value with its application tag; `None` if a constructed one, or one with a context tag, follows.
     ///
     /// # Errors
     /// The encoding is not valid.

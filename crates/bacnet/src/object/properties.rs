@@ -1,4 +1,4 @@
-//! The properties of objects as they stand on the wire (clause 12).
+//! The properties of objects as they are encoded on the wire (clause 12).
 
 use std::net::SocketAddrV4;
 use std::sync::Arc;
@@ -30,7 +30,7 @@ pub(crate) struct Port {
     pub(crate) bbmd: Option<(SocketAddrV4, u16)>,
 }
 
-/// An object whose properties are read, with what it shows now.
+/// An object whose properties are read, with its present value.
 pub(crate) enum Context<'a> {
     Device {
         device: &'a Device,
@@ -135,7 +135,7 @@ const SOURCES: [P; 4] = [
     P::COMMAND_TIME_ARRAY,
 ];
 
-/// The properties that an object has: those that the standard requires, then the others.
+/// The properties that an object has: those that the standard requires, and the optional ones.
 pub(crate) fn list(of: &Context<'_>, environment: &Environment) -> (Vec<P>, Vec<P>) {
     match of {
         Context::Device { .. } => {
@@ -189,7 +189,7 @@ fn of_object(object: &Object) -> (Vec<P>, Vec<P>) {
     (required, optional)
 }
 
-/// Writes an array or one element of it.
+/// Encodes an array, or one element of it.
 fn array(
     out: &mut Writer,
     index: Option<u32>,
@@ -210,7 +210,7 @@ fn array(
 /// Writes the value of a property.
 ///
 /// # Errors
-/// The object has no such property, or the property no such element.
+/// If the object has no such property, or the property no such element.
 pub(crate) fn property(
     out: &mut Writer,
     of: &Context<'_>,

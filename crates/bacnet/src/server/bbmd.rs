@@ -53,7 +53,7 @@ impl Foreign {
         self.bbmd == Some(host)
     }
 
-    /// The BBMD, if it passes broadcasts on.
+    /// The address of the BBMD, if it accepted the registration for broadcasts.
     pub(super) fn passes_on(&self) -> Option<SocketAddrV4> {
         self.bbmd.filter(|_| self.state == Registration::Registered)
     }

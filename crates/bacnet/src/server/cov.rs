@@ -24,7 +24,7 @@ pub(super) struct Key {
     pub(super) subscriber: Address,
     pub(super) process: u32,
     pub(super) object: ObjectId,
-    /// The one subscribed property; none: the value and the status flags of the object.
+    /// The single subscribed property; `None`: value and status flags of the object.
     pub(super) property: Option<PropertyRef>,
 }
 
@@ -33,7 +33,7 @@ pub(super) struct Key {
 pub(super) struct Reported {
     /// The number, where the value is one.
     pub(super) number: Option<f64>,
-    /// Everything except the value, as encoded on the wire.
+    /// All parts of the notification except the value, as encoded on the wire.
     pub(super) rest: Vec<u8>,
 }
 
@@ -60,7 +60,7 @@ pub(super) struct Subscription {
     pub(super) increment: Option<f32>,
     until: Option<Instant>,
     told: Option<Reported>,
-    /// Number since which the subscription waits for its turn.
+    /// Sequence number since which the subscription has been waiting to notify.
     due: Option<u64>,
     lost: u8,
 }
@@ -84,7 +84,7 @@ struct Outstanding {
     until: Instant,
 }
 
-/// All subscriptions of the clients.
+/// All subscriptions to changes of value.
 #[derive(Debug, Default)]
 pub(super) struct Cov {
     one_device: bool,
@@ -95,11 +95,12 @@ pub(super) struct Cov {
     invoke: u8,
 }
 
-/// Looks up the present values of a subscription, and the increment of its object.
+/// Reads the present values of a subscription, and the COV increment of its object.
 pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Reported, f64)>;
 
 impl Cov {
-    /// Where all objects belong to one device, it may have as many subscriptions of a host as all devices.
+    /// The subscriptions with their limits: if all objects belong to one device, a host may have as many there as
+    /// otherwise on all devices.
     pub(super) fn limited(one_device: bool) -> Cov {
         Cov {
             one_device,
@@ -228,8 +229,7 @@ impl Cov {
         first.map(|(device, s)| (device, s.key, s.confirmed))
     }
 
-    /// Records that a notification was sent: the subscription is no longer due, and later values are compared with
-    /// `told`.
+    /// Notes that a notification was sent: the subscription is no longer due, and later values are compared with `told`.
     pub(super) fn notified(&mut self, device: u32, key: &Key, told: Option<Reported>) {
         let all = self.of.get_mut(&device);
         if let Some(subscription) = all.and_then(|all| all.iter_mut().find(|s| s.key == *key)) {
@@ -259,7 +259,7 @@ impl Cov {
         self.outstanding.insert(key.subscriber, outstanding);
     }
 
-    /// A client answered a notification, in whatever way.
+    /// Notes that a client answered a notification, in any form.
     pub(super) fn answered(&mut self, from: Address, device: u32, invoke: u8) {
         let is = |o: &Outstanding| (o.device, o.invoke) == (device, invoke);
         if self.outstanding.get(&from).is_some_and(is)
@@ -284,7 +284,7 @@ impl Cov {
         }
     }
 
-    /// Ends what is over, and gives the notifications that are sent again.
+    /// Ends expired subscriptions, and returns the notifications that must be sent again.
     pub(super) fn poll(&mut self, now: Instant) -> Vec<(Address, u32, Vec<u8>)> {
         let over = |s: &Subscription| s.until.is_some_and(|until| until <= now);
         if self.of.values().flatten().any(over) {

@@ -1,4 +1,4 @@
-//! Who-Is and Who-Has (clauses 16.9, 16.10).
+//! Discovery: Who-Is and Who-Has (clauses 16.9, 16.10).
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -34,7 +34,7 @@ impl Server {
         }
     }
 
-    /// The devices that a question is for, those that do not answer left out.
+    /// The devices to which a request is addressed, without those that do not answer.
     fn asked(&self, target: Target, range: Range, app: &dyn Application) -> Vec<Arc<Device>> {
         let (low, high) = range.0.unwrap_or((0, u32::MAX));
         let in_range = self.by_instance.range(low..=high).map(|(_, place)| *place);

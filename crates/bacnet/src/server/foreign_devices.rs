@@ -3,7 +3,7 @@
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
 
-/// Time after which an entry ends, in addition to its own time.
+/// Time after its registered time for which an entry remains.
 const GRACE: Duration = Duration::from_secs(30);
 
 /// A foreign device.
@@ -65,7 +65,7 @@ impl ForeignDevices {
         self.entries.iter().map(|entry| entry.host)
     }
 
-    /// Each device, the time for which it registered, and what is left of it, in seconds.
+    /// Each foreign device with its registered time and the remaining time, in seconds.
     pub(super) fn all(&mut self, now: Instant) -> impl Iterator<Item = (SocketAddrV4, u16, u16)> {
         self.forget(now);
         self.entries.iter().map(move |entry| {

@@ -1,4 +1,4 @@
-//! The server: a device of its own and a router to the devices behind it.
+//! The server: a device of its own, and a router to the devices behind it.
 
 mod bbmd;
 mod cov;
@@ -67,7 +67,7 @@ pub trait Application {
     /// Whether this device answers.
     fn answers(&self, device: u32) -> bool;
 
-    /// The value of the object at that place.
+    /// The value of the object with this index.
     fn sample(&self, device: u32, place: usize) -> Sample;
 
     /// The priority array and the relinquish default of a commandable object.
@@ -79,7 +79,7 @@ pub trait Application {
     /// Whether a write is a stop, which passes where nothing else does.
     fn stops(&self, device: u32, write: &WriteItem) -> bool;
 
-    /// Orders to that device so far, from whomever: another number when somebody ordered something.
+    /// A counter of the orders to this device by any client, which changes when one is given.
     fn orders(&self, device: u32) -> u64;
 
     /// Whether `given` is the password; false if no password is configured.
@@ -97,7 +97,7 @@ pub struct Counters {
     pub refused: u64,
     /// Requests that were carried out.
     pub done: u64,
-    /// Datagrams that were not sent because their address had used up its share.
+    /// Datagrams that were not sent because the share of their address was used up.
     pub dropped: u64,
     /// Notifications sent.
     pub notifications: u64,
@@ -105,8 +105,8 @@ pub struct Counters {
     pub subscriptions: u64,
 }
 
-/// The server. Datagrams go in by [`Server::receive`] and come out of [`Server::transmit`]; [`Server::poll`] is to be called at
-/// least ten times a second.
+/// The server. Datagrams enter by [`Server::receive`] and leave by [`Server::transmit`]; [`Server::poll`] must be
+/// called at least ten times a second.
 #[derive(Debug)]
 pub struct Server {
     options: Options,
@@ -122,14 +122,14 @@ pub struct Server {
     exchanges: Exchanges,
     /// Increments that clients have set, by device and object.
     increments: HashMap<(u32, ObjectId), f32>,
-    /// Devices that say nothing by themselves, and until when.
+    /// Devices that must not initiate messages, and until when.
     quiet: HashMap<u32, Instant>,
     jobs: VecDeque<Job>,
     counters: Counters,
 }
 
 impl Server {
-    /// A server of these devices, the first of which is its own and has no station.
+    /// A server of these devices; the first is its own device and has no station.
     pub fn new(options: Options, devices: Vec<Arc<Device>>, now: Instant) -> Server {
         let (vendor, vendor_name) = options.vendor.clone();
         let port = Port {
@@ -230,7 +230,7 @@ impl Server {
         self.traffic.next()
     }
 
-    /// The next write to carry out; its result is given to [`Server::written`].
+    /// The next write to carry out; its result must be given to [`Server::written`].
     pub fn take_job(&mut self) -> Option<Job> {
         self.jobs.pop_front()
     }
@@ -257,7 +257,7 @@ impl Server {
         self.foreign.state
     }
 
-    /// The counters so far.
+    /// The counters of traffic so far.
     pub fn counters(&self) -> Counters {
         Counters {
             dropped: self.traffic.dropped,
@@ -276,14 +276,14 @@ impl Server {
     }
 }
 
-/// Where a message came from, and by which way.
+/// The sender of a message, and how the message arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Source {
     address: Address,
     way: Way,
 }
 
-/// The way of a message.
+/// How a message was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
     /// The message was sent to this host alone.
@@ -297,10 +297,10 @@ enum Way {
 enum Target {
     /// The device of the host.
     Own,
-    /// All devices.
+    /// All devices of the server.
     All,
     /// All devices of the virtual network.
     Network,
-    /// The device at this place in the list of the server.
+    /// The device with this index in the list of the server.
     Device(usize),
 }

@@ -1,4 +1,4 @@
-//! Datagrams in and out, and what routers say to each other (clause 6).
+//! Receives and sends datagrams, and answers router messages (clause 6).
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::Instant;
@@ -18,7 +18,7 @@ const OTHER: u8 = 0;
 impl Server {
     /// Processes a datagram that arrived.
     pub fn receive(&mut self, from: SocketAddrV4, bytes: &[u8], app: &dyn Application, now: Instant) {
-        // An own broadcast comes back.
+        // The server's own broadcast was received.
         if from == self.options.address {
             return;
         }
@@ -30,7 +30,7 @@ impl Server {
         let passed_on = of_bbmd || self.is_neighbour(*from.ip());
         let admitted = match datagram {
             Bvlc::Result(_) => of_bbmd,
-            // The one that sent it is judged, not the one that passes it on.
+            // The original sender is judged, not the one that forwards the datagram.
             Bvlc::Forwarded(origin, _) => passed_on && app.admits(*origin.ip()),
             _ => app.admits(*from.ip()),
         };
@@ -90,7 +90,7 @@ impl Server {
         self.traffic.answer(from, answer, now);
     }
 
-    /// Passes a broadcast on to the foreign devices, but for that from which it came.
+    /// Forwards a broadcast to the foreign devices, except to its sender.
     fn distribute(&mut self, from: SocketAddrV4, npdu: &[u8], now: Instant) {
         let others: Vec<SocketAddrV4> = self.foreign_devices.hosts(now).filter(|host| *host != from).collect();
         for host in others {
@@ -98,7 +98,7 @@ impl Server {
         }
     }
 
-    /// Whether a host is on the own network.
+    /// Whether a host is on the same network as the server.
     fn is_neighbour(&self, host: Ipv4Addr) -> bool {
         let mask = u32::MAX
             .checked_shl(32 - u32::from(self.options.prefix.min(32)))
@@ -112,8 +112,8 @@ impl Server {
             self.counters.discarded += 1;
             return;
         };
-        // A source network equal to the virtual network is forged or looped: its devices send nothing through this
-        // socket.
+        // A source network equal to the virtual network is forged or looped, since its devices send nothing through
+        // this socket.
         if npdu.from.is_some_and(|(network, _)| self.is_own(network)) {
             self.counters.discarded += 1;
             return;
@@ -122,7 +122,7 @@ impl Server {
         let target = match npdu.to {
             None => Target::Own,
             Some((_, _, 0)) => return,
-            // The router on the way to the virtual network takes the last hop.
+            // The router to the virtual network uses up the last hop.
             Some((GLOBAL, _, 1)) => Target::Own,
             Some((network, _, 1)) if self.is_own(network) => return,
             Some((GLOBAL, ..)) => Target::All,
@@ -151,9 +151,9 @@ impl Server {
             _ if !matches!(target, Target::Own | Target::All) => {}
             (message::WHO_IS_ROUTER, []) => self.announce_network(Some(source), now),
             (message::WHO_IS_ROUTER, asked) if *asked == network => self.announce_network(Some(source), now),
-            // Another router answers, or what comes is not for us.
+            // These messages are answered by other routers, or are not meant for us.
             (message::WHO_IS_ROUTER | message::I_AM_ROUTER | message::REJECT, _) => {}
-            // The message asks for the table and does not change it.
+            // The message requests the routing table without changing it.
             (message::INITIALIZE_TABLE, [0]) if source.way == Way::Unicast => {
                 let table = [1, network[0], network[1], 1, 0];
                 self.between(source, message::INITIALIZE_TABLE_ACK, &table, now);

@@ -1,4 +1,4 @@
-//! Notifications of changes: what they say (clauses 13.1, 13.6).
+//! The content of change notifications (clauses 13.1, 13.6).
 
 use std::time::Instant;
 
@@ -11,7 +11,7 @@ use crate::object::{Context, Device, cov_value, property};
 use crate::services::{PropertyRef, Subscribe, confirmed, unconfirmed};
 use crate::types::{Address, Error, ObjectId, ObjectType, PropertyId, WILDCARD};
 
-/// Properties that cannot be subscribed to: several at once, clocks, and those that a notification itself changes.
+/// Properties that cannot be subscribed to: groups of properties, clocks, and those that a notification itself changes.
 const NEVER_REPORTED: [PropertyId; 6] = [
     PropertyId::ALL,
     PropertyId::REQUIRED,

@@ -15,10 +15,10 @@ const LONGEST: usize = 64 * 1024;
 /// Longest time for which a device sends no notification by itself.
 const QUIET: Duration = Duration::from_secs(300);
 
-/// The content of an answer, which may be none.
+/// The content of an answer; `None` if nothing is to be answered now.
 type Answered = Result<Option<Vec<u8>>, Failure>;
 
-/// Why a request is not carried out.
+/// Why a request was not carried out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Failure {
     Error(Error),

@@ -32,7 +32,7 @@ struct Sending {
     until: Instant,
 }
 
-/// Answers under way.
+/// Segmented answers in progress.
 #[derive(Debug, Default)]
 pub(super) struct Segments {
     sending: Vec<Sending>,
@@ -90,7 +90,7 @@ impl Segments {
             size: size.saturating_sub(SEGMENT_HEADER).max(1),
             first: 0,
             sent: 0,
-            // The first segment goes alone: its acknowledgement says how many may follow at once.
+            // The first segment is sent alone: its acknowledgement states how many may follow at once.
             window: 1,
             tries: 1,
             until: now + WAIT,
@@ -136,7 +136,7 @@ impl Segments {
         }
     }
 
-    /// Ends an answer, because the client ended it or begins anew.
+    /// Ends a segmented answer, because the client ended it or starts a new request.
     pub(super) fn end(&mut self, from: Address, device: u32, invoke: u8) {
         self.sending
             .retain(|s| (s.to, s.device, s.invoke) != (from, device, invoke));

@@ -139,14 +139,14 @@ fn device(instance: u32, station: Option<u8>, more: u32) -> Arc<Device> {
     ))
 }
 
-/// A server at 10.0.0.1 with itself, 100, and the devices 101 to 103 behind it, and its clients.
+/// A test server at 10.0.0.1 with its own device 100, the devices 101 to 103 behind it, and its clients.
 struct ServerWithClients {
     server: Server,
     plant: Plant,
     now: Instant,
 }
 
-/// A message that came out: where to, network and station of the device, the APDU.
+/// A sent message: destination, network and station of the device, and the APDU.
 type Out = (To, Option<(u16, Mac, u8)>, Option<u8>, Vec<u8>);
 
 impl ServerWithClients {

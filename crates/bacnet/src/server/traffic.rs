@@ -1,13 +1,13 @@
-//! Limits of sending: to an address at most eight times the octets received from it, and a number of broadcasts per
-//! second.
+//! Limits of sending: at most eight times the octets received from an address may be sent to it, and a number of
+//! broadcasts per second.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::{Duration, Instant};
 
-/// Octets that may go to an address within a second for each that came from it.
+/// Octets that may be sent to an address within a second for each octet received from it.
 const FACTOR: u64 = 8;
-/// Octets that may go to an address within a second beyond the factor.
+/// Octets that may be sent to an address within a second in addition to the factor.
 const GRANT: u64 = 16 * 1024;
 /// Octets that may wait for an address, or for a broadcast.
 const WAITING: usize = 64 * 1024;
@@ -15,7 +15,7 @@ const WAITING: usize = 64 * 1024;
 const WAITING_IN_ALL: usize = 1024 * 1024;
 /// Broadcasts within a second.
 const BROADCASTS: u64 = 100;
-/// Addresses that are known at once.
+/// Most addresses that are tracked at a time.
 const ADDRESSES: usize = 1024;
 /// Step in which a second of traffic is counted.
 const STEP: Duration = Duration::from_millis(100);
@@ -24,9 +24,9 @@ const STEPS: usize = 11;
 /// Destination of a datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum To {
-    /// To this host.
+    /// Destination: this host.
     Host(SocketAddrV4),
-    /// To all hosts of the network.
+    /// Destination: all hosts of the network.
     Broadcast,
 }
 
@@ -117,7 +117,7 @@ impl Traffic {
         u64::try_from(steps).unwrap_or(u64::MAX)
     }
 
-    /// Counts octets received from an address, which raise the limit of sending to it.
+    /// Counts octets received from an address, which raise the limit for sending to it.
     pub(super) fn received(&mut self, from: Ipv4Addr, octets: usize, now: Instant) {
         let step = self.step(now);
         if let Some(known) = self.known(from, step) {
@@ -152,7 +152,7 @@ impl Traffic {
         }
     }
 
-    /// Sends an answer, at once or later, or drops it.
+    /// Sends an answer at once or later, or drops it.
     pub(super) fn answer(&mut self, to: SocketAddrV4, bytes: Vec<u8>, now: Instant) {
         let (step, held) = (self.step(now), self.held);
         let len = bytes.len();
@@ -172,7 +172,7 @@ impl Traffic {
         }
     }
 
-    /// Sends what is not reckoned: a notification, a request of our own.
+    /// Sends data that the limits do not count: a notification, or a request of our own.
     pub(super) fn exempt(&mut self, to: SocketAddrV4, bytes: Vec<u8>) {
         self.ready.push_back((To::Host(to), bytes));
     }

@@ -1,7 +1,8 @@
-//! Writes (clauses 15.9, 15.10): each is handed out as a job and answered when its end is known.
+//! Writes (clauses 15.9, 15.10): each is given out as a job and answered when its result is known.
 //!
-//! A request that comes once more joins the one under way. After its end a stop is carried out again; anything else is answered
-//! from memory for a while, unless somebody else gave an order since: a late duplicate starts nothing.
+//! A repeated request joins the one in progress. After the end of the request, a stop is carried out again;
+//! anything else is answered from memory for some time, unless another client gave an order since: a late duplicate
+//! starts nothing.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -32,7 +33,7 @@ pub struct Job {
     pub from: Address,
     /// Instance of the device that is written.
     pub device: u32,
-    /// The object that is written, by its place in the device.
+    /// The object to write, by its index in the device.
     pub place: usize,
     /// The object.
     pub object: ObjectId,
@@ -42,7 +43,7 @@ pub struct Job {
     pub priority: Option<u8>,
     /// When the request of the write arrived.
     pub asked: Instant,
-    /// When its turn came: with the request, or when the write before it in that was answered.
+    /// When this write was started: at the arrival of the request, or when the previous write of the request was answered.
     pub since: Instant,
 }
 
@@ -78,8 +79,8 @@ pub(super) struct Exchanges {
 }
 
 impl Exchanges {
-    /// A client asks a device for something else: the answers to its earlier requests are forgotten, as no repetition
-    /// can follow.
+    /// Notes another request of the client to the device: the answers to its earlier requests are forgotten, as
+    /// they cannot be repeated any more.
     pub(super) fn next_request(&mut self, from: Address, device: u32) {
         self.all
             .retain(|e| matches!(e.state, State::Running) || (e.from, e.device) != (from, device));
@@ -235,7 +236,7 @@ impl Server {
         self.go_on(token, app, now);
     }
 
-    /// Carries out the writes of a request one after the other; after a failed write, only its stops.
+    /// Carries out the writes of a request one after the other; after a failed write only its stops.
     fn go_on(&mut self, token: u64, app: &dyn Application, now: Instant) {
         loop {
             let Some(exchange) = self.exchanges.running(token) else {
@@ -358,7 +359,8 @@ impl Server {
     }
 }
 
-/// The writes in their order, but no stop behind a write to another object, for which it would have to wait.
+/// The writes in their order, with stops moved to the front unless they follow a write to another object, for which
+/// they would have to wait.
 fn stops_first(items: VecDeque<WriteItem>, stops: impl Fn(&WriteItem) -> bool) -> VecDeque<WriteItem> {
     let mut ordered: Vec<WriteItem> = Vec::with_capacity(items.len());
     for item in items {

@@ -82,7 +82,7 @@ impl Dice {
                 _ => {}
             }
         }
-        // The length in the header is mostly right, so that the rest is read.
+        // The length in the header is usually correct, so that the rest is parsed.
         if frame.len() >= 4 && self.below(8) > 0 {
             let length = (frame.len() as u16).to_be_bytes();
             frame[2..4].copy_from_slice(&length);

@@ -159,7 +159,7 @@ fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
         rig.datagram(5, &request);
         assert_eq!(rig.server.transmit().unwrap().1, bvlc::result(code));
     }
-    // A broadcast of the server that comes back to it is not counted as received.
+    // A broadcast of the server that it receives itself is not counted as received.
     let before = rig.server.counters();
     let own = rig.server.options.address;
     rig.server.receive(own, &bvlc::broadcast(&[1, 0]), &rig.plant, rig.now);
@@ -210,7 +210,7 @@ fn bbmd_requests_are_refused_and_those_not_allowed_hear_nothing() {
     );
 }
 
-/// The router on the way to the virtual network takes the last hop of a message.
+/// The router to the virtual network uses up the last hop of a message.
 #[test]
 fn a_message_with_one_hop_left_is_not_delivered_further() {
     let mut rig = ServerWithClients::new();
@@ -265,7 +265,7 @@ fn foreign_devices_have_what_is_broadcast_on_both_sides() {
         rig.datagram(who, &bvlc::register(60));
         assert_eq!(raw(&mut rig), [(To::Host(host(who)), result(code))], "{who}");
     }
-    // From a host of this network: to the foreign devices, and so is the answer.
+    // A broadcast by a host of this network reaches the foreign devices, and so does the answer.
     rig.datagram(5, &bvlc::broadcast(&npdu));
     let out = raw(&mut rig);
     for foreign in [7, 8] {
@@ -276,7 +276,7 @@ fn foreign_devices_have_what_is_broadcast_on_both_sides() {
             .filter(|(to, bytes)| *to == To::Host(host(foreign)) && bytes.ends_with(&[0x91, 1, 0x21, 0]));
         assert_eq!(answers.count(), 1, "{out:?}");
     }
-    // A message of a foreign device goes to this network and to the others.
+    // A message of a foreign device reaches this network and the other foreign devices.
     rig.later(Duration::from_secs(1));
     rig.datagram(7, &bvlc::distribute(&npdu));
     let out = raw(&mut rig);
