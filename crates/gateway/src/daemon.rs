@@ -113,7 +113,7 @@ pub struct Daemon {
     driller: tokio::task::JoinHandle<()>,
     drills: drills::DrillsFile,
     reservations: ReservationsFile,
-    /// Keeps reservations on disk.
+    /// Task that saves reservations on disk.
     reserver: tokio::task::JoinHandle<()>,
     pulse: Pulse,
     /// Receiver of reload requests, and the file that the gateway runs with.
@@ -129,7 +129,7 @@ impl Daemon {
         Daemon::start_with(settings, None).await
     }
 
-    /// As [`Daemon::start`]; `control` takes the commands of local clients to the gateway itself.
+    /// Starts like [`Daemon::start`]; `control` receives the commands of local clients to the gateway itself.
     ///
     /// # Errors
     /// The errors of [`Daemon::start`].
@@ -178,9 +178,9 @@ impl Daemon {
         // The keeper starts before anything happens: it has the earlier events.
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
-        // MQTT starts after the buses; subscribing it now lets its first messages include their events.
+        // MQTT starts after the buses; subscribing now lets its first messages include their events.
         daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
-        // This must happen before the first start is counted.
+        // The guards must be applied before the first start is counted.
         daemon.apply_guards(&settings).await;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
@@ -230,21 +230,21 @@ impl Daemon {
         self.north.clone()
     }
 
-    /// Applies a new configuration and returns what changed. What is unchanged keeps running without a lost cycle.
+    /// Applies a new configuration and returns what changed. Unchanged parts keep running without a lost cycle.
     ///
     /// # Errors
     /// A bus or a server cannot start: everything runs as before. Or a changed recorder cannot: everything else runs as
     /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
-        // All steps that can fail come before a running part is stopped, or its counts change.
+        // All steps that can fail come before any running part is stopped or changed.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
         if let Err(error) = self.apply_recorder(&settings).await {
             self.abort_servers(servers).await;
             return Err(error);
         }
-        // This must happen before the first start is counted.
+        // The guards must be applied before the first start is counted.
         self.apply_guards(&settings).await;
         self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
@@ -332,7 +332,7 @@ impl Daemon {
             bus.queue.close(Outcome::ShuttingDown, Instant::now());
         }
         for (bus, task) in &kept {
-            // Without a configured `stale_after`, data as old as three rounds of a slow bus is not stale.
+            // Without a configured `stale_after`, data of a slow bus becomes stale only after three rounds.
             let floor = match settings.stale_after_written {
                 true => Duration::ZERO,
                 false => 3 * bus.achievable().0,
@@ -369,7 +369,7 @@ impl Daemon {
         self.buses = kept;
     }
 
-    /// Makes these buses the plant from now on.
+    /// Makes these buses the present plant.
     fn show(&self, settings: &Settings, buses: &[(BusSettings, BusTask)]) {
         self.watch(buses);
         self.plant.store(Arc::new(Plant {
@@ -423,7 +423,7 @@ impl Daemon {
     /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,
     /// the last MQTT messages.
     pub async fn stop(mut self) {
-        // Orders that came over the local socket are answered when the buses have ended.
+        // Orders received over the local socket are answered when the buses have ended.
         let local = self.local.server().map(local::Local::connections);
         self.local.stop().await;
         self.slots.stop().await;
@@ -444,7 +444,7 @@ impl Daemon {
         within(STOP_BUSES, "buses", async {
             at_once(buses, BusTask::stop).await;
             if let Some(recorder) = recorder {
-                // If its thread panicked, the panic is logged already.
+                // If the recorder's thread panicked, the panic was already logged.
                 let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
             }
         })
@@ -474,7 +474,7 @@ impl Daemon {
         }
     }
 
-    /// Stops the drives with `on_shutdown = "stop"`; each bus has the time that this takes on its line.
+    /// Stops the drives with `on_shutdown = "stop"`; each bus has the time that its line needs for this.
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
@@ -529,8 +529,8 @@ impl Daemon {
     }
 }
 
-/// Stops buses, all at the same time and outside the runtime, because each takes up to a second. Returns what the buses
-/// leave.
+/// Stops buses simultaneously and outside the runtime, because each takes up to a second. Returns the state that
+/// the buses hand over.
 async fn at_once<B: Send + 'static, T: Send + 'static>(
     buses: Vec<(BusSettings, B)>,
     end: fn(B) -> T,

@@ -102,7 +102,7 @@ fn repeats(principal: &Principal) -> bool {
     by_address || principal.certificate.is_some() || principal.mqtt.is_some() || principal.sparkplug
 }
 
-/// The id of a user of this machine.
+/// The numeric id of a user of this machine.
 fn uid_of(user: &str) -> Result<u32, Finding> {
     if let Ok(uid) = user.parse() {
         return Ok(uid);
@@ -120,7 +120,7 @@ fn uid_of(user: &str) -> Result<u32, Finding> {
     })
 }
 
-/// Two principals that one client could be are none: names, and what proves them.
+/// Refuses two principals that one client could match: their names, and their proofs of identity, must be unique.
 fn unique(tables: &[Reader<'_>], principals: &[Option<Principal>]) {
     let mut seen: BTreeMap<(&str, String), String> = BTreeMap::new();
     for (table, principal) in tables.iter().zip(principals) {

@@ -184,8 +184,8 @@ fn warn(reader: &Reader<'_>, options: &Options) {
     }
 }
 
-/// Checks the instances of drives, each the sum of the gateway's instance and the unit: none may occur twice or be too
-/// high.
+/// Checks the device instances of drives, each the sum of the gateway's instance and the unit id: none may occur
+/// twice or be too high.
 pub(super) fn check_instances(reader: &Reader<'_>, buses: &[Found], bacnet: &Bacnet) {
     let (device, place) = &bacnet.device;
     let is_served = |bus: &&Found| match (&bacnet.buses, &bus.name) {

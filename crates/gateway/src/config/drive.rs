@@ -133,8 +133,8 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     }
 }
 
-/// Interval at which an order is written again: as configured, or as the profile requires for a drive with a lease of
-/// its own.
+/// Reads the interval at which an order is written again: as configured, or as the profile requires for a drive
+/// that has a lease.
 fn read_refresh(
     reader: &Reader<'_>,
     profile: Option<&Profile>,
@@ -263,7 +263,7 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
             "use another profile or put the drive on another bus",
         );
     }
-    // A device on a network has any unit id, and one that answers at 248 has no address of its own.
+    // A device on a network may have any unit id, and one that answers at 248 has no individual address.
     let takes = |address: &u8| {
         let is_modbus = around.protocol != Protocol::N2;
         let has_none = is_modbus && *address == RESERVED && *profile.addresses.end() == 247;
@@ -536,7 +536,7 @@ fn read_supervision(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Lim
     })
 }
 
-/// Whether a drive of that profile shows that it runs, or at least that it has a run command.
+/// Whether a drive of this profile reports that it runs, or at least that it has a run command.
 fn shows_whether_it_runs(profile: &Profile) -> bool {
     let plan = Plan::of(profile);
     let is_read = |point| {

@@ -13,7 +13,7 @@ const OTHERS: u32 = 0o006;
 /// Warns if every user of this machine can read or replace a file with a secret, which the `key` of the configuration
 /// names.
 pub(super) fn warn_of_readers(reader: &Reader<'_>, key: &str, path: &Path) {
-    // A file that cannot be read is reported where it is read.
+    // An unreadable file is reported by the code that reads it.
     let Ok(metadata) = std::fs::metadata(path) else { return };
     let mode = metadata.permissions().mode() & 0o777;
     if metadata.is_file() && mode & OTHERS != 0 {

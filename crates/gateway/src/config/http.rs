@@ -10,14 +10,14 @@ use crate::document::{Finding, Place, Reader};
 use crate::north::http::{self, Credential, Credentials, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
-/// An address that a server listens on, with its place in the file.
+/// An address on which a server listens, with its place in the file.
 pub(super) type Listener = (SocketAddr, Place);
 
 /// The valid settings of `[http]`.
 pub(super) struct Http {
     pub(super) options: Option<http::Options>,
     pub(super) listener: Option<Listener>,
-    /// Clients may command, by what is written.
+    /// Whether the configuration asks for commands.
     pub(super) commands: bool,
 }
 
@@ -112,7 +112,7 @@ fn credentials<C: Credential>(
     }
 }
 
-/// Whether commands can be on: someone has to be known, and passwords must not travel in clear text.
+/// Whether commands can be enabled: there must be users, and passwords must not travel in clear text.
 fn is_safe_to_command(reader: &Reader<'_>, listen: Option<SocketAddr>, has_users: bool) -> bool {
     let key = HTTP.commands.name;
     if !has_users {

@@ -1,5 +1,5 @@
-//! A key of the configuration: its name, form, default and meaning. The loader reads by it, and the JSON Schema and the
-//! tables of `docs/configuration.md` are made from it.
+//! A key of the configuration: its name, form, default and meaning. The loader uses it, and the JSON Schema and the
+//! tables of `docs/configuration.md` are generated from it.
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
@@ -28,9 +28,9 @@ pub(super) struct Key<T: 'static> {
 pub(super) enum Preset {
     /// The key is required.
     Required,
-    /// This value, in notation that is both TOML and JSON.
+    /// A fixed default value, in notation that is both TOML and JSON.
     Value(&'static str),
-    /// The value on a bus of this protocol, in notation that is both TOML and JSON.
+    /// A default value for a bus of this protocol, in notation that is both TOML and JSON.
     ByProtocol(fn(Protocol) -> String),
     /// Decided by the loader; as text.
     Words(&'static str),
@@ -107,7 +107,7 @@ impl<T> Key<T> {
         reader.has(self.name).then(|| self.form.read(reader, self.name))?
     }
 
-    /// Where the key is, or the table if the key is absent.
+    /// Place of the key in the file, or of its table if the key is absent.
     pub(super) fn place(&self, reader: &Reader<'_>) -> Place {
         reader.place_of(self.name)
     }
@@ -156,7 +156,7 @@ impl<T> Key<T> {
     }
 }
 
-/// A default that depends on the protocol, in words: that of Modbus RTU, then those that differ from it.
+/// A default that depends on the protocol, as text: the value for Modbus RTU, then the ones that differ.
 fn by_protocol(default: fn(Protocol) -> String) -> String {
     let usual = default(Protocol::ModbusRtu);
     let mut text = format!("`{usual}`");
@@ -189,7 +189,7 @@ pub(super) fn plain(text: &str) -> String {
     plain + rest
 }
 
-/// The schema of a table: what it is, and for each key its name, whether it is required, and its schema.
+/// The schema of a table: its description, and for each key its name, whether it is required, and its schema.
 pub(super) fn table(about: &str, keys: Vec<(&'static str, bool, Value)>) -> Value {
     let required: Vec<&str> = keys
         .iter()
@@ -209,8 +209,8 @@ pub(super) fn table(about: &str, keys: Vec<(&'static str, bool, Value)>) -> Valu
     })
 }
 
-/// A name that can be part of topics, labels and addresses; these characters are allowed in addition to letters and
-/// digits.
+/// A name that can be part of topics, labels and addresses; the given characters are allowed in addition to letters
+/// and digits.
 pub(super) struct Name(pub(super) &'static str);
 
 impl Form<String> for Name {
@@ -219,7 +219,7 @@ impl Form<String> for Name {
     }
 
     fn schema(&self) -> Value {
-        // In the class of characters, the hyphen is last, where it stands for itself.
+        // In a character class of a pattern, a hyphen stands for itself if it is last.
         let joints: String = self.0.chars().rev().collect();
         json!({ "type": "string", "pattern": format!("^[a-z0-9][a-z0-9{joints}]{{0,{}}}$", NAME_LENGTH - 1) })
     }
@@ -229,7 +229,7 @@ impl Form<String> for Name {
     }
 }
 
-/// Any string that matches the pattern; the loader checks the rest. The second text tells what to write.
+/// Any string that matches the pattern; the loader checks the rest. The second text says what to write.
 pub(super) struct Text(pub(super) &'static str, pub(super) &'static str);
 
 impl<T: FromNode> Form<T> for Text {
@@ -276,13 +276,13 @@ impl<T> Form<T> for Parsed<T> {
     }
 }
 
-/// The value of a key whose range says more than its type, so that the message for a wrong type shows the range.
+/// The value of a key whose range is more specific than its type, so that the message for a wrong type shows the range.
 fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T> {
     let value = T::from_node(reader.raw(key)?);
     reader.accept(
         key,
         value.map_err(|error| match error {
-            // A range without an example or words says less than the type.
+            // A range without an example or words is less specific than the type.
             ValueError::Type(..) | ValueError::NotAList(..) if range.contains(['[', ',', '"']) => {
                 Finding::new(error.to_string(), format!("write {range}"))
             }
@@ -291,7 +291,7 @@ fn of_type<T: FromNode>(reader: &Reader<'_>, key: &str, range: &str) -> Option<T
     )
 }
 
-/// True or false.
+/// A key that is true or false.
 pub(super) struct Flag;
 
 impl Form<bool> for Flag {
@@ -325,7 +325,7 @@ impl Form<f64> for Figure {
     }
 }
 
-/// A whole number in the range; a certain number outside it may have a message of its own.
+/// A whole number in the range; one number outside it may have its own message.
 pub(super) struct Number(pub(super) RangeInclusive<i64>, pub(super) Option<(i64, &'static str)>);
 
 impl<T: TryFrom<i64>> Form<T> for Number {
@@ -416,7 +416,7 @@ impl Form<u64> for Size {
     }
 }
 
-/// One of several words, each with its value.
+/// One of several words, each with the value it stands for.
 pub(super) struct Words<T: 'static>(pub(super) &'static [(&'static str, T)]);
 
 impl<T: Clone> Words<T> {
@@ -450,7 +450,7 @@ impl<T: Clone> Form<T> for Words<T> {
 /// A list of strings, each parsed; every bad item is a problem.
 pub(super) struct List<T> {
     pub(super) parse: fn(&str) -> Result<T, Finding>,
-    /// What to do about an empty list, if the list may not be empty.
+    /// Remedy for an empty list; `None` if the list may be empty.
     pub(super) empty: Option<&'static str>,
     pub(super) range: &'static str,
 }

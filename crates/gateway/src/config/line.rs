@@ -4,7 +4,7 @@ use super::keys::BUS;
 use crate::document::{Reader, format_duration};
 use crate::line::{Level, LineOptions, Rs485};
 
-/// The options of a line, with what is wrong or has no effect in them.
+/// Reads the options of a line; reports those that are invalid or have no effect.
 pub(super) fn read(reader: &Reader<'_>, port: Option<&str>) -> LineOptions {
     let options = LineOptions {
         rs485: BUS.rs485.get(reader),

@@ -1,4 +1,4 @@
-//! From the text of a file to settings: every section is read, then what they say together is judged.
+//! Loads settings from the text of a file: every section is read, then their combination is checked.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -64,7 +64,7 @@ impl Settings {
 
 /// Default path of the configuration.
 pub const DEFAULT_FILE: &str = "/etc/drivegate/drivegate.toml";
-/// What to do if no configuration exists yet.
+/// Remedy if no configuration exists yet.
 const NO_FILE: &str = "name the file with --config; `drivegate try` finds drives and writes a configuration";
 
 impl Settings {
@@ -80,7 +80,7 @@ impl Settings {
     }
 }
 
-/// The variables of this process that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
+/// The environment variables that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
 /// [`Settings::load`] refuses.
 pub fn environment() -> impl Iterator<Item = (String, String)> {
     std::env::vars_os().filter_map(|(name, value)| {
@@ -249,7 +249,7 @@ fn options_of<S, T>(section: Option<S>, of: impl FnOnce(S) -> Option<T>) -> Resu
     section.map(|section| of(section).ok_or(Unusable)).transpose()
 }
 
-/// The user's profiles in use by which a command does what it must not; those of the program are proved by its tests.
+/// The user profiles in use with a command that does something it must not do; built-in profiles are proved by tests.
 fn unsafe_commands(settings: &Settings) -> Vec<Problem> {
     let drives = settings.buses.iter().flat_map(|bus| &bus.drives);
     let commanded = drives.filter(|drive| drive.access == Access::Control && !drive.profile.built_in);

@@ -5,18 +5,19 @@ use crate::history::budget::Budget;
 use crate::history::line;
 use crate::history::trend::Reach;
 
-/// The program, its libraries, its threads and what its servers keep for the clients they allow, bytes; measured.
+/// Memory of the program, its libraries, its threads and its servers for the clients that they allow, bytes; measured.
 const PROGRAM: usize = 25 << 20;
 /// A bus: queue, trace, tape and thread, bytes; measured.
 const BUS: usize = 256 << 10;
-/// A drive: plan, image, health, what the servers remember of it and its part of the longest answers, bytes; measured with 992 drives.
+/// Memory of a drive: plan, image, health, data of the servers and its part of the longest answers, bytes; measured
+/// with 992 drives.
 const DRIVE: usize = 42 << 10;
 
-/// BACnet: subscriptions, writes, answers that wait; and what it shows of a drive, bytes.
+/// Memory for BACnet: subscriptions, writes and waiting answers; and for the objects of one drive, bytes.
 const BACNET: (usize, usize) = (7 << 20, 24 << 10);
 
-/// Memory for comparing the passwords of users, bytes; measured. 12 MiB of it are the cost of a hash made by `drivegate user
-/// add`.
+/// Memory for comparing the passwords of users, bytes; measured. 12 MiB of it are needed by a hash made with
+/// `drivegate user add`.
 const LOGINS: usize = 14 << 20;
 
 /// Memory of a gateway at most.

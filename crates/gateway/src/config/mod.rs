@@ -1,7 +1,7 @@
 //! The configuration: a TOML file and environment variables become [`Settings`].
 //!
-//! One run reports every error with file, line and key. Only the file itself, the profiles and the secrets it names are
-//! opened. Relative paths are relative to the directory of the file.
+//! One run reports every error with file, line and key. Only the file itself, and the profiles and secrets it
+//! names, are opened. Relative paths are relative to the directory of the file.
 
 mod authority;
 mod bacnet;

@@ -15,7 +15,7 @@ use crate::document::{Place, Reader};
 use crate::north::TlsFile;
 use crate::north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
 
-/// Where the short form listens if `listen` is not written.
+/// Default address of the short form, used if `listen` is absent.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
 
 /// Name and place of a `default_drive`, with the buses that its listener shows.
@@ -49,7 +49,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     let tables = MODBUS_TCP.listener.tables(reader);
     let tls_table = MODBUS_TCP.tls.table(reader);
     let mut found = Found::default();
-    // Besides listeners of its own or TLS, the short form counts only if it is written.
+    // With listeners of its own or TLS, the short form counts only if `listen` is present.
     if reader.has(MODBUS_TCP.listen.name) || (tables.is_empty() && tls_table.is_none()) {
         found.add(short_form(reader, &inherited), reader);
     }
@@ -279,7 +279,7 @@ fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
     roles
 }
 
-/// Networks whose addresses are those of hosts on the same site, not of a NAT in between.
+/// Networks whose addresses identify hosts of the same site, not a NAT in between.
 const PRIVATE: [&str; 8] = [
     "10.0.0.0/8",
     "172.16.0.0/12",

@@ -13,7 +13,7 @@ use crate::document::{Finding, FromNode, Reader, format_duration};
 use crate::north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
-/// Most brokers: at three attempts a second, all of them are tried within 10 s.
+/// Most brokers: with three attempts per second, all of them are tried within 10 s.
 const MOST_BROKERS: usize = 16;
 
 /// `url` and `urls`, in this order.
@@ -184,7 +184,7 @@ pub(super) fn secret(path: &Path) -> Result<String, Finding> {
     })
 }
 
-/// Warns of passwords and commands that others on the way to the broker could read or alter.
+/// Warns about passwords and commands that others on the way to the broker could read or alter.
 fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands: bool) {
     let remedy = "write mqtts:// for TLS";
     if password {

@@ -1,5 +1,5 @@
-//! The files that a configuration names, whether or not they can be read and it is valid: for the check of permissions and
-//! for backups.
+//! The files that a configuration names, even if they cannot be read or the configuration is invalid: for the check
+//! of permissions and for backups.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use crate::document::{self, Document, Reader};
 /// The kind of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
-    /// The configuration itself.
+    /// The configuration file itself.
     Configuration,
     /// A profile of the user.
     Profile,

@@ -1,4 +1,4 @@
-//! `[params]`: when parameters are read, and what they are called.
+//! Reads `[params]`: when parameters are read, and the names of parameters.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,11 +18,11 @@ use crate::process_image::Machine;
 pub struct ParamsSettings {
     /// Directory of the readings.
     pub dir: PathBuf,
-    /// Interval at which all parameters are read; none: only on request.
+    /// Interval at which all parameters are read; `None`: only on request.
     pub every: Option<Duration>,
     /// Names of parameters that replace the names in the profiles, by profile.
     pub names: BTreeMap<String, Arc<Names>>,
-    /// Drives of the configuration that this process does not serve, with their names; empty in a gateway.
+    /// Configured drives that this process does not serve, with their names; empty in a gateway.
     pub others: Vec<(Machine, String)>,
 }
 

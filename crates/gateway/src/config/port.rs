@@ -1,4 +1,4 @@
-//! `port` of `[[bus]]`: a serial device, or what is behind a network, and the keys that make no sense there.
+//! `port` of `[[bus]]`: a serial device or a device on the network, and the keys that have no meaning there.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};

@@ -6,7 +6,7 @@ use super::keys::DRIVE;
 use crate::document::{Finding, Node, Raw, Reader};
 use crate::drive::{Profile, RawWrites};
 
-/// Registers that raw writes may set in addition to writable points; none if the key is absent or wrong.
+/// Registers that raw writes may set in addition to writable points; none if the key is absent or invalid.
 pub(super) fn read(reader: &Reader<'_>, profile: Option<&Profile>) -> RawWrites {
     let key = DRIVE.raw_writes.name;
     let parsed = reader.raw(key).map(|node| parse(&node.value, profile));

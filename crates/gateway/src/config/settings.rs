@@ -28,11 +28,12 @@ pub(super) const ENVIRONMENT: &str = "DRIVEGATE";
 pub struct Settings {
     /// Name of the gateway.
     pub gateway: String,
-    /// Where `drivegate read` and `drivegate write` reach the gateway.
+    /// Path of the socket by which `drivegate read` and `drivegate write` reach the gateway.
     pub socket: SocketPath,
     /// Directory for stored data.
     pub state_dir: PathBuf,
-    /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
+    /// Whether events and counters are saved in the state directory: always true as configured, false for commands
+    /// that run only a part of a gateway.
     pub keeps_history: bool,
     /// The settings of the recorder.
     pub recordings: RecorderOptions,
@@ -44,7 +45,7 @@ pub struct Settings {
     pub profiles: Profiles,
     /// Age from which a sample of process data is stale.
     pub stale_after: Duration,
-    /// Whether `stale_after` is configured, so that it applies to slow lines too.
+    /// Whether `stale_after` was configured, so that it also applies to slow lines.
     pub stale_after_written: bool,
     /// The buses in the order of the file.
     pub buses: Vec<BusSettings>,
@@ -69,19 +70,19 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// All drives, each with its bus.
+    /// All drives of all buses, each with its bus.
     pub fn drives(&self) -> impl Iterator<Item = (&BusSpec, &DriveSpec)> {
         let buses = self.buses.iter();
         buses.flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)))
     }
 }
 
-/// A bus with its drives.
+/// A bus with the drives on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {
     /// The part used by other crates.
     pub spec: BusSpec,
-    /// The part used only by the bus itself.
+    /// The settings that only the bus itself uses.
     pub options: BusOptions,
     /// The drives in the order of the file.
     pub drives: Vec<DriveSpec>,

@@ -12,7 +12,7 @@ use crate::process_image::{Access, DriveSpec, OnShutdown, Timing};
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
 pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
-/// The part of the stop time that servers, broker and ports may take.
+/// The part of the stop time that servers, broker and ports may need.
 pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
 /// How long the stops of one bus take, one after another, from the end of the current transaction.
@@ -27,7 +27,7 @@ pub struct ShutdownTime {
 }
 
 impl ShutdownTime {
-    /// The warning about that bus if the service manager may kill the gateway before every drive got its stop.
+    /// The warning about this bus if the service manager may kill the gateway before every drive has its stop.
     pub(crate) fn beyond_unit(&self, bus: &str) -> Option<Finding> {
         let wanted = self.unanswered + OTHER_STOP_TIME;
         let seconds = |time: Duration| time.as_secs_f64().ceil();
@@ -94,7 +94,7 @@ fn is_stopped(drive: &DriveSpec) -> bool {
     drive.access == Access::Control && drive.on_shutdown == OnShutdown::Stop
 }
 
-/// The requests of a stop: the read of the control word, if there is one, and the write.
+/// The requests of a stop: the read of the control word, if needed, and the write.
 fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
     let control = drive.profile.control.as_ref()?;
     let ControlItem { table, address } = control.stop.place.unwrap_or(control.at);

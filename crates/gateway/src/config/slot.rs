@@ -26,7 +26,7 @@ pub(super) struct Surroundings<'s> {
     pub(super) protocol: Protocol,
     pub(super) format: Option<LineFormat>,
     pub(super) mode: Mode,
-    /// Access to the drives of the slot's bus, as far as it is valid.
+    /// Access of the slot to the drives of its bus; only the valid values.
     pub(super) drives: Vec<Access>,
 }
 

@@ -1,4 +1,5 @@
-//! The loader: values of a file, defaults, reload, the environment; listeners and the schema have files of their own.
+//! Tests of the loader: values of a file, defaults, reload, the environment; tests of listeners and the schema are
+//! in separate files.
 
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
@@ -20,7 +21,7 @@ mod schema;
 
 use self::listeners::certificates;
 
-/// Every table of the configuration, so that the loader asks for every key it knows.
+/// Every table of the configuration, so that the loader requests every key that it knows.
 static FULL: LazyLock<String> = LazyLock::new(|| FORM.replace("DIR", &certificates().display().to_string()));
 
 const FORM: &str = r#"

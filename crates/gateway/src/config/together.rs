@@ -26,7 +26,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
     } = *clients;
     unique::check(reader.document(), buses);
     interlocks::check(reader.document(), buses);
-    // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
+    // Without Modbus TCP unit ids are not used, and a gateway may have more drives than unit ids exist.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
         unique::check_default_drives(reader.document(), buses, &modbus_tcp.default_drives);
@@ -52,8 +52,8 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
         warn_of_idle_control(reader, buses);
     }
     if reader.document().is_sound() {
-        // Besides errors, a default may stand in for a wrong value, or an unknown key for the one that is missed; a warning
-        // about it would mislead.
+        // If there are errors, a default may have replaced a wrong value, or an unknown key be the misspelled one:
+        // a warning about that would be misleading.
         if commanded {
             warn_of_missing_leases(reader, buses);
         }
@@ -130,11 +130,11 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
     }
 }
 
-/// Polls so rare that a drive may take them for a silent master. The manual's example is 1 s [T 6.2]; what is set can be read from
-/// the drive only.
+/// Interval between polls from which on a drive may assume that its master is silent. The manual's example is 1 s
+/// [T 6.2]; the actual setting can only be read from the drive.
 const FAULT_TIME: Duration = Duration::from_secs(1);
 
-/// Warns of drives that may trip because they are polled too seldom.
+/// Warns about drives that may trip because they are polled too rarely.
 fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
     let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
     let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {
@@ -216,7 +216,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
     }
 }
 
-/// Commanded drives that nothing stops when the commanding client goes silent.
+/// Warns about controlled drives that nothing stops when the commanding client goes silent.
 fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {
@@ -256,7 +256,7 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     }
 }
 
-/// Refreshes that end by what the configuration does, and drives that need one and have none.
+/// Warns about refreshes that end because of other settings, and about drives that need a refresh and have none.
 fn warn_of_refreshes(reader: &Reader<'_>, buses: &[bus::Found]) {
     let key = DRIVE.refresh.name;
     for drive in buses.iter().flat_map(|bus| &bus.drives) {

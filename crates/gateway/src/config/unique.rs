@@ -77,7 +77,7 @@ fn check_ports(document: &Document, buses: &[Found]) {
     }
 }
 
-/// Devices that dial in at one address are distinguished by their texts: none may be the beginning of another.
+/// Devices that dial in at one address are distinguished by their texts: no text may be the beginning of another.
 fn check_dial_in(document: &Document, buses: &[Found]) {
     let mut seen: Vec<(&str, &str)> = Vec::new();
     for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
@@ -101,7 +101,7 @@ fn check_dial_in(document: &Document, buses: &[Found]) {
     }
 }
 
-/// A slot creates the serial port of its tool: the path may not be that of another slot, or of a line.
+/// A slot creates the serial port for its tool: the path must not be used by another slot or by a line.
 fn check_ptys(document: &Document, buses: &[Found]) {
     let mut seen: Vec<(&Path, String)> = Vec::new();
     for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
@@ -184,7 +184,7 @@ pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Op
                 seen.insert(*unit, (bus, drive));
                 continue;
             };
-            // Two drives with one address on a bus are reported as such.
+            // Two drives with one address on a bus are reported as that error instead.
             if bus == *other_bus && drive.unit_is_address && other.unit_is_address {
                 continue;
             }
@@ -211,7 +211,7 @@ pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Op
     }
 }
 
-/// Two servers cannot listen on one address; `0.0.0.0` and `[::]` take the port of every address.
+/// Two servers cannot listen on one address; `0.0.0.0` and `[::]` use the port on every address.
 pub(super) fn check_listeners<'a>(document: &Document, listeners: impl Iterator<Item = &'a Listener>) {
     let mut seen: Vec<&Listener> = Vec::new();
     for listener in listeners {

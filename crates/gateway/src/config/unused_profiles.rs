@@ -25,7 +25,7 @@ pub(super) fn named_by_drives(root: &Node) -> BTreeSet<String> {
 /// The files with faults: the name that each gives, and its base.
 pub(super) type Faulty = BTreeMap<String, (Option<String>, Option<String>)>;
 
-/// The files in which these faults are.
+/// The profile files in which these problems are.
 pub(super) fn faulty(problems: &[Problem]) -> Faulty {
     let files: BTreeSet<&str> = problems.iter().map(|problem| problem.file.as_str()).collect();
     files
@@ -54,7 +54,7 @@ pub(super) fn divide(
     }
     let is_used = |problem: &Problem| match names.get(&problem.file) {
         Some((Some(name), _)) => used.contains(name),
-        // The directory itself, or a file without a name, which may be the one that a drive misses.
+        // A problem of the directory itself, or of a file without a name, which may define the profile that a drive misses.
         _ => named.iter().any(|name| profiles.get(name).is_none()) || Path::new(&problem.file).is_dir(),
     };
     let (errors, mut warnings): (Vec<Problem>, Vec<Problem>) = problems.into_iter().partition(is_used);

@@ -7,7 +7,7 @@ use ipnet::IpNet;
 
 use crate::document::{Finding, Reader, nearest};
 
-/// Most characters of a name.
+/// Longest name, in characters.
 pub(super) const NAME_LENGTH: usize = 64;
 
 /// `"a"`, `"a" or "b"`, `"a", "b" or "c"`.
@@ -134,7 +134,7 @@ pub(super) fn both_or_none(reader: &Reader<'_>, names: [&str; 2]) {
     }
 }
 
-/// Reports names of buses that the file does not have, and removes them; `remedy` where none is near.
+/// Reports names of buses that do not exist in the file, and removes them; `remedy` is shown if no similar name exists.
 pub(super) fn known_buses(reader: &Reader<'_>, key: &str, names: &mut Vec<String>, known: &[&str], remedy: &str) {
     names.retain(|name| {
         let is_known = known.contains(&name.as_str());

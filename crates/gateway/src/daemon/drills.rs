@@ -1,4 +1,4 @@
-//! Drills that are under way, and the file that keeps them.
+//! Drills in progress, and the file in which they are saved.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,9 +14,9 @@ use crate::plant::SharedPlant;
 const IDLE: Duration = Duration::from_millis(500);
 /// Time between two tries to write the file.
 const AGAIN: Duration = Duration::from_secs(10);
-/// Time for the last stop of a drill that the shutdown ends, and for the file after it.
+/// Time limit for the last stop of a drill that the shutdown ends, and for saving it afterwards.
 const LAST_STOP: Duration = Duration::from_secs(3);
-/// A file that is longer is none of these.
+/// Largest valid size of the file, bytes.
 const LONGEST: u64 = 16 << 20;
 
 /// The file of the drills; `None` while drills are not kept.
@@ -26,7 +26,7 @@ fn path(file: &DrillsFile) -> Option<PathBuf> {
     file.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
-/// Keeps drills in this state directory from now on. Drills in another state directory are taken over.
+/// Saves drills in this state directory from now on. Drills saved in the previous state directory are taken over.
 pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patience: &Patience, drills: &Drills) {
     let new = state_dir.map(|dir| dir.join(DRILLS));
     drills.keep(new.is_some());
@@ -50,7 +50,7 @@ pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patienc
     }
 }
 
-/// State of drills in a file; none where there is no file.
+/// Reads the drills saved in a file; `None` if the file does not exist.
 ///
 /// # Errors
 /// The file cannot be read, or is not one of drills.
@@ -59,7 +59,7 @@ pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
     bytes.map(|bytes| SavedDrills::from_json(&bytes)).transpose()
 }
 
-/// Looks at drills as long as the gateway runs, and keeps the file of them up to date.
+/// Evaluates drills as long as the gateway runs, and keeps their file up to date.
 pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         let mut writer = Writer::default();
@@ -89,7 +89,7 @@ struct Writer {
 }
 
 impl Writer {
-    /// Takes the result of a write that is done, and begins the next one that is due.
+    /// Processes the result of a completed write, and starts the next one that is due.
     async fn advance(&mut self, drills: &Drills, file: &DrillsFile) {
         if let Some(writing) = self.writing.take_if(|writing| writing.is_finished()) {
             match writing.await {
@@ -103,7 +103,7 @@ impl Writer {
                 Err(error) => self.failed(drills, &error.to_string()),
             }
         }
-        // If a drill waits for the write, the write is tried at once.
+        // If a drill is waiting for the write, it is repeated at once.
         let waits = self.again.is_some_and(|again| Instant::now() < again) && !drills.waits_for_disk();
         if self.writing.is_none() && !waits {
             self.writing = begin_to_write(drills, file);
@@ -132,7 +132,7 @@ fn begin_to_write(drills: &Drills, file: &DrillsFile) -> Option<Writing> {
     Some(tokio::task::spawn_blocking(move || (generation, write())))
 }
 
-/// The gateway ends, or the bus of that drill does: so does the drill, with its stop.
+/// Ends a drill because the gateway or the bus of the drive ends; the drill stops its motor.
 pub(super) async fn end(
     plant: &SharedPlant,
     drills: &Drills,

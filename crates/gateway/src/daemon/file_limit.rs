@@ -8,9 +8,9 @@ use crate::north::{bacnet, http, modbus_tcp, slot};
 
 /// Files that the process itself has open: logs, runtimes, queues, the configuration, MQTT with its buffer, local clients.
 const OWN_FILES: usize = 64;
-/// Connections that each server keeps in any case, as far as it is configured to have them.
+/// Connections that each server gets in any case, unless fewer are configured.
 const LEAST_CONNECTIONS: usize = 4;
-/// Files of a bus, twice where a reload replaces it: its port, its queue, its timer.
+/// Open files of a bus: its port, its queue, its timer, and twice that while a reload replaces it.
 const BUS_FILES: usize = 8;
 
 /// Raises the limit of open files as far as `settings` require and the system permits. If that is not enough, the settings
@@ -97,7 +97,7 @@ impl Wanted {
         self.scaled(fewest)
     }
 
-    /// All servers with this share of the connections, in thousandths.
+    /// All servers with this fraction of their connections, in thousandths.
     fn scaled(&self, thousandths: usize) -> Wanted {
         let scale = |connections: usize| (connections * thousandths / 1000).max(LEAST_CONNECTIONS.min(connections));
         let mut scaled = self.clone();

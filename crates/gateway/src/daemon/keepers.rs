@@ -13,8 +13,8 @@ use crate::parameters::Store;
 use crate::start_guard;
 
 impl Daemon {
-    /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are then on
-    /// disk.
+    /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are on
+    /// disk by then.
     pub(super) async fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
         if self.recorder.is_some() && self.settings.recordings == settings.recordings {
             return Ok(());
@@ -57,7 +57,7 @@ impl Daemon {
         self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), vault.clone(), every)));
     }
 
-    /// New drives whose parameters may be half restored take no commands but stops, before their bus starts.
+    /// Locks new drives whose parameters may be half restored, before their bus starts: they accept only stops.
     pub(super) async fn hold_unfinished(&self, settings: &Settings) {
         hold_unfinished(
             &self.north.parameters,
@@ -67,8 +67,8 @@ impl Daemon {
         .await;
     }
 
-    /// Keeps events and counters in the configured directory. If no thread can be started for it, the gateway runs without
-    /// it.
+    /// Saves events and counters in the configured directory. If no thread can be started for it, the gateway runs
+    /// without this.
     pub(super) async fn apply_keeper(&mut self, settings: &Settings) {
         let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
         if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
@@ -136,14 +136,15 @@ impl Daemon {
         }
     }
 
-    /// Keeps reservations on disk if the gateway keeps its state.
+    /// Saves reservations on disk if a state directory is configured.
     pub(super) fn apply_reservations(&self, settings: &Settings) {
         let kept = settings.keeps_history && settings.authority.is_some();
         let dir = kept.then_some(settings.state_dir.as_path());
         reservations::keep_in(&self.reservations, dir);
     }
 
-    /// A bus that is replaced sends no stops to drives that are gone from it: a drill there ends before, and no other begins.
+    /// Ends drills on drives that a changed bus no longer has, since the replaced bus sends no stops to them; no
+    /// other drill can start there.
     pub(super) async fn end_drill_of_changed_bus(&self, settings: &Settings) {
         let changed = |name: &str| {
             let mut before = self.buses.iter().map(|(bus, _)| bus);
@@ -160,7 +161,7 @@ impl Daemon {
         .await;
     }
 
-    /// Applies the configured drills, which are kept on disk if the gateway keeps its state.
+    /// Applies the configured drills, which are saved on disk if a state directory is configured.
     pub(super) async fn apply_drills(&self, settings: &Settings) {
         let drills = &self.north.drills;
         let kept = settings.keeps_history && settings.drill.is_some();
@@ -169,7 +170,7 @@ impl Daemon {
         drills.set_options(settings.drill);
     }
 
-    /// Writes the audit to the configured file. If no thread can be started for it, the gateway runs without it.
+    /// Writes the audit to the configured file. If no thread can be started for it, the gateway runs without this.
     pub(super) async fn apply_audit(&self, settings: &Settings) {
         let audit = self.writes.audit();
         let before = audit.file();

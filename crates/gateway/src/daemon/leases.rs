@@ -1,6 +1,6 @@
-//! The leases of drives over a reload. A lease belongs to a machine and stays with it under any name; where the new configuration no
-//! longer has the machine, an event reports the end. A reload that brings the machine back soon, such as one that restores a former
-//! file, continues the lease. Pure.
+//! The leases of drives across a reload. A lease belongs to a machine and stays with it under any name; if the new
+//! configuration no longer has the machine, an event reports the end. A reload that soon brings the machine back,
+//! such as one that restores an earlier file, continues the lease. Pure.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -35,7 +35,7 @@ struct Left {
     drive: String,
 }
 
-/// State of drives that reloads have left out. Clones share it.
+/// State of drives that reloads have removed. Clones share the state.
 #[derive(Debug, Default, Clone)]
 pub(super) struct Parted(Arc<Mutex<Kept>>);
 
@@ -65,7 +65,7 @@ impl Parted {
         RETURN
     }
 
-    /// For a reload at `now`: the leases that may continue, and the buses that know who commanded their drives, the
+    /// For a reload at `now`: the leases that may continue, and the buses that know who commanded their drives,
     /// latest first.
     pub(super) fn recall(&self, now: Instant) -> (Leases, Vec<BusHandle>) {
         let mut kept = self.lock();
@@ -99,7 +99,8 @@ impl Parted {
 }
 
 impl Leases {
-    /// A bus was stopped; `leases` are those of its drives, in their order. A drive that could have none has left none.
+    /// Takes the leases of a stopped bus; `leases` are those of its drives, in order. A drive that could not have a
+    /// lease has left none.
     pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Carried>) {
         let all = bus.drives.iter().zip(leases);
         for (drive, carried) in all
@@ -117,8 +118,9 @@ impl Leases {
         }
     }
 
-    /// Leases with which the drives of a new bus continue at `now`, in their order. A drive that is no longer commanded has none. The
-    /// time of a lease does not run while its drive is left out, as while a drive is offline.
+    /// The leases with which the drives of a new bus continue at `now`, in order. A drive that is no longer
+    /// controlled has none. The clock of a lease stands still while its drive is removed, as while a drive is
+    /// offline.
     pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Carried> {
         let mut lease = |drive: &DriveSpec| {
             let machine = bus.spec.machine(drive);

@@ -20,7 +20,7 @@ impl Pulse {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Watches exactly these buses from now on.
+    /// Monitors exactly these buses from now on.
     pub(super) fn watch(&self, buses: impl Iterator<Item = (String, Arc<AtomicU64>)>) {
         let before = None;
         *self.watched() = buses.map(|(bus, beats)| Watched { bus, beats, before }).collect();

@@ -1,4 +1,5 @@
-//! Reservations that stops left behind outlive the process: they are written alongside the stop, never before it.
+//! Saves the reservations that stops left, so that they outlive the process: they are written while the stop is
+//! sent, never before it.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,16 +12,16 @@ use crate::plant::{Plant, SharedPlant};
 
 /// Interval of the checks for changed reservations.
 const LOOK: Duration = Duration::from_millis(50);
-/// A file that is longer is none of these.
+/// Largest valid size of the file, bytes.
 const LONGEST: u64 = 1 << 20;
 
 /// The file of the reservations; `None` while reservations are not kept.
 pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
 
-/// The kept reservations, as far as a change of them changes the file.
+/// The saved reservations, as far as a change of them changes the file.
 type Seen = Vec<(Instant, String, u8)>;
 
-/// Keeps the reservations in this state directory from now on.
+/// Saves the reservations in this state directory from now on.
 pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
     let path = state_dir.map(|dir| dir.join(RESERVATIONS));
     *file.lock().unwrap_or_else(PoisonError::into_inner) = path;

@@ -7,16 +7,16 @@ use crate::config::Settings;
 use crate::north::{bacnet, local};
 
 impl Daemon {
-    /// Ends the rights that the broker's clients and those of the local socket no longer have, before anything else
-    /// changes; the new configuration is certain by then. The servers that listen on the network end rights themselves when
-    /// they take their options.
+    /// Ends the rights that clients of the broker and of the local socket lose, before anything else changes; by
+    /// then the new configuration is certain to be applied. Servers that listen on the network end rights
+    /// themselves when they take their options.
     pub(super) fn end_rights(&self, settings: &Settings) {
         self.mqtt.end_rights(settings.mqtt.as_ref());
         self.local.end_rights(self.local_options(settings).as_ref());
     }
 
-    /// Slots that no BACnet client may release any more are void, also those of drives that an earlier reload has left out
-    /// and a later one may bring back.
+    /// Voids slots that no BACnet client may release any more, including those of drives that an earlier reload
+    /// removed and a later one may bring back.
     pub(super) fn void_slots(&self) {
         let time = SystemTime::now();
         let there = self.buses.iter().map(|(_, task)| task.handle());
@@ -24,7 +24,7 @@ impl Daemon {
         self.parted.buses().iter().for_each(|bus| bus.void_slots(None, time));
     }
 
-    /// Where no slots are kept, those of an earlier run of the gateway are void.
+    /// Discards the slots of an earlier run if the gateway does not save slots.
     pub(super) async fn discard_kept_slots(&self, settings: &Settings) {
         let keeps = settings.bacnet.as_ref().is_some_and(|options| options.keep_priorities);
         if !keeps {

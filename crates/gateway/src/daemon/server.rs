@@ -8,8 +8,8 @@ use tokio_util::sync::CancellationToken;
 use crate::north::{NorthState, Reconfigure, Server, ServerError};
 use crate::plant::SharedPlant;
 
-/// Time for what the clients of a server have started that a reload takes away, longer than any order waits for its
-/// bus; and how often it is looked whether that has ended.
+/// Time for orders in progress of a server that a reload removes, longer than any order waits for its bus; and the
+/// interval of checks whether they have ended.
 const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_millis(20));
 /// Result of [`ServerSlot::prepare`].
 #[derive(Default)]
@@ -69,7 +69,7 @@ impl<S: Server> ServerSlot<S> {
         Ok(())
     }
 
-    /// A reload is about to make the server run as configured: ends the rights of its clients that they do not have then.
+    /// Ends rights that clients lose, when a reload is about to make the server run with the options `configured`.
     pub(super) fn end_rights(&self, configured: Option<&S::Options>) {
         if let Some(running) = self.0.as_ref().filter(|running| Some(&running.options) != configured) {
             running.server.end_rights(configured);
@@ -132,7 +132,7 @@ where
     /// Prepares the server to run as configured. [`ServerSlot::commit`] cannot fail after that.
     ///
     /// # Errors
-    /// The server cannot run with these options; it runs as before.
+    /// If the server cannot run with these options; it runs as before.
     pub(super) async fn prepare(
         &mut self,
         configured: Option<&S::Options>,
@@ -168,7 +168,7 @@ where
         }
     }
 
-    /// Leaves the server as it was before the preparation.
+    /// Restores the state of the server from before the preparation.
     pub(super) async fn abort(&mut self, prepared: Prepared<S>) {
         match (prepared, &mut self.0) {
             (Prepared::Started(running), _) => running.stop().await,

@@ -1,4 +1,4 @@
-//! Which servers run.
+//! Starts, changes and stops the servers of the gateway.
 
 use super::Daemon;
 use super::server::Prepared;
@@ -62,8 +62,8 @@ impl Daemon {
         applied
     }
 
-    /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
-    /// again.
+    /// Opens the local socket if one is configured. If it cannot be opened, the gateway runs without it, and the
+    /// next reload tries again.
     pub(super) async fn apply_local(&mut self, settings: &Settings) {
         let options = self.local_options(settings);
         if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.north).await {

@@ -76,7 +76,7 @@ fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_first_birth_of_the_node_names_its_buses() {
-    // The birth may come before or after the buses by milliseconds, so several tries are made.
+    // The birth message may be a few milliseconds before or after the start of the buses, so several attempts are made.
     for _ in 0..6 {
         let (state, listener) = (
             tempfile::tempdir().unwrap(),

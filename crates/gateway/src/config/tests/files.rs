@@ -152,7 +152,7 @@ fn secrets_that_everybody_can_read() {
         );
         assert_eq!(found.contains(&wanted), warned, "{mode:o}: {found:#?}");
     }
-    // Other data that can be read on the way to the broker.
+    // Other data that can be read on the way to the broker causes a warning as well.
     for (url, warned) in [
         ("mqtt://localhost", 0),
         ("mqtt://127.0.0.2", 0),

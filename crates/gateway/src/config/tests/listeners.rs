@@ -11,7 +11,8 @@ use super::{FORM, FULL, load, settings};
 pub(super) fn certificates() -> &'static Path {
     static DIR: LazyLock<(tempfile::TempDir, Child)> = LazyLock::new(|| {
         let dir = tempfile::tempdir().unwrap();
-        // Static values are never dropped, so the folder is removed when this process ends and its pipe closes.
+        // Static values are never dropped, so a child process removes the folder when this process ends and its
+        // pipe closes.
         let mut sweeper = Command::new("sh");
         sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
         let sweeper = sweeper
@@ -66,7 +67,7 @@ fn units_are_unique_where_modbus_tcp_serves_them() {
     );
 }
 
-/// Two lines with the same addresses, and what stands in `[modbus_tcp]`.
+/// Two lines with equal addresses, and this content of `[modbus_tcp]`.
 fn two_lines(modbus_tcp: &str) -> String {
     let mut source = "[gateway]\nname = \"g\"\n".to_string();
     for bus in ["line1", "line2"] {
@@ -104,7 +105,7 @@ fn a_listener_for_each_line() {
         .modbus_tcp
         .unwrap();
     assert_eq!(off.idle_timeout, None);
-    // In one listener, the two buses would share their units.
+    // In one listener the drives of both buses would share their unit ids.
     let (both, _) = load(&split.replace("buses = [\"line2\"]", "buses = [\"line1\", \"line2\"]"));
     assert_eq!(both.errors.len(), 2, "{:?}", both.errors);
     assert!(
@@ -115,7 +116,7 @@ fn a_listener_for_each_line() {
         "{:?}",
         both.errors[0]
     );
-    // Shown twice, reported once.
+    // A drive that is shown by two listeners is reported once.
     let (all, _) = load(&(split + "[modbus_tcp.tls]\ncertificate = \"a\"\n"));
     assert_eq!(
         all.errors

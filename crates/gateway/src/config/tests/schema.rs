@@ -56,7 +56,7 @@ fn the_schema_has_the_keys_of_the_loader() {
     assert_eq!(described, known);
 }
 
-/// Writes the defaults of the schema into `document` wherever its table is there and the key is not.
+/// Adds the defaults of the schema to `document` wherever their table exists and the key is missing.
 fn fill(document: &mut toml::Table, schema: &Value) {
     for (key, property) in schema["properties"].as_object().into_iter().flatten() {
         match document.get_mut(key) {
@@ -114,7 +114,7 @@ fn any_value() -> impl Strategy<Value = String> {
 }
 
 proptest! {
-    /// With any value of any key there is no panic, and there are settings exactly when there is no error.
+    /// Property for any value of any key: there is no panic, and there are settings exactly if there is no error.
     #[test]
     fn any_value_of_any_key_is_judged(which in 0usize..100, value in any_value(), lines in 0usize..40) {
         let mut document: toml::Table = FULL.parse().unwrap();

@@ -14,7 +14,7 @@ fn held(since: Instant) -> Carried {
 
 const LEASE: &str = "supervision = { timeout = \"5s\" }\n";
 
-/// A bus at this port with these drives: name, address and access.
+/// A bus on this port with these drives, each given by name, address and access.
 fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
     let drive = |(name, address, access): &(&str, u8, &str)| {
         format!(
@@ -85,7 +85,8 @@ fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
     }
 }
 
-/// Reloads from the first bus to the last one, each so long after the one before; how long ago the lease of `pump-1` was renewed then.
+/// Reloads from the first bus to the last, each `pause` after the previous; returns how long ago the lease of
+/// `pump-1` was renewed by then.
 fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
     let (parted, mut now) = (Parted::default(), Instant::now());
     let mut held = vec![self::held(now); buses[0].drives.len()];
@@ -117,7 +118,7 @@ fn a_lease_goes_on_when_a_reload_brings_its_drive_back() {
         bus("/dev/ttyUSB0", &[("pump-2", 2, "control")]),
         unsupervised,
     ] {
-        // The lease ran for a pause before the first reload; its time did not run between the two.
+        // The lease ran for one pause before the first reload; its clock stood still between the two reloads.
         let second = Duration::from_secs(1);
         assert_eq!(over(&[&all, &without, &all], 7 * second), Some(7 * second));
         assert_eq!(over(&[&all, &without, &without, &all], 7 * second), Some(7 * second));
