@@ -1,5 +1,5 @@
-//! Notices that the device of a port may have come back: by inotify, on the directories where its path and the links in
-//! it appear. Without inotify, only the pauses between two tries count.
+//! Notices that the device of a port may have returned: by inotify, on the directories where its path and the links
+//! in it would appear. Without inotify, only the pauses between attempts apply.
 
 use std::mem::MaybeUninit;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -10,7 +10,7 @@ use rustix::fs::inotify::{self, CreateFlags, Reader, WatchFlags};
 
 /// Links of links that are followed.
 const MOST_LINKS: usize = 8;
-/// A node or link is made, or its permissions change, which is what the system does last.
+/// A node or link is created, or its permissions change, which is the last step of the system.
 const SEEN: WatchFlags = WatchFlags::CREATE
     .union(WatchFlags::MOVED_TO)
     .union(WatchFlags::ATTRIB)
@@ -20,13 +20,13 @@ const SEEN: WatchFlags = WatchFlags::CREATE
 #[derive(Debug)]
 pub struct Arrival {
     inotify: OwnedFd,
-    /// Each watched directory, with the name that may appear there.
+    /// Each watched directory with the name that may appear in it.
     watched: Vec<(i32, PathBuf)>,
 }
 
 impl Arrival {
-    /// Watches for the device `port`; notices what appears from now on. `None` for device servers, and if the system has
-    /// no inotify left.
+    /// Watches for the device `port` from now on. `None` for device servers, and if the system has no inotify
+    /// instance left.
     pub fn of(port: &str) -> Option<Arrival> {
         if port.contains("://") {
             return None;
@@ -68,8 +68,8 @@ impl Arrival {
     }
 }
 
-/// Where to look: for the path and each link that it is, the nearest directory that exists and the name missing in it or,
-/// where all are there, its directory and its own name.
+/// Where to watch: for the path and each link in it, the nearest existing directory and the name missing there or,
+/// if everything exists, its directory and its own name.
 fn steps(port: &Path) -> Vec<(PathBuf, PathBuf)> {
     let mut steps = Vec::new();
     let mut path = port.to_path_buf();

@@ -16,8 +16,8 @@ const REAL_TIME: u8 = 10;
 /// Priority on the scale of `nice`, where real time is not allowed.
 const NICE: i32 = -10;
 
-/// Time since the machine was started, including the time for which it was suspended, in which the clock of [`Instant`]
-/// stands.
+/// Time since the machine was started, including time during which it was suspended and the clock of [`Instant`]
+/// stood still.
 pub fn since_boot() -> Duration {
     let time = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     // The time since boot is never negative.
@@ -25,11 +25,11 @@ pub fn since_boot() -> Duration {
     Duration::new(seconds.unwrap_or_default(), nanoseconds.unwrap_or_default())
 }
 
-/// Asks the kernel to wake this thread exactly at the requested time: by default it may be 50 microseconds late, to save
-/// power. The thread also goes before all ordinary ones that want the processor, since a thread of a line needs little
-/// time, but needs it at once: in real time, which the kernel allows to root, with CAP_SYS_NICE and within
-/// RLIMIT_RTPRIO; else by `nice` (RLIMIT_NICE). Among ordinary threads even the first may wait for the next tick, 4 ms
-/// later, while the machine is busy. Where everything is refused, waits are later and nothing else changes.
+/// Requests exact wake-ups for this thread: by default the kernel may be 50 microseconds late to save power. The
+/// thread also gets priority over ordinary threads, since a line needs little processor time, but needs it at once:
+/// real-time priority, which the kernel allows to root, with CAP_SYS_NICE and within RLIMIT_RTPRIO; otherwise
+/// `nice` (RLIMIT_NICE). Among ordinary threads, even the first may wait for the next tick, 4 ms later, while the
+/// machine is busy. If everything is refused, wake-ups are later and nothing else changes.
 pub fn sharpen_timers() {
     if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
         tracing::debug!(target: "drivegate::line::clock", "timer slack stays as it is: {error}");
@@ -37,7 +37,7 @@ pub fn sharpen_timers() {
     let Err(refused) = real_time() else {
         return;
     };
-    // Linux takes "this process" for the calling thread alone.
+    // Linux applies "this process" to the calling thread only.
     match rustix::process::setpriority_process(None, NICE) {
         Ok(()) => tracing::debug!(target: "drivegate::line::clock", "no real-time scheduling, but nice {NICE}: \
                                                                      {refused}"),
@@ -56,7 +56,7 @@ fn real_time() -> Result<(), String> {
         .map_err(|error| error.to_string())
 }
 
-/// Takes back what a thread has from the thread of a line that started it.
+/// Resets the priority that a thread inherited from the line thread that started it.
 pub(super) fn be_ordinary() {
     if let Err(error) = ordinary() {
         tracing::debug!(target: "drivegate::line::clock", "a thread keeps the priority of its line: {error}");
@@ -85,7 +85,7 @@ pub fn poll_until(fds: &mut [PollFd<'_>], until: Instant) -> io::Result<bool> {
     }
 }
 
-/// Waits until `at`: sleeps, and watches the clock for the last `spin` of it.
+/// Waits until `at`: sleeps, and spins on the clock for the last `spin`.
 pub fn wait_until(at: Instant, spin: Duration) {
     let asleep = at.checked_sub(spin).unwrap_or(at);
     while Instant::now() < asleep {
@@ -98,8 +98,8 @@ pub fn wait_until(at: Instant, spin: Duration) {
     }
 }
 
-/// How late the kernel wakes a thread, and so how much earlier the wake-up is requested: some microseconds on bare
-/// metal, 50 to 80 on a virtual machine. The rest of the wait is spun.
+/// How late the kernel wakes a thread, and therefore how much earlier the wake-up is requested: a few microseconds
+/// on bare metal, 50 to 80 on a virtual machine. The thread spins for the rest of the wait.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct WakeUps {
     mean: Duration,
@@ -108,7 +108,7 @@ pub(super) struct WakeUps {
 
 /// Longest time for which a processor spins, ...
 const MOST_SPIN: Duration = Duration::from_micros(120);
-/// ... and a wake-up that is this late met a busy processor: spinning more would make it busier.
+/// A wake-up later than this met a busy processor: longer spinning would make it even busier.
 const BUSY: Duration = Duration::from_micros(250);
 
 impl WakeUps {

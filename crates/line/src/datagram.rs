@@ -1,7 +1,7 @@
 //! A device that takes one frame of the line in each datagram (`udp://`).
 //!
-//! Each request is sent from a socket, and so a port, of its own: a datagram that comes late or twice answers a port that
-//! is no longer open, and is never mistaken for the reply to another request.
+//! Each request is sent from a separate socket, and so from a separate port: a late or duplicate datagram is
+//! addressed to a port that is no longer open, and cannot be mistaken for the reply to another request.
 
 use std::cell::{Ref, RefCell};
 use std::io;
@@ -40,14 +40,14 @@ impl Datagrams {
         })
     }
 
-    /// Gives a whole frame to the network.
+    /// Passes a complete frame to the network.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         let socket = socket_to(self.device).map_err(|error| Lost::new(error.to_string()))?;
         let sent = socket.send(frame);
         *self.socket.borrow_mut() = socket;
         match sent {
             Ok(_) => Ok(()),
-            // The frame is lost as on any network.
+            // The frame is lost, which can happen on any network.
             Err(error) if is_of_network(&error) => Ok(()),
             Err(error) => Err(Lost::new(error.to_string())),
         }
@@ -68,7 +68,7 @@ impl Datagrams {
     }
 }
 
-/// Whether the error means that the device or the way to it is not there now.
+/// Whether the error means that the device, or the way to it, is not available now.
 fn is_of_network(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionRefused, HostUnreachable, Interrupted, NetworkDown, NetworkUnreachable};
     [

@@ -1,8 +1,8 @@
 //! Devices that dial in (`tcp-listen://`): modems and converters that connect to the gateway and say a text first.
 //!
-//! One thread for each address accepts connections and finds by that text for which bus one is. A bus whose port has no
-//! text gets any connection. A device that dials in again replaces its connection, which may be dead without a notice;
-//! a connection without the text never gets the line.
+//! One thread for each address accepts connections and assigns each to a bus by the text that it sends first. A bus
+//! whose port has no text accepts any connection. A device that dials in again replaces its connection, which may
+//! be dead without notice; a connection without the text never gets the line.
 
 use std::io::{self, Read};
 use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -15,15 +15,15 @@ use rustix::event::{PollFd, PollFlags};
 
 use super::{Lost, Names, OpenError, UNACKNOWLEDGED, clock, poll_until, read, write_all};
 
-/// A connection without the text is hung up on after that time.
+/// Time after which a connection that has not sent the text is closed.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Most connections at one time whose text has not arrived; further ones are closed.
+/// Most simultaneous connections whose text has not arrived; further ones are closed.
 const MOST_PENDING: usize = 32;
 /// Longest text that identifies a device.
 pub const LONGEST_ID: usize = 64;
 /// Time that a bus waits for its device before the bus counts as down.
 const WAIT: Duration = Duration::from_secs(2);
-/// Waiting threads look again after that time.
+/// Interval at which waiting threads check again.
 const STEP: Duration = Duration::from_millis(100);
 /// Time for which an address that no bus uses stays open: a reload leaves the connections as they are.
 const KEPT: Duration = Duration::from_secs(5);
@@ -31,7 +31,7 @@ const KEPT: Duration = Duration::from_secs(5);
 /// The addresses at which devices dial in.
 static PLACES: Mutex<Vec<Weak<Shared>>> = Mutex::new(Vec::new());
 
-/// The place of one bus at an address.
+/// The entry of one bus at an address.
 pub(super) struct Place {
     shared: Arc<Shared>,
     id: Vec<u8>,
@@ -45,7 +45,7 @@ struct Shared {
 
 struct State {
     lines: Vec<Entry>,
-    /// When a bus last released the address; `None` while a bus has it.
+    /// When a bus last released the address; `None` while a bus uses it.
     free_since: Option<Instant>,
 }
 
@@ -122,7 +122,7 @@ impl Place {
         Ok(Place { shared, id })
     }
 
-    /// Waits for the device; none where it does not come in time, or the port is no longer used.
+    /// Waits for the device; `None` if it does not connect in time, or the port is no longer used.
     fn wait(&self, go_on: &dyn Fn() -> bool) -> Option<TcpStream> {
         let until = Instant::now() + WAIT;
         let mut state = self.shared.state();
@@ -203,7 +203,7 @@ impl Dialled {
         })
     }
 
-    /// Gives a whole frame to the device.
+    /// Passes a complete frame to the device.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         write_all(self.stream.as_fd(), frame)
     }
@@ -221,7 +221,7 @@ impl AsFd for Dialled {
 }
 
 impl Drop for Dialled {
-    /// A connection that still lives waits for the bus that takes the place of this one.
+    /// A connection that still works waits for the bus that replaces this one.
     fn drop(&mut self) {
         let Some(shared) = self.shared.upgrade() else { return };
         let mut state = shared.state();
@@ -326,7 +326,7 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     Ok(())
 }
 
-/// Decides about a connection: it goes to its line, is closed, or still owes its text.
+/// Decides about a new connection: it is given to its line, is closed, or waits for its text.
 fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending> {
     let from = one.from.ip().to_canonical();
     let mut allowed = state
@@ -403,8 +403,8 @@ enum Belongs {
     Unknown,
 }
 
-/// Finds the line of a device by the text it has sent. Line ends before the text are ignored; those behind it are left on
-/// the line, which counts them as bytes between transactions.
+/// Finds the line of a device by the text that it sent. Line ends before the text are ignored; those after it are
+/// passed to the line, which counts them as bytes between transactions.
 fn belongs_to<'i>(said: &[u8], ids: impl Iterator<Item = &'i Vec<u8>>) -> Belongs {
     let said = said.trim_ascii_start();
     let mut may = said.is_empty();
@@ -493,7 +493,7 @@ mod tests {
         let first = open(&mut one, port, "?id=USR-0001").unwrap();
         again.write_all(b"new").unwrap();
         assert_eq!(heard(&first), b"new");
-        // A bus that ends leaves the connection to the one that takes its place.
+        // A bus that ends leaves the connection to the one that replaces it.
         drop(first);
         drop(one);
         let first = open(&mut Names::allowing(&loopback()), port, "?id=USR-0001").unwrap();

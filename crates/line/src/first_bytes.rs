@@ -5,7 +5,7 @@ use crate::codec::checksum::crc16;
 
 /// Number of bytes that decide: the length of an exception of Modbus TCP.
 const ENOUGH: usize = 9;
-/// Most requests of which the beginning is remembered.
+/// Most requests whose first bytes are remembered.
 const ASKED: usize = 32;
 
 /// The kind of server.
@@ -63,12 +63,12 @@ impl FirstBytes {
         self.asked.first().map(|[unit, _]| *unit)
     }
 
-    /// Whether nothing was received yet.
+    /// Whether no bytes were received yet.
     pub(super) fn is_empty(&self) -> bool {
         self.came.is_empty()
     }
 
-    /// Notes received bytes; returns `None` while the kind of server is not decided.
+    /// Notes received bytes; returns `None` while the kind of server is undecided.
     pub(super) fn received(&mut self, bytes: &[u8]) -> Option<Server> {
         let room = ENOUGH - self.came.len().min(ENOUGH);
         self.came.extend(bytes.iter().take(room));
@@ -120,7 +120,7 @@ mod tests {
         out
     }
 
-    /// The server recognised when these bytes come one by one after the request.
+    /// The kind of server recognised when these bytes arrive one by one after the request.
     fn seen(request: &[u8], bytes: &[u8]) -> Option<Server> {
         let mut first = FirstBytes::default();
         first.sent(request);

@@ -52,7 +52,7 @@ use crate::codec::{LineFormat, Parity};
 
 /// Time to reach a device server at one address.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
-/// A connection whose other end has not taken a request for that time is lost.
+/// Time after which a connection is lost whose other end has not acknowledged a request.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 
 /// The port cannot be opened: the bus tries again with back-off.
@@ -213,8 +213,8 @@ impl Line {
         Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }
 
-    /// As [`Line::open`], for callers that open one port repeatedly: `names` remembers the addresses of a device
-    /// server, and `go_on`, called at least once a second, returns whether the port is still needed.
+    /// Opens a port like [`Line::open`], for callers that open one repeatedly: `names` remembers the addresses of a
+    /// device server, and `go_on`, called at least once a second, returns whether the port is still needed.
     ///
     /// # Errors
     /// The errors of [`Line::open`].
@@ -278,7 +278,7 @@ impl Line {
         })
     }
 
-    /// Gives a whole frame to the port. Does not wait until it is on the wire.
+    /// Passes a complete frame to the port, without waiting until it is on the wire.
     ///
     /// # Errors
     /// When the port is gone or does not take the frame within 100 ms.
@@ -296,7 +296,7 @@ impl Line {
     /// Reads the available bytes without waiting; returns 0 if there are none.
     ///
     /// # Errors
-    /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be no raw port.
+    /// If the port is lost (an unplugged adapter reads end of file or EIO), or turns out not to be a raw port.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         match &self.port {
             Port::Serial(fd) => read(fd.as_fd(), buffer).map_err(Lost::of_adapter),
@@ -369,7 +369,7 @@ impl Drop for Exclusive {
     }
 }
 
-/// Gives all bytes to a port that does not block.
+/// Writes all bytes to a non-blocking port.
 fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
     let deadline = Instant::now() + Duration::from_millis(100);
     while !bytes.is_empty() {
@@ -401,7 +401,8 @@ fn read(port: BorrowedFd<'_>, buffer: &mut [u8]) -> Result<usize, Lost> {
     }
 }
 
-/// Waits for a command, for the time, or for the device, with no port to listen to; whether the device may have come.
+/// Waits for a command, for the time, or for the device, without a port to listen to; returns whether the device
+/// may have appeared.
 pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>, arrival: Option<&Arrival>) -> bool {
     let readable = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
     // An error ends the wait early, which is harmless.

@@ -1,8 +1,8 @@
-//! A device on Modbus TCP (`modbus-tcp://`): the frames of a line in those of the network, and back.
+//! A device on Modbus TCP (`modbus-tcp://`): converts the frames of a line to those of the network, and back.
 //!
-//! The bus gives and takes RTU frames. On the network each request has a transaction id of its own, and a reply with
-//! another one than that of the last request belongs to a request that was given up: it is dropped, so that no late or
-//! doubled reply is taken for the reply to another request (MODBUS Messaging on TCP/IP 1.0b, 3.1.3 and 4.2).
+//! The bus sends and receives RTU frames. On the network each request has a unique transaction id, and a reply with
+//! another id than the last request belongs to a request that was given up: it is dropped, so that no late or
+//! duplicate reply is mistaken for the reply to another request (MODBUS Messaging on TCP/IP 1.0b, 3.1.3 and 4.2).
 
 use std::cell::RefCell;
 use std::net::TcpStream;
@@ -16,7 +16,7 @@ const HEADER: usize = 6;
 /// Unit id and PDU at least, and at most.
 const LENGTHS: std::ops::RangeInclusive<usize> = 2..=254;
 
-/// Why a connection is given up.
+/// Reason why a connection is given up.
 const NO_MODBUS_TCP: &str = "what came is not Modbus TCP; write tcp:// if the server has a raw port";
 
 /// A connection by Modbus TCP.
@@ -34,7 +34,7 @@ impl Mbap {
         }
     }
 
-    /// Gives the request of an RTU frame to the device.
+    /// Sends the request in an RTU frame to the device.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         let Some(sent) = self.session.borrow_mut().ask(frame) else {
             return Ok(());
@@ -68,7 +68,7 @@ impl AsFd for Mbap {
 #[derive(Debug, Default)]
 struct Session {
     last: u16,
-    /// The last request has no reply yet.
+    /// Whether the last request has no reply yet.
     awaits: bool,
     received: Vec<u8>,
 }
@@ -89,7 +89,7 @@ impl Session {
         Some(sent)
     }
 
-    /// Bytes came; the RTU frame of the reply to the last request, empty while it is not whole.
+    /// Processes received bytes; returns the RTU frame of the reply to the last request, empty while it is incomplete.
     fn received(&mut self, bytes: &[u8]) -> Result<Vec<u8>, &'static str> {
         self.received.extend_from_slice(bytes);
         let mut reply = Vec::new();

@@ -1,5 +1,6 @@
-//! Names of device servers. The system may take ten seconds and more to report that no name server answers, and a bus
-//! that waits so long looks as if it hung: a thread of its own asks, and the bus waits for it in short steps.
+//! Names of device servers. The system may need more than ten seconds to report that no name server answers, and a
+//! bus that waits that long would seem to hang: so a separate thread makes the lookup, and the bus waits for it in
+//! short steps.
 
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs};
@@ -20,7 +21,7 @@ const STEP: Duration = Duration::from_millis(100);
 
 type Found = io::Result<Vec<SocketAddr>>;
 
-/// The addresses of one device server: at most one thread looks them up, and the last good ones are kept.
+/// The addresses of one device server: at most one thread looks them up, and the last valid ones are kept.
 pub struct Names {
     ask: Arc<dyn Fn(&str) -> Found + Send + Sync>,
     patience: Duration,
@@ -55,7 +56,7 @@ impl Default for Names {
 }
 
 impl Names {
-    /// Names for a line whose device may connect from these networks.
+    /// Names for a line to which a device may connect from these networks.
     pub fn allowing(allow: &[IpNet]) -> Names {
         Names {
             allow: allow.to_vec(),
@@ -81,7 +82,7 @@ impl Names {
     /// called several times a second while the answer is awaited; false ends the wait.
     ///
     /// # Errors
-    /// When there is no address, no answer within two seconds, or `go_on` returned false.
+    /// If there is no address, no answer within two seconds, or `go_on` returned false.
     pub fn addresses(&mut self, address: &str, go_on: &dyn Fn() -> bool) -> Found {
         if let Ok(literal) = address.parse() {
             return Ok(vec![literal]);
@@ -116,7 +117,7 @@ impl Names {
         Ok(self.known.clone())
     }
 
-    /// Looks the name up in a thread, which cannot be cancelled: it ends when the system gives up.
+    /// Looks the name up in a thread. That thread cannot be cancelled; it ends when the system gives up.
     fn ask(&self, address: &str) -> io::Result<Receiver<Found>> {
         let (answer, asked) = sync_channel(1);
         let (ask, address) = (self.ask.clone(), address.to_string());

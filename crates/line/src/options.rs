@@ -1,11 +1,11 @@
-//! The options of a line, except its port and its character format.
+//! The options of a line apart from its port and its character format.
 
 use std::time::Duration;
 
 /// Which part switches the direction of an RS-485 line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Rs485 {
-    /// The adapter itself.
+    /// The adapter itself switches the direction.
     #[default]
     Off,
     /// The kernel, RTS high while sending.
@@ -14,10 +14,10 @@ pub enum Rs485 {
     KernelInverted,
 }
 
-/// A control line of the port that stands at one level, for adapters that are powered or enabled by it.
+/// A control line of the port that is kept at one level, for adapters that it powers or enables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Level {
-    /// As the driver leaves it when the port is opened: Linux asserts RTS and DTR.
+    /// The level that the driver sets when the port is opened: Linux asserts RTS and DTR.
     #[default]
     Driver,
     /// Asserted.
@@ -39,8 +39,8 @@ pub enum Spin {
 }
 
 impl Spin {
-    /// Whether to spin on a machine with so many processors. On a single one the drive's reply is handled by the very processor
-    /// that would spin.
+    /// Whether to spin on a machine with this number of processors. With a single one, the drive's reply is
+    /// processed by the same processor that would spin.
     pub(super) fn holds(self, processors: usize) -> bool {
         match self {
             Spin::Auto => processors > 1,
@@ -54,13 +54,13 @@ impl Spin {
 /// [`Rs485::KernelInverted`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LineOptions {
-    /// Which part switches the direction.
+    /// Which part switches the direction of an RS-485 line.
     pub rs485: Rs485,
     /// Time between switching to sending and the first bit, whole milliseconds up to [`MOST_RTS_DELAY`].
     pub rts_before_send: Duration,
     /// Time between the last bit and switching back, likewise.
     pub rts_after_send: Duration,
-    /// Whether the port receives its own transmission.
+    /// Whether the port receives what it sends.
     pub rx_during_tx: bool,
     /// Whether the driver switches the terminating resistor on.
     pub termination: bool,
@@ -69,7 +69,7 @@ pub struct LineOptions {
     pub dtr: Level,
     /// How precisely waits end.
     pub spin: Spin,
-    /// Whether nothing is ever sent: a port without RTS then needs none to be lowered.
+    /// Whether nothing is ever sent: a port without RTS is then accepted, as RTS need not be lowered.
     pub receives_only: bool,
 }
 

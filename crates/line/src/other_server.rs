@@ -1,9 +1,10 @@
-//! Whether a Modbus TCP server is at the other end of a raw connection on which nothing ever came. Most of these servers drop
-//! the frames of a serial line without a word, and a line whose drives are switched off looks the same.
+//! Detects a Modbus TCP server at the other end of a raw connection on which no bytes ever arrived. Most of these
+//! servers silently drop the frames of a serial line, which looks like a line whose drives are switched off.
 //!
-//! The check uses a connection of its own, closed at once, in a thread: it requests a register, as a Modbus TCP client does. On
-//! a line behind a raw port the request means nothing: it begins with an address that no drive may have and has no check code.
-//! The check is made only after long silence, and not again within an hour; once there was an answer, before each connection.
+//! The check uses a separate connection, closed at once, in a thread: it requests a register, as a Modbus TCP
+//! client does. On a line behind a raw port the request means nothing: it begins with an address that no drive may
+//! have, and has no check code. The check is made only after long silence, and not again within an hour; once it
+//! was answered, before each connection.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
@@ -45,7 +46,7 @@ impl OtherServer {
         self.0.found.load(Ordering::Relaxed)
     }
 
-    /// Whether the recognised server is no longer there: another one may have been set up.
+    /// Whether the recognised server no longer exists: another one may have been set up.
     pub(super) fn is_gone(&self, stream: &TcpStream) -> bool {
         let unit = self.0.unit.load(Ordering::Relaxed);
         let still = stream.peer_addr().is_ok_and(|server| answers(server, unit));
@@ -53,8 +54,8 @@ impl OtherServer {
         !still
     }
 
-    /// Notes that a request `frame` is about to be sent on `stream`, which is open since `opened` and on which nothing
-    /// ever came.
+    /// Notes that a request `frame` is about to be sent on `stream`, which has been open since `opened` without
+    /// receiving any bytes.
     pub(super) fn nothing_came(&self, stream: &TcpStream, opened: Instant, frame: &[u8]) {
         let unit = frame.first().copied().unwrap_or_default();
         let now = Instant::now();
@@ -70,8 +71,8 @@ impl OtherServer {
         self.ask(server, unit, Some(silent), now);
     }
 
-    /// The server closed a connection at a request for the drive `unit`, and nothing ever came on it: some Modbus TCP servers do
-    /// that at a frame of a line.
+    /// Notes that the server closed a connection at a request for the drive `unit` without ever sending bytes: some
+    /// Modbus TCP servers do that when they receive a frame of a line.
     pub(super) fn hung_up(&self, server: SocketAddr, unit: u8) {
         self.ask(server, unit, None, Instant::now());
     }
@@ -87,7 +88,7 @@ impl OtherServer {
         let asking = move || {
             if answers(server, unit) {
                 known.recognised(unit);
-                // This wakes all waiting callers; the error then reaches those that open the connection again.
+                // The shutdown wakes all waiting callers; the error is then reported when the connection is opened again.
                 let ended = silent.map(|silent| silent.shutdown(Shutdown::Both));
                 tracing::debug!(target: "drivegate::line", ?ended, "a Modbus TCP server answers instead of a line");
             }
@@ -101,7 +102,7 @@ impl OtherServer {
     }
 }
 
-/// Asks the server for a register, as a Modbus TCP client.
+/// Whether the server answers a request for a register, sent as by a Modbus TCP client.
 fn answers(server: SocketAddr, unit: u8) -> bool {
     let [high, low] = TRANSACTION;
     let question = [high, low, 0, 0, 0, 6, unit, 3, 0, 0, 0, 1];

@@ -1,4 +1,4 @@
-//! A pseudo-terminal that looks like a serial port to anyone who opens it, with a link that keeps its name.
+//! A pseudo-terminal that looks like a serial port to any program that opens it, with a link whose name stays the same.
 
 use rustix::fs::{Mode, OFlags, fchmod, fcntl_setfl};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -12,13 +12,13 @@ use std::path::{Path, PathBuf};
 /// Directory in which the system has its pseudo-terminals.
 const TERMINALS: &str = "/dev/pts";
 
-/// A pseudo-terminal; dropping it takes path and link away. As a file descriptor it is its own end.
+/// A pseudo-terminal; dropping it removes path and link. Its file descriptor is our own end.
 #[derive(Debug)]
 pub struct Pty {
-    /// The own end.
+    /// Our own end of the pseudo-terminal.
     master: OwnedFd,
-    /// The other program's end, kept open: otherwise reads at our own end would fail while no program has the port
-    /// open.
+    /// The end for the other program, kept open: otherwise reads at our own end would fail while no program has the
+    /// port open.
     slave: OwnedFd,
     path: PathBuf,
     link: Option<PathBuf>,
@@ -56,7 +56,7 @@ impl Pty {
     /// Lets the group of this process open the terminal as well: mode 0660.
     ///
     /// # Errors
-    /// The system refuses it.
+    /// If the system refuses to change the mode.
     pub fn share(&self) -> io::Result<()> {
         fchown(&self.slave, None, Some(rustix::process::getegid().as_raw()))?;
         fchmod(&self.slave, Mode::from_raw_mode(0o660))?;
@@ -66,7 +66,7 @@ impl Pty {
     /// Reads the available bytes, without waiting.
     ///
     /// # Errors
-    /// If nothing is there, or the system reports something else.
+    /// If there are no bytes, or the system reports another error.
     pub fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         Ok(rustix::io::read(&self.master, buffer)?)
     }
@@ -74,7 +74,7 @@ impl Pty {
     /// Writes as many bytes as there is room for, without waiting.
     ///
     /// # Errors
-    /// There is no room, or the system reports another error.
+    /// If there is no room, or the system reports another error.
     pub fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         Ok(rustix::io::write(&self.master, bytes)?)
     }
@@ -84,7 +84,7 @@ impl Pty {
         self.link.as_deref().unwrap_or(&self.path)
     }
 
-    /// Discards what was written and not read yet.
+    /// Discards bytes that were written and not read yet.
     pub fn discard_unread(&self) {
         let _ = tcflush(&self.slave, QueueSelector::IFlush);
     }

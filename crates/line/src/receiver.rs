@@ -1,4 +1,4 @@
-//! A line that is only listened to: it has no way to send.
+//! A line that is only listened to: this type has no way to send.
 
 use std::os::fd::BorrowedFd;
 use std::time::Instant;

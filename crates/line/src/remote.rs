@@ -1,5 +1,5 @@
-//! A device server behind TCP: its port set up over the network (`rfc2217://`), and what passes for a raw port (`tcp://`)
-//! recognised by its first bytes.
+//! A device server behind TCP: its port is set up over the network (`rfc2217://`), or is raw (`tcp://`), which its
+//! first bytes confirm.
 
 use std::cell::RefCell;
 use std::net::{SocketAddr, TcpStream};
@@ -24,13 +24,13 @@ pub(super) struct Raw {
     stream: TcpStream,
     opened: Instant,
     server: Option<SocketAddr>,
-    /// The first bytes; `None` once they are known to come from a line.
+    /// The first bytes received; `None` once they are known to come from a line.
     first: RefCell<Option<FirstBytes>>,
     other: OtherServer,
 }
 
 impl Raw {
-    /// `other` is what is known of the server by connections before.
+    /// Opens the connection; `other` is what earlier connections have shown about the server.
     ///
     /// # Errors
     /// The server speaks Modbus TCP.
@@ -50,7 +50,7 @@ impl Raw {
         })
     }
 
-    /// Gives a whole frame to the server.
+    /// Passes a complete frame to the server.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         if let Some(first) = self.first.borrow_mut().as_mut() {
             first.sent(frame);
@@ -64,7 +64,7 @@ impl Raw {
     /// Reads the available data; returns 0 if there is none.
     ///
     /// # Errors
-    /// When the port is gone, or no raw one: frames would never arrive, stops among them.
+    /// If the port is lost, or is not a raw one: frames, stops among them, would never arrive.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         let count = read(self.stream.as_fd(), buffer).map_err(|lost| self.explained(lost))?;
         let mut first = self.first.borrow_mut();
@@ -171,7 +171,7 @@ impl Remote {
         Ok((remote, warnings))
     }
 
-    /// Gives a whole frame to the server.
+    /// Passes a complete frame to the server.
     pub(super) fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         write_all(self.stream.as_fd(), &escape(frame))
     }

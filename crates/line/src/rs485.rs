@@ -1,6 +1,6 @@
-//! RS-485 by the kernel: the settings requested from the driver, and those it accepted. A driver that cannot do a part
-//! leaves it out, often without an error (`uart_sanitize_serial_rs485` of `serial_core.c`), and returns the settings it
-//! accepted.
+//! RS-485 direction switching by the kernel: the settings requested from the driver, and those that it accepted. A
+//! driver omits parts that it cannot do, often without an error (`uart_sanitize_serial_rs485` of `serial_core.c`),
+//! and returns the accepted settings.
 
 use std::io;
 use std::time::Duration;
@@ -8,11 +8,11 @@ use std::time::Duration;
 use super::options::{LineOptions, Rs485};
 use super::sys::{ENABLED, RTS_AFTER_SEND, RTS_ON_SEND, RX_DURING_TX, SerialRs485, TERMINATE_BUS};
 
-/// Has `driver` switch the direction (it replaces its argument by the accepted settings); returns the settings that it
-/// did not accept.
+/// Lets `driver` switch the direction (it replaces its argument by the accepted settings); returns the settings
+/// that it did not accept.
 ///
 /// # Errors
-/// The error of the driver, such as ENOTTY; `Unsupported` where it accepts the request and leaves the mode off.
+/// If the driver reports an error, such as ENOTTY; `Unsupported` if it accepts the request but leaves the mode off.
 pub(super) fn enable(
     options: &LineOptions,
     driver: impl FnOnce(&mut SerialRs485) -> io::Result<()>,

@@ -1,4 +1,4 @@
-//! The one room with `unsafe`: ioctls that no safe crate offers, and taking over an open descriptor.
+//! The only module with `unsafe`: ioctls that no safe crate offers, and taking ownership of an open descriptor.
 #![allow(unsafe_code)]
 
 use std::os::fd::{AsFd, FromRawFd, IntoRawFd, OwnedFd};
@@ -96,7 +96,7 @@ pub(super) fn set_levels(port: impl AsFd, rts: Level, dtr: Level) -> std::io::Re
     Ok(())
 }
 
-/// Asks the driver to hand bytes on at once (FTDI holds them for 16 ms by default).
+/// Asks the driver to pass bytes on at once (FTDI delays them by 16 ms by default).
 ///
 /// # Errors
 /// ENOTTY where the driver cannot, EPERM where the user may not.
@@ -109,7 +109,7 @@ pub(super) fn low_latency(port: impl AsFd) -> io::Result<()> {
     }
 }
 
-/// Takes over the descriptor of a port.
+/// Takes ownership of the descriptor of a port.
 pub(super) fn own(port: impl IntoRawFd) -> OwnedFd {
     // SAFETY: `into_raw_fd` gives up ownership of an open descriptor, which is taken over here and nowhere else.
     unsafe { OwnedFd::from_raw_fd(port.into_raw_fd()) }

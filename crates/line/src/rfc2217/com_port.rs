@@ -1,5 +1,5 @@
-//! The COM port option of telnet (RFC 2217): the client agrees on it with the server, then sets baud rate and format,
-//! and learns what the server settled on.
+//! The COM port option of telnet (RFC 2217): the client agrees on it with the server, sets baud rate and format,
+//! and receives the settings that the server uses.
 
 use super::telnet::{Command, Decoder, IAC, SB, SE, Verb, escape};
 use crate::codec::{LineFormat, Parity};
@@ -322,7 +322,7 @@ mod tests {
     }
 
     proptest! {
-        /// A hostile server gets few bytes for its own, so that neither end can be made to talk without end.
+        /// A hostile server gets few bytes for its own, so that neither end can be made to answer endlessly.
         #[test]
         fn any_server_is_borne(bytes in prop::collection::vec(prop_oneof![Just(IAC), 240..=255u8, Just(44u8), any::<u8>()], 0..400)) {
             let (mut session, _) = Session::new(settings(9600, "8N1"));

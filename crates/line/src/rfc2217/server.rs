@@ -1,4 +1,4 @@
-//! The other side of the COM port option of telnet (RFC 2217): a program opens a port that is served here.
+//! The server side of the telnet COM port option (RFC 2217), for programs that open a port of this gateway.
 //!
 //! Settings of the program are confirmed and have no effect: baud rate and format of the line are not the program's.
 
@@ -11,7 +11,7 @@ use crate::codec::LineFormat;
 
 const SIGNATURE: u8 = 0;
 const NOTIFY_MODEM_STATE: u8 = 107;
-/// Carrier, data set ready and clear to send: some programs send nothing without them.
+/// Reported modem state: carrier, data set ready and clear to send. Some programs send nothing without them.
 const MODEM_STATE: u8 = 0xB0;
 /// Name of the server, for programs that request it.
 const NAME: &[u8] = b"drivegate";
@@ -108,7 +108,7 @@ impl ServedPort {
 /// The answer to a request for the state of flow control, break, DTR or RTS; anything else is confirmed.
 fn control(asked: u8) -> u8 {
     match asked {
-        // No flow control; no break; DTR on; RTS on; no inbound flow control.
+        // The answers mean: no flow control; no break; DTR on; RTS on; no inbound flow control.
         0 => 1,
         4 => 6,
         7 => 8,
@@ -135,7 +135,7 @@ mod tests {
         [&[IAC, SB, COM_PORT], content, &[IAC, SE]].concat()
     }
 
-    /// drivegate's own client negotiates with it, whatever it requests, and receives the expected replies.
+    /// drivegate's own client can negotiate with this server, whatever it requests, and receives the expected replies.
     #[test]
     fn the_client_of_this_program_settles_with_it() {
         let settings = Settings {

@@ -51,11 +51,11 @@ pub(super) enum Command {
 enum State {
     #[default]
     Data,
-    /// After the byte IAC.
+    /// The byte after IAC is expected.
     Command,
     Option(Verb),
     Sub,
-    /// After IAC within a subnegotiation.
+    /// The byte after an IAC within a subnegotiation is expected.
     SubCommand,
 }
 
@@ -87,7 +87,7 @@ impl Decoder {
                     self.too_long = false;
                     State::Sub
                 }
-                // Commands without content (NOP, break, go ahead ...) mean nothing here.
+                // Commands without content (NOP, break, go ahead ...) have no meaning here.
                 (State::Command, _) => Verb::of(byte).map_or(State::Data, State::Option),
                 (State::Option(verb), _) => {
                     commands.push(Command::Option(verb, byte));
@@ -108,14 +108,14 @@ impl Decoder {
                     }
                     State::Data
                 }
-                // Another command ends a subnegotiation that lacks its end.
+                // Any other command ends a subnegotiation whose end is missing.
                 (State::SubCommand, _) => Verb::of(byte).map_or(State::Data, State::Option),
             };
         }
     }
 }
 
-/// Data in the form in which it is sent: each 255 twice.
+/// Data in the form in which it is sent: each byte 255 is doubled.
 pub fn escape(data: &[u8]) -> Vec<u8> {
     let mut escaped = Vec::with_capacity(data.len() + 4);
     for &byte in data {
@@ -127,8 +127,8 @@ pub fn escape(data: &[u8]) -> Vec<u8> {
     escaped
 }
 
-/// Whether the first bytes of a connection are those of a telnet server: an option that it offers or requests. No frame of any
-/// protocol begins with 255. `None` while that is not decided.
+/// Whether the first bytes of a connection come from a telnet server: an option that it offers or requests. No
+/// frame of any protocol begins with 255. `None` while that is undecided.
 pub(crate) fn is_greeting(first: &[u8]) -> Option<bool> {
     match first {
         [] | [IAC] => None,
