@@ -9,7 +9,7 @@ use super::{Finding, Problem};
 /// Longest file that is read, bytes; no document is longer.
 const LONGEST: u64 = 16 << 20;
 
-/// Why bytes are not the text of a document.
+/// Why bytes are not valid text of a document.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 enum NotText {
     #[error("the file is UTF-16 text")]
@@ -21,7 +21,7 @@ enum NotText {
 /// Reads a file for a document.
 ///
 /// # Errors
-/// The problem of the file and, where it stops being text, the line.
+/// If the file cannot be read; the line is given where it stops being text.
 pub fn read_file(path: &Path) -> Result<String, Problem> {
     let of_file =
         |what: String, remedy: &str| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
@@ -64,7 +64,7 @@ fn text(bytes: Vec<u8>) -> Result<String, NotText> {
     let end = sound.min(zero);
     let (before, rest) = bytes.split_at_checked(end).unwrap_or((&bytes, &[]));
     let Some(&byte) = rest.first() else {
-        // All bytes were checked above.
+        // All bytes were validated above.
         return Ok(String::from_utf8(bytes).unwrap_or_default());
     };
     let before = String::from_utf8_lossy(before);

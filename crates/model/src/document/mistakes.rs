@@ -2,7 +2,7 @@
 
 use super::Finding;
 
-/// The mistake in this line of `source`, if it is a common one.
+/// The common mistake in this line of `source`, if there is one.
 pub(super) fn named(source: &str, line: Option<usize>) -> Option<Finding> {
     other_format(source).or_else(|| in_line(source.lines().nth(line?.checked_sub(1)?)?))
 }
@@ -42,7 +42,7 @@ fn in_line(line: &str) -> Option<Finding> {
         let (key, value) = colon(line.trim())?;
         return Some(Finding::new("a colon after the key", format!("write {key} = {value}")));
     };
-    // Behind the key, and in a list or an inline table behind any of them.
+    // The value follows the key, or is inside a list or an inline table.
     let value = value.split('#').next()?.trim();
     let values = value.split([',', '[', ']', '{', '}']);
     let mut values = values.filter_map(|part| part.rsplit('=').next());

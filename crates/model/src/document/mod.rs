@@ -1,10 +1,10 @@
 //! TOML documents that keep the place of every value, for the configuration and the profiles.
 //!
-//! A [`Reader`] returns the keys of one table. Keys that are missing, unknown or have the wrong type are collected as
-//! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
-//! requested: [`Reader::finish`] reports the others, each with the nearest known key.
+//! A [`Reader`] returns the values of one table. Keys that are missing, unknown or have the wrong type are
+//! collected as [`Problem`]s with file, line and key, so that one run reports every error of a file. A key counts
+//! as known once it was requested: [`Reader::finish`] reports all others, each with the most similar known key.
 //!
-//! `tree` holds the values, `value` the types they can be read as, `mistakes` what is often written instead of TOML.
+//! `tree` has the values, `value` the types as which they can be read, `mistakes` common notations that are not TOML.
 
 mod file;
 mod mistakes;
@@ -24,12 +24,12 @@ pub use reader::{Reader, candidates, nearest};
 pub use tree::{Entry, Node, Raw};
 pub use value::{FromNode, ValueError, parse_duration, parse_size};
 
-/// A fault, and what to do about it.
+/// A fault with its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     /// The fault.
     pub what: String,
-    /// What to do about the fault; empty if there is nothing to add.
+    /// The remedy for the fault; empty if there is nothing to add.
     pub remedy: String,
 }
 
@@ -56,7 +56,7 @@ impl fmt::Display for Finding {
 
 impl std::error::Error for Finding {}
 
-/// A finding, with its place in a file.
+/// A finding with its place in a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Problem {
     /// Name of the file, or of the environment variable that overrides it.
@@ -65,13 +65,13 @@ pub struct Problem {
     pub line: Option<usize>,
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
-    /// The fault, and what to do about it.
+    /// The fault with its remedy.
     #[serde(rename = "message", serialize_with = "as_text")]
     pub finding: Finding,
 }
 
 impl Problem {
-    /// A problem of a whole file, or of `key` in it, without a line.
+    /// A problem of a whole file, or of `key` in it, without a line number.
     pub fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
         Problem {
             file: file.into(),
@@ -112,12 +112,12 @@ pub struct Place {
     pub key: String,
 }
 
-/// A parsed file, with the problems found in it so far.
+/// A parsed file with the problems found in it so far.
 #[derive(Debug, Clone)]
 pub struct Document {
     file: String,
     root: Node,
-    /// Syntax errors. Any other finding may be a consequence of these.
+    /// Syntax errors. Any other finding may be only a consequence of these.
     syntax: Vec<Problem>,
     problems: RefCell<Vec<Problem>>,
     warnings: RefCell<Vec<Problem>>,
@@ -125,7 +125,8 @@ pub struct Document {
 }
 
 impl Document {
-    /// Parses `source`, the text of `file`. The first syntax error becomes the one problem; whatever can be read is kept.
+    /// Parses `source`, the text of `file`. The first syntax error becomes the only problem; everything that can be
+    /// parsed is kept.
     pub fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let mut document = Document {
@@ -136,7 +137,7 @@ impl Document {
             warnings: RefCell::default(),
             known: RefCell::default(),
         };
-        // A missing bracket makes an error of every line after it, so only the first error is reported.
+        // A missing bracket makes every later line an error, so only the first error is reported.
         for (line, message) in errors.into_iter().take(1) {
             let place = Place {
                 line,
@@ -151,7 +152,7 @@ impl Document {
         document
     }
 
-    /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
+    /// Adds the top-level section `name` if it is absent, so that environment variables can set its keys.
     pub fn ensure_section(&mut self, name: &str) {
         let Raw::Table(entries) = &mut self.root.value else {
             return;
@@ -161,8 +162,8 @@ impl Document {
         }
     }
 
-    /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
-    /// The table that the scalar is in must exist.
+    /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars. The
+    /// table that contains the scalar must exist.
     pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
@@ -206,7 +207,7 @@ impl Document {
         self.problems.borrow_mut().push(problem);
     }
 
-    /// Adds a warning: the document can be used, but part of it will not do what it seems to.
+    /// Adds a warning: the document can be used, but a part of it will not have the effect that it seems to have.
     pub fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let warning = self.problem_at(place, Finding::new(what, remedy));
         self.warnings.borrow_mut().push(warning);
@@ -221,8 +222,7 @@ impl Document {
         }
     }
 
-    /// Every key that a reader of this document requested, as a path without the numbers of array elements:
-    /// `bus[].drive[].address`.
+    /// Every key that the readers of this document requested, as a path without array indices: `bus[].drive[].address`.
     pub fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()
     }
@@ -237,7 +237,7 @@ impl Document {
         self.syntax.is_empty()
     }
 
-    /// Problems and warnings, each in the order of the lines; of a file that is not TOML, only where it is not.
+    /// Problems and warnings, each sorted by line; for a file that is not TOML only the syntax error.
     pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         if !self.is_toml() {
             return (self.syntax, Vec::new());

@@ -65,7 +65,7 @@ impl<'d> Reader<'d> {
         self.document.warning(&self.place_of(key), what, remedy);
     }
 
-    /// All keys in the table, known or not.
+    /// All keys of the table, known or not.
     pub fn keys(&self) -> Vec<&'d str> {
         self.entries.iter().map(|(key, _, _)| key.as_str()).collect()
     }
@@ -147,7 +147,7 @@ impl<'d> Reader<'d> {
             .collect()
     }
 
-    /// Accepts unknown keys, for a table with an error that is already reported and may explain them.
+    /// Accepts unknown keys, for a table whose reported error may explain them.
     pub(crate) fn tolerate(&self) {
         self.lenient.set(true);
     }
@@ -227,7 +227,7 @@ fn without_numbers(path: &str) -> String {
     path.chars().filter(keep).collect()
 }
 
-/// The key for what other programs name so, with an example of its value.
+/// The key that corresponds to a name used by other programs, with an example of its value.
 fn named_elsewhere(key: &str) -> Option<(&'static str, &'static str)> {
     match key {
         "parity" | "stopbits" | "stop_bits" | "databits" | "data_bits" | "bytesize" => Some(("format", "\"8E1\"")),
@@ -237,7 +237,8 @@ fn named_elsewhere(key: &str) -> Option<(&'static str, &'static str)> {
     }
 }
 
-/// The known word nearest to `word`, if one is close enough to be a misspelling, or the only one that has its parts.
+/// The known word most similar to `word`, if it is close enough to be a misspelling, or is the only one that
+/// contains its parts.
 pub fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     match candidates(word, known).as_slice() {
         [only] => Some(only),
@@ -245,8 +246,8 @@ pub fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&
     }
 }
 
-/// The known words that `word` may stand for: the one it is a misspelling of, else those that have its parts (`speed_ref` is
-/// part of `speed_reference`), the shortest first, four at most.
+/// The known words that `word` may stand for: the one it is a misspelling of, otherwise those that contain its
+/// parts (`speed_ref` is part of `speed_reference`), the shortest first, at most four.
 pub fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let known: Vec<&str> = known.collect();
     let mut best: Option<(usize, &str)> = None;

@@ -5,7 +5,7 @@ use toml::de::{DeTable, DeValue};
 /// A key of a table: the key, its line, the value.
 pub type Entry = (String, Option<usize>, Node);
 
-/// A value, with its place in the file.
+/// A value with its place in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
     /// The value.
@@ -15,7 +15,7 @@ pub struct Node {
 }
 
 impl Node {
-    /// The value of `key`; `None` if this is no table or lacks the key.
+    /// The value of `key`; `None` if this is not a table or lacks the key.
     pub fn entry(&self, key: &str) -> Option<&Node> {
         entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
     }
@@ -25,7 +25,7 @@ impl Node {
         self.line
     }
 
-    /// Takes over the place of another value: problems of this one are reported there.
+    /// Takes over the place of another value: problems of this one are then reported there.
     pub(crate) fn move_to(&mut self, other: &Node) {
         self.line = other.line;
         self.env = other.env.clone();
@@ -104,7 +104,7 @@ pub(super) fn entries(node: &Node) -> &[Entry] {
     }
 }
 
-/// Parses `source` as far as it can be read; an error is its line and what is wrong.
+/// Parses `source` as far as possible; each error has its line and text.
 pub(super) fn parse(source: &str) -> (Node, Vec<(Option<usize>, String)>) {
     let lines = Lines::of(source);
     let (table, errors) = DeTable::parse_recoverable(source);
@@ -150,7 +150,7 @@ fn table_of(table: DeTable<'_>, lines: &Lines) -> Raw {
             lines.line(span.start)
         };
         let value = value_of(value.into_inner(), lines);
-        // A table is placed at its header or key, not at its first value.
+        // The place of a table is its header or key, not its first value.
         let node_line = if matches!(value, Raw::Table(_)) {
             line
         } else {
@@ -219,7 +219,7 @@ impl OverrideError {
     }
 }
 
-/// Puts the `text` of the variable `name` at `path` below `root`, into a table that exists.
+/// Sets the value at `path` below `root` to the `text` of the variable `name`; its table must exist.
 ///
 /// # Errors
 /// The path leads nowhere.

@@ -7,7 +7,7 @@ use crate::codec::duration;
 
 use super::{Finding, Node, Raw};
 
-/// Why a value cannot be read: the value or its type, then the correction.
+/// Why a value is invalid: contains the value or its type, and the correction.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ValueError {
     #[error("`\"{0}\"` is a string")]

@@ -1,4 +1,4 @@
-//! The registers and coils in which a drive is commanded: nothing but its commands may write there.
+//! The registers and coils by which a drive is commanded: only its commands may write to them.
 
 use super::control::{Control, ControlItem, OwnWord, Run, Setting};
 use super::profile::Form;
@@ -6,7 +6,7 @@ use super::{ModelPoint, PointIndex, Profile};
 use crate::codec::Table;
 
 impl Control {
-    /// Everything that commands set, also on the way to a run command.
+    /// All settings that commands write, including the steps to a run command.
     fn settings(&self) -> impl Iterator<Item = Setting> {
         let steps = match &self.run {
             Run::Steps(steps) => steps.iter().map(|step| step.write).collect(),
@@ -16,12 +16,12 @@ impl Control {
         steps.into_iter().chain([self.stop]).chain(self.reverse).chain(reset)
     }
 
-    /// Whether a command is written to this place.
+    /// Whether commands are written to this register or coil.
     fn is_place(&self, place: ControlItem) -> bool {
         place == self.at || self.settings().any(|setting| setting.place == Some(place))
     }
 
-    /// Whether a command sets one of these bits at this place.
+    /// Whether a command sets one of these bits in this register or coil.
     fn sets(&self, place: ControlItem, bits: u16) -> bool {
         self.settings()
             .any(|setting| setting.place.unwrap_or(self.at) == place && setting.mask & bits != 0)
@@ -29,8 +29,9 @@ impl Control {
 }
 
 impl Profile {
-    /// Whether a write of that point changes what commands are written to, though it is none of them: it could start the motor
-    /// past every rule for starts. Bits of its own in a word whose other bits are kept do not.
+    /// Whether writing this point changes a register of the commands although the point is not a command: that
+    /// could start the motor and evade every rule for starts. A point with its own bits in a word whose other bits
+    /// are kept does not.
     pub fn is_past_commands(&self, index: PointIndex) -> bool {
         let Some(control) = &self.control else { return false };
         let own = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset];

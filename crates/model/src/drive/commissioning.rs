@@ -10,11 +10,11 @@ pub enum Step {
     Connect,
     /// Termination and bias.
     Terminate,
-    /// Where protocol, address, baud rate, parity and timeout are set, and their factory settings.
+    /// Settings for protocol, address, baud rate, parity and timeout, and their factory values.
     Settings,
     /// How to make the drive obey the bus.
     ControlPlace,
-    /// Where the drive's own timeout is set, and what it counts.
+    /// Setting for the drive's own timeout, and the messages that restart it.
     Timeout,
     /// Lamps and panel.
     Lamps,
@@ -23,7 +23,7 @@ pub enum Step {
 }
 
 impl Step {
-    /// All steps in their order.
+    /// All commissioning steps in their order.
     pub const ALL: [Step; 7] = [
         Step::Connect,
         Step::Terminate,
@@ -102,11 +102,11 @@ pub struct Shared<'p> {
     pub line: &'p str,
 }
 
-/// The lines of these steps in several profiles: each line once, those of the first profile first.
+/// The text lines of these steps from several profiles: each line once, those of the first profile first.
 pub fn gather<'p>(profiles: &[&'p Profile], steps: &[Step]) -> Vec<Shared<'p>> {
     let mut gathered: Vec<Shared<'p>> = Vec::new();
     for step in steps {
-        // A line that one profile has in two steps is shown in both.
+        // A line that one profile has in two steps is shown for both.
         let start = gathered.len();
         for profile in profiles {
             for line in profile.commissioning.lines(*step) {

@@ -1,4 +1,4 @@
-//! How a family is commanded: the control word, which words run, stop and reset, and what comes before. Pure.
+//! How a family is commanded: the control word, the words that run, stop and reset, and the sequence before them. Pure.
 
 mod contradictions;
 
@@ -21,7 +21,7 @@ pub struct Control {
     pub run: Run,
     /// How the motor is stopped, and how a stop is recognised.
     pub stop: Setting,
-    /// Further words of the control register by which the drive stops by another of its own means: the gateway sends none of them.
+    /// Other words of the control register that also stop the drive; the gateway never sends them.
     pub also_stop: Vec<Setting>,
     /// How the motor is reversed, unless that is part of `run`.
     pub reverse: Option<Setting>,
@@ -29,7 +29,7 @@ pub struct Control {
     pub fault_reset: Option<Reset>,
     /// A reset while a run command is set starts the motor.
     pub restarts_on_reset: bool,
-    /// Time between two refreshes, if the family needs them because its timeout counts only writes.
+    /// Interval of the refresh, if the family needs one because its timeout counts only writes.
     pub refresh: Option<Duration>,
     /// A refresh of the reference alone feeds that timeout, too.
     pub refresh_with_reference: bool,
@@ -45,7 +45,7 @@ pub struct ControlItem {
 }
 
 impl ControlItem {
-    /// The place of a raw point.
+    /// The register or coil of a raw point.
     pub(super) fn of(raw: &Raw) -> ControlItem {
         ControlItem {
             table: raw.table,
@@ -60,10 +60,10 @@ pub enum OwnWord {
     /// The register reads as the word written last.
     #[default]
     Read,
-    /// The register reads as something else, or not at all: the gateway remembers its own word.
+    /// The register cannot be read, or has another meaning when read: the gateway remembers its own word.
     Shadow,
-    /// The commands are single bits of it, as the points of the profile name them; its other bits are kept by every command, and
-    /// it is read before it is written while it is not known.
+    /// The commands are single bits of the word, defined by points of the profile; every command keeps the other
+    /// bits, and the word is read before it is written if it is unknown.
     Kept,
 }
 
@@ -77,47 +77,47 @@ pub struct Always {
 }
 
 impl Always {
-    /// The word with these bits.
+    /// The word with these bits set.
     pub fn applied(self, word: u16) -> u16 {
         (word | self.set) & !self.clear
     }
 
-    /// Whether the word has all these bits.
+    /// Whether the word has all these bits set.
     pub fn holds(self, word: u16) -> bool {
         self.applied(word) == word
     }
 }
 
-/// Some bits of a word, with their values.
+/// Bits of a word with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Setting {
-    /// Place of the word; `None` for the control word.
+    /// Register of the word; `None` for the control word.
     pub place: Option<ControlItem>,
     /// The bits.
     pub mask: u16,
     /// Values of the bits.
     pub value: u16,
-    /// Whether the setting acts once, when it is written; clearing it undoes nothing.
+    /// Whether the setting acts once, when it is written, so that clearing it has no effect.
     pub once: bool,
 }
 
 impl Setting {
-    /// The word with these bits.
+    /// The word with these bits set to these values.
     pub fn applied(&self, word: u16) -> u16 {
         word & !self.mask | self.value & self.mask
     }
 
-    /// Whether the word has these bits with these values.
+    /// Whether these bits of the word have these values.
     pub fn holds(&self, word: u16) -> bool {
         word & self.mask == self.value
     }
 
-    /// The word with these bits the other way, where that is one bit.
+    /// The word with the opposite value of these bits, if there is only one bit.
     pub fn undone(&self, word: u16) -> u16 {
         word & !self.mask | !self.value & self.mask
     }
 
-    /// The word without a pulse of these bits: they are as between two pulses. Bits of another place are not in the word.
+    /// The word as between two pulses of these bits. Bits of a separate register are not in the word.
     pub fn released(&self, word: u16) -> u16 {
         match self.place {
             None if self.value == 0 => word | self.mask,
@@ -126,7 +126,7 @@ impl Setting {
         }
     }
 
-    /// Whether a word can fulfil this setting and another one at the same time.
+    /// Whether a word can satisfy this setting and another one at the same time.
     pub fn agrees(&self, other: &Setting) -> bool {
         let both = self.mask & other.mask;
         self.place != other.place || self.value & both == other.value & both
@@ -149,10 +149,10 @@ pub enum Run {
     Steps(Vec<Step>),
 }
 
-/// A word of a sequence.
+/// A step of a start or reset sequence, which writes one word.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// The word to write; the bits of `reverse` are set in it as commanded.
+    /// The word to write; the direction bits are added to it as commanded.
     pub write: Setting,
     /// The condition that ends the step.
     pub until: Until,
@@ -163,9 +163,9 @@ pub struct Step {
 /// The condition that ends a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Until {
-    /// The word was acknowledged.
+    /// The step is done when its word was acknowledged.
     Written,
-    /// This time after the write.
+    /// The step is done when this time has passed after the write.
     Time(Duration),
     /// A state.
     State(Mask),
@@ -178,7 +178,7 @@ pub struct Mask {
     pub point: PointIndex,
     /// Bits of the register that count.
     pub mask: u64,
-    /// Value of these bits.
+    /// Required value of these bits.
     pub is: u64,
 }
 
@@ -201,7 +201,7 @@ pub struct Reset {
 }
 
 impl Control {
-    /// Every setting that starts the motor; of a sequence, the last one.
+    /// Every setting that starts the motor; for a sequence, its last word.
     pub fn runs(&self) -> Vec<Setting> {
         match &self.run {
             Run::One(setting) => vec![*setting],
@@ -210,7 +210,7 @@ impl Control {
         }
     }
 
-    /// Whether the word, written to this place, stops the motor.
+    /// Whether the word, written to this register, stops the motor.
     pub fn is_stop(&self, place: ControlItem, word: u16) -> bool {
         self.is_own_stop(place, word) || self.is_also_stop(place, word)
     }
@@ -220,19 +220,19 @@ impl Control {
         self.stop.place.unwrap_or(self.at) == place && self.stop.holds(word)
     }
 
-    /// Whether the word stops the drive in another of its own ways.
+    /// Whether the word is one of the other words that also stop the drive.
     fn is_also_stop(&self, place: ControlItem, word: u16) -> bool {
         place == self.at && self.also_stop.iter().any(|stop| stop.holds(word))
     }
 
-    /// Whether the word, written to this place, starts the motor or lets it run.
+    /// Whether the word, written to this register, starts the motor or keeps it running.
     pub fn is_run(&self, place: ControlItem, word: u16) -> bool {
         let of = |setting: &Setting| setting.place.unwrap_or(self.at) == place && self.holds_run(setting, word);
         !self.is_stop(place, word) && self.runs().iter().any(of)
     }
 
-    /// Whether a client may write that word there as it stands: in the control word only what clearly stops or runs, at other
-    /// places only what they are for.
+    /// Whether a client may write this word here unchanged: to the control register only words that clearly stop or
+    /// run, to other registers only what they are meant for.
     pub fn admits(&self, place: ControlItem, word: u16) -> bool {
         if self.own_word == OwnWord::Kept {
             return true;
@@ -262,7 +262,7 @@ impl Control {
         (word ^ setting.value) & setting.mask & !self.free() == 0
     }
 
-    /// The bits of the words of a sequence that say the direction, as commanded.
+    /// The direction bits of a sequence's words, which are set as commanded.
     pub(super) fn free(&self) -> u16 {
         match (&self.run, &self.reverse) {
             (Run::Steps(_), Some(reverse)) if reverse.place.is_none() => reverse.mask,
@@ -270,8 +270,8 @@ impl Control {
         }
     }
 
-    /// The states of the control word in which a run command stands: those of [`Control::runs`] without the words that stop by
-    /// other means.
+    /// The states of the control word that contain a run command: those of [`Control::runs`] without the words that
+    /// also stop.
     pub(super) fn run_states(&self) -> Vec<Setting> {
         let (free, always) = (self.free(), self.always);
         let differ = |stop: &Setting| (stop.value & always.clear) | (!stop.value & stop.mask & always.set);
@@ -290,8 +290,8 @@ impl Control {
         self.runs().into_iter().map(state).collect()
     }
 
-    /// The word from which the next one is made where the drive has `own`: after a stop in another way this is the word of a stop,
-    /// so that no later write runs.
+    /// The word from which the next one is made if the drive has `own`: after a stop by another word this is the
+    /// normal stop word, so that no later write runs the motor.
     pub fn standing(&self, own: u16) -> u16 {
         match self.is_also_stop(self.at, own) {
             true => self.stop_word(own),
@@ -299,13 +299,13 @@ impl Control {
         }
     }
 
-    /// The word without a reset: its bits are as between two resets.
+    /// The word without a reset: its reset bits are as between two resets.
     pub fn without_reset(&self, own: u16) -> u16 {
         let reset = self.fault_reset.map(|reset| reset.setting);
         reset.map_or(own, |reset| reset.released(own))
     }
 
-    /// The word with that direction, where the direction is a setting of the control word.
+    /// The word with this direction, if the direction is part of the control word.
     pub fn with_direction(&self, word: u16, reverse: bool) -> u16 {
         match self.reverse.filter(|setting| setting.place.is_none()) {
             Some(setting) if reverse => setting.applied(word),
@@ -342,7 +342,7 @@ impl Control {
         self.always.applied(own & !bits)
     }
 
-    /// The word of a stop, made from the present word.
+    /// The stop word, made from the present word.
     pub fn stop_word(&self, own: u16) -> u16 {
         match self.stop.place {
             None => self.stop.applied(self.always.applied(own)),
@@ -372,7 +372,7 @@ mod tests {
         all.iter().copied().filter(|word| of(control, place, *word)).collect()
     }
 
-    /// The direction that stands in the word of a sequence does not make it another command.
+    /// The direction in the word of a sequence does not make it another command.
     #[test]
     fn a_run_command_reads_as_one_in_either_direction() {
         use crate::drive::profile::Profiles;
@@ -396,7 +396,7 @@ mod tests {
         }
     }
 
-    /// Words that run and stop, by hand from the manuals' figures (`control-words.md`), for each form.
+    /// Words that run and stop, taken by hand from the manuals' figures (`control-words.md`), for each form.
     #[test]
     fn words_that_run_and_stop() {
         let sequence = control(

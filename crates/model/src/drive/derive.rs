@@ -6,7 +6,7 @@ use std::time::Instant;
 use super::control::Mask;
 use super::model::{Quality, Sample, Value, tidy};
 
-/// Share of the lower end of a band by which a value may miss it for the rounding of floats.
+/// Fraction of the lower end of a band by which a value may be below it because of float rounding.
 const ROUNDING: f64 = 1e-9;
 
 /// An end of a band: another point, or a number from the manual.
@@ -16,11 +16,11 @@ pub enum Bound {
     Point(PointIndex),
     /// A fixed bound, in the unit of the band.
     Fixed(f64),
-    /// `frequency_range` of the drive's configuration: nothing of the drive says it.
+    /// `frequency_range` in the configuration of the drive: the drive itself does not report it.
     Configured,
 }
 
-/// How a value is derived from other points, given by their indices in the profile. All of them are raw points.
+/// How a value is derived from other points, given by their indices in the profile. All of these are raw points.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Derived {
     /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`. A minimum above zero is that of either
@@ -58,18 +58,18 @@ pub enum Derived {
         /// Greatest difference, in the unit of the points.
         within: f64,
     },
-    /// True while all of the points are true.
+    /// True if all of the points are true.
     All {
         /// Points.
         of: Vec<PointIndex>,
     },
-    /// True while a register is in one of these states.
+    /// True if a register is in one of these states.
     State {
         /// Alternatives.
         any: Vec<Mask>,
     },
-    /// The sum of the points, each times its weight. All of them must be of one reading: a counter that rolls over into the
-    /// next register would seem to go back.
+    /// The sum of the points, each multiplied by its weight. All must come from one reading: otherwise a counter
+    /// that rolls over into the next register would seem to decrease.
     Sum {
         /// Points.
         of: Vec<PointIndex>,
@@ -131,7 +131,7 @@ impl Derived {
         first.into_iter().chain(second).chain(more)
     }
 
-    /// All points that the derived point depends on, including the ends of a band.
+    /// All points on which the derived point depends, including the ends of a band.
     pub fn rests_on(&self) -> Vec<PointIndex> {
         self.sources().chain(self.ends()).collect()
     }
@@ -145,7 +145,7 @@ impl Derived {
         })
     }
 
-    /// The value for these values of the sources; `None` if it cannot be computed.
+    /// The value calculated from these values of the sources; `None` if it cannot be calculated.
     pub fn value(&self, sources: impl IntoIterator<Item = Value>, band: Option<(f64, f64)>) -> Option<Value> {
         let mut sources = sources.into_iter();
         let first = sources.next()?;
@@ -154,7 +154,7 @@ impl Derived {
             Derived::Percent { .. } => {
                 let band = band.filter(|(low, high)| high > low)?;
                 let value = first.as_f64();
-                // A drive with a lower reference turns at its minimum; a negative zero is the minimum in reverse.
+                // With a lower reference the drive turns at its minimum; a negative zero is the minimum in reverse.
                 let percent = percentage(value, band).unwrap_or(0.0_f64.copysign(value));
                 Some(Value::Number(tidy(percent)))
             }
@@ -192,8 +192,8 @@ impl Derived {
         }
     }
 
-    /// The value of the source for which this point is `value`; `None` if it cannot be commanded, as what is below a
-    /// minimum above zero.
+    /// The value of the source that makes this point `value`; `None` if it cannot be commanded, such as a value
+    /// below a minimum above zero.
     pub fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
         match self {
             _ if band.1 <= band.0 => None,
@@ -223,8 +223,9 @@ impl Derived {
     }
 }
 
-/// The value at `percent` of a band. A lower end above zero is the minimum of a drive that turns no slower in either
-/// direction, and a negative percentage turns it in reverse (reference/drives.md 3.5). Any other band is a straight line.
+/// The value at `percent` of a band. A lower end above zero is the minimum of a drive that turns no slower in
+/// either direction, and a negative percentage turns it in reverse (reference/drives.md 3.5). Any other band is
+/// linear.
 fn in_band(percent: f64, (low, high): (f64, f64)) -> f64 {
     if low > 0.0 && percent < 0.0 {
         -in_band(-percent, (low, high))
@@ -243,7 +244,7 @@ fn percentage(value: f64, (low, high): (f64, f64)) -> Option<f64> {
     (above >= -low * ROUNDING).then_some(percent.copysign(value))
 }
 
-/// Shown values have no negative zero.
+/// Removes the sign of zero, since displayed values have no negative zero.
 fn unsigned_zero(value: Value) -> Value {
     match value {
         Value::Number(number) => Value::Number(number + 0.0),
@@ -320,7 +321,7 @@ mod tests {
             let share = band.inverse(exact, range).unwrap();
             assert!((0.0..1e-6).contains(&share) && share.is_sign_positive(), "{share} %");
         }
-        // The motor turns at its minimum. A shown value has no sign then, a limited one does.
+        // The motor turns at its minimum. The displayed value then has no sign, the limited one does.
         let seen = |hertz: f64| {
             let sample = Sample {
                 value: Some(Value::Number(hertz)),
@@ -336,7 +337,7 @@ mod tests {
     }
 
     proptest! {
-        /// A value ordered in one unit converts to the other one and back with its sign, whatever the band.
+        /// A value ordered in one unit converts to the other one and back with its sign, for any band.
         #[test]
         fn there_and_back(low in 0.01f64..100.0, width in 0.1f64..100.0, share in -100.0f64..100.0, line in any::<bool>()) {
             let low = if line { -low } else { low };
@@ -348,7 +349,7 @@ mod tests {
             let hertz = band.value([Value::Number(share)], Some(range)).unwrap().as_f64();
             prop_assert!(low <= 0.0 || (hertz < 0.0) == (share < 0.0));
             prop_assert!(low <= 0.0 || (low - 1e-6..=low + width + 1e-6).contains(&hertz.abs()));
-            // As exact as a value is kept, to a millionth.
+            // The result must match to a millionth, the precision of stored values.
             let near = |a: f64, b: f64, by: f64| (a - b).abs() <= by;
             prop_assert!(near(percent.value([Value::Number(hertz)], Some(range)).unwrap().as_f64(), share, 1e-3));
             prop_assert!(near(percent.inverse(share, range).unwrap(), hertz, 1e-6));

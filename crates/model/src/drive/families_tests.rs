@@ -150,7 +150,7 @@ fn modbus_families() {
         assert_eq!(place(&hvx, point), wanted, "{point}");
         assert_eq!(place(&profile("eaton-svx"), point), "-", "{point} is none of SVX");
     }
-    // As the N2 map has them: BO 4 to 16, BI 8 to 15.
+    // BO 4 to 16 and BI 8 to 15 as in the N2 map.
     let (nx, n2) = (profile("vacon-nx"), profile("vacon-nx-n2"));
     for bit in 3..16 {
         let name = format!("control_bit_{bit}");
@@ -473,7 +473,7 @@ fn limits_and_lines() {
     }
 }
 
-/// A title shows the doubts about its profile.
+/// Doubts about a profile appear in its title.
 #[test]
 fn titles_of_unverified_profiles() {
     for profile in Profiles::built_in().iter() {
@@ -520,7 +520,7 @@ fn commands_of_every_family() {
     }
 }
 
-/// A round of the fast class on N2 is some 35 ms an object: it stays below a third of a second.
+/// A round of the fast class on N2 takes about 35 ms per object: it must stay below a third of a second.
 #[test]
 fn process_data_is_few_requests() {
     for (name, most) in [
@@ -565,7 +565,7 @@ fn process_data_in_by_application() {
                 .iter()
                 .filter(|point| point.name.starts_with("process_data_in"));
             assert_eq!(process_data.count(), 0, "{}: the rest is not used", own.name);
-            // Everything else comes from the family.
+            // All other points come from the family.
             assert_eq!(own.points.len(), base.points.len() - 8 + points.len());
             assert_eq!((&own.ranges, &own.faults), (&base.ranges, &base.faults));
             assert_eq!(own.commissioning, base.commissioning);
@@ -645,7 +645,7 @@ fn what_is_not_confirmed() {
     }
 }
 
-/// Every family whose manual is at hand has the steps of it, and one board has one list.
+/// Every family with an available manual has commissioning steps from it, and families with one board share one list.
 #[test]
 fn steps_at_the_cabinet() {
     for family in Profiles::built_in().iter().filter(|profile| profile.verified) {

@@ -1,4 +1,4 @@
-//! Indexes with types of their own, so that the compiler notices when one is used in place of another, and the vectors that they index.
+//! Index types, so that the compiler notices when one is used in place of another, and the vectors that they index.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -14,7 +14,7 @@ macro_rules! index {
         pub struct $name(usize);
 
         impl $name {
-            /// The one at that place, from 0.
+            /// The index with this number, from 0.
             pub const fn new(place: usize) -> $name {
                 $name(place)
             }
@@ -59,12 +59,12 @@ macro_rules! index {
 }
 
 index! {
-    /// Which drive of a bus, in the order of the file.
+    /// The index of a drive on its bus, in the order of the file.
     DriveIndex
 }
 
 index! {
-    /// Which point of a profile, in the order of the profile.
+    /// The index of a point in its profile, in the order of the profile.
     PointIndex
 }
 
@@ -91,7 +91,7 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
         self.elements.get_mut(index.into())
     }
 
-    /// Each element, with its index.
+    /// Each element with its index.
     pub fn enumerate(&self) -> impl DoubleEndedIterator<Item = (I, &T)> + ExactSizeIterator {
         self.elements
             .iter()
@@ -99,13 +99,13 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
             .map(|(place, one)| (I::from(place), one))
     }
 
-    /// Each element with its index; elements can be changed.
+    /// Each element, mutable, with its index.
     pub fn enumerate_mut(&mut self) -> impl DoubleEndedIterator<Item = (I, &mut T)> + ExactSizeIterator {
         let elements = self.elements.iter_mut().enumerate();
         elements.map(|(place, one)| (I::from(place), one))
     }
 
-    /// All indexes, which do not borrow the vector.
+    /// All indexes, without borrowing the vector.
     pub fn indexes(&self) -> impl DoubleEndedIterator<Item = I> + ExactSizeIterator + use<I, T> {
         (0..self.elements.len()).map(I::from)
     }

@@ -27,16 +27,16 @@ pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
 pub use raw_writes::RawWrites;
 pub use refresh::{REFRESH, Repeats};
 
-/// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
-/// P2.7.22.
+/// Name of the point for the drive's own response to a silent master; 0 is no response. For Vacon NX it is
+/// parameter P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
 /// Name of the command that restarts the communication of a drive that counts messages (function 08, subfunction 01);
 /// written like a point.
 pub const RESTART_COMMUNICATION: &str = "restart_communication";
 
-/// Name of the point with what a drive does after a communication error; 3 is that its motor runs on. For TECO 7300PA the first two
-/// digits of Sn-08.
+/// Name of the point for the reaction of a drive to a communication error; 3 lets the motor run on. For TECO 7300PA
+/// it is the first two digits of Sn-08.
 pub const COMMUNICATION_ERROR_REACTION: &str = "communication_error_reaction";
 
 /// Name of the point with the time without data, in seconds, after which a drive has a communication fault. For TECO 7300PA Cn-31.

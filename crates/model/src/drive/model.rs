@@ -23,7 +23,7 @@ pub enum Value {
     Text(Text),
 }
 
-/// A text of a drive: as much as a value may have, kept in place.
+/// A text of a drive, of limited length and stored without allocation.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Text {
     bytes: [u8; Text::MOST_BYTES],
@@ -33,7 +33,7 @@ pub struct Text {
 impl Text {
     const MOST_BYTES: usize = 2 * super::profile::MOST_REGISTERS;
 
-    /// The text in these registers up to its first NUL; `None` if there are too many.
+    /// The text in these registers up to its first NUL; `None` if there are too many registers.
     pub(crate) fn of_registers(words: &[u16], order: Order) -> Option<Text> {
         let mut text = Text {
             bytes: [0; Text::MOST_BYTES],
@@ -72,7 +72,7 @@ impl Serialize for Text {
 }
 
 impl Value {
-    /// The value as a number; true is 1, a text is none (NaN).
+    /// The value as a number; true is 1, a text is NaN.
     pub fn as_f64(self) -> f64 {
         match self {
             Value::Bool(b) => f64::from(u8::from(b)),
@@ -83,7 +83,7 @@ impl Value {
         }
     }
 
-    /// The value as a number that is it to the last digit; `None` for a text and for a whole number that is rounded.
+    /// The value as an exact number; `None` for a text and for a whole number that would be rounded.
     pub fn exact_f64(self) -> Option<f64> {
         let number = self.as_f64();
         let exact = match self {
@@ -118,7 +118,7 @@ impl fmt::Display for Value {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
-    /// Read from the drive recently enough.
+    /// The value was read from the drive recently enough.
     Good,
     /// Older than allowed, or the drive is offline.
     Stale,
@@ -147,7 +147,7 @@ impl Quality {
     }
 }
 
-/// A value, with its quality and the time when it was read.
+/// A value with its quality and the time of reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
     /// The last value; absent if no value was ever read.
@@ -166,7 +166,7 @@ impl Sample {
         at: None,
     };
 
-    /// The value if it is good.
+    /// The value; `None` if it is not good.
     pub fn good(&self) -> Option<Value> {
         if self.quality == Quality::Good {
             self.value
@@ -188,7 +188,7 @@ pub enum State {
     Ready,
     /// Runs.
     Running,
-    /// Has a fault.
+    /// The drive has a fault.
     Fault,
 }
 
@@ -228,7 +228,7 @@ impl State {
 /// Kind of a point's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// True or false.
+    /// True or false, as a kind of value.
     Bool,
     /// A number with a unit.
     Number,
@@ -267,7 +267,7 @@ macro_rules! model_points {
         }
 
         impl ModelPoint {
-            /// All points in their public order.
+            /// All points of the model in their public order.
             pub const ALL: &'static [ModelPoint] = &[$(ModelPoint::$variant,)*];
 
             /// The public name.

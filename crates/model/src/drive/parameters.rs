@@ -15,7 +15,7 @@ pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 pub struct ParameterList {
     /// Parameters that are known by name, by ascending address.
     pub named: Vec<Parameter>,
-    /// Where others may lie; the drive is read to find which of them it has.
+    /// Address ranges that may contain further parameters; reading shows which of them the drive has.
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
     pub identification: Vec<PointIndex>,
@@ -56,7 +56,7 @@ impl Numbering {
         }
     }
 
-    /// The address of the parameter of that name.
+    /// The address of the parameter with this name.
     pub fn address(self, id: &str) -> Option<u16> {
         match self {
             Numbering::Id => id.parse::<u16>().ok()?.checked_sub(1),
@@ -91,7 +91,7 @@ pub struct Parameter {
 const TOLERANCE: f64 = 1e-6;
 
 impl Parameter {
-    /// Whether the drive takes the value, as far as its family is known.
+    /// Whether the drive accepts the value, as far as its family is known.
     pub fn accepts(&self, raw: RawValue) -> bool {
         let scale = match raw {
             RawValue::Word(_) if self.label.scale > 0.0 => self.label.scale,
@@ -108,11 +108,11 @@ impl Parameter {
 /// Name, unit and scale of a parameter.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Label {
-    /// Name; empty where none is known.
+    /// Name of the parameter; empty if unknown.
     pub name: String,
     /// Unit of the value; empty for codes.
     pub unit: String,
-    /// Value of one count; 0 where none is known.
+    /// Value of one count; 0 if unknown.
     pub scale: f64,
 }
 
@@ -161,7 +161,7 @@ impl RawValue {
         }
     }
 
-    /// The words of a write.
+    /// The words to write for this value.
     pub fn words(self) -> Vec<u16> {
         match self {
             RawValue::Word(word) => vec![word],
@@ -169,7 +169,7 @@ impl RawValue {
         }
     }
 
-    /// Whether a drive that shows `other` has this value: an object of N2 is kept in counts of its own.
+    /// Whether a drive that shows `other` has this value: an N2 object is stored in counts internally.
     pub fn is_shown_by(self, other: RawValue) -> bool {
         match (self, other) {
             (RawValue::Word(one), RawValue::Word(other)) => one == other,
@@ -181,7 +181,7 @@ impl RawValue {
         }
     }
 
-    /// As a number: counts of a register, or the value of an object.
+    /// The value as a number: counts of a register, or the value of an object.
     pub fn number(self) -> f64 {
         match self {
             RawValue::Word(word) => f64::from(word),
@@ -202,7 +202,7 @@ impl Profile {
         if self.protocols.contains(&Protocol::N2) { 2 } else { 1 }
     }
 
-    /// Most parameters in one read at `address`, and whether the read may cover addresses without one.
+    /// Most parameters in one read at `address`, and whether the read may include addresses without a parameter.
     pub fn parameter_read(&self, address: u16) -> (u16, bool) {
         let range = self.range(Table::Holding, address);
         range.map_or((1, false), |range| {
@@ -223,7 +223,7 @@ impl ParameterList {
         self.named.is_empty() && self.spans.is_empty()
     }
 
-    /// The parameter at an address, if its name is known.
+    /// The parameter at an address; `None` if its name is unknown.
     pub fn by_address(&self, address: u16) -> Option<&Parameter> {
         let index = self.named.binary_search_by_key(&address, |parameter| parameter.address);
         index.ok().and_then(|index| self.named.get(index))
@@ -241,7 +241,7 @@ impl ParameterList {
         span.and_then(|span| span.numbering.id(address))
     }
 
-    /// The address of the parameter of that name.
+    /// The address of the parameter with this name.
     pub fn address(&self, id: &str) -> Option<u16> {
         if let Some(parameter) = self.named.iter().find(|parameter| parameter.id == id) {
             return Some(parameter.address);

@@ -44,7 +44,7 @@ impl PlannedRead {
 /// The points that decide the drive's state.
 const DECIDING: [ModelPoint; 3] = [ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready];
 
-/// All requests to one drive, the fast ones first.
+/// All read requests for one drive, the fast ones first.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Plan {
     /// The reads in the order of class, table, address.
@@ -59,7 +59,7 @@ pub struct Plan {
     pub trials: Vec<PlannedRead>,
     /// The reads of process data that decide the drive's state: fault, running, ready.
     pub behind_state: Vec<PlannedRead>,
-    /// The slow reads of the other bits of the status word, which precede other slow reads once the drive answers.
+    /// The slow reads of the remaining bits of the status word, which precede other slow reads when the drive comes online.
     pub behind_status_word: Vec<PlannedRead>,
 }
 
@@ -137,12 +137,12 @@ impl Plan {
         of_class.filter(shows).copied().collect()
     }
 
-    /// All requests: those of the poll classes, those after a fault and those of comparisons.
+    /// All requests: those of the poll classes, those after a fault, and those for comparisons.
     pub fn all(&self) -> impl Iterator<Item = &PlannedRead> {
         self.reads.iter().chain(&self.monitors).chain(&self.on_fault)
     }
 
-    /// Whether these requests read a point of that profile: everything it is in or derived from.
+    /// Whether these requests read a point of this profile, including everything it is derived from.
     pub fn shows(&self, profile: &Profile, point: PointIndex) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
@@ -198,8 +198,8 @@ fn addresses(start: u16, items: u16) -> impl Iterator<Item = u16> {
     (0..items).filter_map(move |item| start.checked_add(item))
 }
 
-/// The values that the plan reads, each in the fastest class of those whose registers it shares: values that overlap are
-/// one piece, so that none of them is ever put together from two reads.
+/// The values that the plan reads, each in the fastest class among those that share its registers: overlapping
+/// values form one piece, so that no value is put together from two reads.
 fn pieces_of(profile: &Profile) -> BTreeMap<Piece, PollClass> {
     let polled = profile.points.iter().filter(|point| point.class < PollClass::Fault);
     let raws = polled.filter_map(|point| Some((point.raw()?, point.class)));
@@ -234,9 +234,9 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
             continue;
         };
         let piece_end = u32::from(address) + u32::from(items);
-        // These are the registers of a value after its first register.
+        // These are the registers of a value after its first one.
         let inner = low_bits(items) & !1;
-        // The last read of another table may lie above this address.
+        // The last read of another table may be above this address.
         if let Some(last) = reads.last_mut().filter(|last| last.table == table) {
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = piece_end.max(end) - u32::from(last.start);
@@ -271,8 +271,8 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
 pub struct WireTime {
     /// Characters of the request.
     pub request: Duration,
-    /// Silence by which the drive detects the end of the request (Modbus RTU: 3.5 characters); its turnaround begins
-    /// after it.
+    /// Silence by which the drive detects the end of the request (Modbus RTU: 3.5 characters); its turnaround
+    /// begins after that.
     pub recognition: Duration,
     /// Characters of the regular reply.
     pub reply: Duration,

@@ -1,5 +1,5 @@
-//! A drive family as data: its points, their addresses and scales, and what the drive allows. Files are read, and the
-//! built-in ones listed, in `profile_file`.
+//! A drive family as data: its points, their addresses and scales, and what the drive permits. `profile_file` reads
+//! the files and lists the built-in ones.
 
 mod raw;
 
@@ -29,9 +29,9 @@ pub struct Profile {
     pub title: String,
     /// Manual and tables the profile is based on.
     pub source: String,
-    /// Whether the profile is part of the program; otherwise it came from a file.
+    /// Whether the profile is built into the program; otherwise it came from a file.
     pub built_in: bool,
-    /// The profile that the file of this profile is based on.
+    /// The base profile of this profile's file.
     pub base: Option<String>,
     /// Protocols of the family.
     pub protocols: Vec<Protocol>,
@@ -43,7 +43,7 @@ pub struct Profile {
     pub addresses: RangeInclusive<u8>,
     /// Time that a drive takes to begin its reply; used only for the prediction.
     pub turnaround: Duration,
-    /// Update period of the drive's process data; a reset pulse is held for two of them.
+    /// Update period of the drive's process data; a reset pulse lasts two of these.
     pub update_period: Duration,
     /// Time after an acknowledged command within which a read must show the command's effect.
     pub confirm_within: Duration,
@@ -61,26 +61,26 @@ pub struct Profile {
     pub ranges: Vec<AddressRange>,
     /// The functions by which single items and bits are written.
     pub functions: WriteFunctions,
-    /// All points, in the order of the file.
+    /// All points in the order of the file.
     pub points: PerPoint<Point>,
     /// Whether the drive counts received messages, damaged or not, and reports them by function 08 (subfunctions 0B to
     /// 0F).
     pub counts_messages: bool,
-    /// The drive may stop by itself when its master goes silent, and no readable point shows whether it does.
+    /// Whether the drive may stop by itself when its master goes silent, while no readable point shows whether it does.
     pub may_stop_by_itself: bool,
-    /// A broadcast that clears the whole control word stops every drive of the family on the line.
+    /// Whether a broadcast that clears the whole control word stops every drive of the family on the line.
     pub broadcast_stop: bool,
     /// Points that are read at once when a drive has a new fault.
     pub on_fault: Vec<PointIndex>,
     /// How the drive is commanded, where its profile has `[control]`.
     pub control: Option<Control>,
-    /// Whether someone has seen the profile right on hardware, or it is made from manuals of that very family.
+    /// Whether the profile was confirmed on hardware, or made from the manuals of this very family.
     pub verified: bool,
     /// Parameters of the family.
     pub parameters: ParameterList,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
-    /// Fault codes by which a drive reports that its own timeout tripped it.
+    /// Fault codes that mean that the drive's own timeout tripped it.
     pub timeout_faults: Vec<u16>,
     /// Lines for the engineer at the cabinet.
     pub commissioning: Commissioning,
@@ -90,8 +90,8 @@ pub struct Profile {
     pub(super) model: Vec<Option<PointIndex>>,
     /// The text of the profile's file, without the text of its base.
     pub text: Cow<'static, str>,
-    /// The file merged with its base, for profiles based on this one. `None` for built-in profiles: their texts contain
-    /// everything, in a fifth of the memory.
+    /// The file merged with its base, for profiles based on this one. `None` for built-in profiles: their texts
+    /// contain everything in a fifth of the memory.
     pub(super) tree: Option<Node>,
     /// Warnings about probable mistakes; empty for built-in profiles.
     pub warnings: Vec<Problem>,
@@ -102,7 +102,7 @@ pub struct Profile {
 pub struct FaultText {
     /// The text of the fault.
     pub text: String,
-    /// The text on the drive's panel; empty if no available manual gives it.
+    /// The text shown on the drive's panel; empty if no available manual gives it.
     pub panel: String,
     /// Cause of the fault; empty if no available manual gives it.
     pub cause: String,
@@ -121,7 +121,8 @@ pub struct AddressRange {
     pub addresses: RangeInclusive<u16>,
     /// Items per read request.
     pub read: u16,
-    /// Items per read request that no manual states: such a read is tried, and used once its reply proves it; 0 is none.
+    /// Items per read request that no manual states: such a read is tried, and used once a reply has proved it; 0
+    /// means none.
     pub try_read: u16,
     /// Items per write request; 0 is read-only.
     pub write: u16,
@@ -219,11 +220,11 @@ pub enum PollClass {
     Fast,
     /// Polled every `slow_cycle`.
     Slow,
-    /// Read once, when the drive comes online.
+    /// Read only when the drive comes online.
     Once,
-    /// Once after a new fault: see [`Profile::on_fault`].
+    /// Read once after a new fault; see [`Profile::on_fault`].
     Fault,
-    /// Read when the drive comes online and when a comparison needs it: see [`Point::monitor`].
+    /// Read when the drive comes online and when a comparison needs it; see [`Point::monitor`].
     Monitor,
     /// Never read without a request.
     Never,
@@ -252,11 +253,11 @@ pub struct Point {
     pub model: Option<ModelPoint>,
     /// Unit, empty for states and codes.
     pub unit: String,
-    /// Where the value comes from.
+    /// Source of the value.
     pub source: Source,
     /// How often the point is read.
     pub class: PollClass,
-    /// A slow point that is read in the fast class on lines that carry it.
+    /// Whether this slow point is read in the fast class on lines that can carry it.
     pub fast_if_carried: bool,
     /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
     /// when the drive comes online.
@@ -291,13 +292,13 @@ pub struct Point {
 pub struct Blocks {
     /// The cause in one word, for programs.
     pub cause: String,
-    /// The state in which the point blocks: true or not zero, or false.
+    /// The state in which the point blocks the motor: true or not zero, or false.
     pub when: bool,
     /// The remedy.
     pub remedy: String,
 }
 
-/// Where a value comes from.
+/// Source of a value.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Source {
     /// The value is in registers or bits of the drive.
@@ -336,7 +337,7 @@ impl Point {
         self.write && !self.hidden
     }
 
-    /// Whether polling shows it: from its own registers, or derived, which rests on points that are polled.
+    /// Whether polling provides the value: from its own registers, or derived from points that are polled.
     pub fn is_read(&self) -> bool {
         self.raw().is_none() || self.class != PollClass::Never
     }
@@ -366,14 +367,14 @@ impl Point {
         self.texts.get(&code).map(String::as_str)
     }
 
-    /// The value of an enumeration that a text means; `None` also where it means several.
+    /// The enumeration value with this text; `None` also if several values have it.
     pub fn code_of(&self, text: &str) -> Option<i64> {
         let mut codes = self.texts.iter().filter(|(_, meaning)| *meaning == text);
         let first = codes.next().map(|(code, _)| *code);
         first.filter(|_| codes.next().is_none())
     }
 
-    /// The raw source of the point, if it has one.
+    /// The raw source of the point; `None` if it is derived.
     pub fn raw(&self) -> Option<&Raw> {
         match &self.source {
             Source::Raw(raw) => Some(raw),
@@ -393,7 +394,7 @@ impl Profile {
         self.model_index(point).and_then(|i| self.points.get(i))
     }
 
-    /// The points with registers of their own that a point is, or is derived from.
+    /// The points with their own registers from which a point is read or derived.
     pub fn raw_points_of(&self, point: PointIndex) -> Vec<PointIndex> {
         match self.points.get(point).map(|point| &point.source) {
             Some(Source::Derived(derived)) => {
@@ -405,7 +406,7 @@ impl Profile {
         }
     }
 
-    /// The profile with the points that are fast where the line carries it; `None` if it has none.
+    /// The profile with its `fast_if_carried` points in the fast class; `None` if it has none.
     pub fn with_faster_points(&self) -> Option<Profile> {
         if !self.points.iter().any(|point| point.fast_if_carried) {
             return None;
@@ -438,7 +439,7 @@ impl Profile {
         }
     }
 
-    /// The title as shown, with any doubt about the profile.
+    /// The title for display, including any doubt about the profile.
     pub fn described(&self) -> Cow<'_, str> {
         match self.verified {
             true => Cow::Borrowed(&self.title),
@@ -488,7 +489,7 @@ impl Profile {
         };
         let run = setting(ModelPoint::Run, true)?;
         let at = run.place?;
-        // A setting within the control word has no place of its own.
+        // A setting within the control word has no separate register.
         let within = |setting: Setting| Setting {
             place: setting.place.filter(|place| *place != at),
             ..setting
@@ -513,21 +514,22 @@ impl Profile {
         })
     }
 
-    /// The place where the run command is written; it is also read there if the drive allows that.
+    /// The register to which the run command is written; also read there if the drive allows it.
     pub fn run_place(&self) -> Option<ControlItem> {
         let control = self.control.as_ref().map(Control::run_place);
         control.or_else(|| self.model_point(ModelPoint::Run)?.raw().map(ControlItem::of))
     }
 
-    /// Whether that word, written there, is a run command or a stop; `None` if neither.
+    /// Whether this word, written to this register, is a run command or a stop; `None` if neither.
     pub fn runs_by(&self, table: Table, address: u16, word: u16) -> Option<bool> {
         let (control, place) = (self.control.as_ref()?, ControlItem { table, address });
         let run = control.is_run(place, word).then_some(true);
         run.or(control.is_stop(place, word).then_some(false))
     }
 
-    /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
-    /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
+    /// Whether a write of these items is skipped if the drive already has the values, because it stores them in
+    /// EEPROM with limited write cycles. On N2 this includes addresses without a point, but never a stop or a
+    /// pulse.
     pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
         let spared = |address: u16| {
             let covers = |p: &&Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, address));
@@ -553,8 +555,8 @@ impl Profile {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
-    /// The write that stops every drive of the family on a line when it is broadcast: it clears the whole control word.
-    /// None where the family has no such write.
+    /// The write that stops every drive of the family on a line when it is broadcast: it clears the whole control
+    /// word. `None` if the family has no such write.
     pub fn broadcast_stop(&self) -> Option<RequestPdu> {
         let run = self.run_place().filter(|_| self.broadcast_stop)?;
         let pdu = match run.table {
@@ -579,7 +581,7 @@ impl Profile {
 pub struct Profiles(BTreeMap<String, Arc<Profile>>);
 
 impl Profiles {
-    /// Adds a profile; it replaces a profile with the same name.
+    /// Adds a profile; replaces an existing one with the same name.
     pub(crate) fn insert(&mut self, profile: Profile) {
         self.0.insert(profile.name.clone(), Arc::new(profile));
     }

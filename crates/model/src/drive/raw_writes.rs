@@ -14,15 +14,16 @@ pub enum RawWrites {
     /// No other raw writes.
     #[default]
     Points,
-    /// Only these PDU addresses, of registers and coils alike.
+    /// Only these PDU addresses, for registers and coils alike.
     Ranges(Vec<RangeInclusive<u16>>),
-    /// Everything that the profile lets write.
+    /// All addresses that the profile allows to be written.
     All,
 }
 
 impl RawWrites {
-    /// The first of the `addresses` of one write that may not be set; `None` if the write may go out. A write that
-    /// contains the control word may, so that process data can be written as one block and no stop is refused.
+    /// The first of the `addresses` of one write that must not be set; `None` if the write is allowed. A write that
+    /// contains the control word is always allowed, so that process data can be written as one block and no stop is
+    /// refused.
     pub fn refused(
         &self,
         profile: &Profile,
@@ -53,7 +54,7 @@ impl RawWrites {
         configured || is_of_writable_point(profile, table, address)
     }
 
-    /// The addresses that the profile lets write and that are refused, each range as long as it goes.
+    /// The addresses that the profile allows but this setting refuses, as the longest possible ranges.
     pub fn refused_ranges(&self, profile: &Profile) -> Vec<(Table, RangeInclusive<u16>)> {
         let mut refused: Vec<(Table, RangeInclusive<u16>)> = Vec::new();
         for range in profile.ranges.iter().filter(|range| range.write > 0) {
@@ -73,8 +74,8 @@ impl RawWrites {
     }
 }
 
-/// Whether a command to a point sets that register or coil; a point that is read in one place and written in another
-/// has the other one.
+/// Whether a command to a point sets this register or coil; a point that is read in one register and written in
+/// another uses the latter.
 fn is_of_writable_point(profile: &Profile, table: Table, address: u16) -> bool {
     let covers = |raw: &super::Raw| raw.covers(table, address);
     let points = profile.points.iter();

@@ -1,7 +1,8 @@
-//! Parts that a refresh may repeat for a family: its control word, its reference, or both. Pure.
+//! Which writes a refresh may repeat for a family: its control word, its reference, or both. Pure.
 //!
-//! The timeout of some drives counts only writes of the control word or of a reference, so polling does not feed it; such a write
-//! is repeated. What acts once, lies in a coil or at a place of its own, and what the drive stores, is never repeated.
+//! The timeout of some drives counts only writes of the control word or of a reference, so polling does not restart
+//! it; such a write is repeated. A setting that acts once, a coil, a separate register, and a value that the drive
+//! stores are never repeated.
 
 use std::time::Duration;
 
@@ -15,15 +16,15 @@ pub const REFRESH: std::ops::RangeInclusive<Duration> = Duration::from_millis(10
 /// The parts that a refresh repeats.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Repeats {
-    /// The control word.
+    /// Whether the control word is repeated.
     pub word: bool,
     /// A reference.
     pub reference: bool,
 }
 
 impl Control {
-    /// Bits of the control word that `[control]` gives a meaning, except resets. A word with other bits is not repeated: these
-    /// may jog.
+    /// Bits of the control word to which `[control]` gives a meaning, except resets. A word with other bits is not
+    /// repeated, since these may jog the motor.
     pub fn known_bits(&self) -> u16 {
         let here = |setting: &&super::control::Setting| setting.place.is_none();
         let runs = self.runs();
@@ -43,7 +44,7 @@ impl Control {
         self.at.table == Table::Holding && self.runs().iter().all(level) && level(&self.stop)
     }
 
-    /// Whether the drive reports its control word.
+    /// Whether the drive reports its control word when read.
     pub fn is_read(&self) -> bool {
         self.own_word != OwnWord::Shadow
     }
@@ -53,7 +54,7 @@ impl Profile {
     /// The point whose register takes the commands for a point.
     pub fn behind(&self, index: PointIndex) -> PointIndex {
         let mut at = index;
-        // A point rests on one with a register, over one that takes its commands.
+        // Follows a point to the register behind it, through the point that takes its commands.
         for _ in 0..4 {
             let Some(point) = self.points.get(at) else { return at };
             let next = match (&point.source, point.write_to) {
@@ -77,16 +78,16 @@ impl Profile {
             .filter_map(|point| self.points.get(self.behind(self.model_index(point)?))?.raw())
     }
 
-    /// Whether a refresh may repeat that register as a reference.
+    /// Whether a refresh may repeat this register as a reference.
     pub fn is_repeated_reference(&self, address: u16) -> bool {
         let covers = |raw: &Raw| raw.covers(Table::Holding, address);
         self.references().any(covers) && !self.writes_on_change(Table::Holding, &[(address, 0)])
     }
 
-    /// The parts that a refresh repeats, or why there are none.
+    /// The parts that a refresh repeats.
     ///
     /// # Errors
-    /// Why commands are not repeated.
+    /// If commands are not repeated; contains the reason.
     pub fn repeats(&self) -> Result<Repeats, &'static str> {
         if self.protocols.contains(&Protocol::N2) {
             return Err("an N2 drive stores what is written");
@@ -130,7 +131,8 @@ mod tests {
     use super::*;
     use crate::drive::profile::Profiles;
 
-    /// A row for each family: the repeated parts, by hand from the control words in their profiles. `-` is nothing.
+    /// A row for each family: the repeated parts, worked out by hand from the control words in their profiles. `-`
+    /// means nothing.
     #[test]
     fn what_is_repeated_of_each_family() {
         let table = [

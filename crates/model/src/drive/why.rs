@@ -1,8 +1,8 @@
-//! Why a drive does not run: causes from its points, its profile and the last command. Pure: state and time are
-//! arguments.
+//! Explains why a drive does not run: causes from its points, its profile and the last command. Pure: state and
+//! time are arguments.
 //!
-//! A profile names the bits of its family that keep a motor from running (`blocks` of a point); the rest follows from
-//! the common model. States that a family does not report are listed as such, rather than taken for granted.
+//! A profile names the bits of its family that prevent a motor from running (`blocks` of a point); the rest follows
+//! from the common model. States that a family does not report are listed as unknown instead of being assumed.
 
 use crate::drive::PointIndex;
 use std::time::{Duration, Instant};
@@ -12,14 +12,14 @@ use serde::{Deserialize, Serialize};
 use super::model::{ModelPoint, Sample, Value};
 use super::profile::{Point, Profile};
 
-/// A DC link below this, in V, is not charged: the least supply of these families is 200 V, rectified 280 V.
+/// DC link voltage in V below which it is not charged: the lowest supply of these families is 200 V, rectified 280 V.
 const UNCHARGED: f64 = 50.0;
 
 /// Word for an unknown cause.
 const NOT_KNOWN: &str = "not_known";
-/// Word for local control, as `blocks` of a point names it.
+/// Word for local control in `blocks` of a point.
 const LOCAL_CONTROL: &str = "local_control";
-/// Word for an interlock, as `blocks` of a point names it.
+/// Word for an interlock in `blocks` of a point.
 const INTERLOCKED: &str = "interlocked";
 
 /// One reason why a motor does not run.
@@ -29,14 +29,14 @@ pub struct Cause {
     pub cause: String,
     /// The evidence.
     pub evidence: String,
-    /// Age of the evidence, ms; absent if it is not a reading.
+    /// Age of the evidence, ms; absent if the evidence is not a reading.
     pub age_ms: Option<u64>,
     /// The remedy.
     pub remedy: String,
-    /// Who gave the order, where the cause is the last order.
+    /// The client that gave the order, if the cause is the last order.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
-    /// Result code of the order, where it was refused.
+    /// Result code of the order, if it was refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub result: Option<String>,
     /// Time after which a start that must wait may be tried again.
@@ -47,16 +47,16 @@ pub struct Cause {
 /// Whether a motor runs, and why not.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Explanation {
-    /// Whether the motor runs; `None` while that is not known.
+    /// Whether the motor runs; `None` if unknown.
     pub runs: Option<bool>,
     /// Why the drive does not run, the most significant cause first; empty while it runs.
     pub causes: Vec<Cause>,
-    /// States that the family does not report, so that they cannot be ruled out.
+    /// States that the family does not report, so that they cannot be excluded as causes.
     pub not_told: Vec<String>,
 }
 
 impl Explanation {
-    /// The causes with their evidence in one line; `None` if there are none.
+    /// The causes with their evidence as one line; `None` if there are none.
     pub fn blocked_by(&self) -> Option<String> {
         let cause = |Cause { cause, evidence, .. }: &Cause| match evidence.starts_with(cause.as_str()) {
             true => evidence.clone(),
@@ -72,7 +72,7 @@ impl Explanation {
         self.causes.push(cause);
     }
 
-    /// Each cause in one word, in the order of the causes and only once.
+    /// One word for each cause, in the order of the causes and without repetition.
     pub fn words(&self) -> Vec<String> {
         let mut words: Vec<String> = Vec::new();
         for Cause { cause, .. } in &self.causes {
@@ -89,7 +89,7 @@ impl Explanation {
 pub enum Contact {
     /// The process data of the drive is fresh.
     Fresh,
-    /// The drive answers, but its process data is older than it may be.
+    /// The drive answers, but its process data is too old.
     Stale,
     /// The drive does not answer.
     Silent,
@@ -114,7 +114,7 @@ pub struct RunOrder {
     pub text: String,
     /// The outcome as a result code.
     pub result: String,
-    /// How long ago it ended.
+    /// How long ago the last order ended.
     pub age: Duration,
 }
 
@@ -125,7 +125,7 @@ pub enum RunWish {
     Run,
     /// The order was to stop.
     Stop,
-    /// To have no fault any more; a reset starts nothing.
+    /// The order was a fault reset, which starts nothing.
     Reset,
 }
 
@@ -138,7 +138,7 @@ pub enum Fate {
     Refused,
     /// The order was accepted and not sent.
     NotSent,
-    /// The order was sent; whether the drive took it is not known.
+    /// The order was sent, but it is unknown whether the drive accepted it.
     Unsure,
 }
 
@@ -149,11 +149,11 @@ pub enum Giver {
     Client,
     /// Supervision, because a lease expired.
     Supervision,
-    /// The gateway, when it was stopped.
+    /// The gateway gave the order when it was stopped.
     Shutdown,
     /// An interlock that does not hold.
     Interlock,
-    /// The gateway, when the drive's local control place took it while its run command was on.
+    /// The gateway gave the order when local control took over the drive while its run command was on.
     LocalControl,
 }
 
@@ -167,13 +167,13 @@ pub struct Situation<'s> {
     pub read_at: Option<Instant>,
     /// Whether this gateway may command the drive.
     pub is_commandable: bool,
-    /// Why the drive accepts only stops, if so, and what ends that.
+    /// Why the drive accepts only stops and what ends that; `None` if it accepts all commands.
     pub held: Option<String>,
     /// The last command of the run point; requested only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,
 }
 
-/// Why the drive does not run; `sample` has its points, by their index in the profile.
+/// Explains why the drive does not run; `sample` returns its points by their index in the profile.
 pub fn explain(profile: &Profile, sample: &dyn Fn(PointIndex) -> Sample, situation: &Situation<'_>) -> Explanation {
     let look = Examination {
         profile,
@@ -246,7 +246,7 @@ impl Examination<'_> {
         self.model(point).map(|(value, at)| (value.as_bool(), at))
     }
 
-    /// Whether a speed is not zero; `None` where none is known.
+    /// Whether a speed is not zero; `None` if no speed is known.
     fn turns(&self) -> Option<bool> {
         let speeds = [
             ModelPoint::OutputFrequency,
@@ -341,8 +341,8 @@ impl Examination<'_> {
             let blocks = point.blocks.as_ref()?;
             let sample = (self.sample)(index);
             let value = sample.good().filter(|value| value.as_bool() == blocks.when)?;
-            // A drive that is ready waits for no interlock, whatever an uncertain bit seems to say (HVX status word bit 8, where
-            // table and legend of the manual contradict).
+            // A drive that is ready waits for no interlock, whatever an uncertain bit shows (HVX status word bit 8,
+            // on which table and legend of the manual contradict each other).
             let ready = || self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
             if !point.verified && blocks.cause == INTERLOCKED && ready() {
                 return None;
@@ -353,7 +353,7 @@ impl Examination<'_> {
         })
     }
 
-    /// Another control place, where no point of the profile has shown which.
+    /// A cause for another control place, if no point of the profile has shown which one.
     fn local_control(&self, found: &[Cause]) -> Option<Cause> {
         let (_, at) = self.bit(ModelPoint::Remote).filter(|(remote, _)| !remote)?;
         if found.iter().any(|cause| cause.cause == LOCAL_CONTROL) {
@@ -415,7 +415,7 @@ impl Examination<'_> {
             }
             (reads, _) => {
                 let at = reads.and_then(|(_, at)| at);
-                // A fault takes the run command away, so another master is not the cause.
+                // A fault also takes the run command away, so another master is not the cause then.
                 let is_fault = found.iter().any(|cause| cause.cause == "fault");
                 if is_fault && taken == Some(RunWish::Run) {
                     return Vec::new();
@@ -511,7 +511,7 @@ impl Examination<'_> {
     }
 
     fn zero_reference(&self) -> Option<Cause> {
-        // In Hz first: zero percent may be the minimum frequency.
+        // The reference in Hz is checked first, because zero percent may be the minimum frequency.
         let references = [ModelPoint::FrequencyReference, ModelPoint::SpeedReference];
         let known = |point| self.model(point).map(|(value, at)| (point, value, at));
         let (point, value, at) = references.into_iter().find_map(known)?;
@@ -564,7 +564,7 @@ impl Examination<'_> {
     }
 }
 
-/// The result of a stop of the gateway itself, in words.
+/// The result of a stop by the gateway itself, as text.
 fn stopped(fate: Fate, text: &str) -> String {
     match fate {
         Fate::Taken => "it acknowledged the stop".to_string(),

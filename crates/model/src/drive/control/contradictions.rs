@@ -88,7 +88,7 @@ impl Control {
             .collect()
     }
 
-    /// What is wrong with a word that is to stop by other means.
+    /// The mistake in a word that is declared as another way to stop.
     fn wrong_stop(&self, stop: &Setting) -> Option<(&'static str, String, &'static str)> {
         let key = "also_stop";
         let is = format!("{:#06x} in {:#06x}", stop.value, stop.mask);

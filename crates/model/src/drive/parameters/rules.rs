@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 /// PDU addresses of parameters.
 pub type Addresses = Vec<RangeInclusive<u16>>;
 
-/// Rules for writing parameters back; the default has no rules and leaves nothing out.
+/// Rules for writing parameters back; by default there are no rules and nothing is left out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct WriteRules {
     /// Written only if the user names the parameter; and why.
@@ -19,8 +19,8 @@ pub struct WriteRules {
     pub volatile: Addresses,
     /// Parameters that bound one another.
     pub limits: Vec<Limit>,
-    /// The write after which the drive keeps the parameters without power: PDU address and value. Without it every write
-    /// is kept at once, as far as the family is known.
+    /// The write after which the drive stores the parameters permanently: PDU address and value. Without it every
+    /// write is stored at once, as far as the family is known.
     pub save: Option<(u16, u16)>,
     /// Parameters that the drive takes in one mode only.
     pub lock: Option<Lock>,
@@ -28,10 +28,10 @@ pub struct WriteRules {
     pub note: String,
 }
 
-/// Two parameters of one scale of which one is never above the other.
+/// Two parameters of one scale, of which one must never be above the other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limit {
-    /// PDU address of the one that is not below the other.
+    /// PDU address of the parameter that must not be below the other.
     pub upper: u16,
     /// PDU address of the parameter that may not be greater.
     pub lower: u16,
@@ -42,10 +42,10 @@ pub struct Limit {
 pub struct Lock {
     /// The addresses that the lock concerns.
     pub of: Addresses,
-    /// Point (index in the profile) that is true only while the drive refuses them. While it is false the drive may still
-    /// refuse them.
+    /// Point (index in the profile) that is true only while the drive refuses parameters. While it is false, the
+    /// drive may still refuse them.
     pub point: PointIndex,
-    /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual gives it.
+    /// Exception code of the refusal; N2 codes with 0x80 added. `None` if no manual states it.
     pub exception: Option<u8>,
     /// The remedy.
     pub remedy: String,
@@ -57,7 +57,7 @@ pub fn has(addresses: &[RangeInclusive<u16>], address: u16) -> bool {
 }
 
 impl WriteRules {
-    /// Why the parameter is written only if the user names it; `None` if it is written like the others.
+    /// Why the parameter is written only if the user names it; `None` if it is written like all others.
     pub fn held_back(&self, address: u16) -> Option<&str> {
         if has(&self.nameplate, address) {
             return Some("it describes the drive itself");

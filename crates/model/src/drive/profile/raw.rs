@@ -31,7 +31,7 @@ pub struct Raw {
     pub order: Order,
     /// Selected bits, shifted down to bit 0.
     pub mask: Option<u64>,
-    /// The count that means true; with it, the values of the point are true and false.
+    /// The count that means true, for a point with the values true and false.
     pub equals: Option<Equals>,
     /// Register contents, before `mask`, that mean "no value".
     pub invalid: Vec<u64>,
@@ -41,7 +41,7 @@ pub struct Raw {
     pub offset: f64,
     /// Index of the point whose value is the power of ten by which a count is multiplied.
     pub scale_from: Option<PointIndex>,
-    /// Indices of the points by whose values it is multiplied, such as the ratio of a transformer.
+    /// Indices of the points whose values multiply this one, such as the ratio of a transformer.
     pub factor_from: Vec<PointIndex>,
 }
 
@@ -153,16 +153,16 @@ impl Raw {
     /// Whether a value cannot be converted back to its registers.
     pub(in crate::drive) fn is_only_read(&self) -> bool {
         let derived = self.equals.is_some() || self.mask.is_some() || self.scaled_by().next().is_some();
-        // A byte could be written only together with the other byte of its register.
+        // A single byte could only be written together with the other byte of its register.
         derived || matches!(self.form, Form::Text { .. } | Form::I8 { .. })
     }
 
-    /// The points that the value of this one depends on.
+    /// The points by which the value of this one is scaled.
     pub fn scaled_by(&self) -> impl Iterator<Item = PointIndex> {
         self.scale_from.into_iter().chain(self.factor_from.iter().copied())
     }
 
-    /// Whether its values are codes or whole numbers of 64 bits, which are shown as they are.
+    /// Whether the values are codes or 64-bit whole numbers, which are shown unchanged.
     pub(in crate::drive) fn is_code(&self) -> bool {
         let long = matches!(self.form, Form::U64 | Form::I64);
         matches!(self.form, Form::Bits { .. }) || self.is_unscaled() && (long || self.mask.is_some())
@@ -173,8 +173,8 @@ impl Raw {
         self.scale == 1.0 && self.offset == 0.0 && self.scaled_by().next().is_none()
     }
 
-    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them or
-    /// they hold no value. A value with `scale_from` or `factor_from` is decoded by [`Raw::decode_scaled`].
+    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few or
+    /// they contain no value. A value with `scale_from` or `factor_from` is decoded by [`Raw::decode_scaled`].
     pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
         match self.scaled_by().next() {
             Some(_) => None,
@@ -242,7 +242,7 @@ impl Raw {
     }
 
     fn scaled(&self, count: f64, power: i64) -> Option<Value> {
-        // A division by a power of ten is rounded once, a product with a fraction of it twice.
+        // A division by a power of ten is rounded once, a multiplication by a fraction of it twice.
         let count = match i32::try_from(power) {
             Ok(0) => count,
             Ok(power @ 1..=MOST_POWER) => count * 10f64.powi(power),
@@ -339,7 +339,7 @@ fn to_digits(number: u64) -> u64 {
     (0..8).map(digit).sum()
 }
 
-/// A single as its shortest decimal: 0.1 and not 0.10000000149; `None` for NaN and infinities.
+/// A single-precision float as its shortest decimal: 0.1 and not 0.10000000149; `None` for NaN and infinities.
 fn short(single: f32) -> Option<f64> {
     single
         .is_finite()

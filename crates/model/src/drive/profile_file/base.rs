@@ -1,7 +1,7 @@
 //! `base`: a profile that changes a few keys of another one.
 //!
-//! The trees of both files are merged before anything is read, so that every check sees the whole. Problems of what
-//! comes from the base name the base instead of a line.
+//! The trees of a file and its base are merged before anything is read, so that every check sees the whole profile.
+//! Problems of parts from the base name the base instead of a line.
 
 use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 
@@ -68,7 +68,7 @@ pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
     document.set_root(merged);
 }
 
-/// Where a change of a point is wrong: key, line, what and what to do.
+/// An invalid change of a point: key, line, and the problem with its remedy.
 type Mistake = (String, Option<usize>, Finding);
 
 /// Applies `points.NAME.key` and `remove` to the list `point`; names of unknown points are reported.
@@ -217,7 +217,7 @@ fn merge_points(old: &mut Entry, new: Entry) {
     }
 }
 
-/// Merges a point; a point with a new source loses the keys of its old source.
+/// Merges a point; a point with a new source loses the keys of its previous source.
 fn merge_point(point: &mut Node, own: Vec<Entry>) {
     let Raw::Table(into) = &mut point.value else { return };
     let text = |wanted: &str| {
@@ -240,8 +240,8 @@ fn merge_point(point: &mut Node, own: Vec<Entry>) {
     merge_keys(into, own);
 }
 
-/// A range with the start of a base's range changes that range; others come first, so that they take precedence where
-/// both contain an address.
+/// A range that starts like a range of the base changes that one; other ranges are put first, so that they take
+/// precedence if both contain an address.
 fn merge_ranges(old: &mut Entry, new: Entry) {
     let (Raw::Array(into), Raw::Array(from)) = (&mut old.2.value, &new.2.value) else {
         *old = new;

@@ -189,7 +189,7 @@ pub(super) fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Set
 /// `point` of a form cannot be written to, which is reported.
 struct Unusable;
 
-/// Reads `point` of a form; `None` means the control word.
+/// Reads the key `point` of a form; without it the form uses the control word.
 fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Result<Option<ControlItem>, Unusable> {
     let Some(name) = form.optional::<String>("point") else {
         return Ok(None);
@@ -407,9 +407,9 @@ fn read_refresh(table: &Reader<'_>) -> Option<Duration> {
     Some(every)
 }
 
-/// The points of the common model that `[control]` makes, to be put behind `before` others: what they read as rests on the
-/// control word, or on a place of its own; a word that reads as something else is not read. A helper for the control word goes
-/// before them.
+/// The points of the common model that follow from `[control]`, to be added after `before` other points: their
+/// values are read from the control word or a separate register; a word that has another meaning when read is not
+/// used. A helper point for the control word precedes them.
 pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: usize) -> Vec<Point> {
     let mut helpers: Vec<Point> = Vec::new();
     let mut index_of = |place: ControlItem| {
@@ -455,7 +455,7 @@ pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: u
     helpers.iter().cloned().chain(made).collect()
 }
 
-/// The control word as a point, for the points that depend on it.
+/// The control word as a hidden point, for the points that depend on it.
 fn helper(control: &Control, place: ControlItem) -> Point {
     let form = match place.table {
         Table::Coil | Table::DiscreteInput => Form::Bit { bit: 0, invert: false },

@@ -7,7 +7,7 @@ use crate::codec::Table;
 use crate::document::{self, Finding, Reader};
 use crate::drive::{PerPoint, Plan, PlannedRead, PointIndex, Profile};
 
-/// The `maximum` of a band that only the configuration of a drive says: its key there.
+/// Value of `maximum` for a band that only the configuration of a drive defines: its key there.
 const CONFIGURED: &str = "frequency_range";
 
 pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
@@ -81,7 +81,7 @@ fn read_sum(reader: &Reader<'_>, names: &[String]) -> Option<Derived> {
     Some(Derived::Sum { of: of?, weights })
 }
 
-/// Checks that one request of the plan brings all parts of each sum.
+/// Checks that one request of the plan reads all parts of each sum.
 pub(super) fn check_sums(tables: &[Reader<'_>], profile: &Profile) {
     let plan = Plan::of(profile);
     for ((_, point), table) in profile.points.enumerate().zip(tables) {
@@ -134,7 +134,7 @@ fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<
     }
 }
 
-/// The ends of a band are polled: commands are converted and limited by them, and they can be changed at the drive.
+/// Makes sure that the ends of bands are polled: they convert and limit commands, and can be changed at the drive.
 pub(super) fn keep_ends_fresh(points: &mut PerPoint<Point>) {
     let ends: Vec<PointIndex> = points
         .iter()

@@ -1,5 +1,5 @@
-//! What of a profile can only be judged as a whole: states that the gateway would read from its own command, and what a
-//! person should look at twice.
+//! Checks that need the whole profile: states that the gateway would read from its own command, and suspicious
+//! settings that a person should check.
 
 use super::super::control::{Control, Mask, OwnWord, Run, Until};
 use super::super::model::ModelPoint;
@@ -26,7 +26,7 @@ pub(super) fn check(reader: &Reader<'_>, profile: &Profile) {
     }
 }
 
-/// The masks of a status word, by the point of the common model or the step that they are of.
+/// The masks of a status word, by the point of the common model or the step to which they belong.
 fn masks(profile: &Profile, control: &Control) -> Vec<(String, Mask)> {
     let of_state = |point: &ModelPoint| match &profile.model_point(*point)?.source {
         Source::Derived(Derived::State { any }) => Some((point.name().to_string(), any.clone())),
@@ -49,7 +49,8 @@ fn raw_of(profile: &Profile, index: PointIndex) -> Option<&Raw> {
     profile.points.get(index).and_then(Point::raw)
 }
 
-/// A control word that reads back what was written shows what was ordered, not what the drive does.
+/// Refuses states read from a control word that reads back what was written: it shows what was ordered, not what
+/// the drive does.
 fn refuse_own_word(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     if control.own_word != OwnWord::Read {
         return;
@@ -71,7 +72,7 @@ fn refuse_own_word(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     }
 }
 
-/// A drive that was switched on holds 0 in its registers and coils.
+/// Warns if 0 would mean running: a drive that was just switched on has 0 in its registers and coils.
 fn warn_of_running_at_power_up(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     let place = control.run_place();
     let written = profile.model_point(ModelPoint::Run).is_some_and(|run| run.write);
@@ -87,7 +88,7 @@ fn warn_of_running_at_power_up(reader: &Reader<'_>, profile: &Profile, control: 
     }
 }
 
-/// A status word without a value makes every state of it bad.
+/// Warns about a status value that counts as invalid: it would make every state bad.
 fn warn_of_invalid_states(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     let masks = masks(profile, control);
     let state_of = |index: PointIndex, word: u64| {
@@ -113,7 +114,7 @@ fn warn_of_invalid_states(reader: &Reader<'_>, profile: &Profile, control: &Cont
     }
 }
 
-/// A reference register holds 0 until somebody writes it.
+/// Warns about an offset of a reference: its register contains 0 until it is written.
 fn warn_of_offset(reader: &Reader<'_>, profile: &Profile, model: ModelPoint) {
     let Some(point) = profile.model_point(model).filter(|point| point.write) else {
         return;

@@ -1,5 +1,5 @@
-//! Profile files: TOML to a validated [`Profile`], every error with its line. `BUILT_IN` lists the profiles that are
-//! part of the program.
+//! Profile files: parses TOML into a validated [`Profile`] and reports every error with its line. `BUILT_IN` lists
+//! the profiles that are part of the program.
 
 mod base;
 mod commissioning;
@@ -41,7 +41,7 @@ macro_rules! files {
     };
 }
 
-/// A base stands before the profiles that are based on it, and has none itself.
+/// The built-in profiles. A base precedes the profiles that are based on it, and has no base itself.
 const BUILT_IN: &[(&str, &str)] = files![
     "eaton-hvx-n2.toml",
     "eaton-hvx.toml",
@@ -101,14 +101,14 @@ impl Profiles {
         READ.clone()
     }
 
-    /// The name that a profile file gives, and its base; none for what is missing or cannot be read.
+    /// The name and the base in a profile file; `None` for what is missing or cannot be read.
     pub fn names_in(file: &Path) -> (Option<String>, Option<String>) {
         let source = document::read_file(file).unwrap_or_default();
         base::peek(&Document::parse(file.display().to_string(), &source))
     }
 
-    /// Adds the profiles of the files `*.toml` in `directory`; they replace built-in ones of the same name. A file may
-    /// have any other of them as its `base`, in any order.
+    /// Adds the profiles of the files `*.toml` in `directory`; they replace built-in ones with equal names. A file
+    /// may have any other of them as its `base`, in any order.
     pub fn load(&mut self, directory: &Path) -> Vec<Problem> {
         let mut problems = Vec::new();
         let files = match files_of(directory) {
@@ -165,7 +165,7 @@ fn is_configuration(document: &Document) -> bool {
     !has("name") && (has("gateway") || has("bus"))
 }
 
-/// A file whose base may not be read yet.
+/// A file whose base may not have been read yet.
 struct Waiting {
     file: String,
     source: String,
@@ -184,7 +184,7 @@ impl Waiting {
         }
     }
 
-    /// Whether the file waits for one of these; a file that replaces its own base does not wait.
+    /// Whether the file waits for one of these files; a file that replaces its own base does not wait.
     fn waits_for_any_of(&self, files: &[Waiting]) -> bool {
         self.base.is_some() && self.base != self.name && files.iter().any(|other| other.name == self.base)
     }
@@ -206,15 +206,15 @@ impl Profile {
     /// Reads and validates the profile `source`, the text of `file`, whose base can only be a built-in profile.
     ///
     /// # Errors
-    /// Every error of the file, with line and key.
+    /// If the file is invalid; contains every error with line and key.
     pub fn parse(file: &str, source: &str, built_in: bool) -> Result<Profile, Vec<Problem>> {
         Profile::parse_over(file, source, built_in, &Profiles::built_in())
     }
 
-    /// Reads a profile file over a base among the `known` profiles.
+    /// Parses a profile file over its base among the `known` profiles.
     ///
     /// # Errors
-    /// Every error of the file, with line and key.
+    /// If the file is invalid; contains every error with line and key.
     pub fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
         let mut document = Document::parse(file, source);
         let (_, base) = base::peek(&document);
@@ -386,11 +386,11 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     name.map(|_| profile)
 }
 
-/// The parameters of the base, of the base of that one, and so on.
+/// The parameters of the base, of the base of that profile, and so on.
 fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k ParameterList> {
     let first = base.and_then(|base| known.get(base));
     let next = |profile: &&'k Arc<Profile>| {
-        // A profile that has replaced its own base is the last known one.
+        // A profile that has replaced its own base is the last one in the chain.
         let base = profile.base.as_deref().filter(|base| *base != profile.name)?;
         known.get(base)
     };
@@ -398,7 +398,7 @@ fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k P
     all.map(|profile| &profile.parameters).collect()
 }
 
-/// `on_fault`: points that are read at once when a fault comes up; of a derived one, those that it is made of.
+/// Reads `on_fault`: points that are read at once when a fault appears; for a derived one, the points it is derived from.
 fn read_on_fault(reader: &Reader<'_>, points: &PerPoint<Point>) -> Vec<PointIndex> {
     let names: Vec<String> = reader.or("on_fault", Vec::new());
     let mut found = Vec::new();
@@ -418,7 +418,7 @@ fn read_on_fault(reader: &Reader<'_>, points: &PerPoint<Point>) -> Vec<PointInde
     found
 }
 
-/// The base of this profile; the files are merged by now, so only an unknown name is left to report.
+/// The base of this profile. The files are merged by now, so only an unknown name remains to be reported.
 fn read_base(reader: &Reader<'_>, known: &Profiles) -> Option<String> {
     let base: String = reader.optional("base")?;
     if known.get(&base).is_none() {

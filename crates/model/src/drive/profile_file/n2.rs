@@ -80,8 +80,8 @@ fn read_bit(table: &Reader<'_>, key: &str) -> Option<u8> {
     (bit <= 7).then_some(bit)
 }
 
-/// N2 outputs are stored in EEPROM with limited write cycles: unless a point has its own `on_change`, it is written on
-/// change only. Pulses are always written.
+/// N2 outputs are stored in EEPROM with limited write cycles: unless a point has its own `on_change`, they are
+/// written on change only. Pulses are always written.
 pub(super) fn write_on_change(tables: &[Reader<'_>], points: &mut [Point]) {
     for (table, point) in tables.iter().zip(points) {
         if point.write && !point.pulse && point.raw().is_some() && !table.has("on_change") {

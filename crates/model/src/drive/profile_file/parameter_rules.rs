@@ -11,7 +11,8 @@ use super::place::parse_address;
 use crate::codec::Table;
 use crate::document::{Reader, nearest};
 
-/// Reads the rules of `table`; the parameters that they name are those of `list`, in what comes from a base also those of `bases`.
+/// Reads the rules of `table`; the parameters in them are those of `list` and, in parts that come from a base, also
+/// those of `bases`.
 pub(super) fn read(
     table: &Reader<'_>,
     list: &ParameterList,
@@ -41,7 +42,7 @@ fn is_inherited(table: &Reader<'_>, key: &str) -> bool {
 struct Rules<'a, 'd> {
     table: &'a Reader<'d>,
     list: &'a ParameterList,
-    /// Parameters of the base, of its base, and so on.
+    /// Parameters of the base, of the base's base, and so on.
     bases: &'a [&'a ParameterList],
 }
 
@@ -67,7 +68,7 @@ impl Rules<'_, '_> {
         ids.iter().filter_map(|ids| self.span(key, ids)).collect()
     }
 
-    /// `Cn-02`, or `On-20..On-24`.
+    /// Parses a span such as `Cn-02` or `On-20..On-24`.
     fn span(&self, key: &str, ids: &str) -> Option<RangeInclusive<u16>> {
         let (first, last) = ids.split_once("..").unwrap_or((ids, ids));
         let (first, last) = (self.address(key, first)?, self.address(key, last)?);
@@ -83,7 +84,7 @@ impl Rules<'_, '_> {
     fn address(&self, key: &str, id: &str) -> Option<u16> {
         let id = id.trim();
         let of_bases = || {
-            // A profile with a list of its own keeps the addresses of the base.
+            // A profile with its own list keeps the addresses of its base.
             let bases = self.bases.iter().filter(|_| is_inherited(self.table, key));
             bases.filter_map(|base| base.address(id)).next()
         };
@@ -135,11 +136,11 @@ impl Rules<'_, '_> {
     }
 }
 
-/// A limit that is part of a circle, if there is one.
+/// A limit that is part of a circle; `None` if there is none.
 fn in_circle(limits: &[Limit]) -> Option<Limit> {
     let mut left = limits.to_vec();
-    // A limit with nothing below it or nothing above it is not part of a circle; removing such limits repeatedly leaves
-    // only circles.
+    // A limit with nothing below it or nothing above it is not part of a circle; removing such limits repeatedly
+    // leaves only circles.
     loop {
         let (uppers, lowers): (Vec<u16>, Vec<u16>) = left.iter().map(|limit| (limit.upper, limit.lower)).unzip();
         let before = left.len();

@@ -1,4 +1,5 @@
-//! Address and format of a value: `at` and the keys of its form; those that change what is made of it are in `meaning`.
+//! Reads address and format of a value: `at` and the keys of its form; keys that change the interpretation are read
+//! in `meaning`.
 
 use super::super::control::ControlItem;
 use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};

@@ -14,7 +14,7 @@ use super::{is_name, read_pair};
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
 
-/// Names that are keys of states and commands, or metrics of their own: a point with such a name could not be
+/// Names that are keys of states and commands, or have their own metrics: a point with such a name could not be
 /// distinguished from them.
 const TAKEN: [&str; 13] = [
     "age_ms",
@@ -88,7 +88,7 @@ pub(super) fn read_point(
         }
         None => reader.or("unit", String::new()),
     };
-    // The other keys of a point are known even where its source has a fault.
+    // The other keys of a point count as known even if its source is faulty.
     let derived = reader.has("derive");
     let class = if derived { PollClass::Never } else { read_class(reader) };
     let point = Point {
@@ -138,7 +138,7 @@ pub(super) fn read_point(
 fn misspelt(name: &str) -> Option<&'static str> {
     let near = |model: &&'static str| {
         let numbered = name.ends_with(|c: char| c.is_ascii_digit());
-        // Most names differ more in length than one letter can: they cost no comparison.
+        // Most names differ in length by more than one letter, so they need no comparison.
         let near = name.len().abs_diff(model.len()) <= 1;
         near && model.len() > 5 && !numbered && strsim::damerau_levenshtein(name, model) == 1
     };
@@ -193,7 +193,7 @@ pub(super) fn check_target(reader: &Reader<'_>, index: PointIndex, points: &PerP
     }
 }
 
-/// Checks `monitor`: both are registers of their own with values of the same type.
+/// Checks `monitor`: both points must have their own registers and values of equal type.
 pub(super) fn check_monitor(reader: &Reader<'_>, index: PointIndex, points: &PerPoint<Point>) {
     let Some(point) = points.get(index) else { return };
     let Some(monitor) = point.monitor.and_then(|monitor| points.get(monitor)) else {

@@ -125,7 +125,7 @@ impl FromNode for OneOrMore {
     }
 }
 
-/// Checks that an address is in one range only. A file with a base may give other limits to a part of a base's range.
+/// Checks that an address is in one range only. A file with a base may set other limits for a part of a base's range.
 pub(super) fn check_overlaps(reader: &Reader<'_>, ranges: &[AddressRange]) {
     let tables = reader.tables("range");
     let mut seen: Vec<(&AddressRange, Option<String>)> = Vec::new();

@@ -51,7 +51,7 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut PerPoint<Point>) {
     }
 }
 
-/// Reads one of two words; `true` for the second.
+/// Reads a key with one of two words; returns `true` for the second.
 fn word(table: &Reader<'_>, key: &str, words: [&str; 2]) -> Option<bool> {
     let [first, second] = words;
     table.parsed(key, |text| match text {

@@ -6,7 +6,7 @@ use super::super::control::{Reset, Setting, Step, Until};
 use super::control::{Around, read_setting, read_steps, read_time};
 use crate::document::Reader;
 
-/// `fault_reset`: a form, or the words of it.
+/// Reads `fault_reset`: either a form, or a list of words.
 pub(super) fn read(table: &Reader<'_>, around: &Around<'_>, stop: Option<Setting>) -> Option<Reset> {
     let form = table.table("fault_reset")?;
     if form.has("steps") {
@@ -26,8 +26,8 @@ pub(super) fn read(table: &Reader<'_>, around: &Around<'_>, stop: Option<Setting
     })
 }
 
-/// A reset as words: the one that resets for its time, the one behind it, and before them the latter at most. With the bits of
-/// a stop as they are in the word that resets.
+/// A reset given as words: the word that resets for a time, the word after it, and at most the latter before them.
+/// The bits of a stop have their values from the word that resets.
 fn reset_of_steps(form: &Reader<'_>, steps: &[Step], stop: Option<Setting>, pulse: Duration) -> Option<Reset> {
     let refuse = |what: &str, remedy: &str| {
         form.problem("steps", what, remedy);

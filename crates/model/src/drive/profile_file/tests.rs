@@ -1,4 +1,4 @@
-//! Errors of profile files with their places, and what a valid file means.
+//! Errors of profile files with their places, and the meaning of valid files.
 
 use tempfile::TempDir;
 
@@ -46,7 +46,7 @@ fn built_in_profiles_are_valid() {
     }
 }
 
-/// A profile over a built-in one that has a base has what both of them have.
+/// A profile based on a built-in one that has a base inherits from both.
 #[test]
 fn a_base_may_have_a_base() {
     let source = "name = \"p\"\nbase = \"vacon-nx-pid\"\npoints.pid_setpoint.class = \"never\"\n";
@@ -129,7 +129,7 @@ derive = "zero" / of = "b"                               -> there is no point `b
 derive = "zero" / of = "a"                               -> `a` is derived itself; m:12, point[0].derive
 derive = "band" / of = "a"                               -> `maximum` is missing; m:10"#;
 
-/// The lines of a profile on the left of `->`, with ` / ` between them, and the problem on the right.
+/// The lines of a profile to the left of `->`, separated by ` / `, and the expected problem to the right.
 fn mistakes_of(table: &'static str) -> impl Iterator<Item = (String, &'static str)> {
     let rows = table.trim_start().lines();
     let sides = rows.map(|row| row.split_once(" -> ").unwrap());
@@ -316,7 +316,7 @@ fn choices_of_the_reference() {
     assert_eq!(cx.ranges.last().unwrap().addresses, 9901..=9999);
 }
 
-/// Points that convert commands are polled, whatever their class.
+/// Points that convert commands are polled, whatever their class is.
 #[test]
 fn ends_of_a_band_are_polled() {
     let source = HEAD.to_string()
@@ -403,7 +403,7 @@ fn the_page_names_every_key() {
         .any(|p| key.starts_with(p))
     });
     known.retain(|key| !key.contains("texts.") && !key.contains(".always.") && !key.contains(".until."));
-    // One table contains the keys of all forms of commands.
+    // One table has the keys of all forms of commands.
     const FORMS: [&str; 5] = ["run", "stop", "also_stop[]", "reverse", "fault_reset"];
     let form = |key: String| {
         let of = FORMS.iter().find_map(|of| key.strip_prefix(&format!("control.{of}.")));
@@ -467,12 +467,12 @@ fn points_for_faults_are_read_by_their_registers() {
         .map(|i| profile.points.get(*i).unwrap().name.as_str())
         .collect();
     assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
-    // A point that is polled anyway, or is compared with process data, needs no read of its own.
+    // A point that is polled anyway, or is compared with process data, needs no separate read.
     let plan = crate::drive::Plan::of(&profile);
     assert_eq!(plan.on_fault, []);
     let monitors: Vec<_> = plan.monitors.iter().map(|read| (read.start, read.count)).collect();
     assert_eq!(monitors, [(0, 2), (3, 4), (44, 1), (98, 1)]);
-    // A derived point is read by what it is made of; what is removed is not read.
+    // A derived point is read through its sources; a removed point is not read.
     let derived = Profile::parse("p", &source("\"frequency_reference\""), false).unwrap();
     let names: Vec<&str> = derived
         .on_fault

@@ -10,7 +10,7 @@ fn profile(name: &str) -> Arc<Profile> {
     Profiles::built_in().get(name).unwrap().clone()
 }
 
-/// Values of a drive, by point; the rest is not known.
+/// Values of a drive by point; all others are unknown.
 struct Says {
     profile: Arc<Profile>,
     values: BTreeMap<PointIndex, Value>,
@@ -161,7 +161,7 @@ fn every_family_tells_what_the_common_model_has() {
     }
 }
 
-/// Table and legend of the manual contradict about bit 8 of the status word: it blocks no drive that is ready.
+/// Table and legend of the manual contradict each other on bit 8 of the status word: the bit blocks no drive that is ready.
 #[test]
 fn an_uncertain_interlock_blocks_no_drive_that_is_ready() {
     let ready = stands("eaton-hvx").with("interlocked", Value::Bool(true));
@@ -204,7 +204,7 @@ fn what_only_some_families_tell() {
         let cause = &says.explain().causes[0];
         assert!(cause.evidence.contains(point), "{cause:?}");
         assert!(!cause.remedy.is_empty() && cause.age_ms == Some(140), "{cause:?}");
-        // A drive that it keeps from being ready is not also unready for no reason.
+        // A drive that this state keeps from being ready is not also reported as unready for no reason.
         let unready = stands(family).with(point, Value::Bool(state)).off("ready");
         let also = if word == "local_control" {
             "local_control not_ready"

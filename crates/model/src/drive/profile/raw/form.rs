@@ -7,7 +7,7 @@ pub enum Form {
     Bit {
         /// Number of the bit.
         bit: u8,
-        /// 0 means true.
+        /// Whether the bit is inverted, so that 0 means true.
         invert: bool,
     },
     /// Neighbouring bits of a register as a number.
@@ -19,7 +19,7 @@ pub enum Form {
     },
     /// Signed 8 bit, two's complement: one byte of a register.
     I8 {
-        /// Whether it is the high byte; otherwise the low one.
+        /// Whether the value is in the high byte of the register; otherwise in the low one.
         high: bool,
     },
     /// Unsigned 16 bit.
@@ -38,7 +38,7 @@ pub enum Form {
     F32,
     /// IEEE 754 double in four registers; likewise.
     F64,
-    /// Four binary-coded decimals.
+    /// Four binary-coded decimal digits in one register.
     Bcd16,
     /// Eight binary-coded decimals in two registers.
     Bcd32,
@@ -49,14 +49,14 @@ pub enum Form {
     },
 }
 
-/// Order of the bytes of a value, as 32 bits of it appear on the wire; A is the most significant byte. With four registers
-/// CDAB is that of all words, the least significant first.
+/// Byte order of a 32-bit value on the wire; A is the most significant byte. With four registers, CDAB means the
+/// least significant word first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Order {
     /// High byte and high word first, as in most Modbus devices.
     #[default]
     Abcd,
-    /// Low word first.
+    /// The low word is first.
     Cdab,
     /// Low byte first in each register.
     Badc,
@@ -65,7 +65,7 @@ pub enum Order {
 }
 
 impl Order {
-    /// All orders.
+    /// All byte orders.
     pub const ALL: [Order; 4] = [Order::Abcd, Order::Cdab, Order::Badc, Order::Dcba];
 
     /// The name in profiles and output.
@@ -82,7 +82,7 @@ impl Order {
         matches!(self, Order::Cdab | Order::Dcba)
     }
 
-    /// The word with its bytes in the usual order: high byte first.
+    /// The word with its bytes in normal order, the high byte first.
     pub(super) fn word(self, word: u16) -> u16 {
         match self {
             Order::Abcd | Order::Cdab => word,
@@ -173,7 +173,7 @@ impl Form {
         matches!(self, Form::I8 { .. } | Form::I16 | Form::I32 | Form::I64)
     }
 
-    /// Whether the form is a whole number of registers, so that `mask` may take bits of it.
+    /// Whether the form is a whole number of registers, so that `mask` can select bits of it.
     pub fn takes_mask(self) -> bool {
         matches!(self, Form::U16 | Form::U32 | Form::U64)
     }

@@ -2,7 +2,7 @@
 
 use super::{EXACT, Equals, Form, Raw, low_mask, to_digits};
 
-/// Bits of a register or of an item of a bit table, and what they are.
+/// Bits of a register or of an item of a bit table, with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Part {
     /// The bits.
@@ -12,7 +12,8 @@ pub struct Part {
 }
 
 impl Raw {
-    /// The bits that make a point of states true, item by item, and whether they make it false instead; `None` for other points.
+    /// The bits that make a point with states true, item by item, and whether they make it false instead; `None`
+    /// for other points.
     pub fn state_parts(&self) -> Option<(Vec<Part>, bool)> {
         match (self.equals, self.form) {
             (Some(Equals { count, invert }), form) => {
@@ -44,7 +45,7 @@ impl Raw {
         words.map(|(mask, value)| Part { mask, value }).collect()
     }
 
-    /// Register contents for a number, as near as the type comes to it, with the count divided by this power of ten.
+    /// Register contents for a number, as close as the type allows, with the count divided by this power of ten.
     pub fn number_parts(&self, value: f64, power: i64) -> Vec<Part> {
         let power = i32::try_from(power)
             .unwrap_or(0)

@@ -23,7 +23,7 @@ const AT: ControlItem = ControlItem {
     address: 0,
 };
 
-/// As Siemens has them: the bits without which a word counts for nothing are in the masks.
+/// A sequence as for Siemens: the bits without which a word is ignored are part of the masks.
 const SEQUENCE: &str = "always = { set = [1, 2, 3, 10], clear = [8] }\nstop = { mask = 0x0401, value = 0x0400 }\n\
     run = { steps = [{ write = 0x040E }, { write = 0x040F }] }\nreverse = { bit = 11 }\n\
     also_stop = [{ mask = 0x0402, value = 0x0400 }, { bit = 2, is = 0 }]";
