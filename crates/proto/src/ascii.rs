@@ -1,8 +1,9 @@
 //! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (reference/drives.md 5.1, worked frames section 7.3).
 //!
-//! A frame has a definite beginning and end, so anything outside it is recognised at once: characters before a colon
-//! are noise, and a colon in the middle begins the frame again. Digits are sent in upper case and taken in either. Of
-//! the pause of 1 s between two characters that ends a frame only a slave needs to know: a master has its deadline.
+//! Modbus ASCII. A frame has a definite start and end, so anything outside of it is recognised at once: characters
+//! before a colon are noise, and a colon inside a frame starts it again. Digits are sent in upper case and accepted
+//! in either case. Only a slave needs the pause of 1 s between two characters that ends a frame; a master has its
+//! deadline.
 
 use super::checksum::lrc;
 use super::modbus::{MAX_PDU, Reply, RequestPdu};
@@ -41,7 +42,7 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     encode_frame(request.address, &pdu, out);
 }
 
-/// Decodes `bytes` as the answer to `request`. A reply's `used` counts the noise before it too.
+/// Decodes `bytes` as the answer to `request`. `used` of a reply includes the noise before it.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let start = noise(bytes);
     let rest = bytes.get(start..).unwrap_or_default();
@@ -69,8 +70,8 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// Characters before the first frame that cannot belong to it: all until its colon, the last one where several came
-/// before a line feed. Without any colon, all of them.
+/// Characters before the first frame that cannot belong to it: everything up to its colon, or to the last colon if
+/// several precede a line feed. Without any colon, all of them.
 pub fn noise(bytes: &[u8]) -> usize {
     let Some(first) = bytes.iter().position(|&b| b == BEGIN) else {
         return bytes.len();
@@ -84,7 +85,7 @@ pub fn noise(bytes: &[u8]) -> usize {
     first + line.iter().rposition(|&b| b == BEGIN).unwrap_or(0)
 }
 
-/// Length of what a master sent up to its first line feed; `None` while that is not there.
+/// Length of a master's frame up to its first line feed; `None` while the line feed has not arrived.
 pub fn request_len(bytes: &[u8]) -> Option<usize> {
     bytes.iter().position(|&b| b == END).map(|end| end + 1)
 }
@@ -94,7 +95,7 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     parse(frame.get(noise(frame)..)?).ok()
 }
 
-/// The address and PDU of a frame without its LRC, as far as they can be trusted.
+/// The address and PDU of a damaged frame without its LRC, as far as they can be trusted.
 pub fn damaged_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     let body = body(frame.get(noise(frame)..)?).ok()?;
     check(&body).err()?;
@@ -104,7 +105,7 @@ pub fn damaged_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     }
 }
 
-/// The request in a whole frame, as a slave reads it; `None` when the frame or its LRC is wrong (a slave stays silent).
+/// The request in a complete frame, as a slave decodes it; `None` if the frame or its LRC is wrong (a slave stays silent).
 pub fn decode_request(frame: &[u8]) -> Option<(u8, super::rtu::ReceivedPdu)> {
     let (address, pdu) = open_frame(frame)?;
     let function = *pdu.first()?;
@@ -120,7 +121,7 @@ fn unfinished(frame: &[u8]) -> Result<(), &'static str> {
     digits.iter().try_for_each(|&b| value(b).map(|_| ()))
 }
 
-/// Address and PDU of a frame from its colon to its line feed, or why it is none.
+/// Address and PDU of a frame from its colon to its line feed, or the reason why it is not a valid frame.
 fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
     let body = body(frame)?;
     check(&body)?;
@@ -130,7 +131,7 @@ fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
     }
 }
 
-/// Address, PDU and LRC between the colon of a frame and its line feed, or why the frame has none.
+/// Address, PDU and LRC between the colon of a frame and its line feed, or the reason why the frame has none.
 fn body(frame: &[u8]) -> Result<Vec<u8>, &'static str> {
     let line = frame.strip_prefix(b":").ok_or("it does not start with a colon")?;
     let line = line.strip_suffix(b"\n").ok_or("it does not end with a line feed")?;
@@ -164,7 +165,7 @@ pub(crate) fn digit(nibble: u8) -> u8 {
     if nibble < 10 { b'0' + nibble } else { b'A' + nibble - 10 }
 }
 
-/// The value of a digit, or what is wrong with a character that stands for one.
+/// The value of a digit, or the problem with a character in place of a digit.
 fn value(character: u8) -> Result<u8, &'static str> {
     match character {
         b'0'..=b'9' => Ok(character - b'0'),

@@ -1,4 +1,4 @@
-//! Frames in plain words, one line each, as text who look at a line.
+//! Frames as plain text, one line each, for people who watch a line.
 //!
 //! Registers are in hexadecimal as on the wire, addresses are PDU addresses, counted from 0.
 
@@ -14,8 +14,7 @@ pub use parts::{Kind, Part, parts};
 /// Values that a line shows; the bytes of the frame have the others.
 const SHOWN: usize = 16;
 
-/// The characters of a protocol that is text: control characters by their pictures, such as `␍␊`, and what is none of
-/// ASCII as `\xFF`.
+/// The characters of a text protocol: control characters as symbols such as `␍␊`, and bytes outside of ASCII as `\xFF`.
 pub fn text(bytes: &[u8]) -> String {
     let mut text = String::with_capacity(bytes.len() + 4);
     for &byte in bytes {
@@ -86,7 +85,7 @@ pub fn request(request: &RequestPdu) -> String {
     }
 }
 
-/// A request as that protocol's users know it: `read AI 2 value` and not `read input 2..3` on N2.
+/// A request in the terms of users of the protocol: on N2 `read AI 2 value` and not `read input 2..3`.
 pub fn request_on(protocol: Protocol, pdu: &RequestPdu) -> String {
     if let (Protocol::N2, RequestPdu::Other(digits)) = (protocol, pdu) {
         return format!("command {}", text(digits));

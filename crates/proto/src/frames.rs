@@ -1,15 +1,15 @@
-//! Splits the bytes on a line into requests, replies and others. Pure: time is an argument.
+//! Splits the bytes on a line into requests, replies and other pieces. Pure: time is an argument.
 //!
-//! Drivers and adapters hand bytes over late and in lumps, so silence decides little. A frame is known by its content: a
-//! request by function, length and check code; a reply by the request before it. Only what stays incomplete is given up by
-//! silence.
+//! Drivers and adapters deliver bytes late and in lumps, so silence proves little. A frame is recognised by its
+//! content: a request by function, length and check code; a reply by the preceding request. Silence only discards
+//! incomplete frames.
 
 use std::time::{Duration, Instant};
 
 use super::n2::{self, Command};
 use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
 
-/// As long as a USB adapter holds bytes back, and longer.
+/// Time for which a USB adapter may hold bytes back, with a margin.
 pub const HELD_BACK: Duration = Duration::from_millis(30);
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
@@ -20,7 +20,7 @@ pub const GLITCH: usize = 2;
 /// The piece found at the beginning of the bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Cut {
-    /// A request of the other master; the PDU is `None` where the codec has none for it.
+    /// A request of the other master; the PDU is `None` if the codec does not know it.
     Request {
         /// The address; 0 is the broadcast.
         address: u8,
@@ -43,7 +43,7 @@ pub enum Cut {
 pub struct Piece {
     pub cut: Cut,
     pub bytes: Vec<u8>,
-    /// Beginning of its first and end of its last character on the wire, as far as arrival shows it.
+    /// Start of its first and end of its last character on the wire, estimated from the arrival of the bytes.
     pub began: Instant,
     pub ended: Instant,
 }
@@ -51,12 +51,12 @@ pub struct Piece {
 /// Result of looking for a frame at one place in the bytes.
 enum FrameSearch {
     Is(usize, Cut),
-    /// The bytes may become a frame when more arrive. `true`: the part received already makes a reply likely.
+    /// The bytes may become a frame when more arrive. `true` means that the received part already makes a reply likely.
     MayBecome(bool),
     Nothing,
 }
 
-/// Bytes that are not cut into frames yet, with their times.
+/// Bytes that are not split into frames yet, with their times.
 #[derive(Debug)]
 pub struct Frames {
     protocol: Protocol,
@@ -69,8 +69,8 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Starts without any received bytes. Behind an incomplete frame that goes silent for `held_back`, on top of 3.5
-    /// characters, the rest is no longer expected.
+    /// Starts without any received bytes. The rest of an incomplete frame is no longer expected after silence of
+    /// `held_back` in addition to 3.5 characters.
     pub fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
         Frames {
             protocol,
@@ -82,8 +82,8 @@ impl Frames {
         }
     }
 
-    /// Bytes arrived at `now`: the last of them just then, the others as much earlier as the wire takes, but not before those
-    /// that came before.
+    /// Adds bytes that arrived at `now`: the last of them just then, the others earlier by their wire time, but not
+    /// before previously received bytes.
     pub fn add(&mut self, bytes: &[u8], now: Instant) {
         for (place, byte) in bytes.iter().enumerate() {
             let behind = self.format.chars(bytes.len() - 1 - place);
@@ -95,7 +95,7 @@ impl Frames {
         }
     }
 
-    /// When bytes that wait for more are given up; sooner for whole frames that are not a request the codec knows.
+    /// When bytes that wait for more are given up; sooner for complete frames that are not a request known to the codec.
     pub fn patience(&self) -> Option<Instant> {
         let last = self.last.filter(|_| !self.bytes.is_empty())?;
         let held_back = match self.protocol {
@@ -110,7 +110,7 @@ impl Frames {
         &self.bytes
     }
 
-    /// The next piece, if one can be cut by `now`; `open` is the request whose reply may come.
+    /// The next piece, if one can be split off by `now`; `open` is the request whose reply may arrive.
     pub fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
         if self.bytes.is_empty() {
             return None;
@@ -127,7 +127,7 @@ impl Frames {
         let mut incomplete = false;
         for at in 0..self.bytes.len() {
             let rest = self.bytes.get(at..).unwrap_or_default();
-            // After more than a glitch no reply is accepted: the request that it belongs to may be in the garbage.
+            // After more than a short glitch no reply is accepted: the request that it belongs to may be in the garbage.
             let open = open.filter(|_| at <= GLITCH);
             match rtu_at(rest, open) {
                 FrameSearch::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {
@@ -164,7 +164,7 @@ impl Frames {
         let begin = begin_of(self.protocol, line);
         let frame = line.get(begin..).unwrap_or_default();
         let cut = line_cut(self.protocol, frame, open.filter(|_| begin <= GLITCH));
-        // Bytes before a request become a piece of their own.
+        // Bytes before a request become a separate piece.
         if begin > 0 && !matches!(cut, Cut::Reply { .. } | Cut::Garbage) {
             return self.cut(begin, Cut::Garbage);
         }
@@ -185,7 +185,7 @@ impl Frames {
     }
 }
 
-/// Looks for a frame at the beginning of `bytes` on a Modbus RTU line.
+/// Searches for a frame at the start of `bytes` on a Modbus RTU line.
 fn rtu_at(bytes: &[u8], open: Option<&Request>) -> FrameSearch {
     let reply = open.map_or(FrameSearch::Nothing, |open| rtu_reply(bytes, open));
     match (reply, rtu_request(bytes)) {
@@ -218,7 +218,7 @@ fn rtu_reply(bytes: &[u8], open: &Request) -> FrameSearch {
                 None => FrameSearch::Nothing,
             }
         }
-        // Two bytes fit a request too.
+        // Two bytes may also be the start of a request.
         Decoded::Incomplete => FrameSearch::MayBecome(bytes.len() > 2 && announced(&open.pdu).is_some()),
         Decoded::Foreign { .. } | Decoded::Corrupt(_) => FrameSearch::Nothing,
     }
@@ -232,8 +232,8 @@ fn announced(pdu: &RequestPdu) -> Option<u8> {
     }
 }
 
-/// Judges a PDU whose form answers `open`. `None` where the PDU repeats the open request. A reply to a read that would be a
-/// request as well is ambiguous: the other master may be asking for something else.
+/// Judges a PDU that has the form of a reply to `open`. `None` if the PDU repeats the open request. A reply to a
+/// read that could also be a request is ambiguous: the other master may be sending another request.
 fn reply_or_request(open: &Request, reply: &Reply, pdu: &[u8]) -> Option<Cut> {
     let request = RequestPdu::decode(pdu).ok();
     let reads = matches!(reply, Reply::Bits(_) | Reply::Registers(_));
@@ -253,7 +253,7 @@ fn rtu_request(bytes: &[u8]) -> FrameSearch {
     if address > 247 || !rtu::is_known(function) {
         return FrameSearch::Nothing;
     }
-    // These bytes must agree with a count before them.
+    // The number of bytes must agree with a count before them.
     let counted = match function {
         15 => (usize::from(word(bytes, 4)).div_ceil(8), 6),
         16 => (2 * usize::from(word(bytes, 4)), 6),
@@ -318,7 +318,7 @@ fn word(bytes: &[u8], at: usize) -> u16 {
     u16::from_be_bytes([byte(at), byte(at + 1)])
 }
 
-/// Where the frame of a line begins: at its last colon or `>`, or with N2 at its first letter.
+/// Where the frame in a line begins: at its last colon or `>`, or on N2 at its first letter.
 fn begin_of(protocol: Protocol, line: &[u8]) -> usize {
     match protocol {
         Protocol::N2 => {

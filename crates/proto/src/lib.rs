@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 /// One request to one drive: address and PDU.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Request {
-    /// Address of the drive on its bus, 1..=247, with N2 to 255 (0 is broadcast: no reply follows).
+    /// Address of the drive on its bus, 1..=247, on N2 up to 255 (0 is a broadcast, which gets no reply).
     pub address: u8,
     /// The request PDU.
     pub pdu: RequestPdu,
@@ -44,7 +44,7 @@ impl Request {
 /// The bytes received so far, decoded against the outstanding request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Decoded {
-    /// The frame is not complete yet; read on until the deadline.
+    /// The frame is incomplete; more bytes are read until the deadline.
     Incomplete,
     /// The reply to the request; `used` bytes belong to its frame.
     Reply {
@@ -59,8 +59,8 @@ pub enum Decoded {
         /// Bytes of the buffer to drop.
         used: usize,
     },
-    /// The bytes cannot become the reply any more (check code, impossible length): the transaction
-    /// has failed, the schedule retries it once the line is silent.
+    /// The bytes cannot become the reply any more (check code, impossible length): the transaction has failed, and
+    /// the schedule retries it once the line is silent.
     Corrupt(&'static str),
 }
 
@@ -121,7 +121,7 @@ impl Protocol {
         }
     }
 
-    /// Appends a frame of this PDU to `out`; nothing in N2, whose frames hold no PDU.
+    /// Appends a frame with this PDU to `out`; nothing on N2, whose frames contain no PDU.
     pub fn encode_frame(self, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
         match self {
             Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
@@ -139,7 +139,8 @@ impl Protocol {
         }
     }
 
-    /// Characters at the beginning of `bytes` that cannot be part of a frame. With Modbus RTU and N2 that cannot be known.
+    /// Number of characters at the start of `bytes` that cannot be part of a frame. With Modbus RTU and N2 that
+    /// cannot be determined.
     pub fn noise(self, bytes: &[u8]) -> usize {
         match self {
             Protocol::ModbusAscii => ascii::noise(bytes),
@@ -147,8 +148,8 @@ impl Protocol {
         }
     }
 
-    /// Whether a reply from `address` that begins with this character may be accepted although garbage preceded it.
-    /// Never in N2, whose replies have no address and a check code of only 8 bits.
+    /// Whether a reply from `address` that begins with this character may be accepted after garbage. Never on N2,
+    /// whose replies have no address and a check code of only 8 bits.
     pub fn may_begin_behind_garbage(self, address: u8, character: u8) -> bool {
         match self {
             Protocol::ModbusRtu => character == address,
@@ -157,8 +158,8 @@ impl Protocol {
         }
     }
 
-    /// Whether invalid bytes begin like the reply to `request`, so that they were that reply, damaged on the line, and
-    /// no noise before it. An N2 reply shows nothing of its request: there the length has to do.
+    /// Whether invalid bytes begin like the reply to `request`, so that they are a damaged reply and not noise
+    /// before it. An N2 reply shows nothing of its request, so there only the length counts.
     pub fn begins_reply(self, request: &Request, bytes: &[u8]) -> bool {
         let head = [request.address, request.pdu.function()];
         match self {
@@ -175,7 +176,7 @@ impl Protocol {
         }
     }
 
-    /// The address and PDU of any valid Modbus frame; `None` in N2, whose frames have none.
+    /// The address and PDU of any valid Modbus frame; `None` on N2, whose frames have no PDU.
     pub fn open_frame(self, frame: &[u8]) -> Option<(u8, Vec<u8>)> {
         match self {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec())),
@@ -205,12 +206,12 @@ impl Protocol {
     pub fn recognition(self, format: &LineFormat) -> Duration {
         match self {
             Protocol::ModbusRtu => format.silence_chars(),
-            // ASCII and N2 frames end with a character of their own, so no silence is needed.
+            // ASCII and N2 frames end with a special character, so no silence is needed.
             Protocol::ModbusAscii | Protocol::N2 => Duration::ZERO,
         }
     }
 
-    /// Silence before a request on a line where nothing else is configured than `silence`.
+    /// Silence before a request on a line with no other time settings than `silence`.
     pub fn silence(self, silence: Silence, format: &LineFormat) -> Duration {
         match (self, silence) {
             (Protocol::N2, Silence::Spec) => n2::GAP.max(format.silence_chars()),

@@ -1,7 +1,7 @@
 //! Modbus PDUs, shared by RTU, ASCII and TCP, for both ends.
 //!
-//! A master encodes requests and decodes replies; the Modbus TCP server and the simulated drives
-//! do it the other way round with the same types.
+//! Modbus requests and replies. A master encodes requests and decodes replies; the Modbus TCP server and the
+//! simulated drives do the opposite with these types.
 
 mod exception;
 mod reply;
@@ -21,13 +21,13 @@ pub const MAX_PDU: usize = 253;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Table {
-    /// Read and write bits, 0xxxx.
+    /// Bits that can be read and written, 0xxxx.
     Coil,
-    /// Read-only bits, 1xxxx.
+    /// Bits that can only be read, 1xxxx.
     DiscreteInput,
-    /// Read-only registers, 3xxxx.
+    /// Registers that can only be read, 3xxxx.
     Input,
-    /// Read and write registers, 4xxxx.
+    /// Registers that can be read and written, 4xxxx.
     Holding,
 }
 
@@ -64,7 +64,7 @@ impl Table {
             .find(|t| t.name() == name)
     }
 
-    /// Most items of the table that one request may read in the protocol.
+    /// Most items of the table that the protocol allows in one read.
     pub fn max_read(self) -> u16 {
         if self.is_bits() { 2000 } else { 125 }
     }

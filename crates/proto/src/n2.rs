@@ -8,9 +8,9 @@
 //! | AO n | holding register | 2 (n - 1) and the next, float, high word first | read of attribute 3; written by override |
 //! | ADI n | input register | 0x4000 + n - 1 | read of attribute 2 |
 //!
-//! A request without an object has no frame: it is never sent. Behaviour that no manual specifies is listed in one
-//! table, see [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated
-//! drive reads and answers with the same types.
+//! A request without an N2 object has no frame and is never sent. Behaviour that no manual specifies is listed in
+//! one table, see [`ASSUMPTIONS`]. This module is the master's side; [`command`] has the frames themselves, which a
+//! simulated drive decodes and answers with these types.
 
 pub mod assumptions;
 pub mod command;
@@ -46,14 +46,14 @@ pub const RETRIES: u32 = 2;
 /// Session messages to a drive, in addition to reads and writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Session {
-    /// Identify device type. A restarted drive answers no other command before it.
+    /// Identify device type. A restarted drive answers no other command before this one.
     Identify,
     /// Poll for changes.
     Poll {
         /// Whether the poll acknowledges the previous report.
         again: bool,
     },
-    /// Gives an overridden object back to the drive's own control.
+    /// Returns an overridden object to the drive's own control.
     Release {
         /// Table of the object.
         table: Table,
@@ -93,8 +93,8 @@ pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
     }
 }
 
-/// The request that a master's command means, as [`command_of`] the other way round; `None` where this master has none for it:
-/// attributes that are no value, objects that no table has, times, memory, uploads.
+/// The request that corresponds to a master's command, the inverse of [`command_of`]; `None` if this master has no
+/// such request: attributes other than a value, objects in no table, times, memory, uploads.
 pub fn pdu_of(command: &Command) -> Option<RequestPdu> {
     match command {
         Command::Identify => Some(RequestPdu::N2(Session::Identify)),
@@ -129,7 +129,7 @@ fn switch(address: u16, on: bool) -> Option<Command> {
     Some(Command::Override { object, data })
 }
 
-/// Appends the request's frame to `out`; nothing for a request that means no object.
+/// Appends the request's frame to `out`; nothing if the request refers to no object.
 pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     match (&request.pdu, command_of(&request.pdu)) {
         (RequestPdu::Other(text), _) => command::encode_text(request.address, text, out),
@@ -152,16 +152,17 @@ pub enum Form {
     Integer,
     /// The device type.
     Identity,
-    /// Change records, or none.
+    /// The answer contains change records, possibly none.
     Changes,
     /// No data: an acknowledgement.
     Acknowledgement,
-    /// Whatever a request that is not decoded is answered with.
+    /// Any answer, for a request that is not decoded.
     Any,
 }
 
 impl Form {
-    /// Whether a late reply of this form could pass for one of that. A late identity is distinguished from a state by its value.
+    /// Whether a late reply of this form could be mistaken for one of the wanted form. A late identity is
+    /// distinguished from a state by its value.
     pub fn is_like(self, wanted: Form) -> bool {
         use Form::{Acknowledgement, Any, Changes, Float, Identity, Integer, State};
         matches!(
@@ -198,8 +199,8 @@ pub fn form(pdu: &RequestPdu) -> Option<Form> {
 
 /// Decodes `bytes` as the answer to `request`.
 ///
-/// A reply carries neither address nor command: only its form is checked against what was asked. Blank characters and
-/// the glitches of a line that changes direction are passed over before the first letter.
+/// Decodes the answer to a request. A reply contains neither address nor command: only its form is compared with
+/// the request. Blank characters and glitches of a line that changes direction are skipped before the first letter.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let begin = bytes.iter().position(u8::is_ascii_graphic);
     if begin.unwrap_or(bytes.len()) > LONGEST {
@@ -224,7 +225,7 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// A line without its CR: more bytes may follow, unless the line cannot become a reply.
+/// Judges a line without its CR: more bytes may follow, unless the line cannot become a reply.
 fn unended(frame: &[u8]) -> Decoded {
     if frame.len() > LONGEST {
         return Decoded::Corrupt("no CR in the longest reply's characters");
@@ -255,7 +256,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
         (Form::Identity, [device]) => Ok(Reply::Identified(*device)),
         (Form::State, [status]) => Ok(state(*status, &request.n2)),
         (Form::Integer, [a, b] | [_, a, b]) => Ok(Reply::Registers(vec![word(*a, *b)])),
-        // Any bit pattern is accepted here; NaN becomes "no value" where the point is decoded.
+        // Any bit pattern is accepted here; NaN becomes "no value" when the point is decoded.
         (Form::Float, [a, b, c, d] | [_, a, b, c, d]) => Ok(Reply::Registers(vec![word(*a, *b), word(*c, *d)])),
         (Form::Acknowledgement, _) => Err("data where an acknowledgement was expected"),
         (_, []) => Err("an acknowledgement where data was expected"),

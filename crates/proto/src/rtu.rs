@@ -17,7 +17,7 @@ pub fn encode_frame(address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     end_frame(start, out);
 }
 
-/// Appends the CRC of what is in `out` from `start` on.
+/// Appends the CRC of the bytes in `out` from `start` on.
 fn end_frame(start: usize, out: &mut Vec<u8>) {
     let crc = crc16(out.get(start..).unwrap_or_default());
     out.extend_from_slice(&crc.to_le_bytes());
@@ -43,11 +43,11 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
 
 /// Decodes `bytes` as the answer to `request`.
 ///
-/// The end of a reply is known from its own first bytes, so no silence has to be waited for: the
-/// regular reply has a fixed length, an exception five characters, 43/14 counts its objects.
-/// Bytes that begin another drive's or another function's frame are measured the same way and
-/// dropped when their CRC is right. A length that no frame has is refused as soon as it is announced. Of a function that is not
-/// decoded no length is known: all that came is its reply as soon as the CRC is right, and silence shows whether it was all.
+/// Decodes the reply to a request. Its own first bytes show where the reply ends, so no silence is needed: the
+/// regular reply has a fixed length, an exception five characters, 43/14 counts its objects. A frame of another
+/// drive or another function is measured in this way too, and dropped if its CRC is right. An impossible length is
+/// refused as soon as it is announced. For a function that is not decoded the length is unknown: all bytes together
+/// are its reply as soon as the CRC is right, and silence shows whether they were all.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let begins_it = || bytes.starts_with(&[request.address, request.pdu.function()]);
     if matches!(request.pdu, RequestPdu::Other(_)) && begins_it() {
@@ -89,7 +89,8 @@ fn foreign_or(bytes: &[u8], why: &'static str) -> Decoded {
     }
 }
 
-/// Length of the frame that starts `bytes`, once its first bytes show it; more than [`LONGEST`] when it cannot be one.
+/// Length of the frame at the start of `bytes`, once its first bytes show it; more than [`LONGEST`] if it cannot be
+/// a frame.
 fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
     let function = *bytes.get(1)?;
     let own = function == request.pdu.function();
@@ -111,7 +112,7 @@ fn device_identification_len(bytes: &[u8]) -> Option<usize> {
     let objects = usize::from(*bytes.get(7)?);
     let mut at = 8;
     for missing in (1..=objects).rev() {
-        // Each missing object takes at least two bytes.
+        // Each missing object needs at least two bytes.
         let least = at + 2 * missing + 2;
         if least > LONGEST {
             return Some(least);
@@ -121,14 +122,14 @@ fn device_identification_len(bytes: &[u8]) -> Option<usize> {
     Some(at + 2)
 }
 
-/// Whether requests of that function are decoded here, so that their length is known.
+/// Whether requests of this function are decoded here, so that their length is known.
 pub fn is_known(function: u8) -> bool {
     matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43)
 }
 
-/// Splits what a slave or a listener received into the first frame of a master and the rest.
+/// Length of the first frame of a master in the bytes that a slave or a listener received.
 ///
-/// Returns `None` while the frame is not whole; the length comes from the function code.
+/// Returns `None` while the frame is incomplete; the function code determines the length.
 pub fn request_len(bytes: &[u8]) -> Option<usize> {
     let function = *bytes.get(1)?;
     let pdu = match function {
@@ -356,7 +357,7 @@ mod tests {
         }
     }
 
-    /// The misprinted frames whose CRC is valid must not be believed (reference/drives.md, section 7, 8).
+    /// The misprinted frames whose CRC is valid must be rejected (reference/drives.md, section 7, 8).
     #[test]
     fn misprints_are_not_believed() {
         let cases = [

@@ -1,4 +1,4 @@
-//! Commands and answers of N2 in the words of its objects.
+//! Commands and answers of N2 in terms of its objects.
 
 use crate::n2::{self, Command, Region};
 use crate::{Reply, RequestPdu};
@@ -23,7 +23,7 @@ pub(super) fn command(pdu: &RequestPdu) -> Option<String> {
     })
 }
 
-/// A reply of N2 in the words of its object: `25`, `on`, `acknowledged`, `N11 (…)`.
+/// A reply of N2 in terms of its object: `25`, `on`, `acknowledged`, `N11 (…)`.
 pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
     match reply {
         Reply::Bits(bits) => if bits.first() == Some(&true) { "on" } else { "off" }.to_string(),
@@ -34,8 +34,7 @@ pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
         },
         Reply::Written => "acknowledged".to_string(),
         Reply::Exception(code) if code.0 & 0x80 != 0 => format!("N{:02X}: {}", code.0 & 0x7F, code.meaning()),
-        // The reply is sound but its status byte marks the value as unreliable, so no exception of the drive is
-        // reported.
+        // The reply is valid but its status byte marks the value as unreliable, so no exception of the drive is reported.
         Reply::Exception(_) if matches!(asked, RequestPdu::Read { .. }) => "unreliable".to_string(),
         _ => super::answer(reply),
     }

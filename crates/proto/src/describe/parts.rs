@@ -1,11 +1,11 @@
-//! What was received in a transaction, split into its parts: echo, reply, foreign frames, garbage.
+//! The bytes received in a transaction, split into their parts: echo, reply, foreign frames, garbage.
 
 use std::ops::Range;
 
 use super::n2_words;
 use crate::{Decoded, Protocol, Reply, Request, RequestPdu};
 
-/// Which part of a transaction some bytes are.
+/// The kind of a part of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// The request, echoed by the adapter.
@@ -18,17 +18,18 @@ pub enum Kind {
     Garbage,
 }
 
-/// A part of what was received in a transaction.
+/// A part of the bytes received in a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Part {
     /// Kind of this part.
     pub kind: Kind,
-    /// Place of the part among the bytes.
+    /// Range of the part within the bytes.
     pub range: Range<usize>,
 }
 
-/// Splits what came after `request`, whose frame was `frame`, into its parts, in the order of arrival. `answered`: the
-/// transaction ended with a reply, which distinguishes the reply to a write from its echo.
+/// Splits the bytes received after `request`, whose frame was `frame`, into parts in the order of arrival.
+/// `answered` means that the transaction ended with a reply, which distinguishes the reply to a write from its
+/// echo.
 pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], answered: bool) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut at = 0;
@@ -62,8 +63,8 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
     parts
 }
 
-/// Most requests cannot be answered by their own frame; the write of one register is, so there only a second frame, or
-/// the lack of an answer, shows.
+/// Whether a frame is the echo of the request. Most requests cannot be answered by their own frame; the write of
+/// one register can, so there only a second frame, or the lack of an answer, shows an echo.
 fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], answered: bool) -> bool {
     let Some(more) = rest.strip_prefix(frame).filter(|_| !frame.is_empty()) else {
         return false;
@@ -72,8 +73,8 @@ fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], ans
     !like_its_reply || !answered || more.starts_with(frame)
 }
 
-/// Bytes before the reply that was accepted although garbage precedes it, or all. Exceptions and acknowledgements are
-/// not accepted there.
+/// Number of garbage bytes before the accepted reply, or all bytes if there is none. After garbage, exceptions and
+/// acknowledgements are not accepted.
 fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: bool) -> usize {
     let is_reply = |at: &usize| {
         let behind = rest.get(*at..).unwrap_or_default();

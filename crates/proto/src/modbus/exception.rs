@@ -1,4 +1,4 @@
-//! Exception codes: those of Modbus, of one family, and those that stand for N2's errors.
+//! Exception codes: those of Modbus, those of one family, and those that represent N2 errors.
 
 use std::fmt;
 
@@ -15,11 +15,11 @@ impl Exception {
     pub const VALUE: Exception = Exception(0x03);
     /// 04: the device failed.
     pub const DEVICE_FAILURE: Exception = Exception(0x04);
-    /// 05: the device has accepted the request and still works on it.
+    /// 05: the device has accepted the request and is still processing it.
     pub const ACKNOWLEDGE: Exception = Exception(0x05);
     /// 06: the device is busy.
     pub const BUSY: Exception = Exception(0x06);
-    /// 0x0A: the gateway has no way to that unit.
+    /// 0x0A: the gateway has no path to this unit.
     pub const GATEWAY_PATH: Exception = Exception(0x0A);
     /// 0x0B: the device behind the gateway does not reply.
     pub const GATEWAY_TARGET: Exception = Exception(0x0B);
@@ -42,22 +42,22 @@ impl Exception {
         matches!(self.0, 0x01..=0x03 | 0x21 | 0x81 | 0x85 | 0x90..=0x92)
     }
 
-    /// Whether the drive does not look at the request now and may do so later.
+    /// Whether the drive cannot process the request now but may do so later.
     pub fn is_busy(self) -> bool {
         self == Exception::BUSY
     }
 
-    /// Whether a gateway sends the exception because it does not reach the drive: the drive answered nothing.
+    /// Whether a gateway sends the exception because it cannot reach the drive: the drive itself sent no answer.
     pub fn is_no_answer(self) -> bool {
         matches!(self, Exception::GATEWAY_PATH | Exception::GATEWAY_TARGET)
     }
 
-    /// Whether the exception leaves the result of a write unknown: the drive still works on it, or did not answer.
+    /// Whether the exception leaves the result of a write unknown: the drive is still processing it, or did not answer.
     pub fn leaves_open(self) -> bool {
         self == Exception::ACKNOWLEDGE || self.is_no_answer()
     }
 
-    /// What the code means, by the Modbus specification and the TECO list (reference/drives.md 5.6).
+    /// Meaning of the code according to the Modbus specification and the TECO list (reference/drives.md 5.6).
     pub fn meaning(self) -> &'static str {
         match self.0 {
             0x01 => "illegal function",
@@ -85,8 +85,8 @@ impl Exception {
 }
 
 impl fmt::Display for Exception {
-    /// As the manuals print it: the codes of Modbus with two digits, those of a family in hexadecimal with H (TECO: 22H), N2
-    /// errors with their own two digits.
+    /// The code as the manuals print it: Modbus codes with two digits, those of a family in hexadecimal with H
+    /// (TECO: 22H), N2 errors with their own two digits.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let meaning = self.meaning();
         match self.0 {

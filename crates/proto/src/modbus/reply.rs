@@ -9,7 +9,7 @@ pub enum Reply {
     Bits(Vec<bool>),
     /// Reply to functions 3, 4 and 23: the registers.
     Registers(Vec<u16>),
-    /// To functions 5, 6, 15, 16 and 22: the echo fits the request.
+    /// Reply to functions 5, 6, 15, 16 and 22, whose echo matches the request.
     Written,
     /// Reply to function 8: the data word.
     Diagnostics(u16),
@@ -17,9 +17,9 @@ pub enum Reply {
     DeviceIdentification(Vec<u8>),
     /// Reply to N2's Identify: the device type.
     Identified(u8),
-    /// To a poll of N2: the digits of the report, none where nothing changed.
+    /// Reply to an N2 poll: the digits of the report, empty if nothing changed.
     Changes(Vec<u8>),
-    /// To a request that is not decoded: the PDU, or on N2 the line without its CR.
+    /// Reply to a request that is not decoded: the PDU, or on N2 the line without its CR.
     Other(Vec<u8>),
     /// Refused.
     Exception(Exception),
@@ -31,7 +31,7 @@ impl Reply {
         self.clone().into_words()
     }
 
-    /// The words of the reply, like [`Reply::words`].
+    /// The words of the reply like [`Reply::words`], without a copy.
     pub fn into_words(self) -> Option<Vec<u16>> {
         match self {
             Reply::Registers(words) => Some(words),
@@ -76,7 +76,7 @@ impl Reply {
         }
     }
 
-    /// Decodes the reply in `pdu`, if it fits `request`.
+    /// Decodes the reply in `pdu` if it matches `request`.
     ///
     /// # Errors
     /// [`Misfit`] when function, byte count or echo do not fit: the frame answers something else.

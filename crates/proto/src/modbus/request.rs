@@ -67,20 +67,20 @@ pub enum RequestPdu {
     Diagnostics {
         /// Subfunction.
         subfunction: u16,
-        /// Data word.
+        /// Data word of the subfunction.
         data: u16,
     },
     /// Function 43, MEI type 14.
     DeviceIdentification {
         /// Read device id code: 1 basic, 2 regular, 3 extended, 4 one object.
         code: u8,
-        /// First object.
+        /// First object to read.
         object: u8,
     },
     /// Session commands that exist only on an N2 bus; never encoded as a Modbus function.
     N2(Session),
-    /// A request that is passed on as it is: the PDU of a function that is not decoded here, or on N2 the digits of a command
-    /// between address and checksum.
+    /// A request that is passed on unchanged: the PDU of a function that is not decoded here, or on N2 the digits
+    /// of a command between address and checksum.
     Other(Vec<u8>),
 }
 
@@ -103,7 +103,7 @@ impl RequestPdu {
         }
     }
 
-    /// The function code; 0, which is none, for what is not of Modbus.
+    /// The function code; 0, which is not a valid code, for requests outside of Modbus.
     pub fn function(&self) -> u8 {
         match self {
             RequestPdu::Read { table, .. } => table.read_function(),
@@ -120,7 +120,7 @@ impl RequestPdu {
         }
     }
 
-    /// Whether the request changes something in the drive, as far as it is decoded.
+    /// Whether the request changes something in the drive, as far as it can be decoded.
     pub fn is_write(&self) -> bool {
         matches!(
             self,
@@ -148,7 +148,7 @@ impl RequestPdu {
         }
     }
 
-    /// Bytes of the regular reply's PDU; where only the reply shows its length, its shortest.
+    /// Length in bytes of the regular reply's PDU; its minimum if only the reply shows the length.
     pub fn reply_len(&self) -> usize {
         match self {
             RequestPdu::Read { table, count, .. } => {

@@ -1,7 +1,7 @@
-//! Assumptions about N2 that no manual confirms, in one place. Nothing here was verified on hardware.
+//! Assumptions about N2 that no manual confirms, collected here. None of them was verified on hardware.
 //!
-//! Johnson Controls' own specification is not public, and the manuals of the drives print no frame. What the frames
-//! rest on, and what may turn out otherwise with a real drive, is listed in [`ASSUMPTIONS`]; whatever matters to the
+//! Johnson Controls' own specification is not public, and the manuals of the drives print no frames. The basis of
+//! the frames, and what may differ with a real drive, is listed in [`ASSUMPTIONS`]; everything that matters to the
 //! master is an option of a profile, section `[n2]`.
 
 use std::time::Duration;
@@ -30,7 +30,7 @@ impl RegionWidth {
 pub struct N2Options {
     /// Bit of the status byte of BI and BO that is the state, 0..=7.
     pub state_bit: u8,
-    /// Bit of that byte which calls the state unreliable; `None`: not looked at.
+    /// Bit of that byte which marks the state as unreliable; `None` ignores it.
     pub unreliable_bit: Option<u8>,
     /// Digits of the region in override and release.
     pub region_width: RegionWidth,
@@ -42,7 +42,8 @@ pub struct N2Options {
     pub device_type: u8,
     /// An overridden analog output is released afterwards.
     pub release: bool,
-    /// Pause between two polls for changes; a drive that is not polled takes itself for alone after about 10 minutes.
+    /// Pause between two polls for changes; a drive that is not polled considers itself disconnected after about 10
+    /// minutes.
     pub poll: Duration,
 }
 
@@ -70,23 +71,23 @@ impl Default for N2Options {
 pub const CONFIG_REPORT_BIT: u8 = 0;
 /// Bit of a status byte that shows an override; simulator only.
 pub const STATUS_OVERRIDE_BIT: u8 = 5;
-/// What the simulator sends for a limit that is switched off.
+/// Value that the simulator sends for a limit that is switched off.
 pub const INVALID_FLOAT: u32 = 0x7FC0_0000;
 
 /// A behaviour of N2 drives that no manual specifies.
 #[derive(Debug, Clone, Copy)]
 pub struct Assumption {
-    /// Key of `[n2]` in a profile that changes it; `None` where nothing needs to be changed.
+    /// Key of `[n2]` in a profile that changes the assumption; `None` if it need not be changed.
     pub key: Option<&'static str>,
     /// The assumption.
     pub what: &'static str,
-    /// Why the assumption is made.
+    /// The reason for the assumption.
     pub why: &'static str,
     value: fn(&N2Options) -> String,
 }
 
 impl Assumption {
-    /// The value that holds with those options, as a profile writes it where it has a key.
+    /// The value in force with these options, as a profile would write it if there is a key.
     pub fn value(&self, options: &N2Options) -> String {
         (self.value)(options)
     }

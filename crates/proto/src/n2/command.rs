@@ -14,7 +14,7 @@ pub const CHECKSUM: u8 = 0x02;
 pub const OVERRUN: u8 = 0x03;
 /// A field has the wrong size for the command.
 pub const SIZE: u8 = 0x05;
-/// A field of the command is out of its range.
+/// A field of the command is outside its range.
 pub const DATA: u8 = 0x10;
 /// The command is not allowed for that type of data.
 pub const TYPE: u8 = 0x11;
@@ -96,7 +96,7 @@ impl Command {
         self
     }
 
-    /// Appends the frame to `out`; [`Command::Other`] has none.
+    /// Appends the frame of the command to `out`; [`Command::Other`] has none.
     pub fn encode(&self, address: u8, width: RegionWidth, out: &mut Vec<u8>) {
         let mut body = Vec::with_capacity(24);
         put(address, &mut body);
@@ -139,8 +139,8 @@ impl Command {
         seal(b'>', &body, out);
     }
 
-    /// The command in a frame, from its lead to its CR, as a drive reads it. A new lead begins the frame again. `None`
-    /// for what a drive does not answer: no lead, no CR, no address, or not hexadecimal.
+    /// The command in a frame from its lead to its CR, as a drive decodes it. A new lead starts the frame again.
+    /// `None` for a frame that a drive does not answer: no lead, no CR, no address, or not hexadecimal.
     pub fn decode(frame: &[u8]) -> Option<Heard> {
         let line = frame.strip_suffix(b"\r")?;
         let lead = line.iter().rposition(|byte| *byte == b'>')?;
@@ -209,8 +209,8 @@ fn write(region: u8, rest: &[u8]) -> Result<Command, u8> {
     })
 }
 
-/// The object of 7/2 and 7/3 and what stands after it. A region never begins with 0, so a 0 shows the form of two
-/// characters.
+/// The object of 7/2 and 7/3, and the characters after it. A region never begins with 0, so a 0 shows the form with
+/// two characters.
 fn commanded(rest: &[u8]) -> Result<(Object, Vec<u8>), u8> {
     let rest = rest.strip_prefix(b"0").unwrap_or(rest);
     let (region, rest) = rest.split_first().ok_or(SIZE)?;
@@ -263,7 +263,7 @@ impl Answer {
     /// Decodes the answer in a line without its CR.
     ///
     /// # Errors
-    /// Why the line is no answer.
+    /// If the line is not a valid answer; contains the reason.
     pub fn decode(line: &[u8]) -> Result<Answer, &'static str> {
         let (lead, text) = line.split_first().ok_or("the reply is empty")?;
         if !text.iter().all(u8::is_ascii_hexdigit) {

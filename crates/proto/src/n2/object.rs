@@ -1,4 +1,4 @@
-//! The objects of a drive and where they lie in the tables of Modbus.
+//! The N2 objects of a drive, and their places in the tables of Modbus.
 
 use std::fmt;
 
@@ -7,7 +7,7 @@ use crate::modbus::Table;
 /// First input register of the internal integers.
 pub const ADI_BASE: u16 = 0x4000;
 
-/// A type of object; the number is its region on the wire (reference/drives.md 6.2).
+/// A type of N2 object; the number is its region on the wire (reference/drives.md 6.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Region {
     /// Analog input, a float.
@@ -27,7 +27,7 @@ pub enum Region {
 }
 
 impl Region {
-    /// All regions, in the order of their numbers.
+    /// All regions in the order of their numbers.
     pub const ALL: [Region; 7] = [
         Region::Ai,
         Region::Bi,
@@ -103,7 +103,7 @@ impl Object {
         Some(Object { region, number })
     }
 
-    /// Where it lies: table and first address; `None` for objects that no table has.
+    /// Place of the object: table and first address; `None` for objects in no table.
     pub fn place(self) -> Option<(Table, u16)> {
         let index = u16::from(self.number.checked_sub(1)?);
         match self.region {

@@ -29,7 +29,7 @@ fn set(object: Object, data: Vec<u8>) -> Command {
     Command::Override { object, data }
 }
 
-/// All requests of reference/n2.md section 1 and reference/drives.md 6.8, from both ends.
+/// All requests of reference/n2.md section 1 and reference/drives.md 6.8, encoded and decoded.
 #[test]
 fn requests_of_the_reference() {
     use RegionWidth::{One, Two};
@@ -102,7 +102,7 @@ fn regular(text: &str, reply: Reply) -> Decoded {
     Decoded::Reply { used, reply }
 }
 
-/// All replies of reference/n2.md section 1 and reference/drives.md 6.8, as the master reads them.
+/// All replies of reference/n2.md section 1 and reference/drives.md 6.8, as the master decodes them.
 #[test]
 fn replies_of_the_reference() {
     let words = |high, low| Reply::Registers(vec![high, low]);
@@ -407,7 +407,7 @@ proptest! {
     }
 }
 
-/// Danfoss and GE count from 0 (their maps' object 1 is 0 on the wire).
+/// Danfoss and GE count objects from 0 (object 1 of their maps is 0 on the wire).
 #[test]
 fn objects_of_a_family_that_counts_from_zero() {
     let of = |first_object, pdu: &RequestPdu| {
