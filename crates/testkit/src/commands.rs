@@ -1,4 +1,4 @@
-//! Commands without a client, and what became of them.
+//! Reads commands from queues without a client, and their audit records.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use drivegate_core::queue::{CommandQueue, Pending, Ready};
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
 
-/// All records of the audit that are kept, oldest first. What cannot be read as JSON is null.
+/// All kept records of the audit, oldest first. A record that is not valid JSON becomes null.
 pub fn audited(audit: &Audit) -> Vec<Value> {
     let lines = audit.recent(None);
     lines
@@ -17,7 +17,7 @@ pub fn audited(audit: &Audit) -> Vec<Value> {
         .collect()
 }
 
-/// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
+/// Takes the next command of this rank or a higher one, with every drive ready and no stop redundant.
 pub fn next_command(pending: &mut Pending, lowest: Urgency, now: Instant) -> Option<Command> {
     let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
     let chosen = ranks

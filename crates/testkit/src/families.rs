@@ -1,4 +1,4 @@
-//! How the families are commanded whose profiles come from reports, by hand from the figures of their manuals.
+//! How to command the families whose profiles come from reports, taken by hand from the figures of their manuals.
 
 use drivegate_proto::RequestPdu;
 
@@ -9,7 +9,7 @@ pub enum Order {
     Word(u16, u16),
     /// A register written with function 16.
     Single(u16, u16),
-    /// Two registers by function 16.
+    /// Two registers written by function 16.
     Pair(u16, u16, u16),
     /// A coil written with function 05.
     Coil(u16, bool),
@@ -27,8 +27,8 @@ impl Order {
     }
 }
 
-/// Orders as the tables write them: `8501=6,7` is two words to one register, `2=[2500]` and `0=[0,2500]` are by function 16,
-/// `3=on` is a coil.
+/// Orders as the tables write them: `8501=6,7` is two words to one register, `2=[2500]` and `0=[0,2500]` use
+/// function 16, `3=on` is a coil.
 pub fn orders(text: &str) -> Vec<Order> {
     let each = text.split_whitespace().map(|part| {
         let (address, values) = part.split_once('=').unwrap();

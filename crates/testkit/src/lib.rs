@@ -1,7 +1,7 @@
-//! Parts that the tests of several packages share: plants made by hand, and readers of a queue or the audit.
+//! Parts that the tests of several packages share: hand-made plants, and readers of a queue or the audit.
 //!
-//! No bus runs: a test fills the process images and empties the queues. The unit tests of `drivegate-core` compile this
-//! source as a module of their own, because this package depends on that one.
+//! No bus runs in these tests: a test fills the process images and empties the queues. The unit tests of
+//! `drivegate-core` compile this source as a module, because this package depends on that one.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "tests may panic")]
 
 mod commands;

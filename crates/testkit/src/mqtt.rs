@@ -2,7 +2,7 @@
 
 use std::io::Read;
 
-/// The next packet: its first byte and its body. `None` when the connection ends.
+/// The next MQTT packet: its first byte and its body. `None` when the connection ends.
 pub fn read_packet(stream: &mut impl Read) -> Option<(u8, Vec<u8>)> {
     let mut byte = || {
         let mut byte = [0];

@@ -1,4 +1,4 @@
-//! Plants made by hand.
+//! Hand-made plants for tests.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -63,13 +63,13 @@ pub fn bus(spec: BusSpec, drives: Vec<Arc<DriveImage>>) -> BusHandle {
     }
 }
 
-/// The bus with its port open.
+/// The bus with its port shown as open.
 pub fn up(bus: BusHandle) -> BusHandle {
     bus.image.update_health(|health| health.up = true);
     bus
 }
 
-/// A bus `line1` with NX drives of these names at 1, 2, …; all may be commanded.
+/// A bus `line1` with NX drives with these names at addresses 1, 2, …; all may be commanded.
 pub fn nx_bus(drives: &[&str]) -> BusHandle {
     let nx = nx();
     let drives = drives.iter().zip(1..);
@@ -96,7 +96,7 @@ pub fn read(image: &DriveImage, start: u16, words: &[u16], now: Instant) {
     });
 }
 
-/// The drive answered at `now`: all that is planned to be read, each word by its address.
+/// Stores a reading of all planned registers at `now`, each word given by its address.
 pub fn read_all(image: &DriveImage, now: Instant, word: impl Fn(u16) -> u16) {
     image.update(|snapshot| {
         snapshot.link = Link::Online(SystemTime::now());
