@@ -65,6 +65,9 @@ struct Connection {
 /// drive that is off, or close after one request; but a server that never replies does not reach the drives.
 const MOST_IN_VAIN: u32 = 3;
 
+/// Interval of the checks whether a thread that reads orders is stalled; short beside the stall that counts.
+const DEAF_CHECK: Duration = Duration::from_millis(20);
+
 /// The request to send when the line is clear.
 #[derive(Debug)]
 struct Chosen {
@@ -95,6 +98,8 @@ pub struct BusCore {
     news: Vec<News>,
     /// Stalls of the bus thread; `None` before it runs.
     stalls: Option<Stalls>,
+    /// When the threads that read orders were last checked for a stall.
+    deaf_checked: Instant,
     /// Whether the thread was stalled since the request on the line was sent.
     stood: bool,
 }
@@ -130,6 +135,7 @@ impl BusCore {
             tap: None,
             news: Vec::new(),
             stalls: None,
+            deaf_checked: now,
             stood: false,
         }
     }
@@ -139,21 +145,31 @@ impl BusCore {
     /// then be read before anything else.
     pub fn note_run(&mut self, now: Instant, boot: Duration) -> bool {
         let stalls = self.stalls.get_or_insert_with(|| Stalls::new(now, boot));
-        let before = stalls.last_run();
         let Some(stall) = stalls.observe(now, boot) else {
-            if self.report.is_deaf(now) {
-                self.master.prolong(now.saturating_duration_since(before));
-            }
+            self.prolong_while_deaf(now);
             return false;
         };
+        self.deaf_checked = now;
         self.stood = true;
         self.master.after_stall(stall, now);
         self.report.after_stall(stall);
         true
     }
 
+    /// Prolongs the leases while a thread that reads orders is stalled.
+    fn prolong_while_deaf(&mut self, now: Instant) {
+        let since = now.saturating_duration_since(self.deaf_checked);
+        if since >= DEAF_CHECK {
+            self.deaf_checked = now;
+            if self.report.is_deaf(now) {
+                self.master.prolong(since);
+            }
+        }
+    }
+
     /// Records that the thread was not stalled but did other work since it last ran, such as opening the port.
     pub fn runs_on(&mut self, now: Instant, boot: Duration) {
+        self.deaf_checked = now;
         match &mut self.stalls {
             Some(stalls) => stalls.go_on(now, boot),
             None => self.stalls = Some(Stalls::new(now, boot)),

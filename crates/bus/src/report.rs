@@ -22,7 +22,7 @@ use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, Po
 use crate::event::{EventKind, Events};
 use crate::order::WriteStats;
 use crate::process_image::{
-    Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
+    Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Reading, Snapshot, TapedRead, Verdict,
 };
 use crate::stalls::Stall;
 
@@ -157,12 +157,17 @@ impl Report {
         let News::Read { drive, read, at, .. } = news else {
             return Wanted::default();
         };
-        let monitors = self.compare_selection(*drive, read, *at);
-        let new_fault = self.check_fault(*drive, now);
-        self.report_state(*drive, now);
-        self.check_own_response(*drive, now);
+        let index = *drive;
+        let Some(drive) = self.drive(index) else {
+            return Wanted::default();
+        };
+        let monitors = self.compare_selection((index, &drive), read, *at);
+        let reading = drive.reading(now, RECENT);
+        let new_fault = self.check_fault(index, &reading);
+        self.report_state(index, &reading);
+        self.check_own_response(index, &reading);
         Wanted {
-            fault: new_fault.then_some(*drive),
+            fault: new_fault.then_some(index),
             monitors,
         }
     }
@@ -295,14 +300,14 @@ impl Report {
 
     /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did respond
     /// in between.
-    fn check_own_response(&mut self, index: DriveIndex, now: Instant) {
+    fn check_own_response(&mut self, index: DriveIndex, reading: &Reading<'_>) {
         let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
             return;
         };
         if known.looked_at || drive.spec.access != Access::Control {
             return;
         }
-        let response = own_response(&drive.reading(now, RECENT));
+        let response = own_response(reading);
         known.looked_at = response != OwnResponse::Unknown;
         let OwnResponse::Off(point) = response else {
             known.told &= response == OwnResponse::Unknown;
@@ -328,9 +333,8 @@ impl Report {
     }
 
     /// Reports faults that appeared or cleared with the last poll. Returns whether one appeared.
-    fn check_fault(&mut self, index: DriveIndex, now: Instant) -> bool {
-        let Some(drive) = self.drive(index) else { return false };
-        let reading = drive.reading(now, RECENT);
+    fn check_fault(&mut self, index: DriveIndex, reading: &Reading<'_>) -> bool {
+        let now = reading.now;
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
             return false;
         };
@@ -355,7 +359,7 @@ impl Report {
             let trip = Trip {
                 fault: code,
                 after: now.saturating_duration_since(written),
-                repeats: drive.spec.refresh.is_some(),
+                repeats: reading.spec.refresh.is_some(),
             };
             self.diagnosis.tripped(index, trip, now);
         }
@@ -364,7 +368,10 @@ impl Report {
                 format!("drive {name} has a fault with an unknown code")
             }),
             Some(code) => self.drive_event(index, EventKind::Fault, Some(code), |name| {
-                format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code))
+                format!(
+                    "drive {name} has fault {code}: {}",
+                    reading.spec.profile.fault_text(code)
+                )
             }),
             None => self.drive_event(index, EventKind::FaultEnd, None, |name| {
                 format!("the fault of drive {name} has cleared")
@@ -447,7 +454,7 @@ impl Report {
         at: Instant,
         now: Instant,
     ) -> bool {
-        let Some(drive) = self.image.drives.get(index) else {
+        let Some(drive) = self.drive(index) else {
             return false;
         };
         self.image.tape.read(index, || TapedRead {
@@ -458,8 +465,9 @@ impl Report {
         });
         let mut fast = false;
         drive.update(|snapshot| fast = snapshot.hear(table, start, words, at));
-        self.check_fault(index, now);
-        self.report_state(index, now);
+        let reading = drive.reading(now, RECENT);
+        self.check_fault(index, &reading);
+        self.report_state(index, &reading);
         fast
     }
 

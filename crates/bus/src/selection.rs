@@ -192,10 +192,13 @@ impl Selections {
         differ: Vec<(PointIndex, f64, f64)>,
         restored: Vec<PointIndex>,
     ) -> Findings {
-        let monitored = self.points(drive).filter(|compared| compared.is_monitored());
-        let monitored: Vec<PointIndex> = monitored.map(|compared| compared.point).collect();
+        let points = self.drives.get(drive).into_iter().flat_map(|drive| &drive.points);
+        let monitored = points
+            .filter(|compared| compared.is_monitored())
+            .map(|compared| compared.point);
+        let is_new = !monitored.clone().eq(reading.snapshot.monitored.iter().copied());
         Findings {
-            monitored: (monitored != reading.snapshot.monitored).then_some(monitored),
+            monitored: is_new.then(|| monitored.collect()),
             wanted,
             differ,
             restored,
@@ -298,7 +301,10 @@ fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict 
 }
 
 fn covers(read: &PlannedRead, raw: &Raw) -> bool {
-    raw.addresses().all(|address| read.covers(raw.table, address))
+    let after = |start: u16, count: u16| u32::from(start) + u32::from(count);
+    raw.table == read.table
+        && raw.address >= read.start
+        && after(raw.address, raw.form.items()) <= after(read.start, read.count)
 }
 
 #[cfg(test)]

@@ -3,10 +3,11 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
-use super::{RECENT, Report};
+use super::Report;
 use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::{Event, EventKind};
 use crate::order::Origin;
+use crate::process_image::Reading;
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
@@ -121,9 +122,8 @@ fn cause(who: &str) -> String {
 impl Report {
     /// Starts, stops, warnings and control places that changed with the last poll. The value at the first read is not
     /// an event; a change while the drive was offline is one.
-    pub(super) fn report_state(&mut self, index: DriveIndex, now: Instant) {
-        let Some(drive) = self.drive(index) else { return };
-        let reading = drive.reading(now, RECENT);
+    pub(super) fn report_state(&mut self, index: DriveIndex, reading: &Reading<'_>) {
+        let now = reading.now;
         for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
             let Some(Value::Bool(value)) = reading.model(point).good() else {
                 continue;
@@ -134,7 +134,7 @@ impl Report {
             };
             let [comes, goes] = changes;
             let (kind, words) = if value { comes } else { goes };
-            let name = &drive.spec.name;
+            let name = &reading.spec.name;
             let by = (point == ModelPoint::Running).then(|| self.who(name, change, now));
             let mut text = format!("drive {name} {words}");
             match &by {

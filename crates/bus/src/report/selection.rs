@@ -13,17 +13,14 @@ impl Report {
     /// Compares what was just read. The monitoring points to be read: drive, point and time.
     pub(super) fn compare_selection(
         &mut self,
-        index: DriveIndex,
+        (index, drive): (DriveIndex, &DriveImage),
         read: &PlannedRead,
         at: Instant,
     ) -> Vec<(DriveIndex, PointIndex, Instant)> {
-        let Some(drive) = self.drive(index) else {
-            return Vec::new();
-        };
         let findings = self.selections.read(index, read, &drive.reading(at, RECENT));
         let wanted = findings.wanted.iter().map(|(point, at)| (index, *point, *at));
         let wanted = wanted.collect();
-        self.selection_found(&drive, index, &findings);
+        self.selection_found(drive, index, &findings);
         wanted
     }
 

@@ -40,7 +40,7 @@ impl BusHandle {
             let Some(image) = self.image.drives.get(drive) else {
                 continue;
             };
-            let (kind, text) = words(&told, &rules);
+            let (kind, text) = event_text(&told, &rules);
             events.publish(Event {
                 bus: self.image.spec.name.clone(),
                 drive: Some(image.spec.name.clone()),
@@ -218,6 +218,11 @@ impl DriveHandle {
 }
 
 impl Plant {
+    /// Whether `[authority]` is on for a bus.
+    pub fn has_authority(&self) -> bool {
+        self.buses.iter().any(|bus| bus.queue.has_authority())
+    }
+
     /// The reservations in force with their ends, to be saved for the next start of the gateway. `now` is `time` on
     /// the calendar.
     pub fn reservations(&self, now: Instant, time: SystemTime) -> Vec<(Instant, KeptReservation)> {
@@ -251,7 +256,7 @@ impl Plant {
 }
 
 /// The event for a change of a hold.
-fn words(told: &HoldChange, rules: &Rules) -> (EventKind, String) {
+fn event_text(told: &HoldChange, rules: &Rules) -> (EventKind, String) {
     let named = |claim: &Claim| format!("{} ({})", claim.name, rules.rank(claim.rank));
     let who = named(&told.who);
     match &told.what {

@@ -11,7 +11,9 @@ use crate::permit::KeptReservation;
 use crate::plant::{Plant, SharedPlant};
 
 /// Interval of the checks for changed reservations.
-const LOOK: Duration = Duration::from_millis(50);
+const CHECK: Duration = Duration::from_millis(50);
+/// Interval of the checks whether a reload has turned `[authority]` on.
+const CHECK_AUTHORITY: Duration = Duration::from_secs(1);
 /// Largest valid size of the file, bytes.
 const LONGEST: u64 = 1 << 20;
 
@@ -59,10 +61,9 @@ pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::J
     tokio::spawn(async move {
         let mut seen = Seen::new();
         let mut told = false;
-        let mut ticks = tokio::time::interval(LOOK);
-        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
-            ticks.tick().await;
+            let has_authority = plant.load().has_authority();
+            tokio::time::sleep(if has_authority { CHECK } else { CHECK_AUTHORITY }).await;
             let kept = plant.load().reservations(Instant::now(), SystemTime::now());
             let now: Seen = kept
                 .iter()

@@ -173,6 +173,11 @@ impl Raw {
         self.scale == 1.0 && self.offset == 0.0 && self.scaled_by().next().is_none()
     }
 
+    /// Whether the value is in a single register, and no other point scales it.
+    pub fn is_one_word(&self) -> bool {
+        self.form.items() == 1 && self.scale_from.is_none() && self.factor_from.is_empty()
+    }
+
     /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few or
     /// they contain no value. A value with `scale_from` or `factor_from` is decoded by [`Raw::decode_scaled`].
     pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
