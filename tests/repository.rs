@@ -13,6 +13,7 @@ mod repository {
     mod config;
     mod documents;
     mod fuzz_seeds;
+    mod names;
     mod packages;
     mod packaging;
     mod permission;

@@ -405,7 +405,7 @@ fn an_interlock_that_fails_stops_the_motor_and_keeps_it_from_starting() {
         stopped.unwrap().text.contains("an interlock is not satisfied"),
         "{told:?}"
     );
-    let why = play.rig.drive(1).why(&play.rig.drive(1).reading(play.rig.now)).words();
+    let why = play.rig.drive(1).why(&play.rig.drive(1).reading(play.rig.now)).names();
     assert!(why.contains(&"interlocked".to_string()), "{why:?}");
 }
 

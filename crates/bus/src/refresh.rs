@@ -12,7 +12,7 @@ mod round;
 use std::time::{Duration, Instant};
 
 pub(crate) use self::end::End;
-use self::ordered::{InForce, Ordered, does, reference_of};
+use self::ordered::{InForce, Ordered, in_force, reference_of};
 use self::round::Round;
 pub(super) use self::round::requests;
 use crate::codec::{RequestPdu, Table};
@@ -164,7 +164,7 @@ impl Refresh {
                     ordered.fed = Some(now);
                 }
             }
-            if let Some(does) = does(control, place, word) {
+            if let Some(does) = in_force(control, place, word) {
                 ordered.does = does;
                 self.says_run = true;
             }

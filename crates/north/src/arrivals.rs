@@ -13,7 +13,7 @@ pub(super) struct Arrivals(VecDeque<(usize, Arrival)>);
 
 impl Arrivals {
     /// Adds this number of bytes with their arrival time.
-    pub(super) fn came(&mut self, count: usize, arrival: Arrival) {
+    pub(super) fn add(&mut self, count: usize, arrival: Arrival) {
         if count == 0 {
             return;
         }
@@ -68,9 +68,9 @@ mod tests {
         let at = |ms| over(&connection, began + Duration::from_millis(ms));
         let mut arrivals = Arrivals::default();
         assert_eq!(arrivals.take(1), None);
-        arrivals.came(3, at(0));
-        arrivals.came(0, at(5));
-        arrivals.came(7, at(10));
+        arrivals.add(3, at(0));
+        arrivals.add(0, at(5));
+        arrivals.add(7, at(10));
         assert_eq!(arrivals.take(2), Some(at(0)));
         assert_eq!(
             arrivals.take(2),
@@ -78,7 +78,7 @@ mod tests {
             "the last byte of the first piece, and one of the second"
         );
         assert_eq!(arrivals.take(1), Some(at(10)));
-        arrivals.came(1, at(20));
+        arrivals.add(1, at(20));
         assert_eq!(arrivals.take(5), Some(at(10)));
         assert_eq!(arrivals.take(1), Some(at(20)));
         assert_eq!(arrivals.take(1), None);
@@ -96,9 +96,9 @@ mod tests {
             ..over(&connection, at(100))
         };
         let mut arrivals = Arrivals::default();
-        arrivals.came(5, over(&connection, at(50)));
-        arrivals.came(7, behind);
-        arrivals.came(12, over(&connection, at(9000)));
+        arrivals.add(5, over(&connection, at(50)));
+        arrivals.add(7, behind);
+        arrivals.add(12, over(&connection, at(9000)));
         let first = arrivals.take(12).unwrap();
         assert_eq!((first.asked, first.stall, first.pause), (at(50), stall, stall));
         let next = arrivals.take(12).unwrap();
@@ -110,7 +110,7 @@ mod tests {
         let began = Instant::now();
         let (mut arrivals, connection) = (Arrivals::default(), Connection::opened(began));
         for ms in 0..1000 {
-            arrivals.came(1, over(&connection, began + Duration::from_millis(ms)));
+            arrivals.add(1, over(&connection, began + Duration::from_millis(ms)));
         }
         assert_eq!(arrivals.0.len(), MOST_PIECES);
         for ms in 0..1000 {

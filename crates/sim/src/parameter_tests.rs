@@ -225,7 +225,7 @@ fn what_the_profile_names_is_read_first() {
             let id = profile.parameters.id(*start).unwrap_or_default();
             assert!(now.contains(&id), "{}: {now} is not {id}", profile.name);
             searching = searching || now.starts_with("looking for others: ");
-            let is_named = profile.parameters.at(*start).is_some();
+            let is_named = profile.parameters.by_address(*start).is_some();
             assert!(!(searching && is_named), "{}: {now}", profile.name);
             let outcome = match rig.ask(pdu) {
                 Reply::Exception(exception) => Outcome::Exception(exception),

@@ -176,7 +176,7 @@ fn owner(port: &str) -> Option<Owner> {
 
 /// The configuration of the gateway at this socket: a gateway names it to a client that expects another.
 async fn config_of(socket: PathBuf) -> Option<PathBuf> {
-    let client = Client::at(&SocketPath::At(socket), Expected::Configuration(PathBuf::new()));
+    let client = Client::for_socket(&SocketPath::At(socket), Expected::Configuration(PathBuf::new()));
     match client.ask(&Asked::view("/api/v1/health")).await {
         Err(ClientError::NotFound(missed)) => {
             let file = missed.others.first()?.split_once(RUNS_WITH)?.1;

@@ -148,7 +148,7 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
         let at = packet.at.saturating_sub(first) + wire;
         player.wait(&mut now, at);
         player.core.on_bytes(&packet.bytes, began + now);
-        player.tell(now);
+        player.report(now);
     }
     let end = now;
     player.wait(&mut now, end + AFTERWARDS);
@@ -165,13 +165,13 @@ impl Player {
                 .on_time(self.began + *now)
                 .saturating_duration_since(self.began);
             *now = wake.clamp(*now + Duration::from_micros(1), *now + STEP).min(until);
-            self.tell(*now);
+            self.report(*now);
         }
         self.core.on_time(self.began + *now);
-        self.tell(*now);
+        self.report(*now);
     }
 
-    fn tell(&mut self, now: Duration) {
+    fn report(&mut self, now: Duration) {
         while let Ok(event) = self.events.try_recv() {
             // Writing to a string cannot fail.
             let _ = writeln!(

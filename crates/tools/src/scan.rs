@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde_json::{Value as Json, json};
 
 pub(super) use self::found::Found;
-pub(super) use self::search::{Extent, Heard, Search};
+pub(super) use self::search::{Extent, Search, StrayBytes};
 pub(super) use self::settings::{Options, Setting, parse_port, protocols};
 pub(super) use self::snippet::{Snippet, absolute};
 pub(super) use self::values::figure;

@@ -96,7 +96,7 @@ pub(super) struct Cov {
 }
 
 /// Reads the present values of a subscription, and the COV increment of its object.
-pub(super) type Look<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Reported, f64)>;
+pub(super) type PresentValue<'a> = &'a mut dyn FnMut(u32, &Subscription) -> Option<(Reported, f64)>;
 
 impl Cov {
     /// The subscriptions with their limits: if all objects belong to one device, a host may have as many there as
@@ -199,7 +199,7 @@ impl Cov {
     }
 
     /// Compares the subscriptions of a device with its values: those whose clients need a notification become due.
-    pub(super) fn compare(&mut self, device: u32, look: Look<'_>) {
+    pub(super) fn compare(&mut self, device: u32, look: PresentValue<'_>) {
         let Some(all) = self.of.get_mut(&device) else { return };
         for subscription in all.iter_mut().filter(|subscription| subscription.due.is_none()) {
             let Some((now, increment)) = look(device, subscription) else {

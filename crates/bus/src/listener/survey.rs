@@ -136,7 +136,9 @@ impl Survey {
             None => {}
         }
         let pdu = exchange.request.as_ref().map(|request| &request.pdu);
-        let what = pdu.map_or("a command of another kind".to_string(), |pdu| words(protocol, pdu));
+        let what = pdu.map_or("a command of another kind".to_string(), |pdu| {
+            request_text(protocol, pdu)
+        });
         if address.requests.len() >= MOST_REQUESTS && !address.requests.contains_key(&what) {
             return;
         }
@@ -175,7 +177,7 @@ impl Survey {
 }
 
 /// Text of a request without the values that it writes, which differ each time.
-fn words(protocol: Protocol, pdu: &RequestPdu) -> String {
+fn request_text(protocol: Protocol, pdu: &RequestPdu) -> String {
     let text = describe::request_on(protocol, pdu);
     match text.split_once(" = ") {
         Some((what, _)) if pdu.is_write() => what.to_string(),

@@ -80,7 +80,7 @@ impl Ordered {
 }
 
 /// Effect of a word in this register on run and stop; `None` if it has none.
-pub(super) fn does(control: &Control, place: ControlItem, word: u16) -> Option<Option<InForce>> {
+pub(super) fn in_force(control: &Control, place: ControlItem, word: u16) -> Option<Option<InForce>> {
     let word = if place == control.at {
         control.without_reset(word)
     } else {

@@ -148,7 +148,7 @@ impl Reading {
     /// Whether the profile names a parameter of the block.
     fn names(&self, block: &Block) -> bool {
         let list = &self.profile.parameters;
-        self.addresses(block).any(|address| list.at(address).is_some())
+        self.addresses(block).any(|address| list.by_address(address).is_some())
     }
 
     /// What is read now: `parameters 101 to 130`, or `looking for others: 1200 to 1229`; none at the end.

@@ -73,7 +73,7 @@ impl Explanation {
     }
 
     /// One word for each cause, in the order of the causes and without repetition.
-    pub fn words(&self) -> Vec<String> {
+    pub fn names(&self) -> Vec<String> {
         let mut words: Vec<String> = Vec::new();
         for Cause { cause, .. } in &self.causes {
             if !words.contains(cause) {

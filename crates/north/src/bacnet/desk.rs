@@ -125,7 +125,7 @@ impl Desk {
     }
 
     /// Notes when the datagrams arrived that are processed at `now`.
-    pub(super) fn came(&mut self, arrival: Arrival, now: Instant) {
+    pub(super) fn received(&mut self, arrival: Arrival, now: Instant) {
         if self.arrivals.len() >= MOST_KEPT {
             self.arrivals.pop_front();
         }

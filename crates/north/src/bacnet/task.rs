@@ -169,8 +169,8 @@ impl Task {
                 return;
             };
             if place == 0 {
-                reader.came(now, false, || false);
-                self.desk.came(reader.last(), now);
+                reader.note_read(now, false, || false);
+                self.desk.received(reader.last(), now);
             }
             if let Some(datagram) = buffer.get(..length) {
                 self.desk.receive(from, datagram, now);

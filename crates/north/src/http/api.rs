@@ -122,7 +122,7 @@ impl<'d> Drive<'d> {
             since,
             age_ms: reading.age().map(millis),
             fault_text: reading.fault_text(),
-            blocked_by: why.words(),
+            blocked_by: why.names(),
             why: why.causes,
             held: image.restore_lock.reason().map(|why| why.to_string()),
             stop_waits_ms: drive.stop_waits(clock.now).map(millis),

@@ -95,7 +95,7 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
             };
             match accepted {
                 Ok((stream, peer)) => {
-                    reader.came(Instant::now(), false, || false);
+                    reader.note_read(Instant::now(), false, || false);
                     self.admit(Dated::new(stream, Arc::new(reader.accepted())), peer);
                     // Connections that yielded to this one are closed before the next one is accepted.
                     tokio::task::yield_now().await;

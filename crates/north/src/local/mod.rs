@@ -157,7 +157,7 @@ async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel:
         if cancel.is_cancelled() {
             return;
         }
-        reader.came(Instant::now(), false, || false);
+        reader.note_read(Instant::now(), false, || false);
         match accepted {
             Ok((stream, _)) => match limit.acquire(newcomer, Instant::now(), || Some(Authority::Write)) {
                 Ok((permit, _)) => {

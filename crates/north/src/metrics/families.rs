@@ -144,7 +144,7 @@ fn drives(plant: &Plant, north: &NorthState, now: Instant, all: &mut Families) {
                 all.add(state, labels.with("state", one.name()), one == current);
             }
         }
-        for cause in drive.why(&reading).words() {
+        for cause in drive.why(&reading).names() {
             all.add(blocked, labels.with("reason", cause), 1.0);
         }
         let fault_text =

@@ -80,7 +80,7 @@ impl Dialogue {
 
     /// Notes that `count` bytes arrived at this time in the free part of the input buffer.
     pub(super) fn received(&mut self, count: usize, arrival: Arrival) {
-        self.arrivals.came(count, arrival);
+        self.arrivals.add(count, arrival);
         self.filled = (self.filled + count).min(self.input.len());
         if self.filled == self.input.len() && self.filled < INPUT_MOST {
             // A client that fills the buffer sends batches; with a larger buffer a whole batch is read and answered at

@@ -98,7 +98,7 @@ impl Loopback {
                     *place = byte;
                 }
                 if count > 0 {
-                    reader.came(now, self.backlog.is_empty(), || has_gone);
+                    reader.note_read(now, self.backlog.is_empty(), || has_gone);
                     self.dialogue.received(count, reader.last());
                 }
             }

@@ -345,7 +345,7 @@ impl DriveTopics {
 
     fn shown(&self, reading: &Reading<'_>) -> StateContent {
         let (drive, indices) = (&self.drive, self.indices.iter().copied());
-        let words = drive.why(reading).words();
+        let words = drive.why(reading).names();
         let hold = drive.hold_view(None, reading.now).map(|(view, _)| view);
         StateContent {
             refreshing: reading.spec.refresh.map(|_| drive.image.is_refreshing()),

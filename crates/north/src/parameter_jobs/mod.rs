@@ -99,7 +99,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
 }
 
 /// Progress of a reading.
-struct Looks {
+struct ReadProgress {
     /// Number of addresses requested so far, and of all.
     progress: (usize, usize),
     /// Time for that, without the pauses.
@@ -115,7 +115,7 @@ async fn read(
     origin: Origin,
     known: BTreeSet<u16>,
     (pace, names): (Pace, &Names),
-    mut seen: impl FnMut(Looks),
+    mut seen: impl FnMut(ReadProgress),
 ) -> Result<ParameterFile, String> {
     let spec = &drive.image.spec;
     let mut reading = Reading::new(spec.profile.clone(), known);
@@ -125,7 +125,7 @@ async fn read(
         let now = Instant::now();
         let outcome = drive.read_in_background(pdu, pace, origin.clone(), EXPIRY, now).await;
         let next = reading.answered(&outcome);
-        let mut looks = Looks {
+        let mut looks = ReadProgress {
             progress: reading.progress(),
             worked: begun.elapsed().saturating_sub(paused),
             reading: reading.now(),

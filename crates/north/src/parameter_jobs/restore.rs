@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::unfinished::{concerning, held_unfinished, not_understood, unfinished_event};
-use super::{Looks, identification, read};
+use super::{ReadProgress, identification, read};
 use crate::codec::RequestPdu;
 use crate::drive::Profile;
 use crate::drive::plan::WireTime;
@@ -76,7 +76,7 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
         true => Reading::addresses_of(&spec.profile, &wanted),
         false => Default::default(),
     };
-    let seen = |looks: Looks| {
+    let seen = |looks: ReadProgress| {
         vault.update_restore(machine, |restore| {
             (restore.progress, restore.waits) = (looks.progress, looks.waits);
         });

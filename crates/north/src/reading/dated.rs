@@ -111,7 +111,7 @@ impl<S: AsyncRead + Source + Unpin> AsyncRead for Dated<S> {
             Poll::Ready(Ok(())) => match buffer.filled().len() - before {
                 0 if room > 0 => reader.ended(),
                 0 => {}
-                count => reader.came(now, count < room, || stream.has_gone()),
+                count => reader.note_read(now, count < room, || stream.has_gone()),
             },
             Poll::Ready(Err(_)) => reader.ended(),
         }

@@ -83,7 +83,7 @@ impl Reader {
 
     /// The reader read bytes at `now`; `all`: and nothing is left. `has_gone` returns whether the client has closed or
     /// reset the connection since.
-    pub(crate) fn came(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
+    pub(crate) fn note_read(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
         let mut state = self.state();
         let boot = state.waited.then(|| self.watch.since_boot());
         let dated = match self.watch.turn(now, boot) {
@@ -157,8 +157,8 @@ mod tests {
         }
 
         /// Reads at that time; the date.
-        fn came(&self, ms: u32, all: bool) -> u128 {
-            self.reader.came(self.start + MS * ms, all, || false);
+        fn note_read(&self, ms: u32, all: bool) -> u128 {
+            self.reader.note_read(self.start + MS * ms, all, || false);
             self.ms(&self.reader.last())
         }
 
@@ -171,20 +171,24 @@ mod tests {
     fn what_is_read_dates_from_when_it_came() {
         let rig = Rig::new();
         assert_eq!(
-            rig.came(5, true),
+            rig.note_read(5, true),
             0,
             "it may have been there since the connection was opened"
         );
-        assert_eq!(rig.came(7, true), 5, "and this since the read before");
+        assert_eq!(rig.note_read(7, true), 5, "and this since the read before");
         rig.nothing(10);
-        assert_eq!(rig.came(1000, false), 1000, "what is waited for comes when it is read");
-        assert_eq!(rig.came(1001, true), 1000, "the rest of it");
+        assert_eq!(
+            rig.note_read(1000, false),
+            1000,
+            "what is waited for comes when it is read"
+        );
+        assert_eq!(rig.note_read(1001, true), 1000, "the rest of it");
         assert_eq!(rig.ms(&rig.reader.first()), 1000);
-        assert_eq!(rig.came(1010, true), 1001);
+        assert_eq!(rig.note_read(1010, true), 1001);
         assert_eq!(rig.ms(&rig.reader.first()), 1000, "all since nothing was left");
         rig.nothing(1011);
         rig.reader.ceased();
-        assert_eq!(rig.came(5000, true), 1011, "it did not read meanwhile");
+        assert_eq!(rig.note_read(5000, true), 1011, "it did not read meanwhile");
         assert_eq!(rig.ms(&rig.reader.first()), 1011);
     }
 
@@ -197,14 +201,14 @@ mod tests {
         reader.nothing(start + MS, || false);
         let now = start + 2000 * MS;
         reader.nothing(now, || true);
-        reader.came(now + MS, false, || true);
+        reader.note_read(now + MS, false, || true);
         let first = reader.last();
         assert_eq!(first.asked, start + MS);
         assert!(first.stall.is_some() && first.pause.is_some());
         assert!(first.connection.is_gone(), "its client gave up");
-        reader.came(now + 2 * MS, true, || false);
+        reader.note_read(now + 2 * MS, true, || false);
         assert_eq!(reader.last().asked, start + MS, "the rest of it");
-        reader.came(now + 3 * MS, true, || false);
+        reader.note_read(now + 3 * MS, true, || false);
         let since = reader.last();
         assert_eq!((since.asked, since.stall), (now + 2 * MS, None), "nothing was left");
         assert!(since.pause.is_some(), "its connection is older than the pause");

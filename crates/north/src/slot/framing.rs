@@ -49,7 +49,7 @@ impl Framing {
     /// Adds bytes with this arrival that are read at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) {
         self.frames.add(bytes, now);
-        self.arrivals.came(bytes.len(), arrival);
+        self.arrivals.add(bytes.len(), arrival);
     }
 
     /// The next complete message of the tool at `now`.

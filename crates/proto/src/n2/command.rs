@@ -81,7 +81,7 @@ pub(super) fn encode_text(address: u8, text: &[u8], out: &mut Vec<u8>) {
 }
 
 /// A command as a drive receives it: the address and the command, or the error code to return.
-pub type Heard = (u8, Result<Command, u8>);
+pub type ReceivedCommand = (u8, Result<Command, u8>);
 
 impl Command {
     /// The command with the object numbers of a drive whose first object has that number.
@@ -141,7 +141,7 @@ impl Command {
 
     /// The command in a frame from its lead to its CR, as a drive decodes it. A new lead starts the frame again.
     /// `None` for a frame that a drive does not answer: no lead, no CR, no address, or not hexadecimal.
-    pub fn decode(frame: &[u8]) -> Option<Heard> {
+    pub fn decode(frame: &[u8]) -> Option<ReceivedCommand> {
         let line = frame.strip_suffix(b"\r")?;
         let lead = line.iter().rposition(|byte| *byte == b'>')?;
         let text = line.get(lead + 1..)?;

@@ -24,7 +24,7 @@ mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosqu
 Ctrl-C ends the demo.",
         crate::version::VERSION,
         lines(&place.ports),
-        look(&quoted(&program), sides),
+        reading_hints(&quoted(&program), sides),
         page(place, sides),
         command(sides),
     )
@@ -74,7 +74,7 @@ fn lines(ports: &[String]) -> String {
     lines.join("\n")
 }
 
-fn look(program: &str, sides: &Sides) -> String {
+fn reading_hints(program: &str, sides: &Sides) -> String {
     let (http, modbus, mqtt) = (sides.http, sides.modbus.port(), sides.mqtt.port());
     format!(
         "\

@@ -25,7 +25,7 @@ use crate::port_users;
 
 /// Bytes received apart from replies.
 #[derive(Debug, Default)]
-pub(crate) struct Heard {
+pub(crate) struct StrayBytes {
     /// Settings and addresses that were answered with invalid frames.
     pub(crate) garbage: Vec<(Setting, u8)>,
     /// Bytes that came in transactions, echoes of requests aside.
@@ -61,7 +61,7 @@ pub(crate) struct Search<'a> {
     options: &'a Options,
     pub(crate) profiles: Profiles,
     pub(crate) found: Vec<Found>,
-    pub(crate) heard: Heard,
+    pub(crate) heard: StrayBytes,
     progress: Progress,
     stop: Arc<AtomicBool>,
     /// The first values of each drive are shown; set where that is enough, and the search ends with the drives found so far.
@@ -75,7 +75,7 @@ impl<'a> Search<'a> {
             options,
             profiles,
             found: Vec::new(),
-            heard: Heard::default(),
+            heard: StrayBytes::default(),
             progress: Progress::new(),
             stop,
             enough: None,

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use super::{Found, Heard, Setting};
+use super::{Found, Setting, StrayBytes};
 use crate::diagnosis::Cause;
 use crate::drive::Step;
 use crate::drive::commissioning::{Shared, gather};
@@ -13,7 +13,7 @@ use crate::drive::profile::{Profile, Profiles};
 const FEW_BYTES: usize = 8;
 
 /// Error and remedy if bytes came before anything was sent.
-pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> Option<String> {
+pub(crate) fn somebody_speaks(heard: &StrayBytes, port: &str, listened: Duration) -> Option<String> {
     (heard.unasked >= FEW_BYTES).then(|| {
         format!(
             "{} bytes came within {listened:?} before anything was sent, so nothing was sent: another master sends on \
@@ -25,7 +25,7 @@ pub(crate) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> 
 }
 
 /// The probable reason why no drive answered, and the remedy.
-pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
+pub(crate) fn nobody_answers(heard: &StrayBytes, port: &str) -> String {
     let requests = heard.requests;
     if let Some(told) = told_by_shape(heard) {
         return format!("no drive answered, but {told}; {port}");
@@ -70,8 +70,8 @@ pub(crate) fn nobody_answers(heard: &Heard, port: &str) -> String {
 }
 
 /// The fault indicated by the form of the received bytes, if there is one.
-fn told_by_shape(heard: &Heard) -> Option<String> {
-    let Heard {
+fn told_by_shape(heard: &StrayBytes) -> Option<String> {
+    let StrayBytes {
         start_lost,
         cut_echoes,
         stray_before,
@@ -100,7 +100,7 @@ fn told_by_shape(heard: &Heard) -> Option<String> {
 }
 
 /// A remark on a line on which drives answered but invalid bytes were received too.
-pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
+pub(crate) fn beside_answers(heard: &StrayBytes) -> Option<String> {
     if let Some(told) = told_by_shape(heard) {
         return Some(told);
     }
@@ -113,7 +113,7 @@ pub(crate) fn beside_answers(heard: &Heard) -> Option<String> {
 }
 
 /// What to check at the drives: for the families with manuals whose protocol was tried; all families would fill pages.
-pub(crate) fn at_silent_drives(heard: &Heard, tried: &[Setting], profiles: &Profiles) -> String {
+pub(crate) fn at_silent_drives(heard: &StrayBytes, tried: &[Setting], profiles: &Profiles) -> String {
     let speaks = |profile: &&Profile| tried.iter().any(|one| profile.protocols.contains(&one.protocol));
     // Profiles with a base have the lines of their base.
     let families = profiles
@@ -163,7 +163,7 @@ fn grouped(lines: &[Shared<'_>]) -> String {
 }
 
 /// The setting with most invalid replies, and how many.
-fn most_garbage(heard: &Heard) -> Option<(Setting, usize)> {
+fn most_garbage(heard: &StrayBytes) -> Option<(Setting, usize)> {
     let count = |setting: &Setting| heard.garbage.iter().filter(|(other, _)| other == setting).count();
     let settings = heard.garbage.iter().map(|(setting, _)| *setting);
     settings
@@ -185,38 +185,38 @@ mod tests {
 
     #[test]
     fn what_was_heard_decides() {
-        let silent = Heard {
+        let silent = StrayBytes {
             requests: 30,
-            ..Heard::default()
+            ..StrayBytes::default()
         };
-        let echo = Heard {
+        let echo = StrayBytes {
             requests: 30,
             echoes: 30,
-            ..Heard::default()
+            ..StrayBytes::default()
         };
-        let wrong = Heard {
+        let wrong = StrayBytes {
             requests: 30,
             bytes: 90,
             garbage: vec![(at(9600), 1), (at(19_200), 1), (at(19_200), 2)],
-            ..Heard::default()
+            ..StrayBytes::default()
         };
-        let noise = Heard {
+        let noise = StrayBytes {
             requests: 30,
             bytes: 5,
-            ..Heard::default()
+            ..StrayBytes::default()
         };
-        let late = Heard {
+        let late = StrayBytes {
             requests: 30,
             bytes: 60,
             start_lost: 4,
-            ..Heard::default()
+            ..StrayBytes::default()
         };
-        let early = Heard {
+        let early = StrayBytes {
             requests: 30,
             bytes: 60,
             cut_echoes: 30,
             garbage: vec![(at(9600), 1)],
-            ..Heard::default()
+            ..StrayBytes::default()
         };
         for (heard, wanted) in [
             (
@@ -242,9 +242,9 @@ mod tests {
 
     #[test]
     fn another_master_is_not_disturbed() {
-        let heard = |unasked| Heard {
+        let heard = |unasked| StrayBytes {
             unasked,
-            ..Heard::default()
+            ..StrayBytes::default()
         };
         let second = Duration::from_secs(1);
         assert_eq!(somebody_speaks(&heard(3), "/dev/x", second), None);
@@ -258,13 +258,13 @@ mod tests {
     #[test]
     fn the_steps_are_those_of_the_families_that_were_tried() {
         let profiles = Profiles::built_in();
-        let silent = at_silent_drives(&Heard::default(), &[at(9600)], &profiles);
+        let silent = at_silent_drives(&StrayBytes::default(), &[at(9600)], &profiles);
         let wanted = "  eaton-hvx, eaton-svx, vacon-nx\n    - green LED (FS) steady: the board is active and has seen no message yet";
         assert!(silent.contains(wanted), "{silent}");
         assert!(silent.contains("  vacon-cx\n") && !silent.contains("teco"), "{silent}");
-        let wrong = Heard {
+        let wrong = StrayBytes {
             garbage: vec![(at(9600), 1)],
-            ..Heard::default()
+            ..StrayBytes::default()
         };
         let ascii = Setting {
             protocol: Protocol::ModbusAscii,

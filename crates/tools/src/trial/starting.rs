@@ -84,7 +84,7 @@ mod tests {
             let of_http = lines("and below [http]:\n", "  2. ");
             std::fs::write(folder.path().join("users"), "").unwrap();
             let user = crate::north::http::User::new("alice", "a long password").unwrap();
-            let users = crate::credentials_file::CredentialsFile::at(&folder.path().join("users"));
+            let users = crate::credentials_file::CredentialsFile::open(&folder.path().join("users"));
             users.put(&user, true).unwrap();
             let text = text
                 .replace("name = \"drive-1\"\n", &format!("name = \"drive-1\"\n{of_drive}"))

@@ -18,7 +18,7 @@ pub(in crate::permit) const RULE: Rule = Rule {
 
 /// Effect of an order on a machine, as far as the age of the order matters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Does {
+enum OrderKind {
     /// The order takes the run command away.
     Stop,
     /// The order can start a standing motor.
@@ -35,7 +35,7 @@ struct Age<'a> {
     /// When and over which connection the order arrived.
     arrival: &'a Arrival,
     /// Effect of the order.
-    does: Does,
+    does: OrderKind,
     /// The order is not sent after this time.
     expires: Option<Instant>,
     /// The last stops of the machine.
@@ -47,10 +47,10 @@ struct Age<'a> {
 fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
     let window = &ask.intent.window;
     let does = match (&ask.intent.order, ask.asks()) {
-        (Order::Read(_), _) => Does::Read,
-        (_, Asks::Stop) => Does::Stop,
-        (_, Asks::Run) => Does::Start,
-        (_, Asks::Steer | Asks::Other | Asks::Nothing) => Does::Other,
+        (Order::Read(_), _) => OrderKind::Read,
+        (_, Asks::Stop) => OrderKind::Stop,
+        (_, Asks::Run) => OrderKind::Start,
+        (_, Asks::Steer | Asks::Other | Asks::Nothing) => OrderKind::Other,
     };
     let age = Age {
         arrival: &window.arrival,
@@ -65,7 +65,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
 
 fn verdict(age: Age<'_>, now: Instant) -> Verdict {
     let Age { arrival, does, .. } = age;
-    if does == Does::Stop {
+    if does == OrderKind::Stop {
         return Verdict::Go;
     }
     if age.expires.is_some_and(|expires| expires <= now) {
@@ -77,10 +77,10 @@ fn verdict(age: Age<'_>, now: Instant) -> Verdict {
         return Verdict::Refuse(Outcome::Expired);
     }
     let stopped = age.stops.of_others(&arrival.connection);
-    if does != Does::Read && stopped.is_some_and(|stopped| arrival.asked < stopped) {
+    if does != OrderKind::Read && stopped.is_some_and(|stopped| arrival.asked < stopped) {
         return Verdict::Refuse(Outcome::Purged);
     }
-    if does != Does::Start {
+    if does != OrderKind::Start {
         return Verdict::Go;
     }
     let of_before = |pause: Stall| arrival.connection.opened_at() < pause.ended && now < pause.over();
@@ -173,7 +173,7 @@ mod tests {
             stall: case.stall.map(stall),
             pause: case.pause.map(stall),
         };
-        let all = [Does::Stop, Does::Start, Does::Other, Does::Read].map(|does| {
+        let all = [OrderKind::Stop, OrderKind::Start, OrderKind::Other, OrderKind::Read].map(|does| {
             let age = Age {
                 arrival: &arrival,
                 does,

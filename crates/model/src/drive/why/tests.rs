@@ -110,7 +110,7 @@ impl Says {
     }
 
     fn words(&self) -> String {
-        self.explain().words().join(" ")
+        self.explain().names().join(" ")
     }
 }
 
@@ -154,7 +154,7 @@ fn every_family_tells_what_the_common_model_has() {
             .on("reverse");
         let explanation = runs.explain();
         assert_eq!(
-            (explanation.runs, explanation.words().len()),
+            (explanation.runs, explanation.names().len()),
             (Some(true), 0),
             "{family}"
         );
@@ -268,7 +268,7 @@ fn a_drive_that_is_held_takes_no_order() {
             .ordered(RunWish::Run, Fate::Refused, Giver::Client)
     };
     let explanation = held(refused()).explain();
-    assert_eq!(explanation.words(), ["held", "order_refused"]);
+    assert_eq!(explanation.names(), ["held", "order_refused"]);
     assert_eq!(explanation.causes[0].evidence, "half restored");
     let mut silent = refused();
     silent.contact = Contact::Silent;
@@ -290,7 +290,7 @@ fn a_drive_that_cannot_be_asked_tells_nothing() {
             .ordered(RunWish::Run, Fate::NotSent, Giver::Client);
         says.contact = contact;
         let explanation = says.explain();
-        assert_eq!(explanation.words(), [word, "order_expired"]);
+        assert_eq!(explanation.names(), [word, "order_expired"]);
         assert_eq!(explanation.runs, None);
     }
 }
@@ -322,7 +322,7 @@ fn a_motor_that_is_enabled_at_zero_speed() {
         .with("frequency_reference", Value::Number(0.0));
     let explanation = says.explain();
     assert_eq!(
-        (explanation.words().join(" ").as_str(), explanation.runs),
+        (explanation.names().join(" ").as_str(), explanation.runs),
         ("reference_zero", Some(false))
     );
     let ramps = stands("vacon-nx").on("running").explain();
