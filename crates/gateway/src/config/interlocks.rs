@@ -11,7 +11,7 @@ use crate::drive::model::Kind;
 use crate::drive::{Plan, PointIndex, Profile};
 use crate::process_image::{Access, DriveSpec};
 
-/// Reports interlocks that can never be satisfied, or always are.
+/// Reports interlocks that can never be satisfied, or have no effect.
 pub(super) fn check(document: &Document, buses: &[bus::Found]) {
     let drives = || buses.iter().flat_map(|bus| &bus.drives);
     let name = |found: &Found| found.name.as_ref().map(|(name, _)| name.clone());
@@ -71,7 +71,7 @@ fn unfit(profile: &Profile, name: &str) -> Option<(String, String)> {
     ))
 }
 
-/// Lets starts of drives count whose `stagger` group contains other drives with a guard.
+/// Lets the starts of drives count that share a group, or a bus, with a drive that has `stagger`.
 pub(super) fn note_staggers(buses: &mut [BusSettings]) {
     let staggers = |drive: &DriveSpec| drive.guard.is_some_and(|guard| !guard.stagger.is_zero());
     let drives = buses.iter().flat_map(|bus| &bus.drives);
