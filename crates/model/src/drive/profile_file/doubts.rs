@@ -88,7 +88,7 @@ fn warn_of_running_at_power_up(reader: &Reader<'_>, profile: &Profile, control: 
     }
 }
 
-/// Warns about a status value that counts as invalid: it would make every state bad.
+/// Warns about a status word with a value that the profile declares invalid: every state in it would then be bad.
 fn warn_of_invalid_states(reader: &Reader<'_>, profile: &Profile, control: &Control) {
     let masks = masks(profile, control);
     let state_of = |index: PointIndex, word: u64| {
