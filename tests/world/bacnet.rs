@@ -1,8 +1,9 @@
-//! BACnet's clients as a source of orders in virtual time: priorities, NULL, stops from elsewhere, silent clients, lost frames and drives
-//! that are away, through the real server, its datagrams, the real core and a simulated line.
+//! BACnet clients as a source of orders in virtual time: priorities, NULL, stops from other interfaces, silent
+//! clients, lost frames and offline drives, through the real server, its datagrams, the real core and a simulated
+//! line.
 //!
-//! `one_by_one` compares every answer, the arrays and the drive itself with the rules as they are written in `docs/bacnet.md`;
-//! `all_at_once` checks what must always hold: nothing starts behind a stop, and no request is answered twice.
+//! `one_by_one` compares every answer, the arrays and the drive itself with the rules in `docs/bacnet.md`;
+//! `all_at_once` checks what must always hold: nothing starts after a stop, and no request is answered twice.
 
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
@@ -33,7 +34,7 @@ const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
 const SPEED: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 1);
 const LEASE: Duration = Duration::from_secs(3);
 
-/// Why a write was not done, as a client sees it: class and code.
+/// Why a write was not carried out, as a client sees it: class and code.
 type Why = (u8, u8);
 const DENIED: Why = (2, 40);
 const REFUSED: Why = (5, 29);
@@ -128,7 +129,7 @@ impl BacnetWorld {
         }
     }
 
-    /// The next thing that happens by `until`; false when nothing does.
+    /// Runs the next event until `until`; returns false if there is none.
     fn step(&mut self, until: Instant) -> bool {
         let seen = self.rig.step(until.min(self.next_poll));
         let now = self.rig.now;
@@ -160,7 +161,7 @@ impl BacnetWorld {
         while self.step(until) {}
     }
 
-    /// Gives the answers to the clients.
+    /// Delivers the answers to the clients.
     fn hear(&mut self) {
         while let Some((to, datagram)) = self.server.transmit() {
             let To::Host(to) = to else { continue };
@@ -198,7 +199,7 @@ impl BacnetWorld {
         self.hear();
     }
 
-    /// The answer to a client's request; none comes from an absent drive.
+    /// The answer to a client's request; an absent drive sends none.
     fn answer(&mut self, client: usize) -> Option<Vec<u8>> {
         let until = self.rig.now + Duration::from_secs(10);
         while self.clients[client].waits && self.step(until) {}
@@ -279,7 +280,7 @@ impl BacnetWorld {
         self.rig.place_as("cloud", DRIVE, order)
     }
 
-    /// Gives an order from elsewhere and waits for its outcome.
+    /// Gives an order over another interface and waits for its outcome.
     fn elsewhere(&mut self, points: &[(&str, f64)]) -> Outcome {
         let mut placed = self.order_elsewhere(points);
         let until = self.rig.now + Duration::from_secs(10);
@@ -349,7 +350,7 @@ impl Rules {
 
 const PRIORITIES: [u8; 9] = [1, 3, 5, 6, 7, 8, 10, 12, 16];
 
-/// A seed in which each client waits for its answer.
+/// Runs a seed in which each client waits for its answer.
 fn one_by_one(seed: u64) {
     let mut world = BacnetWorld::new(seed, "");
     let mut rules = Rules::default();
@@ -414,7 +415,7 @@ fn one_by_one(seed: u64) {
                 }
             }
             _ => {
-                // Only a client whose slot does not govern acts now.
+                // In this step only a client whose slot does not govern acts.
                 let own = governs(&rules.run).map(|(.., client)| client);
                 let other = usize::from(own == Some(0));
                 for _ in 0..10 {
@@ -449,7 +450,7 @@ fn slots_answers_and_the_drive_are_as_the_rules_say() {
     }
 }
 
-/// A seed in which clients do not wait, frames are lost and the drive goes away.
+/// Runs a seed in which clients do not wait, frames are lost and the drive goes offline.
 fn all_at_once(seed: u64) -> (usize, usize) {
     let faults = ["", "drop=0.05", "deaf=0.05,corrupt=0.05"][seed as usize % 3];
     let mut world = BacnetWorld::new(seed, faults);
@@ -460,8 +461,8 @@ fn all_at_once(seed: u64) -> (usize, usize) {
         let pause = Duration::from_millis(world.dice.within(0..=200));
         match world.dice.within(0..=15) {
             0..=9 if world.clients[client].waits => {
-                // The answer is late, so the client repeats its request. The repetition is not a new order, unless the
-                // drive was away before.
+                // The answer is late, so the client repeats its request. The repetition is not a new order, unless
+                // the drive was offline before.
                 let content = world.clients[client].last.clone();
                 if !world.clients[client].taken {
                     world.stopped = None;

@@ -27,7 +27,7 @@ use drivegate_world::start_guard::{BusGuards, Guards};
 
 use super::scenario::Line;
 
-/// Last request on the line.
+/// The last request on the line.
 #[derive(Debug, Clone)]
 pub struct Asked {
     pub drive: usize,
@@ -36,9 +36,9 @@ pub struct Asked {
     pub is_poll: bool,
     /// Whether the request is a refresh: an order written again.
     pub is_refresh: bool,
-    /// When the image last had the first word of a read before this request.
+    /// When the image last received the first word of a read before this request.
     pub last_read: Option<Instant>,
-    /// Reply of the drive, if it acted upon the request.
+    /// Reply of the drive, if it carried out the request.
     pub reply: Option<Reply>,
     /// Frame of the reply.
     pub frame: Vec<u8>,
@@ -46,7 +46,7 @@ pub struct Asked {
     pub acted: u8,
 }
 
-/// Something that happened on the line.
+/// An event that was observed on the line.
 #[derive(Debug, Clone)]
 pub enum Seen {
     Sent(Asked),
@@ -64,22 +64,22 @@ pub struct WorldBus {
     pub core: BusCore,
     pub wire: HalfDuplex,
     pub options: BusOptions,
-    /// Record of the drives' starts; it lasts as long as the process.
+    /// Record of the drives' starts, kept as long as the process.
     pub guards: Arc<Guards>,
     pub profile: Arc<Profile>,
     pub open: bool,
-    /// Whether the bus is about to stop its drives: its polls cease.
+    /// Whether the bus is about to stop its drives, so that it does not poll any more.
     pub ending: bool,
     pub exchanges: u64,
-    /// Whether replies may come twice, or when they are no longer expected.
+    /// Whether replies may be duplicated, or arrive when they are no longer expected.
     pub late: bool,
-    /// The fast cycle of the line when it is saturated with polls, as predicted.
+    /// The predicted fast cycle of the line when polls saturate it.
     pub round: Duration,
     /// The slow cycle of the line, as predicted.
     pub slow_round: Duration,
-    /// The slow round while drives come online, whose process data is compared with its monitoring registers.
+    /// The slow round while drives come online, when their process data is compared with the monitoring registers.
     pub first_slow_round: Duration,
-    /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
+    /// Share of the frames to the gateway in which one bit is wrong, in addition to the faults of the line.
     pub flips: f64,
     dice: Random,
     began: Instant,
@@ -88,7 +88,7 @@ pub struct WorldBus {
     asked: Option<Asked>,
     /// The last request without an address of a drive.
     broadcast: Option<Asked>,
-    /// The exchange before: a late reply may have ended it while its request was still on the wire.
+    /// The previous transaction: a late reply may have ended it while its request was still on the wire.
     ended: Option<Asked>,
 }
 
@@ -206,7 +206,7 @@ impl WorldBus {
         }
     }
 
-    /// Starts the bus anew, as a reload does, with the same drives on the same line.
+    /// Restarts the bus as a reload does, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.handle.queue.begin_handover(Vec::new(), now);
         let leaving: Vec<_> = self.handle.image.drives.iter().cloned().collect();
@@ -228,7 +228,7 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    /// The process is killed and started again: of all that it knew, `guards` has what is left.
+    /// Kills and restarts the process: `guards` contains what remains of its state.
     pub fn kill(&mut self, guards: Guards, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.wire.cut();
         self.guards = Arc::new(guards);
@@ -243,8 +243,8 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    /// The maximum frequency in a drive, in Hz; set to `new` first, as at the drive's panel. `None` if the family has
-    /// no register of its own for it, or the drive is off.
+    /// The maximum frequency in a drive, in Hz; with `new` it is first set, as at the drive's panel. `None` if the
+    /// family has no register for it, or the drive is off.
     pub fn maximum_frequency(&mut self, address: u8, new: Option<f64>, now: Instant) -> Option<f64> {
         if self.line.protocol == Protocol::N2 {
             return None;
@@ -299,7 +299,7 @@ impl WorldBus {
         }
     }
 
-    /// The port goes, or comes back.
+    /// The port disappears, or returns.
     pub fn set_open(&mut self, open: bool, now: Instant) {
         if open == self.open {
             return;
@@ -315,8 +315,7 @@ impl WorldBus {
         }
     }
 
-    /// Lets the device server close its connection; bytes on the line may then be lost. The bus does what its thread
-    /// would do.
+    /// Lets the device server close its connection; bytes on the line may then be lost. The bus reacts as its thread would.
     pub fn close(&mut self, lose_reply: bool, now: Instant) -> Closed {
         if lose_reply {
             self.wire.cut();
@@ -353,13 +352,13 @@ impl WorldBus {
         self.wire.wake().map(|wake| self.began + wake.at)
     }
 
-    /// The wire and the drives go on, whatever the bus does.
+    /// Advances the wire and the drives, whatever the bus does.
     pub fn wire_runs(&mut self, now: Instant, seen: &mut Vec<Seen>) {
         self.wire.on_time(self.sim(now));
         self.note_acts(seen);
     }
 
-    /// The thread of the bus sleeps until this time, or until an order comes.
+    /// Lets the thread of the bus sleep until this time, or until an order arrives.
     pub fn waits(&mut self, until: Instant, commands: bool, seen: &mut Vec<Seen>) {
         self.note_over(seen);
         (self.until, self.commands) = (until, commands);
@@ -396,7 +395,8 @@ impl WorldBus {
         self.note_acts(seen);
     }
 
-    /// Delivers the due bytes to the drives and to the gateway, which also reads without bytes after it `stood` still.
+    /// Delivers the due bytes to the drives and to the gateway. The gateway also reads without bytes after it
+    /// `stood` still.
     pub fn deliver(&mut self, now: Instant, stood: bool, seen: &mut Vec<Seen>) {
         let sim = self.sim(now);
         self.wire.on_time(sim);
@@ -428,7 +428,7 @@ impl WorldBus {
                 .get(DriveIndex::new(asked.drive))
                 .is_none_or(|image| image.spec.address == act.address);
             if let Some(broadcast) = self.broadcast.as_mut().filter(|_| !is_asked) {
-                // A drive may carry a broadcast out after the request to another drive was sent.
+                // A drive may carry out a broadcast after the request to another drive was sent.
                 broadcast.acted = act.address;
                 seen.push(Seen::Acted(broadcast.clone()));
                 continue;
@@ -457,7 +457,7 @@ impl WorldBus {
         }
     }
 
-    /// The exchange is over when the core has nothing on the line any more.
+    /// Notes the end of the transaction once the core has nothing on the line any more.
     fn note_over(&mut self, seen: &mut Vec<Seen>) {
         if self.core.asked().is_none()
             && let Some(asked) = self.asked.take()

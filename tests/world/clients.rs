@@ -14,7 +14,7 @@ use drivegate_world::plant::{Placed, SharedPlant};
 
 use super::scenario::Habit;
 
-/// A client, with the orders that it waits for.
+/// A client with the orders for which it waits.
 pub struct Client {
     pub habit: Habit,
     pub next: Instant,
@@ -23,7 +23,7 @@ pub struct Client {
     pub open: usize,
     /// Time before which the client sends nothing.
     pub silent_until: Instant,
-    /// Bus and drive that it commands for a moment, and with how many more orders.
+    /// Bus and drive that the client commands for a while, and with how many more orders.
     pub burst: (usize, usize, u64),
 }
 
@@ -79,7 +79,7 @@ impl Broker {
     }
 }
 
-/// Everything that all clients share.
+/// The servers that all clients share.
 pub struct Servers {
     plant: SharedPlant,
     modbus_tcp: modbus_tcp::Loopback,
@@ -105,8 +105,8 @@ impl Servers {
         self.modbus_tcp.watch()
     }
 
-    /// A connection of a Modbus TCP client. Connections of [`Habit::Shares`] belong to two clients, one of them with a
-    /// certificate.
+    /// A connection of a Modbus TCP client. Connections of [`Habit::Shares`] belong to two clients, one of them
+    /// with a certificate.
     pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Loopback {
         let (host, name) = match habit {
             Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),

@@ -1,4 +1,4 @@
-//! Orders that stop a drive and do more: the stop is sent whatever is wrong with the rest, and one answer reports both.
+//! Orders that stop a drive and do more: the stop is sent even if the rest is invalid, and one answer reports both.
 
 use std::time::Duration;
 
@@ -155,7 +155,7 @@ fn behind_a_stop_that_failed_nothing_is_sent() {
     rig.set_alive(1, true);
     rig.run(PATIENCE);
     assert_eq!(rig.word(1, REFERENCE), 5_000);
-    // To a drive that is away the stop goes as its probe, and the rest not at all.
+    // For an offline drive the stop is sent as its probe, and the rest is not sent.
     rig.set_alive(1, false);
     rig.until("offline", PATIENCE, |rig| !rig.is_online(0));
     let order = rig.points(1, &[("run", 0.0), ("speed_reference", 10.0)]);

@@ -31,7 +31,7 @@ fn usual() -> [Rig; 3] {
     })
 }
 
-/// Lets the bus go on until a request is on the line that fits, and closes the connection then.
+/// Runs the bus until a matching request is on the line, and then closes the connection.
 fn close_on(rig: &mut Rig, fits: impl Fn(&Seen) -> bool, lose_reply: bool) -> Closed {
     let until = rig.now + PATIENCE;
     loop {
@@ -73,7 +73,7 @@ fn values_and_drives_stay_as_they_are_whenever_the_server_closes() {
         let drives = rig.bus.line.drives;
         let mut bad = 0;
         for turn in 0..300 {
-            // The connection closes after the reply, or before it; the reply is then lost, or comes by the next
+            // The connection closes after the reply, or before it; the reply is then lost, or arrives over the next
             // connection.
             let lose_reply = turn % 12 == 3;
             let closed = match turn % 4 {
@@ -96,7 +96,7 @@ fn values_and_drives_stay_as_they_are_whenever_the_server_closes() {
     }
 }
 
-/// A request within 5 ms of a reply goes into a connection that the server no longer reads.
+/// A request within 5 ms of a reply enters a connection that the server no longer reads.
 #[test]
 fn a_server_that_closes_soon_after_each_reply_costs_no_time_of_a_reply() {
     for mut rig in usual() {
@@ -146,7 +146,7 @@ fn orders_survive_the_end_of_a_connection() {
         let outcome = rig.answered(&mut waits);
         assert!(outcome.is_ok(), "what waited is served: {outcome:?}");
         rig.until_good(1, ModelPoint::Running, Value::Bool(true));
-        // The reply to the first stop comes by the next connection, the reply to the second never comes.
+        // The reply to the first stop arrives over the next connection, the reply to the second is lost.
         for lose_reply in [false, true] {
             assert!(rig.set(1, &[("run", 1.0)]).is_ok());
             let order = rig.points(1, &[("run", 0.0)]);
@@ -235,8 +235,8 @@ fn a_server_that_closes_all_the_time_is_told_and_nothing_else() {
     }
 }
 
-/// The measured speed of a line that is faster than its baud rate holds for the next connection and for the next bus, so
-/// that no reply is doubted.
+/// The learned speed of a line that is faster than its baud rate is kept for the next connection and for the next
+/// bus, so that no reply is doubted.
 #[test]
 fn a_line_that_is_faster_than_its_baud_rate_is_known_after_an_outage() {
     for usual in [

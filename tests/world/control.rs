@@ -1,6 +1,6 @@
-//! Families that are commanded by `[control]`: orders in any sequence on a line that loses, damages and delays frames, to a drive
-//! that trips and is taken to its panel. A stop that was acknowledged stands, only a run command starts the motor, and when the
-//! faults are over all becomes good again.
+//! Families with `[control]`: orders in any sequence on a line that loses, damages and delays frames, to a drive
+//! that trips and is switched to panel control. An acknowledged stop stays in force, only a run command starts the
+//! motor, and after the faults everything recovers.
 
 use std::time::Duration;
 
@@ -32,7 +32,7 @@ fn works(family: &'static str, faults: &str) -> Line {
 enum Allowed {
     /// A stop was acknowledged, and no start was given since.
     Stands,
-    /// A run command was given, whatever its outcome.
+    /// A run command was given, whatever its outcome was.
     MayRun,
 }
 
@@ -70,7 +70,7 @@ impl World {
         (self.reference, f64::from(self.dice.within(0..=39) as u32) + 10.0)
     }
 
-    /// Gives an order and waits for its outcome; a permission counts from when the order was given, a stop from its
+    /// Gives an order and waits for its outcome; permission for a run counts from the order, a stop from its
     /// acknowledgement.
     fn order(&mut self, points: &[(&str, f64)]) -> Outcome {
         let run = points.iter().find(|(name, _)| *name == "run").map(|(_, value)| *value);

@@ -84,8 +84,8 @@ fn the_first_probe_of_a_silent_drive_comes_within_ten_seconds() {
     }
 }
 
-/// The oldest process data of any drive but the last within `time`, while stops are given to that one, and how many of
-/// them went out.
+/// The oldest process data of any drive except the last within `time`, while stops are given to the last one, and
+/// the number of stops sent.
 fn oldest(rig: &mut Rig, time: Duration, stops: Option<Duration>) -> (Duration, u32) {
     let silent = rig.bus.line.drives;
     let end = rig.now + time;
@@ -192,7 +192,7 @@ fn a_flood_leaves_half_of_the_line_to_polls_and_its_turn_to_another_client() {
     );
 }
 
-/// Two clients that stop a standing drive again and again, as a PLC does that writes 0 in a loop, and a third one.
+/// Two clients that continuously stop a standing drive, as a PLC does that writes 0 in a loop, and a third client.
 #[test]
 fn stops_in_a_loop_keep_no_other_client_waiting() {
     let ms = Duration::from_millis;

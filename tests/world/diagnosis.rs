@@ -192,7 +192,7 @@ fn told(rig: &Rig) -> Told {
         .collect()
 }
 
-/// Lets time pass; a drive is started in between, where that is wanted.
+/// Lets time pass; with `runs`, a drive is started in between.
 fn pass(rig: &mut Rig, time: Duration, runs: bool, mut each: impl FnMut(&Rig, Duration)) {
     let mut gone = Duration::ZERO;
     while gone < time {
@@ -382,7 +382,7 @@ fn nothing_is_told_of_a_sound_line() {
         let mut parts = Parts::of(0, &sound.line, 5);
         (sound.parts)(&mut parts);
         let mut rig = Rig::new(&sound.line, parts);
-        // A drive that was never there is not a fault of the line, and is reported as such.
+        // A drive that was never present is not a fault of the line, and is reported as such.
         let never: Told = sound
             .line
             .dead
@@ -430,7 +430,7 @@ fn a_drive_that_never_answered_is_told_until_it_answers() {
             family => &format!("{family}: green LED (FS) steady: the board is active and has seen no message yet"),
         };
         assert!(verdict.steps.iter().any(|step| step.starts_with(lamp)), "{verdict:?}");
-        // The drive is switched on, and off again: it has answered by then.
+        // The drive is switched on and off again, so it has answered once.
         rig.with_drive(2, |drive, now| drive.power_on(now));
         rig.run(2 * TOLD);
         assert_eq!(told(&rig), Told::new(), "{}", line.family);

@@ -1,5 +1,5 @@
-//! Drills of simulated drives: a drive that stops as it should always passes, each fault is named, every drill ends with a stop, and
-//! the other drives of the line are read as ever.
+//! Drills of simulated drives: a drive that stops correctly always passes, each fault is named, every drill ends
+//! with a stop, and the other drives of the line are read normally.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -19,8 +19,8 @@ use super::scenario::Line;
 
 const SECOND: Duration = Duration::from_secs(1);
 const LIMIT: Duration = Duration::from_secs(25);
-/// PDU address of a parameter of a Vacon NX: what it does when its master was silent for 20 s; 2 is a fault with the stop function,
-/// 0 nothing.
+/// PDU address of the Vacon NX parameter for the reaction to a master that was silent for 20 s; 2 is a fault with
+/// the stop function, 0 nothing.
 const FIELDBUS_FAULT_RESPONSE: u16 = 732;
 /// Register of the deceleration time, 0.1 s.
 const DECELERATION: u16 = 103;
@@ -39,7 +39,7 @@ const FAMILIES: [(&str, Protocol); 8] = [
     ("teco-7300pa", Protocol::ModbusAscii),
     ("schneider-altivar", Protocol::ModbusRtu),
     ("danfoss-fc", Protocol::ModbusRtu),
-    // By the actual speed alone.
+    // Only the actual speed shows the standstill of this family.
     ("siemens-g120", Protocol::ModbusRtu),
 ];
 
@@ -130,7 +130,7 @@ fn is_at(report: &DrillReport, text: &str) -> bool {
 
 #[test]
 fn drives_that_stop_pass() {
-    // An ACS580 is not running as soon as it is stopped: only the actual speed says when it stands.
+    // An ACS580 reports "not running" as soon as it is stopped: only the actual speed shows when it stands.
     for (family, protocol) in FAMILIES.into_iter().chain([("abb-acs580", Protocol::ModbusRtu)]) {
         let mut play = Play::of(&works(family, protocol), 5);
         let report = play.drill(&[Kind::Order, Kind::Client], |_, _| {});
@@ -169,7 +169,7 @@ fn a_drive_that_stops_by_itself_when_its_gateway_is_silent_passes_and_the_others
     // The time is that of the first reading after the silence.
     let took = report.steps[0].took_ms.unwrap();
     assert!((25_000..25_300).contains(&took), "{took} ms");
-    // The exchange that was on the line when the silence began.
+    // One frame is allowed: that of the transaction on the line when the silence began.
     assert!(frames <= 1, "{frames} frames to a drive that is sent nothing");
     let longest = silent[5..].iter().max().unwrap();
     assert!(
@@ -178,7 +178,7 @@ fn a_drive_that_stops_by_itself_when_its_gateway_is_silent_passes_and_the_others
     );
 }
 
-/// The drive stops by itself, later than it should; the readings that would show it turning are lost.
+/// The drive stops by itself later than it should; the readings that would show it turning are lost.
 #[test]
 fn a_standstill_that_was_not_read_in_time_is_not_proven() {
     let mut play = Play::of(&works("vacon-nx", Protocol::ModbusRtu), 19);
@@ -295,7 +295,7 @@ fn what_does_not_stop_is_named() {
 enum Trouble {
     /// Another master keeps the drive running.
     IgnoresStops,
-    /// Another master keeps the drive running for three seconds, which is in time.
+    /// Another master keeps the drive running for three seconds, which is still in time.
     StopsLate,
     Local,
     Fault,
@@ -304,7 +304,7 @@ enum Trouble {
     CommandOfAnother,
     /// The commands reach the motor of another drive.
     WrongMotor,
-    /// The gateway falls silent, and the drive does whatever it does without its master.
+    /// The gateway goes silent, and the drive reacts as it does without its master.
     SilentGateway,
 }
 
@@ -328,7 +328,7 @@ impl Trouble {
         }
     }
 
-    /// Causes the trouble at the step whose `report` calls for it.
+    /// Causes the trouble at the step in which `report` calls for it.
     fn look(self, rig: &mut Rig, report: &DrillReport, happened: &mut Option<Instant>) {
         let steady = is_at(report, "the motor turns at");
         let stopping = is_at(report, "a stop command was sent");
@@ -399,7 +399,7 @@ impl Trouble {
 fn whatever_goes_wrong_is_named_with_every_family() {
     for (number, (family, protocol)) in FAMILIES.into_iter().enumerate() {
         for trouble in Trouble::ALL {
-            // No supervision, so that nothing but the drill stops the drive.
+            // Without supervision, so that only the drill stops the drive.
             let works = Line {
                 supervision: None,
                 ..works(family, protocol)
@@ -407,7 +407,7 @@ fn whatever_goes_wrong_is_named_with_every_family() {
             let mut play = Play::of(&works, number as u64);
             let has_remote = play.rig.good(1, ModelPoint::Remote).is_some();
             if trouble == Trouble::Local && !has_remote {
-                // The drive does not report its control place, so the trouble cannot be seen.
+                // The drive does not report its control place, so this trouble cannot be detected.
                 continue;
             }
             let (mut happened, mut turned) = (None, false);
@@ -440,8 +440,8 @@ fn whatever_goes_wrong_is_named_with_every_family() {
     }
 }
 
-/// On a line that loses and damages frames a drill may end in any way but wrongly: what passed was seen to stand, and all ends with a
-/// stop.
+/// On a line that loses and damages frames a drill may end with any result except a wrong one: a drill that passed
+/// was seen to stop the motor, and all end with a stop.
 #[test]
 fn a_thousand_drills_and_a_noisy_line() {
     let mut play = Play::of(&works("vacon-nx", Protocol::ModbusRtu), 13);
@@ -535,13 +535,13 @@ impl Disk {
     }
 }
 
-/// The gateway is killed at any moment of a drill and comes back: the motor then stands. It never turned while nothing of the drill
-/// was on disk.
+/// The gateway is killed at any moment of a drill and returns: the motor then stands. The motor never turned before
+/// the drill was on disk.
 #[test]
 fn a_kill_at_any_moment_leaves_no_motor_running() {
     let mut stopped = 0;
     for kill in 0..60_u32 {
-        // No supervision, so that nothing but the drill stops the drive.
+        // Without supervision, so that only the drill stops the drive.
         let works = Line {
             supervision: None,
             ..works("vacon-nx", Protocol::ModbusRtu)

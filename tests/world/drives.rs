@@ -1,4 +1,4 @@
-//! The true state of a drive, as seen on its line and inside it, and what must follow from that.
+//! The true state of a drive, as seen on its line and inside it, and the expectations that follow from it.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -16,15 +16,15 @@ const KEPT: usize = 400;
 pub struct Truth {
     /// The run command in the drive.
     pub run: bool,
-    /// Time until which a run may go onto the wire; `None` after a stop.
+    /// Time until which a run command may be sent; `None` after a stop.
     pub may_run: Option<Instant>,
-    /// Open orders that may change the run command the other way: stops, resets.
+    /// End of the open orders that may change the run command to the opposite: stops, resets.
     pub last_stop_over: Option<Instant>,
-    /// Behind that place are the orders that may still go onto the wire, stops apart.
+    /// Only orders after this place may still be sent, apart from stops.
     pub last_place: usize,
-    /// The last order with these words; the words repeat after some thousand orders.
+    /// The last order with these words; the words repeat after several thousand orders.
     pub uniques: HashMap<Unique, usize>,
-    /// Requests that the drive carried out, with the words that it answered.
+    /// Requests that the drive carried out, with the words of its replies.
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
     /// Values that orders set last, as the drive took them.
     pub ordered: HashMap<(Table, u16), u16>,
@@ -49,21 +49,21 @@ pub struct Truth {
     pub troubled_until: Option<Instant>,
     /// The bus was restarted: until this time that excuses some deviations.
     pub found_anew_until: Option<Instant>,
-    /// The word of the control register was changed by something else than the line.
+    /// When the word of the control register was changed by something other than the line.
     pub lost_word: Option<Instant>,
     /// The last order of a client that stops the drive.
     pub last_stop: Option<usize>,
     /// When a write that takes the drive's run command away was last on the wire.
     pub stop_sent: Option<Instant>,
-    /// The action of supervision that was last on the wire, while nothing else was written since.
+    /// The action of supervision that was last on the wire, if nothing else was written since.
     pub action: Option<Tried>,
-    /// Time until which a stop that the broker delivered once more may be in progress.
+    /// Time until which a stop that the broker delivered again may be in progress.
     pub repeated_until: Option<Instant>,
     /// When a request to the drive was last on the wire.
     pub asked: Option<Instant>,
     /// Time since which the drive is offline in the image.
     pub offline_since: Option<Instant>,
-    /// When the bus was started anew while the motor ran; the lease counts from then.
+    /// When the bus was restarted while the motor ran; the lease counts from then.
     pub carried: Option<Instant>,
     /// Maximum frequency in Hz, with the time from which it applies.
     pub maxima: Vec<(Instant, f64)>,
@@ -79,8 +79,8 @@ pub struct Tried {
 }
 
 impl Truth {
-    /// Since when an action is on the wire of which this write, at `now`, is a try. Given up, it comes again a second
-    /// later as a new one.
+    /// Since when an action has been on the wire of which this write, at `now`, is an attempt. After it was given
+    /// up, it comes again a second later as a new one.
     pub fn action_began(&mut self, pdu: &RequestPdu, retries: u32, now: Instant) -> Instant {
         let new = Tried {
             pdu: pdu.clone(),
@@ -128,7 +128,7 @@ impl Truth {
         }
     }
 
-    /// The last order that sets a word of this write with a value that only it writes.
+    /// The last order that sets a word of this write to a value that only that order writes.
     pub fn order_of(&self, pdu: &RequestPdu) -> Option<usize> {
         let (table, items) = written(pdu)?;
         let tails = (0..items.len()).flat_map(|from| (from + 1..=items.len()).map(move |to| from..to));
@@ -159,8 +159,8 @@ impl Truth {
                 .any(|(_, pdu, words)| which(pdu, words.as_ref()))
     }
 
-    /// Whether the last write of these registers set just this, however long ago: stored values are written only when they
-    /// change.
+    /// Whether the last write of these registers set exactly this, however long ago: stored values are written only
+    /// when they change.
     pub fn was_set_last(&self, unique: &Unique) -> bool {
         let (table, address, _) = unique;
         let touches = |pdu: &RequestPdu| {
@@ -178,7 +178,7 @@ impl Truth {
         self.befell_since(since) || self.found_anew_until.is_some_and(|until| until >= since)
     }
 
-    /// Whether something disturbed the drive or its line since then; the gateway does not count.
+    /// Whether something disturbed the drive or its line since then, apart from the gateway.
     pub fn befell_since(&self, since: Instant) -> bool {
         self.troubled_until.is_some_and(|until| until >= since)
     }

@@ -1,5 +1,5 @@
-//! Every family of the reference, over every protocol it speaks, commanded through one sequence and read by one set of
-//! names: the differences are in the profiles, and clients need not know them.
+//! Every family of the reference, over every protocol that it supports, commanded through one sequence and read by
+//! one set of names: the differences are in the profiles, and clients need not know them.
 
 use drivegate_world::codec::Protocol;
 use drivegate_world::drive::profile::Profiles;
@@ -9,7 +9,7 @@ use drivegate_world::sim::simulated_drive::ModelOptions;
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;
 
-/// A family's profile, a fault as the drive's own registers show it, and the code and the text that everybody sees.
+/// Columns: profile, a fault as in the drive's own registers, and the code and the text shown to clients.
 const FAMILIES: [(&str, u16, i64, &str); 14] = [
     ("vacon-nx", 53, 53, "fieldbus fault"),
     ("vacon-nx-n2", 53, 53, "fieldbus fault"),
@@ -88,7 +88,7 @@ fn operate(line: &Line, fault: u16, code: i64, text: &str) {
     rig.until("the reference read back", PATIENCE, |rig| {
         number(rig, ModelPoint::SpeedReference) == Some(50.0)
     });
-    // The drive may report "at reference" some hertz before it reaches the reference.
+    // The drive may report "at reference" a few hertz before it reaches the reference.
     rig.until("half of 50 or 60 Hz", PATIENCE, |rig| {
         number(rig, ModelPoint::OutputFrequency).is_some_and(|output| [25.0, 30.0].contains(&output))
     });
@@ -143,7 +143,7 @@ fn every_family_is_operated_alike_over_each_protocol_it_speaks() {
     }
 }
 
-/// Process data in reaches the register of its application, and comes back under its name.
+/// Process data in reaches the register of its application, and is read back under its name.
 #[test]
 fn process_data_in_is_written_by_the_name_of_its_application() {
     let multipurpose = [
@@ -181,7 +181,7 @@ fn process_data_in_is_written_by_the_name_of_its_application() {
     }
 }
 
-/// The bits of the control word that are the application's change no other bit: not the run command either way.
+/// The application's bits of the control word change no other bit, in particular not the run command.
 #[test]
 fn bits_of_the_application_leave_run_and_stop_alone() {
     let mut rig = Rig::of(&works("vacon-nx", Protocol::ModbusRtu));

@@ -26,7 +26,7 @@ impl History {
         self.long
     }
 
-    /// Notes an entry; its text is made only when it is needed.
+    /// Notes an entry; its text is only created when it is needed.
     pub fn note(&mut self, at: Duration, words: impl FnOnce() -> String + 'static) {
         if self.entries.len() == KEPT[usize::from(self.long)] {
             self.entries.pop_front();

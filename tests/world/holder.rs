@@ -1,5 +1,5 @@
-//! Six clients and the holder of a drive, on a line that loses and damages frames, with reloads and kills: no run or reference of one
-//! who does not hold the drive is on the wire, and every stop is carried out.
+//! Six clients and the holder of a drive, on a line that loses and damages frames, with reloads and kills: no run
+//! command or reference of a client that does not hold the drive is on the wire, and every stop is carried out.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use drivegate_world::drive::DriveIndex;
 const SECOND: Duration = Duration::from_secs(1);
 const LEASE: Duration = Duration::from_secs(3);
 const DRIVES: u8 = 2;
-/// Each client on a north side of its own. Its reference identifies its frames: 10 % plus its place.
+/// The clients, each with a separate interface. A client's reference identifies its frames: 10 % plus its index.
 const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
 /// Ranks of the clients; the last client has none.
 const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
@@ -143,7 +143,7 @@ impl Play {
             while let Some(seen) = self.rig.step(next) {
                 seen.into_iter().for_each(|seen| self.note(seen));
             }
-            // Each file of the guards is written at once and with success.
+            // Each file of the guards is written at once and successfully.
             let guards = self.rig.bus.guards.clone();
             if let Some((generation, _)) = guards.to_write(self.rig.now, self.time()) {
                 guards.wrote(generation, Ok(()));
@@ -301,7 +301,7 @@ fn worlds() -> u64 {
     super::number("HOLDER_SEEDS").unwrap_or(12)
 }
 
-/// How long sixty stops take that one client sends while another one has the motor run.
+/// How long sixty stops by one client take while another client runs the motor.
 fn stops_take(authority: bool, seed: u64) -> Duration {
     let works = works(false);
     let mut rig = Rig::new(&works, Parts::of(0, &works, seed));
@@ -426,7 +426,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
                 play.act();
             }
             if round % 67 == 66 && !play.faulty {
-                // Orders in progress when a bus restarts may end in any way.
+                // Orders in progress when a bus restarts may end with any result.
                 play.run(DEFAULT_EXPIRY + SECOND);
                 play.look();
                 let killed = play.dice.chance(0.5);
@@ -446,7 +446,7 @@ fn only_the_holder_is_on_the_wire_and_every_stop() {
             *all.entry(code).or_insert(0) += count;
         }
     }
-    // Every kind of thing happened.
+    // Every kind of event happened.
     for code in [
         "acknowledged",
         "held_by_other",

@@ -1,5 +1,5 @@
-//! The parts of the seeded world: the crates below the configuration, each under the name of its room. A package of its
-//! own, so that the optimised build of `make check` leaves out configuration and command line.
+//! The parts of the seeded world: the crates below the configuration, each re-exported under its module name. A
+//! separate package, so that the optimised build of `make check` leaves out configuration and command line.
 
 pub use drivegate_bacnet as bacnet;
 pub use drivegate_bus as bus;

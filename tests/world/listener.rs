@@ -1,5 +1,5 @@
-//! The decoder of a line that another master owns, without drives: every reply it accepts was sent to the request that it names,
-//! with frames whose order, damage and delay a seed decides.
+//! The decoder of a line that another master owns, without drives: every accepted reply was sent to the request
+//! that the decoder names, with frames whose order, damage and delay a seed decides.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use drivegate_world::bus::listener::{Decoder, Traffic};
 use drivegate_world::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Table, ascii, n2, rtu};
 
-/// Replies that a decoder accepts from successive frames, each with a pause in ms before it: address, first register, words.
+/// Replies that a decoder accepts from successive frames, each with a pause in ms before it: address, first
+/// register, words.
 fn believed(protocol: Protocol, frames: &[(&[u8], u64)]) -> Vec<(u8, u16, Vec<u16>)> {
     let format = LineFormat::new(19_200, "8N1").unwrap();
     let mut decoder = Decoder::new(protocol, format, BTreeMap::new());
@@ -49,11 +50,11 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     let all = |frames: &[(&[u8], u64)]| believed(Protocol::ModbusRtu, frames);
     let first = (1, 10, vec![5]);
     assert_eq!(all(&[(&one, 5), (&said, 5)]), std::slice::from_ref(&first));
-    // In the middle of an exchange at the beginning, and two exchanges in one lump.
+    // Reception begins in the middle of a transaction, and two transactions arrive in one lump.
     let lump = [one.clone(), said.clone(), two.clone(), said.clone()].concat();
     assert_eq!(all(&[(&said[3..], 5), (&lump, 5)]), [first.clone(), (1, 20, vec![5])]);
-    // The other master gave up the first request, so the reply may be the late one. For the same request, the reply is
-    // true either way.
+    // The other master gave up the first request, so the reply may be the late one. For the same request, the reply
+    // is true in both cases.
     assert_eq!(all(&[(&one, 5), (&two, 200), (&said, 5)]), []);
     assert_eq!(all(&[(&one, 5), (&one, 200), (&said, 5)]), std::slice::from_ref(&first));
     assert_eq!(all(&[(&one, 5), (&two, 900), (&said, 5)]), []);
@@ -103,7 +104,8 @@ fn an_n2_reply_belongs_to_the_request_before_it() {
     let all = |frames: &[(&[u8], u64)]| believed(Protocol::N2, frames);
     assert_eq!(all(&[(read, 5), (&float, 5)]), [(1, 2, vec![0x4270, 0])]);
     assert_eq!(all(&[(state, 5), (b"A4064\r", 5)]), [(1, 1, vec![1])]);
-    // The float may be the late one of another object or drive; a state is none, nor is that of the same object.
+    // The float may be the late reply for another object or drive; a state is not a float, and a float of the same
+    // object is true in any case.
     assert_eq!(all(&[(other, 5), (read, 300), (&float, 5)]), []);
     assert_eq!(all(&[(read, 5), (read, 300), (&float, 5)]), [(1, 2, vec![0x4270, 0])]);
     assert_eq!(all(&[(read, 5), (state, 300), (b"A4064\r", 5)]), [(1, 1, vec![1])]);
@@ -140,7 +142,7 @@ struct Fate {
     late: f64,
 }
 
-/// A master, drives whose every word is different, and the decoder that listens to them.
+/// A master, drives whose words are all different, and the decoder that listens to them.
 struct Talk {
     protocol: Protocol,
     format: LineFormat,
@@ -256,7 +258,7 @@ impl Talk {
         let request = Request::new(address, pdu);
         let mut frame = Vec::new();
         self.protocol.encode(&request, &mut frame);
-        // Late replies to earlier requests come before this request, or collide with it: then neither is received.
+        // Late replies to earlier requests arrive before this request, or collide with it: then neither is received.
         let end = self.now + self.format.chars(frame.len());
         let (before, rest): (Vec<_>, Vec<_>) = std::mem::take(&mut self.coming)
             .into_iter()
@@ -286,7 +288,7 @@ impl Talk {
             self.coming.push((due, answer));
         }
         self.coming.sort();
-        // The master takes whatever comes first, as masters do.
+        // The master accepts whatever reply comes first, as real masters do.
         let taken = self.coming.first().map(|(at, _)| *at).filter(|at| *at <= limit);
         if taken.is_some() {
             let (at, frame) = self.coming.remove(0);
@@ -300,7 +302,7 @@ impl Talk {
         self.check();
     }
 
-    /// Blocks of several lengths, some of which look alike, of three drives.
+    /// Reads blocks of several lengths from three drives; some of the blocks look alike.
     fn rounds(&mut self, exchanges: u64) {
         let blocks: &[(u16, u16)] = match self.protocol {
             Protocol::N2 => &[(0, 2), (2, 2), (4, 2), (6, 2)],

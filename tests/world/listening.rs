@@ -147,7 +147,7 @@ impl Scene {
         }
     }
 
-    /// A transaction of the other master, with `tries`; returns the reply that it accepted.
+    /// A transaction of the other master with `tries` attempts; returns the reply that it accepted.
     fn ask(&mut self, address: u8, pdu: &RequestPdu, tries: u32) -> Option<Reply> {
         (0..tries).find_map(|_| self.try_once(address, pdu))
     }
@@ -226,7 +226,7 @@ impl Scene {
         drives.flat_map(of).collect()
     }
 
-    /// Every change in the image is a value that the drive sent in answer to this request.
+    /// Checks that every change in the image is a value that the drive sent in answer to this request.
     fn check(&mut self, address: u8, pdu: &RequestPdu, before: &[Option<Instant>]) {
         let after = self.times();
         let drives = self.handle.image.drives.iter();
@@ -266,7 +266,7 @@ impl Scene {
         );
     }
 
-    /// Lets the other master run its cycle for this number of exchanges.
+    /// Lets the other master run its cycle for this number of transactions.
     fn cycles(&mut self, exchanges: u64) {
         let end = self.exchanges + exchanges;
         let n2 = self.line.protocol == Protocol::N2;
@@ -293,7 +293,7 @@ impl Scene {
         }
     }
 
-    /// Now and then it commands a drive: the value changes, so that what is read does.
+    /// Commands a drive from time to time, so that the values read from it change.
     fn command(&mut self, address: u8, round: u64) {
         if round % 20 != 7 {
             return;
@@ -446,7 +446,7 @@ fn values_are_good_while_the_other_master_reads_them() {
     let drive = scene.handle.image.drives[0].clone();
     let stale_after = Duration::from_secs(1);
     let fast = scene.plans[0].clone();
-    // Once in ten seconds: good in between as soon as that is known.
+    // A value polled once in ten seconds is good in between, as soon as its interval is known.
     for _ in 0..6 {
         scene.ask(1, &fast, 1);
         scene.now += Duration::from_secs(10);
@@ -455,7 +455,7 @@ fn values_are_good_while_the_other_master_reads_them() {
     let quality = |scene: &Scene| drive.reading(scene.instant(), stale_after).overall();
     assert_eq!(quality(&scene), Quality::Good);
     assert!(drive.snapshot().link.is_online());
-    // The other master stops.
+    // The other master stops polling.
     scene.now += Duration::from_secs(40);
     scene.core.on_time(scene.instant());
     assert_eq!(quality(&scene), Quality::Stale);
@@ -521,7 +521,7 @@ fn drives_come_and_go_with_what_is_heard() {
     scene.ask(1, &fast, 2);
     let online = |scene: &Scene, drive: usize| scene.handle.image.drives[drive].snapshot().link.is_online();
     assert!(online(&scene, 0) && !online(&scene, 1));
-    // Two requests in a row without an answer.
+    // Two requests in a row get no answer.
     scene.wire.slaves().drive(1).unwrap().set_alive(false);
     scene.ask(1, &fast, 3);
     scene.ask(2, &fast, 1);

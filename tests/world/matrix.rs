@@ -1,7 +1,7 @@
-//! The fault matrix: what goes wrong on a line, byte by byte in virtual time, and what the bus makes of it.
+//! The fault matrix: faults on a line, byte by byte in virtual time, and their effect on the bus.
 //!
-//! Every read-only register of a simulated drive holds the drive's address and its own, so a value that came from
-//! elsewhere proves itself.
+//! Every read-only register of a simulated drive contains the drive's address and its own, so a value from another
+//! place is noticed.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -35,7 +35,7 @@ const BACK: Duration = Duration::from_secs(15);
 
 /// Blocks of process data, two of which look alike on the wire.
 const TWINS: &[(u16, u16)] = &[(2100, 3), (2104, 3)];
-/// Two pairs of such blocks.
+/// Two pairs of blocks that look alike on the wire.
 const PAIRS: &[(u16, u16)] = &[(2100, 2), (2103, 2), (2106, 1), (2108, 1)];
 
 /// A profile with these blocks, by first register and count.
@@ -87,7 +87,7 @@ fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
 /// Effect of a fault on the counters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Shows {
-    /// The fault has no effect: the exchange goes well.
+    /// The fault has no effect: the transaction succeeds.
     Nothing,
     /// No reply is accepted; drives are now and then considered offline.
     Timeouts,
@@ -95,7 +95,7 @@ enum Shows {
     Foreign,
     ForeignAndTimeouts,
     Exceptions,
-    /// Any effect may show, but the line keeps working.
+    /// Any effect may appear, but the line keeps working.
     All,
 }
 
@@ -106,7 +106,7 @@ impl Shows {
             // The first write after a change of the echo may have to recognise the echo by its time.
             Shows::Nothing => quiet && c.exception == 0 && c.foreign <= 1,
             Shows::Timeouts => c.timeout > 0 && c.exception == 0,
-            // A bit error may lengthen the reply, a cut one may be as short as nothing.
+            // A bit error may lengthen the reply, and a cut one may be empty.
             Shows::Corrupt => c.corrupt > 0 && c.timeout == 0 && c.exception == 0,
             Shows::Foreign => c.foreign > 0 && c.timeout == 0 && c.exception == 0,
             Shows::ForeignAndTimeouts => c.foreign > 0 && c.timeout > 0 && c.exception == 0,
@@ -116,7 +116,7 @@ impl Shows {
     }
 }
 
-/// A row of the table: a fault, and the effects that it must have.
+/// A row of the matrix: a fault, and the effects that it must have.
 #[derive(Clone)]
 struct Row {
     fault: String,
@@ -124,7 +124,7 @@ struct Row {
     shows: Shows,
     /// Least share of good exchanges, compared with a line without faults.
     share: f64,
-    /// Whether drives are now and then taken for dead; in a storm of all faults it may be either.
+    /// Whether drives are sometimes considered offline; `None` in a storm of all faults, where both are possible.
     vanish: Option<bool>,
     delivery: Delivery,
 }
@@ -271,7 +271,7 @@ impl Watched {
         }
     }
 
-    /// Behind an exchange: is all that is stored true, and is the drive still there?
+    /// Checks after a transaction whether all stored values are true, and whether the drive is still online.
     fn look(&mut self, seen: &Seen) {
         let Seen::Over(asked) = seen else { return };
         for (at, word) in self.stored(asked.drive) {
@@ -375,7 +375,7 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
     let late = row.rates.contains("late");
     must(late || s.collisions == 0, format!("{} collisions", s.collisions));
     must(s.bad_crc == 0, format!("{} broken requests", s.bad_crc));
-    // A frame that is seen only at its end, after the line seemed silent, meets the next request as well.
+    // A frame that is noticed only at its end, when the line already seemed silent, collides with the next request as well.
     let unseen = late || (row.rates.contains("double") && row.delivery != Delivery::Chunks(1));
     let met = s.provoked_overlaps;
     must(unseen || met == 0, format!("{met} requests met noise"));
@@ -431,7 +431,7 @@ fn named(fault: &str, rates: &str, shows: Shows, share: f64) -> Row {
     }
 }
 
-/// As a row of whole replies, but handed over in chunks.
+/// A row like one with whole replies, but delivered in chunks.
 fn by(chunk: u8, row: Row) -> Row {
     Row {
         delivery: Delivery::Chunks(chunk),
@@ -548,7 +548,7 @@ fn n2() {
         row("late:255ms", Timeouts, 0.15),
         row("late:275ms", Timeouts, 0.15),
         row("late:400ms", Timeouts, 0.10),
-        // No reply of N2 names anything, so that a foreign one cannot be recognised: here it is none.
+        // No reply of N2 names its drive, so a foreign one cannot be recognised and is not tested.
         row("foreign-address", Timeouts, 0.15),
         row("foreign-function", Timeouts, 0.15),
         row("foreign-length", Timeouts, 0.15),
@@ -568,8 +568,7 @@ fn n2() {
     matrix(Protocol::N2, rows);
 }
 
-/// A late reply that is mangled on its way comes instead of the reply to a later request, which is late too: the garbage
-/// settles nothing.
+/// A late reply arrives damaged in place of the reply to a later request, which is late too: the garbage proves nothing.
 #[test]
 fn late_replies_that_are_mangled_settle_nothing() {
     for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {

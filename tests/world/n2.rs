@@ -79,7 +79,7 @@ fn what_the_drive_has_already_is_not_written_again() {
         assert!(rig.set(1, &[("run", 0.0)]).is_ok());
     }
     assert_eq!(count(&rig, ">0172040100"), 2, "a stop is never left out");
-    // A parameter that is read once: changed at the panel meanwhile, it is read before it is written.
+    // A parameter of the class `once` that was changed at the panel meanwhile: it is read before it is written.
     let name = "acceleration_time";
     assert!(rig.set(1, &[(name, 7.0)]).is_ok());
     assert!(rig.set(1, &[(name, 7.0)]).is_ok());
@@ -209,7 +209,7 @@ fn a_dead_drive_is_probed_by_identify_and_comes_back() {
     rig.bus.wire.record(10_000);
     rig.until("it is probed", PATIENCE, |rig| count(rig, ">02F") >= 1);
     assert_eq!(count(&rig, ">02"), count(&rig, ">02F"));
-    // Reads of this drive look like unanswered reads of the dead one: they wait until no late reply can come.
+    // Reads of this drive look like unanswered reads of the dead one: they wait until no late reply can arrive.
     rig.until_state(1, State::Ready);
     rig.set_alive(2, true);
     rig.until_state(2, State::Ready);
@@ -237,7 +237,7 @@ fn longest_without_state(rig: &mut Rig, address: u8, time: Duration) -> Duration
     longest
 }
 
-/// The share of looks, one in 10 ms, in which the state of the first drive is known.
+/// The share of checks, one every 10 ms, in which the state of the first drive is known.
 fn known_state(drives: u8, rates: &str) -> f64 {
     let mut rig = ready(drives);
     rig.set_faults(FaultPlan::new(rates.parse().unwrap(), 7));

@@ -1,4 +1,4 @@
-//! A bus and its clients: frames, commands, faults, leases, parameters, a port that comes and goes.
+//! A bus and its clients: frames, commands, faults, leases, parameters, a port that disappears and returns.
 
 use std::time::Duration;
 
@@ -285,8 +285,8 @@ fn a_maximum_frequency_changed_at_the_panel_is_followed() {
     rig.until_good(1, ModelPoint::SpeedReference, Value::Number(50.0));
 }
 
-/// The percentage counts from the minimum frequency, and its sign turns the motor round: what is published is what the motor
-/// does.
+/// The percentage counts from the minimum frequency, and its sign reverses the motor: the published value matches
+/// the motor.
 #[test]
 fn a_minimum_frequency_is_that_of_either_direction() {
     /// Minimum frequency, ID 101, 0.01 Hz; PDU address.
@@ -313,9 +313,9 @@ fn a_minimum_frequency_is_that_of_either_direction() {
     }
 }
 
-/// A reference in Hz, or one within a limit in Hz, depends on the frequency range that the drive has when it gets the
-/// command: neither on one that the command itself changes, nor on one that an earlier command changed and that has not been
-/// read since.
+/// A reference in Hz, or one within a limit in Hz, depends on the frequency range that the drive has when it gets
+/// the command: neither on one that the command itself changes, nor on one that an earlier command changed and that
+/// has not been read since.
 #[test]
 fn no_command_rests_on_a_frequency_range_that_was_changed() {
     let of = |profile: &'static str| Line {
@@ -342,7 +342,8 @@ fn no_command_rests_on_a_frequency_range_that_was_changed() {
         rig.until_good(1, ModelPoint::SpeedReference, Value::Number(60.0));
         let range = rig.points(1, &[("maximum_frequency", 60.0)]);
         let mut range = rig.place(1, range);
-        // In the queue behind it, and while it is not read. A stop is another matter.
+        // The reference waits behind the change of the range, and is refused until the range was read. A stop is
+        // not affected.
         let behind = rig.points(1, &[reference]);
         let mut behind = rig.place_as("other", 1, behind);
         let written = rig.answered(&mut range);
@@ -364,8 +365,8 @@ fn no_command_rests_on_a_frequency_range_that_was_changed() {
     }
 }
 
-/// 80 % of 50 Hz are within a limit of 40 Hz; of 100 Hz they are not. Whatever is ordered, in whatever sequence, the drive never gets a
-/// reference above the limit.
+/// 80 % of 50 Hz are within a limit of 40 Hz, 80 % of 100 Hz are not. Whatever is ordered, in whatever sequence,
+/// the drive never gets a reference above the limit.
 #[test]
 fn the_reference_that_stands_keeps_its_limit_when_the_frequency_range_changes() {
     let of = |profile: &'static str| Line {
@@ -379,7 +380,7 @@ fn the_reference_that_stands_keeps_its_limit_when_the_frequency_range_changes() 
         let known = |hertz: f64| move |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(hertz));
         rig.until("the maximum frequency", PATIENCE, known(50.0));
         rig.until_good(1, ModelPoint::SpeedReference, Value::Number(0.0));
-        // Both orders are in the queue: when the range has its turn, the reference that was read is no longer the one
+        // Both orders are in the queue: when the range is written, the reference that was read is no longer the one
         // in force.
         let reference = rig.points(1, &[("speed_reference", 80.0)]);
         let mut reference = rig.place(1, reference);
@@ -448,7 +449,7 @@ fn a_drive_that_nothing_stops_is_told_once() {
         let mut rig = Rig::recorded(&line, parts);
         let known = |rig: &Rig| rig.value(1, "fieldbus_fault_response").is_some();
         rig.until("the parameter is read", PATIENCE, known);
-        // The drive goes and comes back, which must not be reported again.
+        // The drive goes offline and returns, which must not be reported again.
         rig.set_alive(1, false);
         rig.until_state(1, State::Offline);
         rig.set_alive(1, true);
@@ -470,7 +471,7 @@ fn a_drive_that_nothing_stops_is_told_once() {
 
 #[test]
 fn a_stop_that_waits_while_a_reload_starts_the_bus_anew_is_sent() {
-    // The reload comes at each step of the exchange before the stop, and of the stop's own exchange.
+    // The reload comes at each step of the transaction before the stop, and of the stop's own transaction.
     for steps in 0..12 {
         let mut rig = ready(&nx(19_200, 2));
         assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());

@@ -24,7 +24,7 @@ pub enum Wish {
     /// A parameter that the drive stores: the acceleration time (N2).
     Parameter,
     RawRead,
-    /// By function 5, 6 or 16, registers of which the last is of no point, or of one that is not writable.
+    /// By function 5, 6 or 16, registers of which the last belongs to no point, or to one that is not writable.
     RawOther,
     /// A speed in the unit that the drive does not use: Hz for one with percent, percent for one with Hz.
     Converted,
@@ -85,20 +85,20 @@ pub struct Record {
     pub accepted: Instant,
     pub expires: Instant,
     pub unique: Option<Unique>,
-    /// Place in the order of acceptance; a newer reference takes that of the one it replaces.
+    /// Place in the order of acceptance; a newer reference takes the place of the one that it replaces.
     pub place: usize,
-    /// The earliest place that it may have: the rest of a stop that waits, which it replaces, is answered with the stop.
+    /// The earliest possible place of the order: the rest of a waiting stop, which it replaces, is answered with the stop.
     pub earliest: usize,
     pub sent: Option<Instant>,
     pub answer: Option<(String, Instant)>,
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
-    /// Number of orders to the same drive that waited when this one was accepted and that go before it.
+    /// Number of orders to the same drive that were waiting when this one was accepted and that go before it.
     pub before: usize,
     /// Whether a newer reference took the order's place.
     pub succeeded: bool,
 }
 
-/// The writable register with a figure of its own that sets the speed, and the values that it takes.
+/// The writable register with a separate figure that sets the speed, and the values that it accepts.
 pub fn reference_point(profile: &Profile) -> (PointIndex, &Point) {
     let names = ["speed_reference", "frequency_reference", "frequency_command"];
     let index = names.iter().find_map(|name| {
@@ -110,7 +110,7 @@ pub fn reference_point(profile: &Profile) -> (PointIndex, &Point) {
     (index, profile.points.get(index).unwrap())
 }
 
-/// A value of the reference that no order had for a long time, and the words that it is.
+/// A value of the reference that no order has used recently, with its words.
 pub fn unique_reference(profile: &Profile, number: usize) -> (PointIndex, Value, Unique) {
     let (index, point) = reference_point(profile);
     let raw = point.raw().unwrap();
@@ -148,8 +148,8 @@ pub fn converted(profile: &Profile, number: usize, maximum: f64) -> impl Iterato
         .filter_map(move |percent| percent_reference(profile, percent, maximum))
 }
 
-/// A speed reference in percent of a drive with this maximum frequency, in the units of its register; none where it does
-/// not fit a single word.
+/// A speed reference in percent of a drive with this maximum frequency, in the units of its register; `None` if it
+/// does not fit into a single word.
 pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Option<Unique> {
     let (_, point) = reference_point(profile);
     let raw = point.raw()?;
@@ -162,7 +162,7 @@ pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Optio
     Some((raw.table, raw.address, raw.encode(own, 0).ok()?))
 }
 
-/// The order for a wish, with the words that only it writes; `None` if the family has no such order.
+/// The order for a wish, with the words that only this order writes; `None` if the family has no such order.
 pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, Option<Unique>)> {
     let run = |on: bool| (profile.model_index(ModelPoint::Run).unwrap(), Value::Bool(on));
     let (reference, value, unique) = unique_reference(profile, number);
@@ -243,7 +243,7 @@ pub fn is_of_writable_point(profile: &Profile, table: Table, address: u16) -> bo
 }
 
 /// A permitted write outside the writable points: near the end of a range, where a simulated drive has nothing that
-/// decides about its motor, or the general control word; alone, or behind a writable register.
+/// affects its motor, or the general control word; alone, or after a writable register.
 fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
     let ranges = profile.ranges.iter().filter(|range| range.write > 0);
     let last = ranges.flat_map(|range| {
@@ -277,7 +277,7 @@ fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
     })
 }
 
-/// Whether a write sets just these words.
+/// Whether a write sets exactly these words.
 pub fn sets(pdu: &RequestPdu, (table, address, words): &Unique) -> bool {
     written(pdu).is_some_and(|(of, items)| {
         let has = |(offset, word): (usize, &u16)| items.contains(&(address + offset as u16, *word));

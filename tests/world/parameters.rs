@@ -1,5 +1,5 @@
-//! Readings of parameters in virtual time: what is read is what the drive has, whatever happens on the line, and process data
-//! goes on.
+//! Readings of parameters in virtual time: the result is what the drive has, whatever happens on the line, and
+//! process data continues.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -61,7 +61,7 @@ impl Rig {
         reading.file("d0-1", "none", "2026-03-02T07:40:12Z", &Names::default())
     }
 
-    /// Gives parameters of the drive random values that it takes; those are written at the drive itself.
+    /// Gives parameters of the drive random valid values, written at the drive itself.
     fn scramble(&mut self, file: &ParameterFile, random: &mut Random) {
         let profile = self.drive(DRIVE).image.spec.profile.clone();
         for id in file.values.keys() {
@@ -227,7 +227,7 @@ fn rounds(rig: &Rig) -> u64 {
 
 #[test]
 fn process_data_keeps_its_rate_while_parameters_are_read() {
-    // Some lines cannot keep their cycle, and one has time left over.
+    // Some of these lines cannot keep their cycle, and one has time left over.
     for (baud, drives, cycle) in [(9600, 6, 10), (19_200, 12, 10), (38_400, 4, 100)] {
         let line = Line {
             cycle: Duration::from_millis(cycle),

@@ -11,7 +11,7 @@ use drivegate_world::sim::statistics::{Direction, Recorded};
 use super::bus::Parts;
 use super::rig::{Rig, line};
 
-/// Rounds that are measured; the slow requests that fall into them are part of the cycle.
+/// Number of measured rounds; the slow requests within them are part of the cycle.
 const ROUNDS: usize = 400;
 
 #[test]

@@ -48,7 +48,7 @@ fn run(rig: &mut Rig, recorder: Option<&mut Recorder>, time: Duration) -> Vec<Re
     made
 }
 
-/// Reads on the line since frame `from`: process data, reads on a fault, all others.
+/// Number of reads on the line since frame `from`: process data, reads on a fault, all others.
 fn reads(rig: &Rig, from: usize) -> [usize; 3] {
     let mut counts = [0; 3];
     for frame in &rig.requests()[from..] {
@@ -85,9 +85,9 @@ fn thirty_two_drives_that_trip_at_once_cost_the_line_the_reads_of_their_faults_o
     let (quiet_recorded, recorded, made) = storm(true);
     println!("20 s before the trips: {quiet:?} and recorded {quiet_recorded:?}; after them: {bare:?} and {recorded:?}");
     assert_eq!(quiet, quiet_recorded, "a recorder costs a line nothing");
-    // Without a recorder it is compared with the fault code of process data, with one both come of one read.
+    // Without a recorder the fault code is only compared with process data, with one it is recorded: both use one read.
     assert_eq!((bare[1], recorded[1]), (32, 32), "each drive is asked once");
-    // The reads take the slow share: process data comes as often, and slow reads fewer by these.
+    // The reads use the slow share: process data comes as often, and slow reads are fewer by these.
     let all = |reads: [usize; 3]| reads.iter().sum::<usize>();
     assert!(
         all(bare).abs_diff(all(recorded)) * 100 <= all(bare),
@@ -119,7 +119,7 @@ fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
     let now = clock(&rig);
     recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), SECOND, now);
     run(&mut rig, Some(&mut recorder), 5 * SECOND);
-    // The drive accelerates, which takes increasing current, and trips on the way.
+    // The drive accelerates, which needs increasing current, and trips on the way.
     rig.set(1, &[("speed_reference", 100.0), ("run", 1.0)]);
     run(&mut rig, Some(&mut recorder), 2 * SECOND);
     rig.with_drive(1, |drive, _| drive.trip(1));

@@ -22,7 +22,7 @@ use super::bus::Seen;
 use super::rig::{Rig, line};
 use super::scenario::Line;
 
-/// The drive to which parameters are restored, and the one that they are of.
+/// Address of the drive to which parameters are restored.
 const DRIVE: u8 = 1;
 const SOURCE: u8 = 2;
 
@@ -51,7 +51,7 @@ struct Cut;
 struct RestoreWorld {
     rig: Rig,
     dice: Random,
-    /// The journal on disk.
+    /// The content of the journal on disk.
     disk: Option<String>,
     plan: Plan,
     /// Time at which the gateway is killed.
@@ -62,9 +62,9 @@ struct RestoreWorld {
     troubled: bool,
     /// The motor was last started by somebody at the drive.
     started: Option<Instant>,
-    /// Time at which somebody stops the motor, or puts the drive back on the line.
+    /// Time at which a person stops the motor, or puts the drive back on the line.
     mended: Option<Instant>,
-    /// When the drive answered that its motor stands, if that was the last transaction on the line.
+    /// When the drive reported that its motor stands, if that was the last transaction on the line.
     stands: Option<Instant>,
     stops: Vec<Placed>,
     refused: usize,
@@ -73,7 +73,7 @@ struct RestoreWorld {
     writes: usize,
 }
 
-/// All parameters of a drive, with the values in the drive.
+/// All parameters of a drive with their values in the drive.
 fn held(rig: &mut Rig, address: u8) -> ParameterFile {
     let profile = rig.drive(address).image.spec.profile.clone();
     let mut reading = Reading::new(profile, BTreeSet::new());
@@ -168,7 +168,8 @@ impl RestoreWorld {
         self.rig.drive(DRIVE).image.restore_lock.set(why);
     }
 
-    /// Checks the line: a parameter is written only directly after the answer that the motor stands, and with the journal on disk.
+    /// Checks the line: a parameter is written only directly after the reply that the motor stands, and with the
+    /// journal on disk.
     fn look(&mut self, seen: Vec<Seen>) {
         let profile = self.rig.drive(DRIVE).image.spec.profile.clone();
         let running = profile
@@ -200,7 +201,8 @@ impl RestoreWorld {
                     self.writes += usize::from(taken);
                     let checked = self.stands.take();
                     let fed = self.rig.with_drive(DRIVE, |drive, _| drive.state().running);
-                    // A drive renews what it reports every so often: somebody who starts it just then, or later, is not seen.
+                    // A drive updates its reports at intervals: a start by a person at that moment, or later, is
+                    // not noticed.
                     let unseen = 2 * profile.update_period;
                     let just_started = self
                         .started
@@ -228,7 +230,7 @@ impl RestoreWorld {
         }
     }
 
-    /// Goes on until the next thing, or `until`.
+    /// Runs until the next event, or `until`.
     fn step(&mut self, until: Instant) -> Result<(), Cut> {
         let until = until.min(self.next.max(self.rig.now));
         if let Some(seen) = self.rig.step(until) {
@@ -334,7 +336,7 @@ impl RestoreWorld {
         self.stops.push(placed);
     }
 
-    /// Whatever a client orders is refused while the drive is held.
+    /// Checks that every order of a client is refused while the drive is locked.
     fn order_of_a_client(&mut self) {
         let held = self.rig.drive(DRIVE).image.restore_lock.reason().is_some();
         if !held {
@@ -503,7 +505,7 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
     let records = world.rig.with_drive(DRIVE, |drive, _| drive.parameter_writes());
     let sound = FAULTS[seed as usize / FAMILIES.len() % FAULTS.len()].is_empty();
     for (address, record) in records {
-        // Somebody who starts the motor in between is seen above.
+        // A person who starts the motor in between is noticed above.
         assert!(
             record.while_fed == 0 || world.started.is_some(),
             "seed {seed}: {address} {record:?}"

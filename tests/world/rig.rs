@@ -18,7 +18,7 @@ use drivegate_world::sim::statistics::{Direction, Recorded};
 use super::bus::{Parts, Seen, WorldBus};
 use super::scenario::Line;
 
-/// Bus time in which everything that is waited for must come.
+/// Virtual time within which every awaited event must happen.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 pub struct Rig {
@@ -27,7 +27,7 @@ pub struct Rig {
     pub plant: Plant,
 }
 
-/// Exchanges by their outcome, foreign frames, and faults that occurred.
+/// Numbers of transactions by outcome, of foreign frames, and of faults that occurred.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Counts {
     pub ok: u64,
@@ -51,7 +51,7 @@ impl Counts {
     }
 }
 
-/// A sound line of that family with drives 1 to `drives`, process data as often as it goes.
+/// A healthy line of this family with drives 1 to `drives`, and process data as often as possible.
 pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> Line {
     Line {
         refresh: None,
@@ -230,7 +230,7 @@ impl Rig {
         drive.reading(self.now).sample(index).good()
     }
 
-    /// State of a drive; offline as long as it is not known.
+    /// State of a drive; offline as long as the state is unknown.
     pub fn state(&self, address: u8) -> State {
         self.drive(address).reading(self.now).state().unwrap_or(State::Offline)
     }
@@ -244,7 +244,7 @@ impl Rig {
         self.until(&what, PATIENCE, |rig| rig.good(address, point) == Some(value));
     }
 
-    /// Does something with a simulated drive in its present state.
+    /// Calls `act` with a simulated drive in its present state.
     pub fn with_drive<R>(&mut self, address: u8, act: impl FnOnce(&mut SimulatedDrive, SimTime) -> R) -> R {
         let now = self.bus.sim(self.now);
         let drive = self.bus.wire.slaves().drive(address).unwrap();

@@ -38,7 +38,7 @@ pub struct Line {
     pub slow_cycle: Duration,
     /// Faults of the wire, as `simulate --faults` takes them; empty for a sound one.
     pub faults: String,
-    /// Share of what comes to the gateway in which one bit is wrong besides.
+    /// Share of the frames to the gateway in which one more bit is wrong.
     pub flips: f64,
     pub supervision: Option<Supervision>,
     /// How often the gateway writes its orders again.
@@ -50,33 +50,33 @@ pub struct Line {
     pub swapped: bool,
     /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
-    /// Further changes of its drives.
+    /// Further changes to the specs of its drives.
     pub spec: fn(&mut DriveSpec),
 }
 
 /// Habits of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Habit {
-    /// By MQTT: single points and whole objects, often two at once.
+    /// Over MQTT: single points and whole objects, often two at once.
     Mqtt,
     /// Uses Modbus TCP: words of the common model, and several requests in one segment.
     ModbusTcp,
     /// Orders of all kinds by the function that all north sides use.
     Plain,
-    /// By Modbus TCP: writes 0 to the command word of one drive without end.
+    /// Over Modbus TCP: writes 0 to the command word of one drive endlessly.
     StopsInALoop,
     /// Commands one drive as fast as the drive is answered.
     Floods,
-    /// Commands all drives of a line as fast as it can, with hardly a stop: the queue is full.
+    /// Commands all drives of a line as fast as it can, with hardly any stops, so that the queue is full.
     Crowds,
     /// Run and stop of one drive in turn, the next as soon as one is answered.
     Duels,
-    /// Commands one drive for a moment, is silent for about as long as its lease or for much longer, and is back.
+    /// Commands one drive for a while, is silent for about as long as its lease or for much longer, and returns.
     Operates,
     /// A connection of a client with many connections, by Modbus TCP: each commands the drives of the last line, all
     /// but the last.
     Shares,
-    /// A reference every half second to a drive of its own; it must always be served.
+    /// Sends a reference every half second to a drive of its own; it must always be served.
     Steady,
 }
 
@@ -181,7 +181,7 @@ impl Line {
             _ => LeaseAction::SpeedReference(20.0),
         };
         let supervised = dice.chance(0.6);
-        // Without the dice, as `spec`: every second line that has a lease and registers that are not stored.
+        // Chosen without random numbers, like `spec`: every second line that has a lease and registers that are not stored.
         let repeats = supervised && protocol != Protocol::N2 && timeout.as_millis().is_multiple_of(2);
         // A quarter of the line at most: a round is about a hundred characters.
         let round = Duration::from_micros(u64::from(1_100_000_000 / baud)) + 4 * turnaround;
@@ -221,7 +221,7 @@ impl Line {
             },
             swapped: false,
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
-            // Chosen without the random numbers, so that the rest of the world stays the same.
+            // Chosen without random numbers, so that the rest of the world does not change.
             spec: match drives % 3 {
                 0 => |spec| spec.raw_writes = RawWrites::All,
                 1 => |_| {},
@@ -235,12 +235,12 @@ impl Line {
         !self.faults.is_empty() || self.flips > 0.0
     }
 
-    /// Whether bits of replies change on the way, in a way that a weak checksum does not show.
+    /// Whether bits of replies change on the way in a manner that a weak checksum does not detect.
     pub fn flips_bits(&self) -> bool {
         self.flips > 0.0 || self.faults.contains("corrupt")
     }
 
-    /// Whether replies may come twice, or when they are no longer expected.
+    /// Whether replies may be duplicated, or arrive when they are no longer expected.
     pub fn is_late(&self) -> bool {
         ["late", "double", "stray"]
             .iter()
@@ -255,7 +255,7 @@ fn faults(dice: &mut Random, response_timeout: Duration) -> String {
         let fault = FAULTS[dice.within(0..=FAULTS.len() as u64 - 1) as usize];
         let rate = [0.005, 0.02, 0.08, 0.2][dice.within(0..=3) as usize] / 1.2;
         let fault = match fault {
-            // From just behind the timeout to where a reply is forgotten.
+            // Delays from just after the timeout to the time when a reply is forgotten.
             "late" => format!(
                 "late:{}ms",
                 response_timeout.as_millis() as u64 * dice.within(105..=290) / 100

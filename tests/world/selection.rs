@@ -1,5 +1,5 @@
-//! Process data whose selector was changed at the drive: the value comes from its monitoring register, after one event, and
-//! comes back with the selection.
+//! Process data whose selector was changed at the drive: the value is taken from its monitoring register, after one
+//! event, and returns to process data with the selection.
 
 use std::time::Duration;
 
@@ -83,7 +83,7 @@ fn the_fault_code_is_right_whatever_process_data_out_8_holds() {
         rig.until("its code is told", PATIENCE, |rig| {
             good(rig, ModelPoint::FaultCode) == Some(1.0)
         });
-        // The selection is restored while there is a fault, so that something can be compared.
+        // The selection is restored while there is a fault, so that there are values to compare.
         rig.at_the_drive(1, OUT_8, FAULT);
         rig.until("process data is believed again", PATIENCE, |rig| {
             rig.drive(1).image.snapshot().monitored.is_empty()

@@ -91,7 +91,7 @@ fn an_action_that_the_drive_does_not_hear_is_written_again() {
     }
 }
 
-/// A drive that is off the line when the gateway ends, and comes back within its time, is stopped.
+/// A drive that is offline when the gateway begins to end, and returns within its time, is stopped.
 #[test]
 fn a_stop_of_the_shutdown_is_ordered_again() {
     for (family, protocol) in [("vacon-nx", Protocol::ModbusRtu), ("vacon-nx-n2", Protocol::N2)] {
@@ -153,7 +153,7 @@ fn who_has_much_waiting_does_not_keep_another_waiting() {
     }
 }
 
-/// By Modbus TCP, the many orders come over as many connections of one client.
+/// Over Modbus TCP, the many orders come over as many connections of one client.
 #[test]
 fn connections_of_one_client_share_its_turns() {
     let mut rig = rig(&line("vacon-nx-n2", Protocol::N2, 9600, 3));
@@ -188,7 +188,7 @@ fn a_reference_in_hertz_rests_on_no_old_maximum_frequency() {
     let before = at(&rig);
     rig.until("the maximum frequency is read", 10 * SECOND, |rig| at(rig) != before);
     let (read, now) = (at(&rig), rig.now);
-    // Raised at the panel; the next read of it comes when the drive is busy.
+    // The limit is raised at the panel; its next read comes when the drive is busy.
     assert_eq!(rig.bus.maximum_frequency(1, Some(100.0), now), Some(100.0));
     rig.run(Duration::from_millis(3_700));
     rig.set_faults(faults("busy=1", 1));

@@ -39,7 +39,7 @@ struct Question {
     pdu: RequestPdu,
     at: Instant,
     patience: Duration,
-    /// Answers of the drive to the request, one for each time that it was on the line.
+    /// Answers of the drive to the request, one for each time that the request was on the line.
     said: Vec<Vec<u8>>,
 }
 
@@ -117,7 +117,7 @@ impl ToolRig {
         }
     }
 
-    /// The next thing that happens: on the line, at the slot, or in the tool.
+    /// Runs the next event on the line, at the slot, or in the tool.
     fn step(&mut self, asks: bool) -> Vec<Seen> {
         let gives_up = self.question.as_ref().map(|question| question.at + question.patience);
         let asks_at = (self.question.is_none() && asks).then_some(self.next);
@@ -149,8 +149,8 @@ impl ToolRig {
         seen
     }
 
-    /// Gives the slot bytes of the tool, or none, at the present time; returns the answer. The bus is woken if it was given
-    /// something.
+    /// Gives the slot bytes of the tool, or none, at the present time; returns the answer. The bus is woken if a
+    /// request was given to it.
     fn pass(&mut self, bytes: &[u8]) -> Vec<u8> {
         let now = self.rig.now;
         let given = !bytes.is_empty() || self.slot.wake_at().is_some_and(|at| at <= now);
@@ -343,7 +343,7 @@ fn every_answer_is_the_drives_own_and_belongs_to_its_request() {
     for (seed, line) in (1..).zip(lines()) {
         let name = format!("{} {} {}", line.family, line.protocol.name(), line.baud);
         let mut tool = ToolRig::new(line, SlotAccess::Read, seed);
-        // Everything was read at least once.
+        // By then every register was read at least once.
         tool.rig.run(Duration::from_secs(30));
         let before = tool.rounds();
         tool.rig.run(Duration::from_secs(60));
@@ -445,7 +445,7 @@ fn a_stop_waits_for_the_exchange_on_the_line_at_most() {
             if is_stop {
                 break;
             }
-            // A control word that is not known is read first.
+            // An unknown control word is read first.
             let reads_word = asked.pdu == holding(2000, 1) && asked.drive == usize::from(address) - 1;
             sent += u32::from(!reads_word);
             assert_eq!(sent, 0, "{asked:?} went before the stop");
@@ -527,7 +527,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
             .map(|value| value.as_bool()),
         Some(false)
     );
-    // A stop of the tool is not held back, whatever it wrote before.
+    // A stop of the tool is not held back, whatever the tool wrote before.
     tool.pass(&frame(&set(1)));
     tool.rig.run(Duration::from_millis(200));
     assert_eq!(tool.rig.word(1, 2000), 1);

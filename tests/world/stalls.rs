@@ -1,9 +1,9 @@
-//! Worlds in which threads stand still, names and units move to other machines, and drives restart between two polls.
+//! Worlds in which threads stall, names and units move to other machines, and drives restart between two polls.
 //!
-//! The clients are bytes on connections that a thread must read: bytes sent while the reading thread does not run wait, and a
-//! client may close the connection before they are read. A shadow model (`promised`) records what each of them wanted of which
-//! machine, and when. Every run command to a drive, and every motor that starts, must result from an order that its client
-//! still wanted.
+//! The clients are bytes on connections that a thread must read: bytes sent while the reading thread is stalled
+//! wait, and a client may close the connection before they are read. A shadow model (`promised`) records what each
+//! client wanted of which machine, and when. Every run command to a drive, and every start of a motor, must result
+//! from an order that its client still wanted.
 
 mod befall;
 mod clients;
@@ -36,7 +36,7 @@ use super::scenario::{Habit, Line};
 
 /// Seeds of every test run.
 const FIXED: u64 = 240;
-/// A running thread shows at least this often that it runs.
+/// Longest interval at which a running thread shows that it runs.
 const BEAT: Duration = Duration::from_millis(100);
 /// Interval in which the motors are checked.
 const LOOK: Duration = Duration::from_millis(50);
@@ -62,7 +62,7 @@ struct Connection {
     next: Instant,
 }
 
-/// Which threads do not run, and until when.
+/// Which threads are stalled, and until when.
 #[derive(Debug, Clone, Copy, Default)]
 struct Standing {
     readers: Option<Instant>,
@@ -74,7 +74,7 @@ struct World {
     dice: Random,
     began: Instant,
     now: Instant,
-    /// Whether there is one client and nothing but hiccups: then no order may be lost.
+    /// Whether there is one client and only hiccups occur: then no order may be lost.
     healthy: bool,
     bus: WorldBus,
     plant: SharedPlant,
@@ -129,7 +129,7 @@ impl World {
                     .is_none()
                     .then_some(0.0..=60.0)
             },
-            // A cycle below the full load, so that slow polls come in time, too.
+            // A cycle that leaves room on the line, so that slow polls come in time, too.
             cycle: Duration::from_millis(200),
             ..line(family, Protocol::ModbusRtu, baud, drives)
         };
@@ -309,7 +309,7 @@ impl World {
             .unwrap_or(bus)
     }
 
-    /// Lets the thread of the bus work, if that thread runs now.
+    /// Runs the thread of the bus, if it is not stalled.
     fn run_bus(&mut self) {
         let now = self.now;
         if self.standing.bus.is_some() || self.bus.wake_at().min(self.bus_ran + BEAT) > now {
@@ -403,7 +403,7 @@ impl World {
         }
     }
 
-    /// Lets the thread that reads the connections work, if that thread runs now.
+    /// Runs the thread that reads the connections, if it is not stalled.
     fn run_readers(&mut self) {
         let now = self.now;
         if self.standing.readers.is_some() {

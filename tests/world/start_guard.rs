@@ -1,6 +1,6 @@
-//! Guards of starts with clients that know nothing of them, on a line that loses and damages frames, with drives that go away,
-//! reloads, and a process that is killed at any moment: no start of an order on the wire breaks a rule, and stops come as soon as
-//! without guards.
+//! Guards of starts with clients that do not know about them, on a line that loses and damages frames, with offline
+//! drives, reloads, and a process that is killed at any moment: no start by an order on the wire breaks a rule, and
+//! stops come as soon as without guards.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -52,7 +52,7 @@ fn works(family: &'static str) -> Line {
     }
 }
 
-/// The file of starts on a disk that takes its time, and fails at times.
+/// The file of starts on a disk that is slow, and sometimes fails.
 struct Disk {
     holds: Saved,
     writing: Option<(u64, Saved, Instant)>,
@@ -64,7 +64,7 @@ struct Disk {
 struct Truth {
     running: BTreeMap<u8, bool>,
     stood: BTreeMap<u8, Instant>,
-    /// When each drive acted upon the last word that starts it.
+    /// When each drive carried out the last word that starts it.
     acted: BTreeMap<u8, Instant>,
     /// Starts by orders.
     starts: BTreeMap<u8, Vec<Instant>>,
@@ -469,7 +469,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
         rig.run(8 * SECOND);
         assert!(!turns(&mut rig), "{who}");
     }
-    // Over a reload, after which it is not known for a moment whether the motor runs, it is sent.
+    // After a reload, while it is briefly unknown whether the motor runs, the stop is sent.
     rig.until_state(1, State::Ready);
     start(&mut rig);
     let mut waiting = rig.place(1, stop);
@@ -481,7 +481,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
     rig.until("it stands", PATIENCE, |rig| rig.state(1) == State::Ready);
 }
 
-/// A cyclic client writes its stop again and again, and none of these is a second stop. A stop of another client is.
+/// A cyclic client writes its stop repeatedly, and none of these counts as a second stop. A stop of another client does.
 #[test]
 fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
     let of = Line {

@@ -1,5 +1,5 @@
-//! Stop all on a line that loses and damages frames, with an absent drive and a reload in between: the answer is true for each
-//! drive, every drive that answers stands in the end, and afterwards the line works as before.
+//! Stop all on a line that loses and damages frames, with an absent drive and a reload in between: the answer is
+//! true for each drive, every drive that answers stands in the end, and afterwards the line works as before.
 
 use std::time::Duration;
 
@@ -26,7 +26,7 @@ enum Meanwhile {
     Nothing,
     /// The bus is started anew, as by a reload.
     Reload,
-    /// A drive is away from before the order on, and comes back long after the answer.
+    /// A drive is offline since before the order, and returns long after the answer.
     Away,
 }
 
@@ -34,7 +34,7 @@ fn turns(rig: &mut Rig, address: u8) -> bool {
     rig.with_drive(address, |drive, _| drive.state().running)
 }
 
-/// Gives the order, waits for its answer, and compares it with the drives themselves.
+/// Gives the order, waits for its answer, and compares the answer with the drives themselves.
 fn stop_all(rig: &mut Rig, meanwhile: Meanwhile) -> StopReport {
     let origin = Origin::new(SourceKind::Http, "alice");
     let orders = StopAll::default();
@@ -93,7 +93,7 @@ fn what_is_said_to_stand_stands_and_all_stands_in_the_end() {
             let away = report.drives.iter().find(|drive| drive.drive == "d0-3").unwrap();
             match meanwhile {
                 Meanwhile::Away => assert_eq!(away.outcome, Stopped::Unproven, "{faults}"),
-                // Every stop is tried again until it is acknowledged; whether a motor was read since depends on the line.
+                // Every stop is retried until it is acknowledged; whether a motor was read since depends on the line.
                 _ => {
                     let acknowledged = |reason: &String| reason.starts_with("it acknowledged its stop");
                     let proven = |drive: &StoppedDrive| drive.reason.as_ref().is_none_or(acknowledged);
@@ -126,8 +126,8 @@ fn what_is_said_to_stand_stands_and_all_stands_in_the_end() {
     }
 }
 
-/// The stops of single drives on the wire after the first `before` requests; with `broadcasts`, also those of all
-/// drives.
+/// Number of stops of single drives on the wire after the first `before` requests; with `broadcasts`, also those of
+/// all drives.
 fn stops_since(rig: &Rig, before: usize, broadcasts: bool) -> usize {
     let requests = rig.requests();
     let is_stop = |frame: &&Recorded| {
@@ -181,9 +181,9 @@ fn a_second_order_joins_and_one_behind_a_start_does_not() {
     assert!((1..=DRIVES).all(|address| !turns(&mut rig, address)));
 }
 
-/// A third of 132 drives on three lines, each of which has its own schedule: from the order to the last stop on the wire, against
-/// the time that the characters, the silences between frames and the drives' own turnaround take. Where all obey it, one broadcast
-/// stops the motors first.
+/// A third of 132 drives on three lines, each of which has its own schedule: the time from the order to the last
+/// stop on the wire, compared with the time for the characters, the silences between frames and the drives'
+/// turnaround. If all drives obey it, one broadcast stops the motors first.
 #[test]
 fn forty_four_drives_are_stopped_as_fast_as_the_line_can() {
     const MANY: u8 = 44;
@@ -241,7 +241,7 @@ fn forty_four_drives_are_stopped_as_fast_as_the_line_can() {
         assert_eq!((broadcasts, singles.len()), expected, "monitored: {monitored}");
         let took = singles.last().unwrap().start - singles[0].start;
         let ratio = took.as_secs_f64() / (f64::from(controlled - 1) * exchange);
-        // Polls and reads that show the effect go between; behind the broadcast the stops only confirm it.
+        // Polls and reads that show the effect come in between; after the broadcast the stops only confirm it.
         let most = if monitored { 2.5 } else { 5.0 };
         assert!(
             (0.95..most).contains(&ratio),

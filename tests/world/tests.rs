@@ -77,7 +77,7 @@ fn run_with(seed: u64, floods: bool) -> Figures {
 /// Runs the seeds, on all cores; each world is of one thread.
 fn run_all(seeds: Range<u64>) {
     let began = Instant::now();
-    // To see how many seeds meet a fault, and which.
+    // Set to see how many seeds meet a fault, and which.
     let goes_on = std::env::var_os("WORLD_GO_ON").is_some();
     let (next, ended) = (
         AtomicU64::new(seeds.start),

@@ -1,4 +1,4 @@
-//! The world: its clock, who acts next, and what is checked at each step.
+//! The world: its clock, which actor is next, and the checks of each step.
 
 mod acts;
 mod answers;
@@ -37,13 +37,13 @@ use super::orders::{
 };
 use super::scenario::{Habit, Scenario};
 
-/// Time in which an order is answered behind its expiry: its last exchange, a pulse, a late reply.
+/// Time after its expiry within which an order is answered: its last transaction, a pulse, a late reply.
 const LAST_STEPS: Duration = Duration::from_secs(6);
-/// Time that a stop has, counted from its turn.
+/// Time limit of a stop, counted from its turn.
 const STOP_TIME: Duration = Duration::from_secs(2);
-/// Time between a lease that ran out and its action: a round, and an exchange of another drive.
+/// Time between the expiry of a lease and its action: a round, and a transaction of another drive.
 const ACTION: Duration = Duration::from_millis(1_500);
-/// Longest pause between two requests to a drive that does not answer, with what goes before them.
+/// Longest pause between two requests to a drive that does not answer, with the transactions before them.
 const PROBED: Duration = Duration::from_millis(11_000);
 /// Longest pause between two tries of an action that is not acknowledged: ten times what one took, and a second.
 const REPEATED: Duration = Duration::from_secs(8);
@@ -98,13 +98,13 @@ pub struct World {
     truths: Vec<Vec<Truth>>,
     clients: Vec<Client>,
     records: Vec<Record>,
-    /// Results that may still come of messages that a broker delivered once more, by order.
+    /// Results that may still arrive for messages that a broker delivered again, by order.
     repeats: BTreeMap<usize, u32>,
     /// Orders without an answer, by bus and drive.
     open: BTreeMap<(usize, usize), Vec<usize>>,
     next_incident: Option<Instant>,
     next_reload: Option<Instant>,
-    /// A bus that is started anew when its exchange has ended.
+    /// A bus that is restarted when its transaction has ended.
     restarts: Option<usize>,
     next_look: Instant,
     /// Times that a client has read a drive by HTTP.
@@ -118,7 +118,7 @@ pub struct World {
     answered: u64,
     figures: Figures,
     stopping: bool,
-    /// The faults are over.
+    /// Set once the faults are over.
     healing: Option<heal::Healing>,
 }
 

@@ -1,4 +1,4 @@
-//! A broadcast of a tool is an order to every drive of the bus, with its place among their other orders.
+//! A broadcast of a tool is an order to every drive of the bus, and is ordered among their other orders.
 
 use drivegate_world::drive::RawWrites;
 use drivegate_world::event::{Event, EventKind};
@@ -21,7 +21,7 @@ fn busy(seed: u64) -> ToolRig {
 }
 
 impl ToolRig {
-    /// Time goes by, on the line and in the slot.
+    /// Lets time pass on the line and in the slot.
     fn pass_time(&mut self, time: Duration) {
         let until = self.rig.now + time;
         while self.rig.now < until {

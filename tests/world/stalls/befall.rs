@@ -3,7 +3,7 @@
 use super::*;
 
 impl World {
-    /// A client begins a request before a stall, and completes it in the stall or behind it.
+    /// A client begins a request before a stall, and completes it during the stall or after it.
     fn begins_a_request(&mut self, stall: Duration) {
         let idle =
             |connection: &Connection| connection.open && connection.closed.is_none() && connection.rest.is_none();
@@ -67,7 +67,7 @@ impl World {
                 "the bus"
             }
             _ => {
-                // Threads do not go on at the same moment.
+                // The threads do not continue at the same moment.
                 self.standing.readers = until.map(|until| until + Duration::from_millis(self.dice.within(0..=4)));
                 self.standing.bus = self.standing.bus.max(until);
                 "the process"

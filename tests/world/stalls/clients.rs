@@ -62,7 +62,7 @@ impl World {
         };
     }
 
-    /// A request over a connection; the rest of it may come later. The number of its order.
+    /// Sends a request over a connection; the rest of it may come later. Returns the number of its order.
     pub(super) fn write(&mut self, index: usize, unit: u8, register: u16, value: u16, in_parts: bool) -> usize {
         let now = self.now;
         let does = match (register, value) {
@@ -119,7 +119,7 @@ impl World {
                 Value::Number(self.dice.within(5..=60) as f64),
             ),
         };
-        // A program of this machine stands still with the whole process, or not at all.
+        // A program on this machine stalls together with the whole process, or not at all.
         let Some(index) = self
             .bus
             .profile

@@ -3,18 +3,19 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// An order is started at most 2 s after it was sent, and its effect may take several transactions.
+/// Longest time from sending an order to its last effect: an order is started at most 2 s after it was sent, and
+/// its effect may take several transactions.
 const WANTED: Duration = Duration::from_millis(3_500);
-/// A client that closed its connection this long before the order was read has given up; a shorter time cannot be
-/// noticed.
+/// A client that closed its connection at least this long before the order was read has given up; a shorter time
+/// cannot be noticed.
 pub const UNNOTICED: Duration = Duration::from_millis(160);
-/// A longer stall is a pause: what was sent before its end starts nothing.
+/// A stall longer than this is a pause: orders sent before its end start nothing.
 const PAUSE: Duration = Duration::from_millis(1_010);
 
-/// A motor starts within this time after the write that makes it run was sent.
+/// Time within which a motor starts after the write that makes it run was sent.
 const FOLLOWS: Duration = Duration::from_millis(400);
 
-/// Between the reading that a write rests on and the write there is one exchange.
+/// Time between a write and the reading on which it depends: one transaction.
 const LOOKED: Duration = Duration::from_millis(60);
 
 /// Effect of an order on a motor.
@@ -46,7 +47,7 @@ pub struct Order {
 /// Orders of all clients, and actions of the drives.
 pub struct Promised {
     pub orders: Vec<Order>,
-    /// When the writes that each drive carried out were sent to it.
+    /// When each write that a drive carried out was sent to it.
     told: BTreeMap<u8, Vec<Instant>>,
     running: Vec<bool>,
     /// When each drive was last stopped by anything but the line.
@@ -78,7 +79,7 @@ impl Promised {
         self.orders.len() - 1
     }
 
-    /// Notes that the last byte of the order is sent.
+    /// Notes that the last byte of the order was sent.
     pub fn complete(&mut self, id: usize, now: Instant) {
         self.orders[id].complete = now;
     }
@@ -93,7 +94,7 @@ impl Promised {
         self.orders[id].closed.get_or_insert(now);
     }
 
-    /// Notes that the rest of the order is never sent.
+    /// Notes that the rest of the order will never be sent.
     pub fn never_sent(&mut self, id: usize) {
         self.orders[id].does = Does::Other;
     }
@@ -118,7 +119,7 @@ impl Promised {
         std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
     }
 
-    /// If the motor has started: by a write that some client wanted when it was sent.
+    /// Checks a motor that has started: a client must have wanted the causing write when it was sent.
     pub fn must_want_start(&self, machine: u8, now: Instant) {
         let told = self.told.get(&machine).into_iter().flatten().rev();
         // The motor follows its drive after one or two updates.
@@ -127,7 +128,7 @@ impl Promised {
             return;
         }
         let at = told.first().copied().unwrap_or(now);
-        // A reading just before said that the motor runs, so a word that keeps the run bit is already being sent.
+        // A reading just before showed that the motor runs, so a word that keeps the run bit is already being sent.
         if self
             .befell
             .get(&machine)
@@ -157,7 +158,7 @@ impl Promised {
         orders.any(|(id, order)| order.does == Does::Run && self.unwanted(id, order, machine, at).is_none())
     }
 
-    /// Why the order cannot be the cause of a run of that machine that was sent at `at`.
+    /// Why the order cannot be the cause of a run command to this machine that was sent at `at`.
     fn unwanted(&self, id: usize, order: &Order, machine: u8, at: Instant) -> Option<String> {
         let Some(read) = order.read.filter(|read| *read <= at) else {
             return Some("was not read yet".to_string());

@@ -126,12 +126,12 @@ impl World {
                 } else {
                     Wish::of(&mut self.dice)
                 };
-                // Chosen without the random numbers, so that the rest of the world stays the same.
+                // Chosen without random numbers, so that the rest of the world does not change.
                 let wish = match wish {
                     Wish::RawRead if self.records.len().is_multiple_of(2) => Wish::RawOther,
                     wish => wish,
                 };
-                // An order with a short time may expire while the line goes silent before it.
+                // An order with a short time limit may expire while the bus waits for silence before it.
                 let short = ms(self.dice.within(3..=80));
                 let expiry = [ms(2_000), ms(2_000), ms(400), short][self.dice.within(0..=3) as usize];
                 self.plain(index, bus, drive, wish, expiry);
@@ -165,7 +165,7 @@ impl World {
                 .as_ref()
                 .map_or(ms(1_000), |s| s.timeout);
             let silence = if self.dice.chance(0.7) {
-                // The next burst goes to the drive of this one: the client may be back just in time, or just not.
+                // The next burst goes to the same drive: the client may be back just in time, or just too late.
                 self.clients[index].burst.2 = self.dice.within(1..=3);
                 timeout.mul_f64(0.9 + 0.3 * self.dice.unit())
             } else {
@@ -237,7 +237,7 @@ impl World {
         self.buses[bus].command_came(self.now);
     }
 
-    /// An order was answered at once, so the client waits a moment.
+    /// The order was answered at once, so the client waits a moment.
     fn turned_away(&mut self, client: usize) {
         if !self.scenario.floods {
             self.clients[client].next += TURNED_AWAY;
@@ -273,7 +273,7 @@ impl World {
         self.clients[client].open += usize::from(self.records[id].answer.is_none());
     }
 
-    /// A message by way of the broker, to which the gateway loses its connection now and then.
+    /// Sends a message through the broker, to which the gateway loses its connection now and then.
     pub(super) fn by_broker(&mut self, client: usize, bus: usize, drive: usize) {
         let now = self.now;
         let lost = self.scenario.incidents.is_some() && self.dice.chance(0.02);
@@ -354,8 +354,8 @@ impl World {
         }
     }
 
-    /// Closes a client's connection in the middle of a request and opens it again; the orders that it gave are carried
-    /// out in any case.
+    /// Closes a client's connection in the middle of a request and opens it again; complete orders are carried out
+    /// in any case.
     fn hang_up(&mut self, client: usize) {
         let now = self.now;
         let Way::ModbusTcp(offline, open, _) = &mut self.clients[client].way else {

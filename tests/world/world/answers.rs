@@ -31,8 +31,8 @@ impl World {
         }
     }
 
-    /// Processes answers to orders that a newer one replaced before the newer one is recorded, because it takes their
-    /// place.
+    /// Processes answers to orders that a newer one replaced before the newer one is recorded, because it takes
+    /// their place.
     pub(super) fn replaced(&mut self) {
         self.collect();
         let Some((newest, before)) = self.records.split_last_mut() else {
@@ -44,7 +44,7 @@ impl World {
             let answer = record.answer.as_ref();
             !record.succeeded
                 && newest.wish.replaces(record.wish)
-                // The rest of an order that stops waits as a reference of its own.
+                // The rest of an order with a stop waits as a separate reference.
                 && answer.is_some_and(|(code, at)| (code == "replaced" || code == "stop_only") && *at == now)
         };
         let recent = before.iter_mut().rev().take(1_000);
@@ -54,7 +54,7 @@ impl World {
         {
             older.succeeded = true;
             newest.earliest = older.earliest;
-            // The rest of a stop may have been purged by another stop instead.
+            // The rest of a stop may have been removed by another stop instead.
             if older.answer.as_ref().is_some_and(|(code, _)| code == "replaced") {
                 newest.place = older.place;
             }
@@ -108,15 +108,15 @@ impl World {
         }
     }
 
-    /// Whether a result is that of a message that the broker delivered once more: as the first time, or a refusal, which it
-    /// must be after a stop.
+    /// Whether a result belongs to a message that the broker delivered again: the first result, or a refusal, which
+    /// is required after a stop.
     fn is_of_repetition(&mut self, id: usize, code: &str) -> bool {
         let record = &self.records[id];
         let Some(left) = self.repeats.get_mut(&id).filter(|left| **left > 0) else {
             return false;
         };
         let Some((first, _)) = &record.answer else {
-            // A repeated stop is a command of its own, which may end before the first one is confirmed.
+            // A repeated stop is a separate command, which may end before the first one is confirmed.
             let without_rest = UNSENT.contains(&code) || code == "stop_only";
             let is_second = record.wish.is_stop() && record.sent.is_some() && without_rest;
             *left -= u32::from(is_second);
@@ -179,7 +179,7 @@ impl World {
             "interrupted",
             "stop_only",
         ];
-        // By MQTT the answer comes with the confirmation, long after the order ended.
+        // Over MQTT the answer comes with the confirmation, long after the order ended.
         let writes = record.wish != Wish::RawRead && self.clients[record.client].habit != Habit::Mqtt;
         if writes && (begun.contains(&code) || code.starts_with("exception")) {
             truth.maybe_heard(now);
@@ -220,7 +220,8 @@ impl World {
         self.figures.confirmed += u64::from(code == "confirmed");
     }
 
-    /// Checks an order of which only the stop was done: that it was done, and that the answer reports the rest.
+    /// Checks an order of which only the stop was carried out: that the stop happened, and that the answer reports
+    /// the rest.
     fn check_stop_only(&self, id: usize, record: &Record, outcome: Option<&Outcome>) {
         let (profile, truth) = (&self.buses[record.bus].profile, &self.truths[record.bus][record.drive]);
         let stops = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
@@ -354,7 +355,7 @@ impl World {
         let truth = &self.truths[record.bus][record.drive];
         let calm = self.scenario.incidents.is_none() && !self.buses[record.bus].line.is_noisy();
         if self.clients[record.client].habit == Habit::Steady && calm && !self.stopping {
-            // The older orders to its drive go first, each when the turns of all drives of the crowd have come.
+            // The older orders to its drive go first, each after all drives of the crowd were served once.
             let bus = &self.buses[record.bus];
             let turn = 2 * bus.line.turnaround + bus.handle.image.spec.format.chars(100);
             let turns = u32::from(bus.line.drives) * u32::try_from(record.before + 1).unwrap_or(u32::MAX);

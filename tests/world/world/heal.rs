@@ -7,7 +7,7 @@ use drivegate_world::drive::PollClass;
 use super::*;
 use crate::bus::Parts;
 
-/// Time for which a late reply may arrive; requests that it could be mistaken for wait.
+/// Time within which a late reply may arrive; requests that it could be mistaken for wait.
 const FORGOTTEN: Duration = Duration::from_secs(1);
 /// A slow request that was not answered on a troubled line is tried again after that.
 const MUTE: Duration = Duration::from_secs(4);
@@ -26,12 +26,12 @@ type Ages = Vec<Vec<((Table, u16, PollClass), Option<Duration>)>>;
 pub struct Healing {
     /// When the last fault ended.
     since: Instant,
-    /// From then on no reply can be outstanding that the gateway may take for another.
+    /// Time from which on no reply can be outstanding that the gateway may mistake for another.
     pub settled: Instant,
 }
 
 impl World {
-    /// Ends every fault, after which nothing may stay wrong.
+    /// Ends every fault, after which everything must recover.
     pub(super) fn heal(&mut self) {
         let online = self.end_faults();
         let stops = self.stop_at_once();
@@ -104,7 +104,7 @@ impl World {
                 self.by_broker(client, 0, 0);
             }
         }
-        // A slow read of another look settles whether answers are those to the request before.
+        // A slow read with a reply of another form settles whether answers belong to the previous request.
         let settled = (0..self.buses.len())
             .map(|bus| self.rounds(bus) + 2 * self.buses[bus].first_slow_round)
             .max();
@@ -126,7 +126,7 @@ impl World {
         all.filter(|(bus, drive)| self.is_alive(*bus, *drive))
     }
 
-    /// Stops one drive of each line: whatever came before, the stop is on the wire soon.
+    /// Stops one drive of each line: whatever happened before, the stop is on the wire soon.
     fn stop_at_once(&mut self) -> Vec<(usize, usize, Instant)> {
         let mut stops = Vec::new();
         let client = self.clients.len();
@@ -142,7 +142,7 @@ impl World {
             let drive = self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize;
             if self.is_alive(bus, drive) {
                 self.plain(client, bus, drive, Wish::Stop, Duration::from_millis(400));
-                // Where a slow acknowledgement is waited for, that wait counts for this stop.
+                // If a slow acknowledgement is being waited for, that wait is added for this stop.
                 let waiting = self
                     .open
                     .values()
@@ -153,7 +153,7 @@ impl World {
                     0 => Duration::ZERO,
                     _ => FLOODED,
                 };
-                // A bus that was started anew sends nothing until no late reply can arrive.
+                // A restarted bus sends nothing until no late reply can arrive.
                 let rests = if self.scenario.reloads {
                     FORGOTTEN
                 } else {
@@ -190,7 +190,8 @@ impl World {
         }
     }
 
-    /// The drives answer, their process data is fresh, and their state is known where slow values are back too (`whole`).
+    /// Checks that the drives answer, their process data is fresh, and their state is known if slow values are back
+    /// too (`whole`).
     fn check_back(&mut self, drives: &[(usize, usize)], whole: bool, what: &str) {
         for (bus, drive) in drives {
             let bus = &self.buses[*bus];
@@ -231,7 +232,7 @@ impl World {
                 } else {
                     remains.late_replies
                 },
-                // On N2 the late reply to a probe could pass for a state.
+                // On N2 the late reply to a probe could be mistaken for a state.
                 held_reads: if bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
                     0
                 } else {
@@ -243,7 +244,7 @@ impl World {
         }
     }
 
-    /// Process data comes as often as on the same line without a past, slow values as often as predicted.
+    /// Checks that process data comes as often as on such a line without a past, and slow values as often as predicted.
     fn check_as_good_as_new(&mut self) {
         let window = self.buses.iter().map(|bus| 4 * bus.round.max(bus.line.cycle)).max();
         let window = window.unwrap_or_default();
@@ -259,7 +260,8 @@ impl World {
         for (bus, healed) in self.buses.iter().zip(&healed) {
             let sound = sound_ages(bus, window);
             let round = bus.round.max(bus.line.cycle);
-            // The probe of a dead N2 drive, and what waits for its late reply, come at other moments than in the sound world.
+            // The probe of a dead N2 drive, and requests that wait for its late reply, come at other moments than
+            // in the world without faults.
             let probe = match bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
                 true => Duration::ZERO,
                 false => bus.line.response_timeout + self.exchange(bus),

@@ -115,7 +115,7 @@ impl World {
         self.restarts = Some(index);
     }
 
-    /// Starts the bus anew, which a reload has changed, when the exchange on its line has ended.
+    /// Restarts the bus, which a reload has changed, when the transaction on its line has ended.
     pub(super) fn restart(&mut self, index: usize) {
         self.note(move || format!("a reload starts line{index} anew"));
         self.buses[index].restart(index, &self.events, &self.writes, self.now);

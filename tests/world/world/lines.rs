@@ -23,8 +23,8 @@ impl World {
             statistics.silence_violations, 0,
             "a request came before the line was silent"
         );
-        // After a late reply that was taken for the present one, the present one is still to come: that cannot be
-        // known.
+        // After a late reply was accepted in place of the present one, the present one is still to come: that
+        // cannot be known.
         if !self.buses[index].late {
             assert_eq!(statistics.collisions, 0, "a request met a reply");
             assert_eq!(statistics.provoked_overlaps, 0, "a request met noise");
@@ -85,7 +85,7 @@ impl World {
             if !run && truth.run {
                 let ours = |id: &usize| {
                     let wish = self.records[*id].wish;
-                    // Where the word cannot be read, a motor that was last seen standing is left standing.
+                    // If the word cannot be read, a motor that was last seen standing is left standing.
                     wish.is_stop() || matches!(wish, Wish::Reset | Wish::Reverse)
                 };
                 let repeated = truth.repeated_until.is_some_and(|until| now < until);
@@ -147,7 +147,7 @@ impl World {
         }
     }
 
-    /// A run goes out: no stop that was accepted before it is still to be answered.
+    /// Checks, when a run command is sent, that no stop accepted before it is still unanswered.
     pub(super) fn no_stop_is_overtaken(&mut self, bus: usize, drive: usize) {
         self.collect();
         let now = self.now;
@@ -167,7 +167,7 @@ impl World {
             return;
         };
         for stop in open.iter().filter(|record| record.wish.is_stop() && record.place < run) {
-            // By MQTT the answer of an order that is done waits for its confirmation.
+            // Over MQTT the answer of a completed order waits for its confirmation.
             let by_mqtt = self.clients[stop.client].habit == Habit::Mqtt;
             assert!(
                 by_mqtt || stop.accepted == now,
@@ -201,7 +201,7 @@ impl World {
         );
         let retries = self.buses[bus].line.retries;
         let truth = &mut self.truths[bus][drive];
-        // An action on the wire when a client comes back is not taken back, lost or not: its tries go on.
+        // An action that is on the wire when a client returns is not withdrawn, lost or not: its attempts continue.
         let began = truth.action_began(pdu, retries, now);
         if let Some(heard) = truth.heard.0 {
             assert!(
@@ -217,7 +217,7 @@ impl World {
         }
         for id in self.open.get(&(bus, drive)).into_iter().flatten() {
             let record = &self.records[*id];
-            // By MQTT the answer of an order that is done waits for its confirmation.
+            // Over MQTT the answer of a completed order waits for its confirmation.
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
             let before = record.accepted <= began;
             let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt && before;
@@ -307,7 +307,7 @@ impl World {
         let stored: Vec<u16> = (0..count)
             .map(|i| snapshot.word(table, start + i).unwrap_or(0))
             .collect();
-        // Simulated late replies may overtake each other, which those of a drive do not.
+        // Simulated late replies may overtake each other; those of a real drive do not.
         let slack = if self.buses[bus].late {
             Duration::from_secs(1)
         } else {
@@ -323,8 +323,8 @@ impl World {
             self.now - at
         );
         let truth = &self.truths[bus][asked.drive];
-        // The drive may have answered so to an earlier try; the image dates it back then. The checksum of N2 does not
-        // detect two flipped bits that compensate each other.
+        // The drive may have sent this answer to an earlier attempt; the image then has that time. The checksum of
+        // N2 does not detect two flipped bits that compensate each other.
         let flipped = self.buses[bus].line.protocol == Protocol::N2 && self.buses[bus].line.flips_bits();
         let alike = |words: &Vec<u16>| {
             let bits = words

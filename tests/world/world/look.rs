@@ -28,7 +28,7 @@ impl World {
                 drive.advance(sim);
                 let image = &bus.handle.image.drives[index];
                 let seen = image.reading(now, Duration::from_secs(5)).is_set(ModelPoint::Running);
-                // Where the drive refuses to report whether it runs, its run command stands for it.
+                // If the drive refuses to report whether it runs, its run command counts instead.
                 let blind = index == 0 && bus.line.refuses.is_some() && truth.run && image.snapshot().link.is_online();
                 let running = drive.state().running && drive.answers() && (seen || blind);
                 if drive.state().running {
@@ -77,13 +77,13 @@ impl World {
     pub(super) fn check_answered_in_time(&self) {
         for id in self.open.values().flatten() {
             let record = &self.records[*id];
-            // By MQTT the answer waits for the confirmation, 5 s at most.
+            // Over MQTT the answer waits for the confirmation, 5 s at most.
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
             let most = if by_mqtt { 2 * LAST_STEPS } else { LAST_STEPS };
             // The end of a reset pulse is repeated until the drive accepts it.
             let noisy = self.buses[record.bus].line.is_noisy();
             let most = if noisy { 3 * most } else { most };
-            // A stop does not expire: its time begins when its turn comes.
+            // A stop does not expire: its time limit begins at its turn.
             let expires = match record.wish.is_stop() {
                 true => record.expires.max(record.accepted + 2 * STOP_TIME),
                 false => record.expires,
@@ -96,7 +96,7 @@ impl World {
         }
     }
 
-    /// Checks that supervision acts on a running drive whose client fell silent.
+    /// Checks that supervision acts on a running drive whose client went silent.
     pub(super) fn check_leases(&self) {
         for (index, bus) in self.buses.iter().enumerate() {
             let Some(supervision) = &bus.line.supervision else {
@@ -113,7 +113,7 @@ impl World {
                 let due = last.max(running).max(online) + supervision.timeout + ACTION + round;
                 let repeated = truth.repeated_until.is_some_and(|until| self.now < until);
                 let waits = repeated || self.open.contains_key(&(index, drive));
-                // Until the motor was seen to run, the lease of a motor that stood has ended.
+                // Until the motor was seen to run, the lease of a motor that was standing has ended.
                 let armed = running <= last + supervision.timeout || truth.carried.is_some_and(|at| at >= last);
                 let noisy = bus.line.is_noisy();
                 let late = if noisy { due + Duration::from_secs(2) } else { due };
@@ -137,7 +137,7 @@ impl World {
         }
     }
 
-    /// On a sound line the process data of a drive that answers stays fresh, whichever client commands.
+    /// Checks that on a healthy line the process data of a drive that answers stays fresh, whichever client commands.
     pub(super) fn check_polls(&self) {
         let sound = |bus: &&WorldBus| bus.open && !bus.line.is_noisy() && self.scenario.incidents.is_none();
         for bus in self.buses.iter().filter(sound) {
@@ -156,12 +156,12 @@ impl World {
         }
     }
 
-    /// A drive that does not answer is probed again within 10 s plus the other traffic on the line.
+    /// Checks that a drive that does not answer is probed again within 10 s plus the other traffic on the line.
     pub(super) fn check_probes(&self) {
         for (bus, truths) in self.buses.iter().zip(&self.truths) {
             let round = bus.handle.image.health().fast.last.unwrap_or_default();
-            // A report on N2 that does not come is waited for with the time of the longest one: that of the drive
-            // itself, before the pause, and that of another one behind it.
+            // A report on N2 that does not come is waited for as long as the longest one takes: the report of this
+            // drive before the pause, and that of another one after it.
             let reports = match bus.line.protocol {
                 Protocol::N2 => 2 * (bus.line.response_timeout + Duration::from_secs(1)),
                 Protocol::ModbusRtu | Protocol::ModbusAscii => Duration::ZERO,

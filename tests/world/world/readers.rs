@@ -1,5 +1,5 @@
-//! Readers by HTTP: the JSON of a drive and the metrics say of a point that it is good, or have a figure of it, only if it
-//! is fresh and the drive is there.
+//! Readers over HTTP: the JSON of a drive and the metrics show a point as good, or its figure, only if it is fresh
+//! and the drive is online.
 
 use std::time::SystemTime;
 
@@ -11,7 +11,7 @@ use serde_json::Value as Json;
 
 use super::*;
 
-/// Looks between two readings by HTTP, and readings between two of the metrics.
+/// Checks between two readings by HTTP, and readings between two of the metrics.
 const EVERY: (usize, usize) = (8, 8);
 
 impl World {
@@ -61,7 +61,7 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
         match &point.source {
             Source::Raw(_) => {
                 let most = match point.class {
-                    // The value comes from its monitoring register until comparisons agree.
+                    // The value is taken from its monitoring register until comparisons agree.
                     PollClass::Fast if monitored.contains(&index) => slow,
                     PollClass::Fast => plant.stale_after,
                     PollClass::Slow => slow,

@@ -1,10 +1,10 @@
-//! Refreshes for a drive's own timeout: only ordered values, and only while the order stands.
+//! Refreshes for a drive's own timeout: only ordered values, and only while the order is in force.
 
 use super::*;
 
 impl World {
-    /// Checks the frame of a refresh: no value that no order wrote, only the word of a stop behind a stop, and none to a motor
-    /// that stands.
+    /// Checks the frame of a refresh: only values that an order wrote, only the stop word after a stop, and no run
+    /// word for a standing motor.
     pub(super) fn check_refresh(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         self.collect();
         let now = self.now;
@@ -31,7 +31,7 @@ impl World {
         let open = self.open.get(&(bus, drive)).into_iter().flatten();
         let stops = |id: &&usize| {
             let record = &self.records[**id];
-            // By MQTT the answer of an order that is done waits for its confirmation.
+            // Over MQTT the answer of a completed order waits for its confirmation.
             record.wish.is_stop() && record.accepted < now && self.clients[record.client].habit != Habit::Mqtt
         };
         assert!(
@@ -65,7 +65,8 @@ impl World {
         self.figures.refreshed += 1;
     }
 
-    /// The timeout of a drive that counts writes only is fed while its motor runs by an order whose client is there.
+    /// Checks that the timeout of a drive that counts only writes is kept from expiring while its motor runs by an
+    /// order whose client is present.
     pub(super) fn check_feeding(&self) {
         if self.scenario.incidents.is_some() {
             return;
@@ -77,7 +78,7 @@ impl World {
             if bus.line.is_noisy() || !bus.open || bus.line.refuses.is_some() {
                 continue;
             }
-            // All other drives may have their turn before this one.
+            // All other drives may be served before this one.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
             let most = 4 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
             for (drive, truth) in truths.iter().enumerate() {
@@ -85,7 +86,7 @@ impl World {
                     continue;
                 };
                 let alive = self.now - heard < supervision.timeout / 2;
-                // After a lease expired, only an order begins a new lease, a heartbeat does not.
+                // After a lease expired, only an order begins a new lease; a heartbeat does not.
                 let expired = truth.supervised.is_some_and(|at| at >= ordered);
                 let waits = expired || self.open.contains_key(&(bus.index, drive)) || truth.is_troubled(ordered);
                 let runs = truth.run && truth.running_since.is_some_and(|since| self.now - since > most);
@@ -105,7 +106,8 @@ impl World {
         }
     }
 
-    /// Records the effects of a write that a drive acted upon: what an order set, and what fed the drive's timeout.
+    /// Records the effects of a write that a drive carried out: the values set by an order, and what restarted the
+    /// drive's timeout.
     pub(super) fn note_ordered(&mut self, bus: usize, drive: usize, asked: &Asked) {
         let (profile, now) = (self.buses[bus].profile.clone(), self.now);
         let truth = &mut self.truths[bus][drive];
