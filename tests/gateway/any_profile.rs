@@ -1,5 +1,5 @@
-//! `drivegate simulate` with profiles of the user: those of docs/profiles.md as they stand there, one made from a register list, and
-//! every family of the program.
+//! `drivegate simulate` with user profiles: the examples of docs/profiles.md unchanged, one made from a register
+//! list, and every built-in family.
 
 use std::path::Path;
 use std::process::Output;
@@ -53,10 +53,10 @@ fn examples() -> Vec<(String, String)> {
     blocks.map(|(text, _)| (name(text), text.to_string())).collect()
 }
 
-/// Words sent to a drive of an example, in the order of the comment below.
+/// Words sent to a drive of an example, in the order listed in the comment in the test.
 type Words = (u16, u16, u16, &'static [u16], u16, f64);
 
-/// The meter of the page whose values depend on other registers, with the registers of its example.
+/// The meter on the page whose values depend on other registers, with the register contents of its example.
 fn ratios_sums_and_bytes((name, text): &(String, String)) {
     let site = site_of(name, text);
     let set = [
@@ -101,7 +101,8 @@ fn the_examples_of_the_page_are_simulated() {
     is_shown(&site, "voltage_l1", &json!(231.5));
     is_shown(&site, "serial_number", &json!("SN-42"));
     ratios_sums_and_bytes(&examples[1]);
-    // The address of the reference, its count at 25 Hz, the words that start, one that stops, and the frequency in reverse.
+    // Fields: address of the reference, its count at 25 Hz, the words that start, a word that stops, and the
+    // frequency in reverse.
     let drives: [Words; 2] = [
         (0x2502, 2500, 0x2501, &[1], 0, 25.0),
         (8502, 250, 8501, &[6, 7, 15], 7, 25.0),
@@ -209,7 +210,7 @@ fn read_input(site: &Site, start: u16, count: u16) -> Vec<u16> {
         .collect()
 }
 
-/// All families without a simulator of their own, on one line: whatever the gateway reads of them is answered.
+/// All families without a dedicated simulator on one line: every read of the gateway is answered.
 #[test]
 fn every_family_is_read_whole() {
     let profiles = Profiles::built_in();

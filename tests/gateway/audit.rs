@@ -1,4 +1,4 @@
-//! The audit: of a client that may not write, on disk, and with text from outside in the log.
+//! The audit: for a client that may not write, on disk, and with text from outside in the log.
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
@@ -14,13 +14,13 @@ use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
 const SPEED_REFERENCE: u16 = 0x8101;
 const AUDIT: &str = "[audit]\nfile = \"audit.jsonl\"\n";
 
-/// A site that keeps its audit in a folder of its own.
+/// A site that keeps its audit in a separate folder.
 fn site(parts: &[&str]) -> Site {
     let line1 = LINE1.replace("name = \"test\"\n", "name = \"test\"\nstate_dir = \"state\"\n");
     Site::of(&[&[line1.as_str(), &controlled("pump", 1, ""), AUDIT], parts].concat())
 }
 
-/// Writes to unit 1 from an address that may not, as fast as the gateway answers, until `stop`; counts them.
+/// Writes to unit 1 from an address that may not write, as fast as the gateway answers, until `stop`; counts the refusals.
 fn flood(port: u16, stop: &AtomicBool, refused: &AtomicU64) {
     let socket = rustix::net::socket(rustix::net::AddressFamily::INET, rustix::net::SocketType::STREAM, None).unwrap();
     rustix::net::bind(&socket, &SocketAddr::from(([127, 0, 0, 9], 0))).unwrap();
@@ -165,7 +165,7 @@ fn a_client_that_may_not_write_destroys_nothing() {
         "a cut end does not show without the hash"
     );
     failing(&cut[..cut.len() - 9], &[], "the line is incomplete");
-    // A start names what a crash left, and the chain goes on.
+    // The gateway reports at its start what a crash left, and continues the chain.
     let mut again = site.run_ready();
     write_registers(site.modbus, 1, SPEED_REFERENCE, &[3000]);
     until("the order", || entries_after_crash(&site).then_some(()));

@@ -1,5 +1,5 @@
-//! BACnet/IP from outside: bacpypes3 and node-bacnet, which know nothing of each other, against the real gateway with simulated
-//! drives; tshark reads what they say.
+//! BACnet/IP tested from outside: bacpypes3 and node-bacnet, two independent implementations, against the real
+//! gateway with simulated drives; tshark decodes the traffic.
 
 mod layouts;
 mod rights;
@@ -75,7 +75,7 @@ impl Plant {
         asked(&mut command, orders)
     }
 
-    /// Runs the orders with node-bacnet, which sends to its own port, so the gateway must have the same one.
+    /// Runs the orders with node-bacnet, which sends to its own port number, so the gateway must use that number too.
     fn node(&self, host: u8, orders: &[Json]) -> Vec<Json> {
         let script = root().join("tests/peers/bacnet_node.js").display().to_string();
         let mut command = Command::new(tool("node"));
@@ -130,7 +130,8 @@ fn slots(plant: &Plant) -> Vec<(usize, Json)> {
         .collect()
 }
 
-/// Drives of every family that can be simulated, eight at most on a bus, from unit 1 on; the profiles unit by unit.
+/// Drives of every family that can be simulated, at most eight on a bus, from unit 1 on; returns the profiles in
+/// the order of the units.
 fn simulated_families() -> (String, Vec<String>) {
     let profiles = Profiles::built_in();
     let (mut text, mut names) = ("[gateway]\nname = \"test\"\n".to_string(), Vec::new());
@@ -164,7 +165,7 @@ fn drive_of(profile: &str, address: usize, unit: usize) -> String {
     format!("[[bus.drive]]\nname = \"d{unit}\"\naddress = {address}\nunit = {unit}\nprofile = \"{profile}\"\n")
 }
 
-/// Drives in Python of the other families, each on a bus of its own.
+/// Drives in Python for the other families, each on a separate bus.
 fn other_families(first: usize) -> (String, Vec<String>, Vec<Running>) {
     let (mut text, mut names, mut drives) = (String::new(), Vec::new(), Vec::new());
     let program = root().join("tests/peers/families/run.py").display().to_string();
@@ -186,7 +187,7 @@ fn other_families(first: usize) -> (String, Vec<String>, Vec<Running>) {
     (text, names, drives)
 }
 
-/// Compares the objects of a drive in BACnet with its points over HTTP: the number of objects, or the difference.
+/// Compares the objects of a drive in BACnet with its points over HTTP; returns the number of objects, or the difference.
 fn compared(shown: &Json, told: &Json) -> Result<usize, String> {
     const STATES: [&str; 5] = ["offline", "not_ready", "ready", "running", "fault"];
     let mut count = 0;
@@ -242,7 +243,7 @@ fn every_family_shows_what_http_tells() {
         json!(["who_is", null, null, "global"]),
         json!(["who_is", 103, 104, "global"]),
     ];
-    // On a busy machine one or the other may be away for a moment.
+    // On a busy machine a drive may be offline for a moment.
     let mut seen = std::collections::BTreeSet::new();
     until("each was there", || {
         let heard = plant.bacpypes(20, &asked);
@@ -262,7 +263,7 @@ fn every_family_shows_what_http_tells() {
         .collect();
     let lists = plant.bacpypes(20, &orders);
     let lists: Vec<Vec<Json>> = lists.iter().map(|list| list.as_array().unwrap().clone()).collect();
-    // The values of a motor that stands do not change; still, a value may be read between two comparisons.
+    // Values of a standing motor do not change, but one may be read for the first time between two comparisons.
     let mut left: Vec<usize> = units.clone().collect();
     let mut objects = 0;
     until("all is as HTTP tells", || {
@@ -279,7 +280,7 @@ fn every_family_shows_what_http_tells() {
         for ((unit, told), shown) in left.iter().zip(&told).zip(&shown) {
             match compared(shown, told) {
                 Ok(count) => {
-                    // All but the device itself, its port, the state and the text of the fault.
+                    // All objects except the device itself, its port, the state and the text of the fault.
                     let of = lists[unit - 1].len();
                     assert!(count + 4 >= of, "{}: {count} of {of}", families[unit - 1]);
                     objects += count;
@@ -358,7 +359,7 @@ fn a_write_is_answered_when_the_drive_has_done_it() {
     }
     let real = plant.node(21, &[json!(["write", 1, 5, 1, 1.5, 8])]).remove(0);
     assert!(real["error"].as_str().unwrap().contains("INVALID_DATA_TYPE"), "{real}");
-    // An address that may ask but not write; and of several writes a stop is carried out though another one is refused.
+    // An address that may read but not write; and of several writes a stop is carried out although another one is refused.
     assert_eq!(plant.bacpypes(40, &[run_at(8, false)]), [json!({ "error": [2, 40] })]);
     assert_eq!(plant.site.point("pump-1", "running"), true);
     let several = json!(["several", 1, ["analog-value,1", PV, 500.0, 8], [RUN, PV, false, 8]]);

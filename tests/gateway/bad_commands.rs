@@ -1,4 +1,4 @@
-//! Commands that must not reach a drive, by both protocols; the line is written down and shows that nothing did.
+//! Commands that must not reach a drive, over both protocols; the recorded line proves that nothing reached it.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -42,7 +42,8 @@ struct RecordedSite {
     _others: [Running; 2],
 }
 
-/// Drives `pump` and `plain`, which may be commanded, `watched`, which may not, and `gone`, which is not there.
+/// Drives `pump` and `plain`, which may be commanded, `watched`, which may not, and `gone`, which does not exist on
+/// the line.
 fn rig() -> RecordedSite {
     let drives = [
         controlled("pump", 1, ""),
@@ -104,7 +105,7 @@ fn write(start: u16, values: &[u16]) -> Vec<u8> {
     }
 }
 
-/// Below `drivegate/test/drive`: topic, payload, code of the refusal, and a part of its text.
+/// Columns: topic below `drivegate/test/drive`, payload, code of the refusal, and a part of its text.
 const SET_TOPICS: &str = r#"pump/set                      | {"speed_reference": NaN}                                        | bad_value     | not JSON
 pump/set                      | {"speed_reference": -Infinity}                                  | bad_value     | not JSON
 pump/set                      | {"speed_reference": 1e999}                                      | bad_value     | not JSON
@@ -164,8 +165,8 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
     assert_eq!(rig.writes(), 0, "only reads are on the line");
-    // Each request that names a drive (with Modbus, also a function that the drive has) is audited; refusals of one
-    // kind are counted.
+    // Each request that names a drive (with Modbus, if the drive has the function) is audited; refusals of one kind
+    // are counted.
     until("all refusals in the audit", || {
         let audit = rig.site.audit();
         let of = |source: &str| {
@@ -185,7 +186,7 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
     assert_eq!(rig.site.ask("pump/set", &again), first, "from memory");
     assert_eq!(rig.writes(), written);
 
-    // Two clients that set different bits do not undo each other.
+    // Two clients that set different bits must not undo each other's changes.
     let control_words = || {
         let frames = rig.line.transcript();
         let to_drives = frames.iter().filter(|f| f.direction == Direction::ToDrives);

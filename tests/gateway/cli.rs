@@ -16,7 +16,7 @@ use crate::support::tools::{python, run_well};
 const BINARY: &str = env!("CARGO_BIN_EXE_drivegate");
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// Two drives at 38400 8N1 and 0.5 ms turnaround.
+/// Two drives at 38400 8N1 with 0.5 ms turnaround.
 const SOUND: &str = r#"
 [gateway]
 name = "pump-house"
@@ -266,7 +266,7 @@ fn what_raw_writes_may_not_set_is_listed() {
         });
         row.unwrap().contains("\"read, write\"")
     };
-    // Control word, general control word, minimum frequency, response to a silent master.
+    // Expected points: control word, general control word, minimum frequency, response to a silent master.
     assert_eq!(
         [2000, 2001, 100, 732].map(|at| access(1, at)),
         [true, false, false, true]
@@ -589,7 +589,7 @@ fn a_closed_pipe_ends_the_output_quietly() {
         let Output { status, stderr, .. } = drivegate(&args).stdout(writer).output().unwrap();
         assert_eq!((status.code(), stderr.as_slice()), (Some(0), &b""[..]), "{args:?}");
     }
-    // Even errors cannot be printed, so only the exit code shows them.
+    // Not even errors can be printed, so only the exit code reports the failure.
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let bad = drivegate(&["check", "--config", "tests/bad/twice.toml"])

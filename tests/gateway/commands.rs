@@ -34,7 +34,7 @@ fn plant(baud: &str, keys: &str) -> Plant {
 #[test]
 fn a_client_that_is_killed_leaves_a_lease_that_runs_out() {
     let Plant { site, .. } = &plant("38400", "supervision = { timeout = \"3s\", action = \"stop\" }");
-    // A program that holds its connection and commands the motor to run until it is killed.
+    // A program that keeps its connection open and commands the motor to run until it is killed.
     let script = format!(
         "exec 3<>/dev/tcp/127.0.0.1/{}; while :; do printf '\\0\\1\\0\\0\\0\\6\\1\\6\\201\\0\\0\\1' >&3; sleep 0.5; done",
         site.modbus
@@ -64,11 +64,11 @@ fn a_stop_under_a_full_queue_comes_first() {
     let mut frames = Vec::new();
     for transaction in 0u16..100 {
         let [high, low] = transaction.to_be_bytes();
-        // Reverse off by the raw control word of the other drive, again and again.
+        // The flood repeatedly writes "reverse off" to the raw control word of the other drive.
         frames.extend([high, low, 0, 0, 0, 6, 2, 6, 0x07, 0xD1, 0, low]);
     }
     flood.write_all(&frames).unwrap();
-    // The stop gets a place and is sent; `tests/world` proves that it is the very next request on the line.
+    // The stop gets a place in the queue and is sent; `tests/world` proves that it is the very next request on the line.
     until("the stop", || {
         let reported = mbpoll_write(site.modbus, 1, 33_024, &[0]);
         assert!(
@@ -78,7 +78,7 @@ fn a_stop_under_a_full_queue_comes_first() {
         reported.ok()
     });
     site.until_state("pump-1", "ready");
-    // Each of the flood has its one answer: written, or refused because the queue was full or its time ran out.
+    // Each request of the flood gets exactly one answer: written, or refused because the queue was full or it expired.
     flood.set_read_timeout(Some(PATIENCE)).unwrap();
     let mut seen = [0u8; 100];
     for _ in 0..100 {
@@ -125,7 +125,7 @@ fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
     ]);
     site.until_point("pump-1", "speed_reference", 20.0);
     assert_eq!(site.point("pump-1", "run"), false);
-    // A transaction takes longer than this command lives, so it is too old when its turn comes.
+    // A transaction takes longer than the command is valid, so the command has expired when its turn comes.
     until("an expired command", || {
         site.publish(&["-t", SET, "-m", "{\"speed_reference\": 30, \"expires_ms\": 1}"]);
         site.audit().into_iter().find(|r| r["result"] == "expired")
@@ -160,7 +160,7 @@ fn confirmed_repeated_refused_and_audited() {
     until("the frequency range", || {
         site.point("pump-1", "frequency_reference").is_number().then_some(())
     });
-    // A later command of the same client shows that the repetitions were seen and not carried out.
+    // A later command of the same client shows that the repetitions were received and not carried out.
     for (payload, why) in [
         ("{\"speed_reference\": 50, \"frequency_reference\": 30}", "twice"),
         ("{\"speed_reference\": NaN}", "not JSON"),

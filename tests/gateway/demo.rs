@@ -33,7 +33,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     until_ready(http);
     let drives: Vec<serde_json::Value> = serde_json::from_str(&get(http, "/api/v1/drives").unwrap().1).unwrap();
     assert_eq!(drives.len(), 10);
-    // The drives of the demo move by themselves.
+    // The drives of the demo run by themselves.
     until("a drive that runs by itself", || {
         ["pump-1", "pump-2", "fan-1"]
             .into_iter()
@@ -55,7 +55,8 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
         (point(http, "pump-1", "output_frequency") == 25.0).then_some(())
     });
 
-    // The words of the common model work for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run, read, stop.
+    // The command words of the common model work for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run,
+    // read, stop.
     for (unit, name, half) in [(7, "conveyor-1", 3000), (8, "ahu-1", 2500)] {
         write_registers(modbus, unit, 33_025, &[5000]);
         write_registers(modbus, unit, 33_024, &[1]);
@@ -72,7 +73,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
         (api(http, "pump-1")["state"] == "ready").then_some(())
     });
 
-    // The login that it prints starts a motor as the page does, and no other one does.
+    // The login that the demo prints can start a motor as the page does, and no other login can.
     let (_, rest) = printed.split_once("user operator, password ").unwrap();
     let password = rest.split_whitespace().next().unwrap();
     let order = |password: &str, order: &str| {
@@ -117,7 +118,7 @@ fn a_second_demo_takes_other_ports() {
     until_ready(port(&printed, "http://127.0.0.1:"));
 }
 
-/// Runs a line as if it were pasted into a shell; a command that does not end is ended.
+/// Runs a line as if it were pasted into a shell; a command that does not end by itself is terminated.
 fn pasted(line: &str) -> Output {
     let own = [".tools/venv/bin", ".tools/bin"].map(|dir| root().join(dir).display().to_string());
     let path = format!("{}:{}", own.join(":"), std::env::var("PATH").unwrap_or_default());
@@ -126,7 +127,7 @@ fn pasted(line: &str) -> Output {
     shell.output().unwrap()
 }
 
-/// Examples that read from a gateway at its usual ports, or need none; without the programs that only arrange what is printed.
+/// Examples that read from a gateway at its default ports, or need none; without programs that only format the output.
 fn examples_of_the_pages() -> Vec<String> {
     let pages = [
         "http",
@@ -192,7 +193,7 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
         (api(http, "pump-1")["state"] == "ready").then_some(())
     });
 
-    // The other commands find the demo by its configuration, also under another name of the directory.
+    // The other commands find the demo by its configuration, also under another name of its directory.
     let config = dir.join("drivegate.toml").display().to_string();
     let read = drivegate(&["read", "--config", &config, "--json", "pump-1", "state", "fault_text"])
         .output()
@@ -209,7 +210,7 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
     demo.signal("INT");
     assert!(demo.ended().success());
     assert!(!dir.join("line1").exists(), "the ports end with the demo");
-    // A configuration that no demo has written is left as it is.
+    // A configuration that no demo has written is not touched.
     std::fs::write(&config, "[gateway]\n").unwrap();
     let refused = drivegate(&["demo", "--write-config", dir.to_str().unwrap()])
         .output()

@@ -95,7 +95,7 @@ fn every_command_with_a_list_or_a_result_prints_it_as_json() {
     assert_eq!(stopped["drives"].as_array().map(Vec::len), Some(2));
     let (code, once, _) = with(&commands["watch"]);
     assert_eq!((code, &once["drives"][0]["name"]), (Some(0), &json!("pump-1")));
-    // Without --once a line is printed again and again, until the reader closes.
+    // Without --once, lines are printed continuously until the reader closes the pipe.
     let mut live = drivegate(&["watch", "--json", "--config", &config])
         .stdout(Stdio::piped())
         .spawn()

@@ -1,4 +1,4 @@
-//! A drill on the real program: by the command line and by curl, on simulated drives in a process of their own.
+//! A drill with the real program: by command line and by curl, on simulated drives in a separate process.
 
 use serde_json::{Value as Json, json};
 
@@ -176,7 +176,7 @@ fn what_ends_a_drill_is_named_and_the_motor_is_stopped() {
     let id = begin(json!(["order", "gateway"]));
     assert_eq!(plant.curl("bob", "DELETE", &format!("/{id}"), &Json::Null).0, 200);
     stands(&id, "aborted", "http bob 127.0.0.1 ended it");
-    // The simulated drive does nothing when its master is silent, as it comes from the factory: that is the finding.
+    // With factory settings the simulated drive does not react to a silent master: the drill must report that.
     let id = begin(json!(["gateway"]));
     stands(&id, "failed", "after a silence of 8 s the motor still turns");
     // A drive that cannot pass is refused before anything starts, and the gateway's end stops the motor.

@@ -1,4 +1,4 @@
-//! `scan`, `read` and `write`: on a port of their own, and through a gateway that has it.
+//! `scan`, `read` and `write`: directly on a port, and through a gateway that owns the port.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -9,7 +9,7 @@ use crate::support::process::{self, Running, api, free_port, until, until_ready}
 use crate::support::site::line_of;
 use crate::support::tools::tool;
 
-/// Exit code of a command, and what the command printed on standard output and standard error.
+/// Exit code of a command, and its output on standard output and standard error.
 pub(crate) struct Ran {
     pub(crate) code: i32,
     pub(crate) out: String,
@@ -29,7 +29,7 @@ pub(crate) fn ran(command: &mut Command) -> Ran {
     }
 }
 
-/// Two simulated drives on a line, and the configuration of a gateway for them.
+/// Two simulated drives on a line, with the configuration of a gateway for them.
 pub(crate) struct Line {
     pub(crate) directory: TempDir,
     _drives: Running,
@@ -91,7 +91,7 @@ impl Line {
         drivegate(&[&[what, "--config", config.to_str().unwrap()], rest].concat())
     }
 
-    /// Gives a command, again until it is carried out: on a busy machine its time may run out.
+    /// Gives a command, and repeats it until it is carried out: on a busy machine it may expire.
     fn written(&self, rest: &[&str]) -> Ran {
         until("a command", || {
             Some(self.command("write", rest)).filter(|ran| ran.code == 0)
@@ -123,7 +123,7 @@ impl Line {
         );
     }
 
-    /// Checks that `why` explains why the motor stands although run is still on in the drive.
+    /// Checks that `why` explains why the motor stands although its run command is on.
     fn is_explained(&self) {
         let why = self.command("why", &["pump-1"]);
         assert_eq!(why.code, 0, "{}", why.err);
@@ -192,7 +192,7 @@ impl Line {
         }
         assert_eq!(self.value("running"), true);
         assert_eq!(self.value("speed_reference"), 50.0, "refused is not written");
-        // A fault while it runs (the simulators' own register), and its reset: the motor stays where it is.
+        // A fault while the motor runs (by the simulators' own register), and its reset: the motor stays stopped.
         self.trip();
         until("the fault", || (self.value("fault") == true).then_some(()));
         let reset = self.written(&["pump-1", "fault_reset=true"]);
@@ -218,7 +218,7 @@ fn directly_and_through_the_gateway() {
     let stop = line.command("write", &["pump-1", "run=false"]);
     assert!(stop.out.ends_with(", through the gateway\n"), "{}", stop.out);
     line.operate();
-    // Where the gateway is not found, its port is taken, and the message says so.
+    // If the gateway is not found, its port is locked, and the message says so.
     let text = std::fs::read_to_string(line.config()).unwrap();
     let elsewhere = line.directory.path().join("elsewhere.toml");
     for (socket, wanted) in [
@@ -242,7 +242,8 @@ fn directly_and_through_the_gateway() {
     drop(gateway);
 }
 
-/// The exact reason, whichever way, and nothing of a command is written when a part of it is refused.
+/// The reason of a refusal is exact and identical by every way, and nothing of a command is written if a part of it
+/// is refused.
 #[test]
 fn a_refusal_has_the_same_words_whichever_way() {
     let line = Line::start();
@@ -339,7 +340,7 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     std::fs::write(line.config(), &text).unwrap();
     gateway.signal("HUP");
     sound();
-    // A profile of that name was edited since: the gateway answers with its own, so nothing is misread.
+    // A profile of this name was edited since: the gateway answers with its own version, so nothing is misread.
     assert_eq!(
         line.command("write", &["pump-1", "run=true", "speed_reference=50"])
             .code,
@@ -350,7 +351,7 @@ fn a_gateway_with_another_configuration_is_reported_and_not_commanded() {
     assert_eq!(line.value("output_frequency"), 25.0);
 }
 
-/// Last values of an absent drive are stale, values never read are bad: with `read` as over HTTP.
+/// Last values of an absent drive are stale and values never read are bad, with `read` as over HTTP.
 #[test]
 fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     let folder = TempDir::new().unwrap();
@@ -394,7 +395,7 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
         }
         assert!(others.is_empty(), "{others:#?}");
     }
-    // A reason that all of its points have in common is reported once.
+    // A reason that all of its points share is reported once.
     let ran = drivegate(&["read", "--config", &config, "pump-2"]);
     let wanted = "error: no point of `pump-2` has a value: the drive does not reply\n";
     assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));
@@ -470,7 +471,8 @@ fn a_gateway_that_just_ends_is_asked_again() {
     assert_eq!(read.code, 0, "{}{}", read.out, read.err);
 }
 
-/// Each family is found on the line that its simulator makes, and what is printed for it passes `check` and is read.
+/// Each family is found on the line of its simulator; the printed configuration passes `check`, and the drive can
+/// be read with it.
 #[test]
 fn every_family_is_found_by_reading() {
     // SVX and HVX answer alike to every read.
@@ -491,7 +493,7 @@ fn every_family_is_found_by_reading() {
         let _drives = Running::drivegate(&["simulate", "--profile", profile, "--addresses", "2", "--link", port]);
         until("the line", || link.exists().then_some(()));
         let line = ["--protocol", protocol, "--baud", baud, "--format", format];
-        // On a busy machine the drive may be too late for a search.
+        // On a busy machine the drive may answer too late for a search.
         let ran = until(&format!("{profile} is found"), || {
             let ran = drivegate(&[&["scan", "--port", port, "--addresses", "1-3"], &line[..]].concat());
             (ran.code == 0).then_some(ran)
@@ -516,7 +518,7 @@ fn every_family_is_found_by_reading() {
     }
 }
 
-/// N2 has addresses that Modbus lacks; 255 is not a unit id, so the snippet gives such a drive another.
+/// N2 has addresses that Modbus lacks; 255 is not a valid unit id, so the snippet gives such a drive another one.
 #[test]
 fn drives_at_the_last_addresses_of_n2_are_found() {
     let directory = TempDir::new().unwrap();

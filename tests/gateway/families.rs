@@ -1,5 +1,6 @@
-//! Families whose profiles come from reports: the real gateway with each profile against a drive in Python that was written
-//! from what is known of the family, not from the profile. The words here are by hand, too.
+//! Families whose profiles come from reports: the real gateway with each profile against a drive in Python that was
+//! written from the documents of the family, not from the profile. The words in these tests were also worked out by
+//! hand.
 
 mod behind_its_back;
 mod cases;
@@ -19,7 +20,7 @@ use crate::support::process::{PATIENCE, Running, api, free_port, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, curl};
 use crate::support::tools::{python, root};
 
-/// Each profile, with the module of its drive.
+/// Each profile with the module of its Python drive.
 pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
     let mut all: Vec<_> = cases().iter().map(|case| (case.profile, case.peer)).collect();
     all.sort_unstable();
@@ -27,7 +28,7 @@ pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
     all.into_iter()
 }
 
-/// A gateway and the drive that it commands.
+/// A gateway with the drive that it commands.
 struct Rig {
     site: Site,
     /// The tool slot, by which addresses are reached that are the common model's over Modbus TCP.
@@ -77,11 +78,11 @@ impl Rig {
         }
     }
 
-    /// Sends the orders and checks that the drive sees each of them.
+    /// Sends the orders and checks that the drive receives each of them.
     fn order(&self, orders: &[Order]) {
         for order in orders {
             let before = self.drive.output().len();
-            // On a busy machine the gateway may take an order for older than the stop before it, and answer 06.
+            // On a busy machine the gateway may consider an order older than the stop before it, and answer 06.
             let answer = until("an answer", || {
                 Some(self.exchange(order)).filter(|answer| *answer != Answer::Exception(6))
             });
@@ -147,7 +148,7 @@ impl Rig {
     }
 }
 
-/// Sends a request on a connection of its own; `head` bytes go before the function of the reply.
+/// Sends a request on a separate connection; `head` is the number of bytes before the function of the reply.
 fn answer(port: u16, frame: &[u8], head: usize) -> Answer {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -177,7 +178,7 @@ enum Answer {
     Exception(u8),
 }
 
-/// Reference, start, reverse, stop, a fault and its reset, and words that are not passed on.
+/// Checks reference, start, reverse, stop, a fault and its reset, and words that are not passed on.
 fn obeys(case: &Case) {
     let rig = Rig::new(case, false);
     let name = case.profile;
@@ -266,7 +267,7 @@ fn obeys_the_common_model(case: &Case) {
     done(command(true, false, false));
     rig.printed("motor forward", 0);
     rig.site.until_state("drive", "running");
-    // Once more changes nothing.
+    // The repeated command changes nothing.
     done(command(true, false, false));
     std::thread::sleep(Duration::from_millis(200));
     assert!(!rig.drive.output().contains("motor stopped"), "{name}");
@@ -325,7 +326,7 @@ fn fails_to_start(case: &Case) {
     );
 }
 
-/// The cases of every third family, so that three tests run side by side.
+/// Tests every third family, so that three tests run side by side.
 fn every_third(first: usize, check: fn(&Case)) {
     for case in cases().iter().skip(first).step_by(3) {
         println!("{}", case.profile);

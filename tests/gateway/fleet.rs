@@ -1,4 +1,4 @@
-//! The collection of deploy/fleet as far as it needs no Ansible, which `make fleet-rollout` has.
+//! The collection of deploy/fleet as far as it can be tested without Ansible, which `make fleet-rollout` uses.
 
 use std::fs;
 

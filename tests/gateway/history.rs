@@ -53,7 +53,7 @@ fn counters_and_events_survive_a_kill() {
         let text = fs::read_to_string(site.file("state/events.jsonl")).ok()?;
         text.matches("\"stopped\"").nth(1).map(drop)
     });
-    // An orderly stop writes the counters; after that, a kill only loses what was counted since.
+    // An orderly end writes the counters; a later kill only loses what was counted since.
     gateway.signal("TERM");
     gateway.ended();
     let mut gateway = site.run_ready();
@@ -77,7 +77,7 @@ fn counters_and_events_survive_a_kill() {
     let all = log(&site, "?limit=1000");
     assert_eq!(boots(&all), 3, "three runs, one after the other");
     assert_eq!(log(&site, "?kind=stopped&drive=pump-1").len(), 3);
-    // Page by page, nothing twice and nothing left out.
+    // The pages together contain every event once.
     let mut paged = all[..1].to_vec();
     while let Some(last) = paged.last().cloned() {
         let [boot, id] = ["boot", "id"].map(|key| last[key].to_string().replace('"', ""));

@@ -1,4 +1,4 @@
-//! Rights and views of clients while one of them holds a drive: mbpoll, mosquitto, curl.
+//! Rights and displays of clients while one of them holds a drive: mbpoll, mosquitto, curl.
 
 use serde_json::{Value as Json, json};
 
@@ -78,7 +78,7 @@ fn who_sees_and_may_what() {
     assert_eq!(plant.seen(), (1, 1, json!("held"), json!("plc")));
     let left = until("the time", || mbpoll_read(plant.site.modbus, 1, 0x8014, 1).ok())[0];
     assert!((1..=30).contains(&left), "{left}");
-    // No other client commands the drive, whatever its rank; each refusal names the holder.
+    // No other client can command the drive, whatever its rank; each refusal names the holder.
     let (status, answer) = plant.curl("commands", r#"{"run": true, "speed_reference": 10}"#);
     assert_eq!((status, &answer["result"]), (409, &json!("held_by_other")), "{answer}");
     assert_eq!(
@@ -128,7 +128,7 @@ fn who_sees_and_may_what() {
     let answer = plant.site.ask("pump-1/set", r#"{"run": false}"#);
     assert_eq!(answer["result"], "confirmed", "{answer}");
     assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
-    // Behind the stop of the operator the PLC does not start the motor by going on.
+    // After the stop of the operator, the PLC does not start the motor by repeating its command.
     plant.write(0x8100, &[1, 5000]).unwrap();
     plant.site.until_point("pump-1", "running", true);
     let (status, answer) = plant.curl("commands", r#"{"run": false}"#);

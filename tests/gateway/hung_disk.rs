@@ -47,7 +47,7 @@ fn hang(file: &Path) {
     rustix::fs::mknodat(rustix::fs::CWD, file, rustix::fs::FileType::Fifo, mode, 0).unwrap();
 }
 
-/// The answer to a start, once it is not refused for what passes by itself.
+/// The answer to a start, once it is not refused for a temporary reason.
 fn start(site: &Site, drive: &str) -> Json {
     let path = format!("drives/{drive}/commands");
     until("an answer", || {

@@ -1,4 +1,4 @@
-//! The gateway listens on a line on which programs that were written elsewhere poll simulated drives.
+//! The gateway listens on a line on which independent programs poll simulated drives.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -89,7 +89,7 @@ impl Shared {
         api(self.site.http, name)
     }
 
-    /// Ends the line; returns what the gateway sent on it.
+    /// Ends the line; returns the bytes that the gateway sent on it.
     fn sent_by_the_gateway(self) -> String {
         self.line.signal("TERM");
         self.line.until_printed("the listener sent")
@@ -106,7 +106,7 @@ fn printed(text: &str) -> Vec<Block> {
     text.lines().filter_map(line).collect()
 }
 
-/// A block of registers as a master read it last: address of the drive, first register, words.
+/// A block of registers as a master last read it: address of the drive, first register, words.
 type Block = (String, u16, Vec<f64>);
 
 fn pymodbus(framer: &str, port: &str) -> Vec<Block> {

@@ -93,7 +93,7 @@ fn a_reload_is_asked_for_and_a_refused_one_is_seen() {
     let expected = "changed: bus `line1`, restarted\n";
     assert_eq!((changed.code, changed.out.as_str()), (0, expected), "{}", changed.err);
     site.until_metric("drivegate_config_last_reload_successful 1");
-    // Another file belongs to another gateway.
+    // Another configuration file belongs to another gateway.
     site.write("other.conf", &fs::read_to_string(site.config()).unwrap());
     let other = ran(&mut drivegate(&["reload", "--config", &site.path("other.conf")]));
     assert!(
@@ -134,7 +134,7 @@ fn health_is_an_exit_code() {
     until("readiness", || (command(&site, &["health"]).code == 0).then_some(()));
     let ready = over_http();
     assert_eq!((ready.code, ready.out.as_str()), (0, "ready\n"), "{}", ready.err);
-    // Without the local socket, the command finds HTTP in the file.
+    // Without the local socket, the command finds the HTTP address in the file.
     site.change("own.sock", "");
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");

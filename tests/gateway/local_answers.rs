@@ -1,4 +1,4 @@
-//! An order that came over the local socket is answered, whatever becomes of the socket meanwhile.
+//! An order received over the local socket is answered, whatever happens to the socket meanwhile.
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::support::process::{PATIENCE, Running};
 use crate::support::site::{HTTP, LINE1, Site, controlled};
 
-/// A gateway with a socket, and a drive whose simulator stands still: an order to it takes some seconds.
+/// A gateway with a socket, and a drive whose simulator is stalled, so that an order to it takes some seconds.
 fn site() -> (Site, Running, Running) {
     let site = Site::new();
     let socket = format!("[gateway]\nsocket = \"{}\"\n", site.path("socket"));
@@ -20,7 +20,7 @@ fn site() -> (Site, Running, Running) {
     (site, simulator, gateway)
 }
 
-/// Gives an order over the socket, and does not wait.
+/// Gives an order over the socket without waiting for the answer.
 fn order(site: &Site, body: &str) -> UnixStream {
     let mut stream = UnixStream::connect(site.path("socket")).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -33,7 +33,7 @@ fn order(site: &Site, body: &str) -> UnixStream {
     stream
 }
 
-/// All that the server answers until it closes the connection.
+/// All bytes that the server sends until it closes the connection.
 fn answer(mut stream: UnixStream) -> String {
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
@@ -48,8 +48,8 @@ fn a_reload_that_moves_the_socket_loses_no_answer() {
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
     let answer = answer(waiting);
-    // The new socket may be open to other users: a request that was not sent yet is refused. A poll that waits for the drive when
-    // the order comes may take its whole time: the order then ends as expired.
+    // The new socket may be open to other users, so a request that was not sent yet is refused. A poll that is
+    // waiting for the drive when the order arrives may use its whole time limit: the order then expires.
     let is_told = ["HTTP/1.1 504", "HTTP/1.1 403", "HTTP/1.1 503"]
         .iter()
         .any(|begin| answer.starts_with(begin));

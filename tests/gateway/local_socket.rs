@@ -1,4 +1,4 @@
-//! The local socket of a gateway: its owner, its file, and commands through it while others command too.
+//! The local socket of a gateway: which gateway owns it, its file, and commands through it while others command too.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
@@ -30,7 +30,7 @@ impl Client {
         self.0.get_mut().write_all(text.as_bytes()).unwrap();
     }
 
-    /// The next line without its end; `None` when the gateway has closed the connection.
+    /// The next line without its line end; `None` when the gateway has closed the connection.
     fn line(&mut self) -> Option<String> {
         let mut line = String::new();
         match self.0.read_line(&mut line) {
@@ -175,7 +175,7 @@ fn gateways_of_one_user_are_told_apart() {
             (ran.code == 0 && ran.out.contains("through the gateway")).then_some(())
         });
     }
-    // The third has another name and a line of its own, which is free.
+    // The third configuration has another name and its own line, which is free.
     let direct = write(&lines[2]);
     // The notes may also mention another gateway of this machine.
     let notes = [
@@ -209,7 +209,7 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
         (line.command("read", &["pump-1", "run"]).code == 0).then_some(())
     });
     let points = "/api/v1/drives/pump-1/points";
-    // A client that never reads its answers does not hinder others.
+    // A client that never reads its answers must not delay others.
     let mut deaf = Client::connect(&line.socket());
     deaf.0
         .get_ref()
@@ -439,7 +439,7 @@ fn a_stop_that_comes_in_between_is_not_undone() {
                 scope.spawn(move || {
                     let mut client = Client::connect(socket);
                     for on in [true, false, true, false] {
-                        // A stop may cut the command short; its reply is an answer, too.
+                        // A stop may cut the command short; that reply is also an answer.
                         client.post("/api/v1/drives/fan-1/commands", &json!({ point: on }));
                     }
                 });
@@ -504,7 +504,7 @@ fn it_serves_the_http_api_to_whoever_may_open_it() {
         405,
         "nobody logs in here"
     );
-    // The gateway reloads its configuration, or reports why not.
+    // The gateway reloads its configuration, or reports why it did not.
     let (status, outcome) = http(&line, &["-d", "{}"], "/api/v1/reload");
     assert_eq!((status, &outcome["changes"]), (200, &json!([])), "{outcome}");
     line.reconfigure(|text| text.replace("address = 1", "address = 999"));

@@ -81,7 +81,7 @@ fn every_answer_is_as_the_description_says() {
     assert!(status == 200 && text.contains("\"openapi\":\"3.1"), "{text}");
 }
 
-/// A client that a generator made of the description understands every answer of it, refusals included.
+/// A client generated from the description understands every answer of the API, refusals included.
 fn read_by_a_generated_client(site: &Site, names: &Value) {
     let read = Command::new(python())
         .arg("tests/tools/openapi_client.py")

@@ -1,4 +1,4 @@
-//! Start, reference, fault and reset through `run` and `simulate` in processes of their own: by mbpoll, by Mosquitto.
+//! Start, reference, fault and reset through `run` and `simulate` in separate processes: by mbpoll and by Mosquitto.
 
 use crate::support::process::{Running, api, get, mbpoll_read, mbpoll_write, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive};

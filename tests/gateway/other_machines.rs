@@ -24,7 +24,7 @@ struct Plant {
 }
 
 impl Plant {
-    /// Two drives at addresses 1 and 2, whose names and units are as the sections say.
+    /// Two drives at addresses 1 and 2 with the names and unit ids of these sections.
     fn new(drives: &str) -> Plant {
         let site = Site::new();
         let line = site.line(&[1, 2]);
@@ -125,7 +125,7 @@ fn begin_over_http(site: &Site, drive: &str, body: &str) -> UnixStream {
     stream
 }
 
-/// The head of an order comes, a reload gives its name to the other machine, the rest comes.
+/// The head of an order arrives, a reload gives its name to the other machine, and the rest arrives.
 #[test]
 fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
     let mut plant = Plant::new(&pair("pump-1", "pump-2"));
@@ -177,7 +177,7 @@ fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
     assert_eq!((plant.runs(1), plant.runs(2)), (false, false));
 }
 
-/// A controller holds run and reset bit at a unit; a reload puts another drive there.
+/// A controller keeps run and reset bit set at a unit id; a reload puts another drive there.
 #[test]
 fn a_bit_that_a_controller_holds_is_no_edge_at_another_machine() {
     let mut plant = Plant::new(&pair("pump-1", "pump-2"));
@@ -196,7 +196,7 @@ fn a_bit_that_a_controller_holds_is_no_edge_at_another_machine() {
     let sent = plant.words(2).split_off(before);
     assert_eq!(sent, Vec::<u16>::new(), "no reset, and no start");
     assert_eq!(api(plant.site.http, "pump-2")["state"], "fault");
-    // After a stop from this controller, the bit is an edge again.
+    // After a stop from this controller, the bit counts as an edge again.
     assert_eq!(write(&mut plc, 11, 0)[7], 6);
     assert_eq!(write(&mut plc, 11, 4)[7], 6);
     plant.site.until_state("pump-2", "ready");

@@ -60,7 +60,7 @@ fn only_what_the_gateway_did_not_write_is_told_as_a_change() {
     let first = site.path("first.params");
     let (code, _, said) = ran(&site, &["params", "read", "pump-1", "-o", &first]);
     assert_eq!(code, Some(0), "{said}");
-    // Two files of one second would be one.
+    // Two files made within one second would get one name.
     let second = || std::thread::sleep(std::time::Duration::from_millis(1100));
 
     second();

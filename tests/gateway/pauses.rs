@@ -1,5 +1,5 @@
-//! The gateway is stopped (SIGSTOP) and continues: requests that clients sent meanwhile, and values of the drives. The clients
-//! are bytes on sockets, so that they can give up.
+//! The gateway is stopped (SIGSTOP) and continues: requests that clients sent meanwhile, and values of the drives.
+//! The clients are bytes on sockets, so that they can give up.
 
 use std::io::{Read, Write};
 use std::net::{TcpStream, UdpSocket};
@@ -13,7 +13,7 @@ use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
 
 const MS: Duration = Duration::from_millis(1);
 const RESPONSE_TIMEOUT: Duration = Duration::from_millis(300);
-/// Times of each kind of pause in which the order of two clients is not known.
+/// Repetitions of each kind of pause in which the order of two clients is unknown.
 const TIMES: usize = 12;
 /// Lengths of pauses, as in the tests of what clients sent during a pause.
 const HICCUP: Duration = Duration::from_millis(200);
@@ -64,7 +64,7 @@ impl Plant {
         }
     }
 
-    /// The gateway stands still for that time, in which that happens.
+    /// Stalls the gateway for this time while `meanwhile` runs.
     fn stands<T>(&self, time: Duration, meanwhile: impl FnOnce() -> T) -> T {
         self.gateway.stand();
         let began = Instant::now();
@@ -173,7 +173,7 @@ enum How {
     Http,
 }
 
-/// A client with a connection of its own, which it closes when it is dropped.
+/// A client with a separate connection, which is closed when the client is dropped.
 struct Client {
     stream: Box<dyn Stream>,
     how: How,
@@ -247,7 +247,7 @@ fn a_client_that_gave_up_starts_nothing() {
         ];
         for (name, client) in by {
             let client = client.map(|client| client(&plant));
-            // Whether a client behind a broker, or without a connection, has gone is not known.
+            // For a client behind a broker, or without a connection, it is unknown whether it still exists.
             if client.is_none() && pause < Duration::from_secs(1) {
                 continue;
             }
@@ -299,7 +299,8 @@ fn what_is_completed_in_a_pause_starts_nothing() {
     }
 }
 
-/// Two clients in one pause: the one that stops wins, in whatever sequence they are read; of one client its own order counts.
+/// Two clients in one pause: the one that stops wins, in whatever sequence they are read; for one client, its own
+/// order counts.
 #[test]
 fn a_stop_in_a_pause_wins() {
     let plant = Plant::new();
@@ -348,21 +349,21 @@ fn a_stop_in_a_pause_wins() {
     }
 }
 
-/// On a busy machine, the gateway may stand still for longer than the hiccup: one in ten orders may be lost through
-/// that.
+/// On a busy machine, the gateway may stall for longer than the hiccup: up to one in ten orders may be lost because
+/// of that.
 #[test]
 fn a_healthy_client_loses_nothing_by_a_hiccup() {
     let (plant, mut lost, mut all) = (Plant::new(), Vec::new(), 0);
     let mut clients = [plant.modbus(), plant.http(), plant.slot()];
     for time in 0..TIMES as u32 {
         for client in &mut clients {
-            // Two hiccups in quick succession are one, in which the order of a stop and a start is not known.
+            // Two hiccups in quick succession count as one, in which the order of a stop and a start is unknown.
             std::thread::sleep(400 * MS);
             let run = u16::from(time % 2 == 0);
             plant.stands(HICCUP, || client.gives(run));
             all += 1;
             lost.extend(client.answer().err());
-            // Around a hiccup, and in the time in which what came in it is read.
+            // Around a hiccup, and in the time in which the bytes from the hiccup are read.
             plant.stands(HICCUP, || {});
             std::thread::sleep(50 * MS * (time % 8));
             all += 1;
@@ -390,8 +391,8 @@ fn a_new_connection_starts_a_motor_behind_a_pause_and_an_old_one_later() {
     assert!(plant.runs());
 }
 
-/// While the gateway is stopped its drives send nothing, either: values are reported no younger than that, except for the time
-/// in which the last reply can have left its drive.
+/// While the gateway is stopped, its drives send nothing either: values must not be reported younger than that,
+/// except for the time in which the last reply can have left its drive.
 #[test]
 fn nothing_is_told_as_younger_than_it_is() {
     let plant = Plant::new();

@@ -99,7 +99,8 @@ fn signals_count_from_the_first_moment() {
     let _line = site.line(&[1]);
     for round in 0..20 {
         let mut gateway = site.run();
-        // Handlers are there before any other thread, and before that the program only reads its arguments.
+        // The signal handlers are installed before any other thread starts; before that the program only reads its
+        // arguments.
         let handled = || {
             let status = std::fs::read_to_string(format!("/proc/{}/status", gateway.pid())).ok()?;
             let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"))?;

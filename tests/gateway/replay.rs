@@ -19,7 +19,7 @@ fn captures() -> Vec<PathBuf> {
     files
 }
 
-/// Exit code of the replay, and what it printed on standard output and standard error.
+/// Exit code of the replay, and its output on standard output and standard error.
 fn replay(capture: &Path, config: &Path) -> (Option<i32>, String, String) {
     let arguments = [
         "replay",
@@ -42,7 +42,7 @@ fn shown(printed: &str, point: &str) -> Option<(String, String)> {
     .next()
 }
 
-/// The worked frames of the manuals: what they say in the words of the manuals.
+/// The worked frames of the manuals with their meaning in the words of the manuals.
 const WORKED: [(&str, &[(&str, &str)]); 4] = [
     (
         "nx.pcapng",

@@ -1,4 +1,4 @@
-//! Requests on the line when the gateway starts, dies and starts again; and a port that is not there.
+//! Requests on the line when the gateway starts, dies and starts again; and a port that does not exist.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -244,7 +244,7 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
     let before = site.change("[modbus_tcp]", &more);
     leave_room_for(gateway.pid(), 6);
     let refusals = || gateway.output().matches("reload rejected").count();
-    // The bus that runs is another one the second time; it must not be ended for a bus that never comes.
+    // The second time, another bus is running; it must not be ended for a bus that never starts.
     for refused in 1..=2 {
         gateway.signal("HUP");
         until("the refusal", || (refusals() == refused).then_some(()));

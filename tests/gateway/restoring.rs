@@ -18,7 +18,7 @@ struct Plant {
     line: SimulatedBus,
 }
 
-/// Two drives, the second one full of random parameters, and a file with those parameters.
+/// Two drives, the second one with random parameters, and a file with those parameters.
 fn plant(keys: &str) -> Plant {
     let site = Site::new();
     site.write("few.toml", &few());
@@ -156,7 +156,7 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     let journal = plant.site.file("state/params/pump-1/restore.journal");
     let kills = std::env::var("RESTORE_KILLS").map_or(KILLS, |text| text.parse().unwrap());
     for kill in 0..kills {
-        // The drive has the values of one file, and is to get those of the other.
+        // The drive has the values of one file, and the values of the other are to be restored.
         let at_first = plant.differences(&files[0], "pump-1").is_empty();
         let (former, wanted) = if at_first {
             (&files[0], &files[1])
@@ -177,7 +177,7 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
         until("the journal", || journal.exists().then_some(()));
         let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
         if code == Some(0) && !journal.exists() {
-            // On a busy machine the restore ends before the order arrives.
+            // On a busy machine the restore may end before the order arrives.
             assert_eq!(settle(&plant, &["write", "pump-1", "run=false"]).0, Some(0));
             assert!(restore.ended().success());
             continue;
@@ -236,7 +236,8 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     assert_eq!(code, Some(0), "{said}");
 }
 
-/// A journal as an earlier version wrote it, killed in the middle of a restore of 7 parameters: it names no machine.
+/// A journal in the format of an earlier version, which names no machine, from a process killed in the middle of a
+/// restore of 7 parameters.
 const EARLIER: &str = include_str!("restore_1.journal");
 
 #[test]
@@ -365,7 +366,7 @@ fn a_restore_does_not_go_on_at_another_machine() {
     let others = plant.line.with_drive(2, |drive, _| drive.parameter_writes()).unwrap();
     assert!(others.is_empty(), "{others:?}");
 
-    // While the drive is not configured, its journal is an orphan.
+    // While the drive is not configured, its journal belongs to no drive.
     let there = "name = \"pump-2\"\naddress = 1\n";
     plant.site.change(there, "name = \"pump-2\"\naddress = 3\n");
     let check = drivegate(&["check", "--config", &config]).output().unwrap();

@@ -1,5 +1,5 @@
-//! Rights that a reload takes away: they serve no request in progress, over any interface, and no waiting order starts a
-//! motor.
+//! Rights that a reload removes: they are lost for requests in progress over any interface, and no waiting order
+//! starts a motor.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -19,14 +19,14 @@ trait Stream: Read + Write {}
 
 impl<S: Read + Write> Stream for S {}
 
-/// A request of which the first bytes were sent, and the rest of it.
+/// A request whose first bytes were sent, and its remaining bytes.
 struct Begun {
     stream: Box<dyn Stream>,
     rest: Vec<u8>,
 }
 
 impl Begun {
-    /// Sends the rest; the reply, or nothing where the connection is closed.
+    /// Sends the rest; returns the reply, or nothing if the connection is closed.
     fn finish(mut self) -> Vec<u8> {
         // The connection may be closed already, so an error is ignored.
         let _ = self.stream.write_all(&self.rest);
@@ -62,14 +62,14 @@ fn tcp(port: u16) -> TcpStream {
 }
 
 const COMMANDS: &str = "/api/v1/drives/pump-1/commands";
-/// Still wanted after a login and a reload: an order dates from its first byte.
+/// A start that is still valid after a login and a reload: an order has the time of its first byte.
 const START: &str = "{\"run\": true, \"expires_ms\": 60000}";
 
 fn http(site: &Site) -> Begun {
     start_over_http(tcp(site.http), COMMANDS, START)
 }
 
-/// Requests other than commands that change something, each with its body.
+/// Other requests that change something, each with its body.
 const OTHERS: [(&str, &str); 5] = [
     ("/api/v1/stop", "{}"),
     ("/api/v1/drives/pump-1/hold", "{\"action\": \"take\"}"),
@@ -164,7 +164,7 @@ impl Rights {
         });
     }
 
-    /// Requests on the line that write.
+    /// Number of requests on the line that write.
     fn writes(&self) -> usize {
         functions(&self.line)
             .into_iter()
@@ -301,7 +301,7 @@ fn a_refused_reload_takes_no_right_away() {
     }
 }
 
-/// A tool writes, and its start has to wait for its share of the line; meanwhile a reload takes the right of the slot away.
+/// A tool writes, and its start has to wait for its share of the line; meanwhile a reload removes the right of the slot.
 #[test]
 fn a_start_of_a_tool_that_waits_is_not_sent_without_its_right() {
     let port = free_port();
@@ -362,7 +362,7 @@ fn a_start_of_a_tool_that_waits_is_not_sent_without_its_right() {
     }
 }
 
-/// The broker hands a message over while the client ends whose `commands` a reload turned off.
+/// The broker delivers a message while the client is ending because a reload disabled its `commands`.
 #[test]
 fn a_message_on_its_way_starts_nothing_once_commands_are_off() {
     let site = Site::of(&[LINE1, &controlled("pump-1", 1, ""), MQTT, HTTP]);
@@ -383,7 +383,7 @@ fn a_message_on_its_way_starts_nothing_once_commands_are_off() {
         std::thread::sleep(Duration::from_millis(100));
         let before = site.change("commands = true", "commands = false");
         gateway.signal("HUP");
-        // The client has half a second to say goodbye, in which it is still subscribed.
+        // The client has half a second for an orderly end, during which it is still subscribed.
         std::thread::sleep(Duration::from_millis(60 * round));
         broker.signal("CONT");
         let _ = publisher.wait();

@@ -1,4 +1,4 @@
-//! Guards and interlocks from every side, over a kill and a reload, and with a disk that takes nothing.
+//! Guards and interlocks over every interface, across a kill and a reload, and with a disk that accepts nothing.
 
 use serde_json::{Value as Json, json};
 
@@ -52,7 +52,7 @@ fn starts_are_refused_and_wait_and_stops_pass() {
     site.until_state("pump-1", "ready");
     site.until_state("fan-2", "ready");
 
-    // The interlock refuses the start, and names itself on each side in that side's form.
+    // The interlock refuses the start, and every interface names the interlock in its own form.
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
     assert_eq!((status, &answer["result"]), (409, &json!("interlocked")), "{answer}");
     let message = answer["error"]["message"].as_str().unwrap();
@@ -144,7 +144,7 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
     starts(&site, "fan-2");
     site.until_point("fan-2", "running", true);
     starts(&site, "pump-1");
-    // This folder makes it impossible to write the file of starts.
+    // A folder of this name prevents the file of starts from being written.
     std::fs::create_dir(site.file("state/starts.partial")).unwrap();
     stop(&site);
     let (status, answer) = curl(&site, "pump-1", "{\"run\": true}");
@@ -161,7 +161,8 @@ fn a_disk_that_takes_nothing_refuses_starts_and_no_stops() {
     starts(&site, "pump-1");
 }
 
-/// A reload that is refused, with another group and stagger and another place for the starts, changes none of them.
+/// A reload that is refused, with another group, another stagger and another directory for the starts, changes none
+/// of them.
 #[test]
 fn a_refused_reload_leaves_the_guards_as_they_were() {
     let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
@@ -178,7 +179,7 @@ fn a_refused_reload_leaves_the_guards_as_they_were() {
         &format!("127.0.0.1:{}", site.modbus),
         &taken.local_addr().unwrap().to_string(),
     );
-    // Each drive gets a group of its own.
+    // Each drive gets a separate group.
     let text = std::fs::read_to_string(site.config()).unwrap();
     site.write(
         "drivegate.conf",

@@ -1,4 +1,4 @@
-//! Stop all from every side, each by a client of its own: mbpoll, mosquitto, curl and the command line.
+//! Stop all over every interface, each by a different client: mbpoll, mosquitto, curl and the command line.
 
 use serde_json::{Value as Json, json};
 
@@ -165,7 +165,7 @@ fn from_every_side() {
     plant.all_stand();
 }
 
-/// The broker would repeat it at each connection of the gateway. The topic is cleared by such a message, too.
+/// The broker would repeat a retained stop at each connection of the gateway. The topic is cleared by such a message, too.
 #[test]
 fn a_retained_stop_of_all_stops_nothing_and_is_told() {
     let plant = plant();

@@ -1,5 +1,6 @@
-//! A stop among other things: whatever else a write covers, the motor stands, and the client learns that the rest was refused. By
-//! every way in, with `[authority]` and without. pymodbus, mosquitto, Eclipse Tahu's encoder, curl and bacpypes3.
+//! A stop within a larger write: whatever else the write covers, the motor stops, and the client learns that the
+//! rest was refused. Over every interface, with `[authority]` and without. pymodbus, mosquitto, Eclipse Tahu's
+//! encoder, curl and bacpypes3.
 
 use std::io::{Read as _, Write as _};
 use std::net::{TcpStream, UdpSocket};
@@ -38,7 +39,7 @@ rank = "automation"
 bacnet = ["127.0.0.16/28"]
 "#;
 
-/// The motor runs by a coil among others; of the others none can be written.
+/// The motor runs by one coil among others, none of which can be written.
 const COILS: &str = r#"
 name = "coils"
 protocols = ["modbus-rtu"]
@@ -149,7 +150,7 @@ enum Way {
     Slot(usize, Vec<u8>, u8),
 }
 
-/// The stop with this number of other words before and after it.
+/// The stop word with this number of other words before and after it.
 fn around(before: usize, stop: u16, after: usize) -> Vec<u16> {
     [vec![77; before], vec![stop], vec![77; after]].concat()
 }
@@ -177,7 +178,8 @@ fn ways() -> Vec<(&'static str, Way)> {
     use Way::{Bacnet, Coils, CommandLine, Http, Mqtt, Registers, Slot, Socket, Sparkplug};
     let states = |before: usize, after: usize| [vec![true; before], vec![false], vec![true; after]].concat();
     let mut ways = Vec::new();
-    // The common model: over the register of the hold, whatever stands there, over what does not exist, and over bad values.
+    // A block of the common model across the register of the hold with any value, across missing registers, and
+    // across bad values.
     for hold in [0, 1, 2, 3, 0xFFFF] {
         ways.push(("pump", Registers(1, 0x8100, vec![0, 0, 0, 0, hold], 2)));
     }

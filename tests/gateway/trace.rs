@@ -1,4 +1,4 @@
-//! `drivegate trace` against `drivegate run` on a simulated line: lines, times, the capture as tshark reads it.
+//! `drivegate trace` against `drivegate run` on a simulated line: lines, times, and the capture as tshark decodes it.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -103,7 +103,7 @@ fn frames_their_times_and_their_meaning() {
     assert_eq!(frames.len(), 40);
     let transcript = plant.line.transcript();
 
-    // The frames are found in the line's own record, one directly after the other.
+    // The frames are found in the line's own transcript, one directly after the other.
     let first = transcript
         .windows(frames.len())
         .position(|window| {
@@ -207,7 +207,7 @@ fn silence_of_a_drive_is_shown() {
     assert_eq!(fields[1..], ["-", "line1", "<", "pump-2", "timeout"]);
 }
 
-/// Faults on the line are reported as such, and the next transaction is sound again.
+/// Faults on the line are reported as such, and the next transaction is valid again.
 #[test]
 fn faults_are_told_apart() {
     let plant = Plant::with("200ms");
@@ -217,7 +217,7 @@ fn faults_are_told_apart() {
         trace.until_printed("read holding");
         let rates = format!("{fault}=1").parse().unwrap();
         plant.line.set_faults(FaultPlan::new(rates, 1).only(&[1]));
-        // A request of drive 1 and what came between it and the next one.
+        // A request to drive 1, and everything between it and the next request.
         until(&format!("{fault}: {expected:?}"), || {
             let output = trace.output();
             let whole = output.rsplit_once('\n').map_or("", |(whole, _)| whole);
@@ -254,7 +254,7 @@ fn a_killed_trace_leaves_a_readable_capture() {
     let plant = Plant::start();
     let (url, capture) = (plant.url(), plant.site.path("f.pcap"));
     let trace = Running::drivegate(&["trace", "--url", &url, "--pcap", &capture]);
-    // Something is in the file while the trace goes on.
+    // Packets are in the file while the trace continues.
     until("packets in the file", || {
         let size = std::fs::metadata(&capture).ok()?.len();
         (size > 24).then_some(())
@@ -276,7 +276,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     trace.signal("INT");
     assert!(trace.ended().success());
 
-    // A reader that goes away.
+    // A reader that closes the pipe.
     let mut child = Command::new(DRIVEGATE)
         .args(["trace", "--url", &url])
         .stdout(Stdio::piped())

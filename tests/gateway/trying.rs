@@ -1,4 +1,4 @@
-//! `drivegate try`: from a port to values on a page, on a terminal and without one.
+//! `drivegate try`: from a port to values on a page, with a terminal and without one.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -16,7 +16,7 @@ use super::drive_access::ran;
 use crate::support::process::{PATIENCE, Running, api, drivegate, get, until};
 use crate::support::site::{functions, line_of};
 
-/// A program that runs on a terminal of its own.
+/// A program that runs on its own pseudo-terminal.
 struct OnTerminal {
     child: Child,
     keyboard: File,
@@ -308,7 +308,7 @@ fn the_make_that_no_read_shows_is_named() {
 #[test]
 fn ctrl_c_ends_it_at_any_moment() {
     let rig = TwoDrives::start();
-    // While the line is listened to, or searched.
+    // Interrupted while it listens to the line, and while it searches.
     for moment in ["looking for drives", " left, "] {
         let port = rig.path("line");
         let mut trial = OnTerminal::start(&["try", "--port", &port, "--addresses", "100-247"]);
@@ -316,7 +316,7 @@ fn ctrl_c_ends_it_at_any_moment() {
         trial.press("\x03");
         let status = trial.ended();
         assert_eq!(status.code(), Some(1), "{}", trial.screen());
-        // The thread that reads the terminal may come after the end of the program.
+        // The thread that reads the terminal may finish after the end of the program.
         trial.until_shown("stopped; nothing was written");
     }
     // The key is pressed at the question.
@@ -339,7 +339,7 @@ fn a_script_has_an_option_for_the_question() {
     let again = ran(&mut drivegate(&words(&rig.arguments(&["--write", &written]))));
     assert_eq!(again.code, 2, "{}", again.err);
     assert!(again.err.contains("exists already"), "{}", again.err);
-    // Without a terminal and an option nothing is written.
+    // Without a terminal and without an option, nothing is written.
     let mut silent = Running::drivegate(&words(&rig.arguments(&[])));
     silent.until_printed("no configuration was written; --write FILE writes one");
     silent.signal("INT");
@@ -383,7 +383,7 @@ fn another_master_is_not_disturbed() {
         let (mut stream, _) = listener.accept().unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let mut got = Vec::new();
-        // Polls of somebody else, until the other side has gone.
+        // Polls of another master, until the other side has closed the connection.
         while stream.write_all(&[1, 3, 8, 0x34, 0, 11, 0x47, 0xA3]).is_ok() {
             std::thread::sleep(std::time::Duration::from_millis(20));
         }

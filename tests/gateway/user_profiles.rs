@@ -85,7 +85,7 @@ fn the_energy_meter_of_the_page_is_served() {
     let meter = "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n\
          [[bus.drive]]\nname = \"meter\"\naddress = 7\nprofile = \"our-meter\"\naccess = \"control\"\n\
          limits = { current_transformer_ratio = [1, 500] }\n";
-    // With its socket where the commands below look for it: a command that finds no gateway is a second master.
+    // The socket is where the commands below look for it: a command that finds no gateway would become a second master.
     let bus = LINE1
         .replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""))
         .replace("name = \"test\"", "name = \"test\"\nsocket = \"own.sock\"");
@@ -167,7 +167,7 @@ fn the_energy_meter_of_the_page_is_served() {
     assert!(metrics.contains("point=\"decimals\",unit=\"\"} 1234"), "{metrics}");
     assert_eq!(points.get("power_of_ten"), None);
     assert_eq!(points["season"]["text"], "winter");
-    // An enumeration is set by its text, and refuses any text that it does not list.
+    // An enumeration can be set by its text, and refuses any text that is not listed.
     let program = Path::new(env!("CARGO_BIN_EXE_drivegate"));
     let config = site.config();
     let write = |set: &str| run(program, &["write", "--config", &config, "meter", set]);
@@ -189,7 +189,7 @@ fn the_energy_meter_of_the_page_is_served() {
         shown.contains("9007199254740993") && shown.contains("SN-42") && !shown.contains("power_of_ten"),
         "{shown}"
     );
-    // The common model and the meter's own registers, through Modbus TCP; 32 bits with the high word first.
+    // The common model and the meter's own registers over Modbus TCP; 32 bits with the high word first.
     assert_eq!(read_registers(modbus, 7, 0x800D, 2), [0, 1235]);
     assert_eq!(read_registers(modbus, 7, 256, 2), [40, 15]);
     write_registers(modbus, 7, 256, &[100]);

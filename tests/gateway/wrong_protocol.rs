@@ -1,5 +1,5 @@
-//! A converter that is set to Modbus TCP, and a client that is set to RTU over TCP, both of pymodbus: each is named, and all is well
-//! once it is set up right.
+//! A converter set to Modbus TCP, and a client set to RTU over TCP, both from pymodbus: each mistake is reported,
+//! and communication works once the setting is corrected.
 
 use crate::support::process::{Running, api, free_port, get, until};
 use crate::support::site::{HTTP, MODBUS_TCP, Site, drive};
@@ -46,7 +46,7 @@ fn a_client_with_frames_of_rtu_is_named() {
     let gateway = site.run();
     gateway.until_printed("drivegate is running");
     let script = root().join("tests/peers/rtu_client.py").display().to_string();
-    // From 0, where the request passes for the beginning of Modbus TCP, and from where it does not.
+    // From address 0, where the request looks like the start of a Modbus TCP frame, and from an address where it does not.
     for (start, count) in [("0", "10"), ("0", "2"), ("2100", "11")] {
         let said = run_well(&python(), &[&script, &site.modbus.to_string(), start, count]);
         assert!(said.contains("closed"), "{said}");

@@ -49,7 +49,7 @@ fn one_device_has_the_objects_of_all_drives() {
     assert_ne!(api(plant.site.http, "pump-2")["state"], "running");
     plant.bacpypes(20, &[write("binary-value,1001", json!(false))]);
     plant.site.until_state("pump-1", "ready");
-    // A drive that is away is a fault of its objects; the device goes on answering.
+    // A drive that is offline is shown as a fault of its objects; the device continues to answer.
     plant.drives.signal("TERM");
     plant.drives.ended();
     until("the fault", || {

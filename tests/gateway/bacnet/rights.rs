@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// The configuration of the first plant of [`pumps`], as each right in it can go.
+/// The configuration of the first plant of [`pumps`], changed so that each right in it is removed.
 fn without_right(config: &str) -> Vec<(&'static str, String)> {
     let section = &config[config.find("[bacnet]").unwrap()..];
     let of = |from: &str, to: &str| {
@@ -28,7 +28,7 @@ impl Plant {
         until("the reload", || (count() > before).then_some(()));
     }
 
-    /// Whether a start over Modbus TCP is refused by a slot. The motor stands afterwards.
+    /// Whether a slot blocks a start over Modbus TCP. The motor stands afterwards.
     fn is_locked(&self) -> bool {
         let locked = until("an answer", || match mbpoll_write(self.site.modbus, 1, 33_024, &[1]) {
             Ok(()) => Some(false),
@@ -70,8 +70,8 @@ fn a_slot_is_void_with_the_right_of_its_client_and_does_not_come_back_with_it() 
     plant.reload(&config);
     assert!(plant.is_locked());
     for (round, (what, without)) in without_right(&config).into_iter().enumerate() {
-        // The slot that governs has another client behind it with an active, which keeps its right where that client
-        // has one.
+        // Below the slot that governs, another client has a slot with an active, which is kept if that client keeps
+        // its right.
         assert_eq!(plant.bacpypes(20, &[run_at(3, false)]), [json!("done")], "{what}");
         assert!(plant.is_locked(), "{what}");
         plant.reload(&without);
@@ -120,14 +120,14 @@ fn kept_slots_are_void_at_a_start_that_gives_no_right() {
     }
 }
 
-/// The first of several writes in one request waits for a slow drive; then a reload takes the right of its client away.
+/// The first of several writes in one request waits for a slow drive; then a reload removes the right of its client.
 #[test]
 fn a_write_behind_another_one_needs_the_right_that_its_client_has_then() {
     let plant = pumps("");
     let config = std::fs::read_to_string(plant.site.config()).unwrap();
     for (what, without) in without_right(&config) {
         if matches!(what, "access" | "[bacnet]") {
-            // The reload replaces the bus, or the server, so nothing waits any longer.
+            // The reload replaces the bus, or the server, so nothing waits any more.
             continue;
         }
         plant.drives.signal("STOP");

@@ -1,5 +1,5 @@
-//! A drive that was stopped at its panel, or switched off and on, or that tripped since it was polled last: no order without a run
-//! command starts its motor. The drives share nothing with the profiles.
+//! A drive that was stopped at its panel, was switched off and on, or has tripped since its last poll: no order
+//! without a run command starts its motor. The Python drives share nothing with the profiles.
 
 use std::time::Duration;
 
@@ -60,7 +60,7 @@ fn stays_as_it_is(case: &Case) {
                     .as_str()
                     .unwrap_or_default()
                     .contains("takes effect with the next start");
-                // The control word says that the drive runs, and its status that it does not.
+                // The control word says that the drive runs, its status that it does not.
                 let is_kept = signal == "USR2" && place == 0 && values.starts_with("{\"reverse\"");
                 assert!(waits || !is_kept, "{name}: {printed}, {values}: {result}");
                 assert!(result["ok"] == true, "{name}: {printed}, {values}: {result}");

@@ -1,4 +1,4 @@
-//! Words that the gateway passes on and refuses for each family, by hand from the figures of its manual.
+//! Words that the gateway passes on and refuses for each family, taken by hand from the figures of its manual.
 
 use drivegate_testkit::{families, orders, rows};
 
@@ -7,7 +7,7 @@ use drivegate_testkit::{families, orders, rows};
 pub(super) enum Order {
     /// The order writes registers and coils of the drive directly.
     Raw(drivegate_testkit::Order),
-    /// The common model's command word, and the register and word that the drive gets for it.
+    /// The common model's command word, and the register and word that the drive receives for it.
     Model(u16, u16, u16),
 }
 
@@ -48,7 +48,7 @@ pub(super) struct Case {
     pub(super) start: Vec<Order>,
     pub(super) stop: Vec<Order>,
     pub(super) reverse: Vec<Order>,
-    /// As a client may write it raw; empty where it is passed on only as the model's.
+    /// The reset as a client may write it raw; empty if only the reset of the common model is passed on.
     pub(super) reset: Vec<Order>,
     /// Orders that are refused: neither a stop nor clearly a run command.
     pub(super) refused: Vec<Order>,
@@ -71,7 +71,8 @@ impl Case {
     }
 }
 
-/// Profile, peer, what it shows, reset, refused words. A raw 7 of INVT and a raw 8 of LS are neither a stop nor a run command.
+/// Columns: profile, peer, displayed states, reset, refused words. A raw 7 of INVT and a raw 8 of LS are neither a
+/// stop nor a run command.
 const CASES: &str = "\
 abb-acs550         | abb        | frequency reversed | 0=0x47E,0x4FE,0x47E         | 0=0x7F,0x57E,0x67F
 abb-acs580         | abb        | reversed           | 0=0x47E,0x4FE,0x47E         | 0=0x7,0x77
@@ -92,12 +93,12 @@ ls-g100            | ls         | frequency reversed |                          
 teco-f510          | teco       | frequency reversed | 0x2501=0,8,0                | 0x2501=5,4,0x11
 vacon-10           | vacon10    | frequency reversed | 2000=4                      |";
 
-/// All cases, in the order of [`families`].
+/// All cases in the order of [`families`].
 pub(super) fn cases() -> Vec<Case> {
     let rows = rows::<5>(CASES).into_iter();
     let case = |(family, [profile, peer, shows, reset, refused]): (drivegate_testkit::Family, [&'static str; 5])| {
         assert_eq!(family.profile, profile);
-        // The control word of this family is only the model's.
+        // The control word of this family can only be written through the common model.
         let client = |order| match order {
             Word(2000, word) if peer == "vacon10" => Model(word, 2000, word),
             order => Raw(order),

@@ -1,5 +1,5 @@
-//! Orders of every family end as confirmed once the drive shows them, and as not confirmed where it does not; a stop of all
-//! drives is proven.
+//! Orders of every family end as confirmed once the drive shows them, and as not confirmed if it does not; a stop
+//! of all drives is proven.
 
 use super::Rig;
 use super::cases::{Case, cases};
@@ -55,7 +55,7 @@ fn what_is_shown_is_confirmed_3() {
     every_third(2);
 }
 
-/// A drive that does not run at a word that it takes: the answer and an event say so.
+/// A drive that acknowledges a run word but does not run: the answer and an event report it.
 #[test]
 fn a_start_that_is_ignored_is_not_confirmed() {
     for case in cases().iter().filter(|case| !case.has_sequence()) {

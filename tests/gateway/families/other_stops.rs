@@ -1,5 +1,5 @@
-//! Words by which a drive stops in a way of its own, written by a client over every interface: the motor stops, and no later order
-//! without a run command starts it.
+//! Other words by which a drive stops, written by a client over every interface: the motor stops, and no later
+//! order without a run command starts it.
 
 use std::io::Write;
 use std::net::TcpStream;
@@ -13,7 +13,8 @@ use super::cases::Order::Raw;
 use super::cases::{Case, cases};
 use super::{Answer, Rig, rtu};
 
-/// Profile, control word, and the words, by hand from the manuals: with the bits of a run command.
+/// Columns: profile, control word, and the other stop words, by hand from the manuals; they contain the bits of a
+/// run command.
 const WORDS: &str = "\
 abb-acs550         | 0      | 0x47D 0x47B 0x477 0x7D
 abb-acs580         | 0      | 0x47D 0x47B 0x477 0x7B
@@ -27,7 +28,7 @@ weg-cfw            | 682    | 0x15 0x57 0x55
 toshiba-vf-s15     | 0xFA00 | 0xCC00 0xCE00 0xD400
 ls-g100            | 5      | 0x10 0x12";
 
-/// The way by which a word is sent.
+/// The interface by which a word is sent.
 #[derive(Debug, Clone, Copy)]
 enum Way {
     Alone,
@@ -38,7 +39,7 @@ enum Way {
 }
 
 impl Rig {
-    /// Writes the word; whether that way is one for the drive.
+    /// Writes the word; returns whether this interface can be used for the drive.
     fn stops_by(&self, way: Way, address: u16, word: u16, reference: Option<u16>) -> bool {
         let pdu = Raw(Word(address, word)).pdu();
         let done = match (way, reference) {
@@ -66,7 +67,7 @@ impl Rig {
     }
 }
 
-/// The register of the reference, where one write takes it and the control word.
+/// The register of the reference, if one write can set it together with the control word.
 fn beside(case: &Case, address: u16) -> Option<u16> {
     let profile = Profiles::built_in().get(case.profile).unwrap().clone();
     let range = profile.range(drivegate::codec::Table::Holding, address)?;
@@ -142,7 +143,7 @@ fn other_stops_stop_and_nothing_later_runs_3() {
     every_third(2);
 }
 
-/// The table above has every word that a profile names; one on the base of another has those of its base.
+/// The table above contains every other stop word that a profile names; a profile based on another has those of its base.
 #[test]
 fn every_other_stop_of_the_profiles_is_tried() {
     let profiles = Profiles::built_in();

@@ -1,5 +1,5 @@
-//! Drives whose own timeout counts only writes: `refresh` keeps them running while the gateway lives, and they trip once it is
-//! gone. The drives are those in Python, which trip three seconds after the last write.
+//! Drives whose own timeout counts only writes: `refresh` keeps them running while the gateway lives, and they trip
+//! when it is gone. The Python drives trip two seconds after the last write.
 
 use std::time::Duration;
 
@@ -36,8 +36,8 @@ fn timeouts(rig: &Rig) -> usize {
     rig.drive.output().matches("own timeout").count()
 }
 
-/// A motor that was stopped at its drive, or whose drive was switched off and on, stays still under a refresh; one that runs
-/// goes on as long as the gateway, and no longer.
+/// Under a refresh, a motor that was stopped at its drive, or whose drive was switched off and on, stays stopped; a
+/// running one runs as long as the gateway, and no longer.
 fn is_fed(case: &Case) {
     let name = case.profile;
     let rig = running(case, REFRESH);
@@ -51,7 +51,7 @@ fn is_fed(case: &Case) {
         sleep(3);
         assert_eq!(rig.starts(), starts, "{name} {what}: a refresh started the motor");
         assert_ne!(rig.state(), "running", "{name} {what}");
-        // The control word of a drive that lost its run command in this way is written anew.
+        // The control word of a drive that lost its run command like this is written again.
         rig.command("{\"run\": false}");
         rig.order(&case.reference);
         let (_, result) = rig.command("{\"run\": true}");
@@ -63,7 +63,7 @@ fn is_fed(case: &Case) {
     rig.printed("motor stopped", 2);
 }
 
-/// Families whose control word is a level that a refresh may repeat, or that need only the reference.
+/// Families whose control word has levels that a refresh may repeat, or that need only the reference.
 fn refreshed() -> Vec<Case> {
     let profiles = Profiles::built_in();
     let repeats = |case: &Case| profiles.get(case.profile).unwrap().repeats().is_ok();
@@ -85,7 +85,7 @@ fn a_refresh_feeds_every_family_and_starts_none_3() {
     refreshed().iter().skip(2).step_by(3).for_each(is_fed);
 }
 
-/// Without a refresh the drive trips, and the diagnosis of the line says why.
+/// Without a refresh the drive trips, and the diagnosis of the line explains why.
 #[test]
 fn a_drive_that_is_not_fed_trips_and_is_diagnosed() {
     let profiles = Profiles::built_in();

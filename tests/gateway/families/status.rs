@@ -15,8 +15,8 @@ use super::rtu;
 use crate::support::process::{Running, free_port};
 use crate::support::tools::{python, root};
 
-/// Profile and its status registers with the bits that count: all but fault codes, which each side has its own way to cause.
-/// Hitachi: coils.
+/// Columns: profile, and its status registers with the relevant bits: all except fault codes, which each side
+/// causes differently. For Hitachi, coils.
 const STATUS: &str = "\
 abb-acs550         | 3
 abb-acs580         | 3
@@ -40,7 +40,7 @@ vacon-10           | 2100";
 /// Longer than any of the drives takes to come to a state.
 const SETTLED: Duration = Duration::from_secs(20);
 
-/// As long as the independent drives take to half of their speed.
+/// Time that the independent drives need to reach half of their speed.
 const AT_SPEED: Duration = Duration::from_millis(1200);
 
 struct Status {
@@ -64,7 +64,7 @@ fn status(text: &str) -> Status {
     }
 }
 
-/// Both drives of a family.
+/// The simulated and the independent drive of a family.
 struct Both {
     peer: Running,
     line: TcpStream,
@@ -124,7 +124,7 @@ impl Both {
         reply
     }
 
-    /// Both status words.
+    /// The status words of both drives.
     fn words(&mut self, status: &Status) -> (u16, u16) {
         let read = RequestPdu::read(status.table, status.address, 1);
         let simulated = self.simulated.answer(&read, self.now).unwrap().into_words().unwrap()[0];
@@ -139,8 +139,8 @@ impl Both {
     }
 }
 
-/// Stops both at speed; whether they agree while the motor comes down. On a machine that stood still meanwhile the independent
-/// one may have stopped before it was looked at, and runs again then.
+/// Stops both drives at speed; returns whether they agree while the motor slows down. If the machine stalled
+/// meanwhile, the independent drive may have stopped before it was read, and is started again.
 fn passes_through_the_same(both: &mut Both, case: &Case, all: &[Status]) -> bool {
     both.send(&case.start);
     both.wait(10_000);
@@ -210,7 +210,7 @@ fn agrees(case: &Case, all: &[Status]) {
     }
 }
 
-/// Every third family, so that three tests run side by side.
+/// Tests every third family, so that three tests run side by side.
 fn every_third(first: usize) {
     let rows = rows::<2>(STATUS);
     let cases = cases();

@@ -1,4 +1,4 @@
-//! The effect of every word, by hand from the figures of the manuals, compared with the profiles.
+//! The effect of every word, worked out by hand from the figures of the manuals, compared with the profiles.
 
 use drivegate::codec::Table;
 use drivegate::drive::control::ControlItem;
@@ -33,7 +33,7 @@ fn off_words(word: u16) -> Does {
     }
 }
 
-/// Without bit 10 nothing but OFF1, OFF2 and OFF3 counts.
+/// ABB: without bit 10 only OFF1, OFF2 and OFF3 have an effect.
 fn abb(word: u16) -> Does {
     match off_words(word) {
         Stops if !is(word, 0x0400) && is(word, 0x0007) => Other,
@@ -152,8 +152,8 @@ fn vacon(word: u16) -> Does {
     if is(word, 1) { Runs } else { Stops }
 }
 
-/// A word that a profile takes for a stop stops the motor, whatever else is in it; a word that it passes as a run command
-/// runs the motor. The gateway itself sends a word of each kind.
+/// A word that a profile treats as a stop stops the motor, whatever else it contains; a word that it passes as a
+/// run command runs the motor. The gateway itself sends a word of each kind.
 #[test]
 fn every_word_is_taken_for_what_it_does() {
     type Word = fn(u16) -> Does;

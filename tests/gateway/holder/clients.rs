@@ -1,5 +1,6 @@
-//! Four clients of four kinds that command one drive: for each holder who sees it how, who is refused with what, and whose stop
-//! leaves what behind. pymodbus, curl, mosquitto, and a Sparkplug host on Eclipse Tahu's encoder.
+//! Four clients of four kinds that command one drive: for each holder, what each client sees, who is refused and
+//! why, and what a stop of each leaves behind. pymodbus, curl, mosquitto, and a Sparkplug host with Eclipse Tahu's
+//! encoder.
 
 use std::cell::Cell;
 use std::io::Write as _;
@@ -127,7 +128,7 @@ impl Plant {
         String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Gives a command as a Sparkplug host; returns the command's result in the audit trail.
+    /// Gives a command as a Sparkplug host; returns the command's result from the audit.
     fn dcmd(&self, point: &str, value: &Json) -> String {
         let kind = if value.is_boolean() { "Boolean" } else { "Double" };
         // A payload with the time of an earlier one repeats that.
@@ -181,7 +182,7 @@ impl Plant {
     }
 
     fn reference(&self, client: Client) -> String {
-        // Each client sets another value: a value that is set already would be confirmed at once.
+        // Each client sets a different value: a value that is already set would be confirmed at once.
         self.set(client, "speed_reference", &json!(10.0 + client as usize as f64))
     }
 
