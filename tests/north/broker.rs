@@ -18,11 +18,11 @@ use crate::support::mqtt::{Subscriber, client_of};
 use crate::support::process::PATIENCE;
 use crate::support::tools::{python, run_well};
 
-/// Longest wait for something that must happen. Usually it happens at once, so this measures nothing.
+/// Longest wait for an event that must happen. Usually it happens at once, so this is not a measurement.
 const DEADLINE: Duration = PATIENCE;
 const VERSIONS: [&str; 2] = ["mqttv311", "mqttv5"];
 
-/// A broker with a port of its own.
+/// A demo broker on a separate port.
 struct DemoBroker {
     broker: Broker,
     cancel: CancellationToken,
@@ -63,7 +63,7 @@ impl DemoBroker {
     }
 
     fn subscribe_as(&self, version: &str, format: &str, arguments: &[&str]) -> Reader {
-        // The retained message of the first topic comes as soon as all of them are subscribed to.
+        // The retained message of the first topic arrives as soon as all topics are subscribed to.
         self.publish(version, &["-t", "$ready", "-m", "ready", "-r", "-q", "1"]);
         let reader = self.reader(
             "mosquitto_sub",
@@ -161,7 +161,7 @@ fn connect(level: u8, id: u8, keep_alive: u8) -> Vec<u8> {
 #[test]
 fn messages_reach_subscribers_of_both_versions() {
     let rig = DemoBroker::new();
-    // Two filters match, and the message comes once; a wildcard leaves topics with $ alone.
+    // Two filters match and the message arrives once; a wildcard does not match topics that begin with $.
     let readers = VERSIONS.map(|version| rig.subscribe(version, &["-t", "a/+/c", "-t", "#", "-q", "2"]));
     for version in VERSIONS {
         for qos in ["0", "1"] {
@@ -438,6 +438,6 @@ fn a_client_that_does_not_read_stops_nobody_else() {
         publisher.send(&publish);
         reader.expect(&publish);
     }
-    // The stuck client lost its connection, after the bytes sent until then.
+    // The stuck client lost its connection after the bytes sent until then.
     assert!(stuck.until_closed().len() < 200 * publish.len());
 }

@@ -1,4 +1,4 @@
-//! Under which hosts the server answers, and to whom: hosts, tokens, TLS, and what a reload changes of them.
+//! Which hosts the server answers for, and which clients: hosts, tokens, TLS, and their change by a reload.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -86,7 +86,7 @@ async fn requests_for_other_hosts_are_refused() {
         let reply = of_host(&server, headers).await;
         assert_eq!(reply.status, 400, "{headers:?}: {}", reply.body);
     }
-    // The first line may name the host too, as it is for a proxy.
+    // The first line may name the host too, as in a request to a proxy.
     for (target, status) in [("http://localhost/healthz", 200), ("http://evil.example/healthz", 421)] {
         let text = format!("GET {target} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
         assert_eq!(raw(server.address, &text).await.status, status, "{target}");
@@ -196,7 +196,7 @@ async fn a_token_opens_what_its_scopes_say() {
     );
     let query = format!("/api/v1/drives?token={reader}");
     assert_eq!(get(server.address, &query).await.status, 401, "a URL ends up in logs");
-    // The host comes first: a page of a stranger learns nothing about tokens.
+    // The host is checked first: a page of a stranger learns nothing about tokens.
     let text =
         format!("GET / HTTP/1.1\r\nHost: evil.example\r\nAuthorization: Bearer {reader}\r\nConnection: close\r\n\r\n");
     assert_eq!(raw(server.address, &text).await.status, 421);
@@ -215,7 +215,7 @@ async fn a_removed_token_ends_its_streams() {
     let stream = EventStream::open(server.address, "/api/v1/trace", &header(&one)).await;
     let mut stream = stream.opened().await;
     server.reload(options(left)).await;
-    // The comments that keep the stream alive end with it.
+    // The comments that keep the stream alive end together with it.
     let end = timeout(PATIENCE, stream.next()).await.expect("the stream ends");
     assert_eq!(end, None);
     for (secret, status) in [(one, 401), (two, 200)] {
@@ -288,7 +288,7 @@ async fn https_with_a_certificate_that_is_renewed() {
     assert!(!answered(&curl(&["--cacert", &ca, &url]).await));
 }
 
-/// The daemon with all of it, a reload, and the commands that show its state.
+/// The daemon with hosts, tokens and TLS, a reload, and the commands that show its state.
 #[test]
 fn a_gateway_with_tokens_and_tls() {
     let dir = tempfile::tempdir().unwrap();

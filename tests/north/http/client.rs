@@ -47,7 +47,7 @@ impl Reply {
     }
 }
 
-/// Sends one request on a connection of its own and reads to its end.
+/// Sends one request on a separate connection and reads to its end.
 pub(crate) async fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Reply {
     let head = format!("{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n");
     raw(address, &head).await
@@ -78,7 +78,7 @@ fn unchunked(mut body: &str) -> String {
     whole
 }
 
-/// Sends a POST with a body on a connection of its own and reads to its end.
+/// Sends a POST with a body on a separate connection and reads to its end.
 pub(crate) async fn post(address: SocketAddr, path: &str, headers: &str, body: &str) -> Reply {
     let length = body.len();
     let head = format!(

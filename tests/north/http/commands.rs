@@ -1,4 +1,4 @@
-//! Commands over HTTP: who may give them, what becomes of them, and what attackers cannot do about them.
+//! Commands over HTTP: which users may give them, their results, and attacks that must fail.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -236,7 +236,7 @@ async fn results_have_their_status() {
     );
 }
 
-/// curl is a client that has nothing of this one; the body is that of the MQTT set topics.
+/// curl is an independent client; the body is that of the MQTT set topics.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_program_commands_with_its_password() {
     let rig = Rig::new().await;
@@ -328,7 +328,7 @@ async fn pages_of_others_command_nothing() {
             .status,
         403
     );
-    // The page's own host name, or a preflight for it: the host is checked before everything else.
+    // A request with a foreign host name, and a preflight for it: the host is checked before everything else.
     let rebound = format!(
         "POST {PUMP} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n{alice}Content-Length: 14\r\n\r\n{STOP}"
     );
@@ -402,7 +402,7 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
         let second = post(address, PUMP, &headers, body);
         tokio::join!(first, second)
     });
-    // Both requests wait for the one command in the queue; a client that gives up changes nothing about it.
+    // Both requests wait for the one command in the queue; a client that gives up does not affect it.
     let mut gone = TcpStream::connect(rig.address()).await.unwrap();
     let text = format!(
         "POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{alice}Content-Length: {}\r\n\r\n{body}",
@@ -425,7 +425,7 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     assert_eq!(first.body, second.body);
     assert_eq!(rig.command(&alice, body).await.body, first.body, "later, too");
     assert_eq!(rig.bus.orders().len(), 1);
-    // Another user may use an equal id; after a stop a repetition no longer commands.
+    // Another user may use an equal id; after a stop, a repetition is not executed.
     let bob = rig.log_in("bob").await;
     assert_eq!(rig.command(&bob, body).await.status, 200);
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
@@ -553,7 +553,7 @@ async fn a_flood_of_logins_holds_up_no_stop() {
     assert_eq!(rig.bus.orders().len(), 30);
 }
 
-/// Streams of the operator's own address and of another one have all places.
+/// Streams from the operator's own address, and from another one, use all places.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_stop_gets_in_where_nothing_else_does() {
     let rig = Rig::with(Options {
@@ -631,7 +631,7 @@ async fn a_removed_user_is_out_with_the_reload() {
     let mut rig = Rig::with(options(Some(both.clone()))).await;
     let (alice, bob) = (rig.log_in("alice").await, rig.log_in("bob").await);
     assert_eq!(rig.command(BASIC, STOP).await.status, 200);
-    // A reload that changes something else ends nothing, also that which ends all connections.
+    // A reload of other settings ends no session, even if it ends all connections.
     let hosts = vec!["gateway.example".to_string()];
     let changed = Options {
         hosts: hosts.clone(),
@@ -652,7 +652,7 @@ async fn a_removed_user_is_out_with_the_reload() {
         "nor is its password remembered"
     );
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
-    // Another password ends the sessions, too; so does switching commands off and on.
+    // A new password ends the sessions, and so does disabling and enabling commands.
     let other = User::new("bob", "battery staple").unwrap().to_string();
     rig.server.reload(with(Some(Users::parse(&other).unwrap()))).await;
     assert_eq!(rig.command(&bob, STOP).await.status, 401);

@@ -1,5 +1,5 @@
-//! Every query of the dashboards and alerts, run in a real Prometheus that scrapes two equal gateways; and the route of
-//! an alert to its receiver.
+//! Every query of the dashboards and alerts, run in a real Prometheus that scrapes two equal gateways; and the
+//! route of an alert to its receiver.
 
 use std::collections::BTreeSet;
 use std::fmt::Write;

@@ -403,7 +403,7 @@ async fn bad_requests_harm_nobody() {
     assert_eq!(get(server.address, "/healthz").await.status, 200);
 }
 
-/// The clock is the runtime's own, which moves on at once while nothing else is to be done.
+/// The paused clock of the runtime advances at once while no other work is to be done.
 #[tokio::test(start_paused = true)]
 async fn a_client_that_does_not_finish_its_request_loses_its_place() {
     let server = Server::of(plant::mixed()).await;

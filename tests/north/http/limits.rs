@@ -1,4 +1,4 @@
-//! Clients that take places: silent ones, slow ones, event streams. Whatever they do, others are served.
+//! Clients that occupy places: silent ones, slow ones, event streams. Whatever they do, other clients are served.
 
 use std::net::SocketAddr;
 
@@ -127,7 +127,7 @@ async fn streams_of_one_address_leave_places_to_others() {
         assert_eq!(status, 200);
         open.push(stream);
     }
-    // No place is left: an address that has none takes the oldest of the address that has the most.
+    // If no place is left, an address that has none displaces the oldest connection of the address that has most.
     let (_newcomer, status) = stream_from([127, 0, 0, 4], server.address).await;
     assert_eq!(status, 200);
     let mut rest = Vec::new();

@@ -12,8 +12,8 @@ use super::plant::{self, STALE_AFTER, Server};
 use crate::support::process::{PATIENCE, Running, free_port};
 use crate::support::tools::{feed, tool};
 
-/// Every metric with its type and labels. Dashboards and alerts rest on these: a new metric is added here, none is
-/// renamed, retyped or removed.
+/// Every metric with its type and labels. Dashboards and alerts depend on these: a new metric is added here, and
+/// none may be renamed, retyped or removed.
 const FROZEN: [&str; 64] = [
     "drivegate_build_info gauge commit,gateway,version",
     "drivegate_bus_cycle_seconds histogram bus,class",
@@ -440,7 +440,7 @@ impl Prometheus {
         found[0]["value"][1].as_str().expect("a value").to_string()
     }
 
-    /// The series that a query (as part of a URL) finds, once they are what is wanted.
+    /// The series found by a query (as part of a URL), as soon as they are as wanted.
     pub(super) async fn find(
         &self,
         query: &str,

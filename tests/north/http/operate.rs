@@ -93,7 +93,7 @@ fn a_drive_is_operated_from_the_page_by_the_keyboard() {
     );
 }
 
-/// A user is removed while its page is open, and the lease of the drive that it started runs out.
+/// A user is removed while its page is open, and the lease of the drive that it started expires.
 #[test]
 fn a_removed_user_stops_nothing_and_the_lease_does() {
     let site = site();
@@ -164,7 +164,7 @@ fn commands_need_users_and_a_private_way() {
     assert!(gateway.runs());
 }
 
-/// A bus that a reload starts anew keeps the last commander of each drive, as it keeps the leases.
+/// A bus that a reload restarts keeps the last commander of each drive, and the leases.
 #[test]
 fn a_bus_that_starts_anew_knows_who_commanded_last() {
     let site = site();

@@ -17,7 +17,7 @@ use self::lively::Lively;
 /// A text that must stay one.
 const NASTY: &str = "<img src=x onerror=window.hacked=1>";
 
-/// Runs a script of `tests/north/http/page`, which drives the browser; what it printed.
+/// Runs a script of `tests/north/http/page`, which controls the browser; returns its output.
 async fn browse(script: &str, arguments: Vec<String>) -> String {
     let script = root().join("tests/north/http/page").join(script);
     let run = move || {
@@ -66,25 +66,26 @@ async fn every_view_is_complete_and_accessible() {
     browse("views.js", vec![url(&server)]).await;
 }
 
-/// What the views show when drives, profiles, filters and the connection change under them.
+/// The views follow changes of drives, profiles, filters and the connection.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_page_follows_its_gateway() {
     browse("changes.js", Vec::new()).await;
 }
 
-/// A stop that was not carried out is not missed, references are understood as typed, and a start tells its direction.
+/// A stop that was not carried out is clearly shown, references are accepted in the form typed, and a start shows
+/// its direction.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn drives_are_operated_from_the_page() {
     browse("operating.js", Vec::new()).await;
 }
 
-/// A key that is held answers nothing, and a question ends when what it rests on changes.
+/// A key that is held down answers no question, and a question closes when its basis changes.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn questions_are_answered_about_what_they_asked() {
     browse("questions.js", Vec::new()).await;
 }
 
-/// A drive is taken, taken over and released while its motor goes on.
+/// A drive is taken, taken over and released while its motor keeps running.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_running_drive_is_taken_over() {
     browse("hold.js", Vec::new()).await;
@@ -96,7 +97,7 @@ async fn sixty_drives_are_seen_at_a_glance() {
     browse("rows.js", Vec::new()).await;
 }
 
-/// What is pressed keeps its place and the focus, and is large enough for a finger.
+/// Buttons keep their place and the focus when pressed, and are large enough for a finger.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_page_fits_the_hand() {
     browse("hand.js", Vec::new()).await;
@@ -109,7 +110,7 @@ async fn a_thousand_drives_stay_smooth() {
     println!("{printed}");
 }
 
-/// Calls it every second until it is dropped.
+/// Calls `answer` every second until the result is dropped.
 fn keep_answering(mut answer: impl FnMut() + Send + 'static) -> tokio_util::task::AbortOnDropHandle<()> {
     tokio_util::task::AbortOnDropHandle::new(tokio::spawn(async move {
         loop {

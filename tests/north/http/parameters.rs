@@ -1,4 +1,4 @@
-//! The parameters of a drive: none, kept ones, a reading that goes on, one that failed, a damaged file.
+//! The parameters of a drive: none, stored ones, a reading in progress, one that failed, a damaged file.
 
 use std::fs;
 use std::time::Duration;
@@ -82,7 +82,7 @@ async fn the_last_reading_and_the_present_one_are_served() {
     let done = json_of(&server).await;
     assert_eq!(done["last"]["time"], "2026-03-02T08:00:00Z");
     assert_eq!(done["error"], Value::Null);
-    // While the next one goes on it stays, though the disk has an older one.
+    // While the next reading is in progress the last one stays available, although the disk has an older one.
     vault.begin(&machine).unwrap();
     assert_eq!(json_of(&server).await["last"]["time"], "2026-03-02T08:00:00Z");
 }

@@ -25,7 +25,7 @@ pub(crate) use drivegate_testkit::nx;
 
 pub(crate) const STALE_AFTER: Duration = Duration::from_secs(60);
 
-/// A family that has every point of the model, and one of its own.
+/// A family that has every point of the model, and one point of its own.
 pub(crate) fn everything() -> Arc<Profile> {
     let mut text = "name = \"everything\"\nprotocols = [\"modbus-rtu\"]\n\
         [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 99\nread = 50\n"
@@ -154,8 +154,8 @@ pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
     }
 }
 
-/// A plant in which everything occurs: `pump-1` runs, `fan-2` is offline with old values, `mixer-3` was
-/// never tried, `saw-4` has a fault on a bus of its own.
+/// A plant with every situation: `pump-1` runs, `fan-2` is offline with old values, `mixer-3` was never tried,
+/// `saw-4` has a fault on a separate bus.
 pub(crate) fn mixed() -> Plant {
     let nx = nx();
     let drives = vec![
@@ -174,7 +174,7 @@ pub(crate) fn mixed() -> Plant {
     plant(buses)
 }
 
-/// A drive that answers, ready and without a fault, and refuses to say whether it runs.
+/// A drive that answers, is ready and without a fault, but refuses to report whether it runs.
 pub(crate) fn secretive() -> Arc<DriveImage> {
     let image = drive("line1", "fan-1", 1, &profile("vacon-cx"));
     answer(&image, Instant::now(), |address| u16::from(address == 1));
@@ -257,7 +257,7 @@ impl Server {
     }
 }
 
-/// The table of all words that the hand-made drives have.
+/// The table of all words in the hand-made drives.
 pub(crate) const HOLDING: Table = Table::Holding;
 
 /// A verdict about the line of a bus.

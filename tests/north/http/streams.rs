@@ -204,7 +204,7 @@ async fn a_slow_listener_is_told_what_it_lost() {
         .await
         .opened()
         .await;
-    // On one thread the server cannot send in between, so the number that is lost is certain.
+    // On one thread the server cannot send in between, so the number of lost events is certain.
     for count in 0..2000_u32 {
         plant.buses[0]
             .image

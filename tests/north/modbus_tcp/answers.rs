@@ -1,5 +1,5 @@
-//! Every kind of request with its answer in every state of plant and client, and single requests byte by byte.
-//! `docs/modbus-tcp.md` shows the table of the former; `BLESS=1 cargo test --test north answers` writes it.
+//! Every kind of request with its answer in every state of plant and client, and single requests byte by byte. The
+//! table is part of `docs/modbus-tcp.md`; `BLESS=1 cargo test --test north answers` writes it.
 
 use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
@@ -36,7 +36,7 @@ enum State {
     DriveOwnCode,
 }
 
-/// Names of the table's columns, and what each of them means.
+/// Names of the table's columns with their meaning.
 const STATES: [(State, &str, &str); 12] = [
     (
         State::Usual,
@@ -253,7 +253,7 @@ async fn every_request_in_every_state() {
     documented("answers", &table);
 }
 
-/// Single requests to the plant of these tests and their answers, byte by byte: what, unit, request, answer.
+/// Columns: description, unit id, request, answer. Single requests to the plant of these tests, byte by byte.
 const EXAMPLES: &str = "\
 process data                            |   1 | 3 2100 11                            | 3 = 0x0023 0x2000 5000 2500 1440 123 455 387 2301 540 0
 input is holding                        |   1 | 4 2100 11                            | 4 = 0x0023 0x2000 5000 2500 1440 123 455 387 2301 540 0
@@ -354,7 +354,7 @@ async fn answers_byte_by_byte() {
     rig.end().await;
 }
 
-/// Holds a part of the page against what the tests have found; `BLESS=1` writes it.
+/// Compares a part of the page with the results of the tests; `BLESS=1` writes it.
 fn documented(part: &str, found: &str) {
     let page = tools::root().join("docs/modbus-tcp.md");
     let text = std::fs::read_to_string(&page).unwrap();

@@ -41,7 +41,7 @@ async fn what_came_before_a_bad_header_is_answered() {
     rig.end().await;
 }
 
-/// The requests before it are answered even if the bus takes its time, and whatever follows behind the bad header.
+/// Earlier requests are answered even if the bus takes its time, whatever follows the bad header.
 #[tokio::test]
 async fn a_write_before_a_bad_header_is_executed_and_answered() {
     let rig = Rig::new().await;
@@ -77,7 +77,7 @@ async fn half_frames_and_silence_hold_nobody_up() {
     }
     let mut other = rig.client().await;
     assert_eq!(other.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
-    // The rest of the requests comes after all.
+    // The rest of the requests arrives after all.
     for (cut, client) in &mut idle {
         client.send(&frame(1, 1, &words(3, &[2102, 1]))[*cut..]).await;
         assert_eq!(client.answer().await, Some((1, 1, registers(3, &[5000]))));
@@ -129,8 +129,8 @@ async fn a_long_pipelined_batch() {
     rig.end().await;
 }
 
-/// Random bytes, random frames and random PDUs for known functions: every frame is answered once with its
-/// own transaction id, unit and function, or the connection is closed; the server serves on.
+/// Random bytes, random frames and random PDUs for known functions: every frame is answered once with its own
+/// transaction id, unit id and function, or the connection is closed; the server continues to serve.
 #[test]
 fn garbage() {
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -180,7 +180,7 @@ fn garbage() {
                         .expect("an answer to nothing");
                     wanted.swap_remove(place);
                 }
-                // Bytes of any kind may end the connection, and nothing else.
+                // Arbitrary bytes may end the connection, and must have no other effect.
                 let _ = client.stream.write_all(&garbage).await;
                 let _ = client.stream.shutdown().await;
                 let mut rest = Vec::new();

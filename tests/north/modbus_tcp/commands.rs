@@ -137,7 +137,7 @@ async fn a_write_is_answered_after_the_drive_and_holds_nobody_up() {
     rig.buses[0].pause(true);
     let written = writer.request(1, &words(6, &[0x8101, 5000])).await;
     until("the write waits", || rig.buses[0].waiting() == 1).await;
-    // Other clients, and later requests of the same one, are answered meanwhile.
+    // Other clients, and later requests of the same client, are answered meanwhile.
     assert_eq!(reader.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
     let read = writer.request(1, &words(3, &[2102, 1])).await;
     assert_eq!(writer.answer().await, Some((read, 1, registers(3, &[5000]))));

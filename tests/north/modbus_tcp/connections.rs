@@ -1,4 +1,4 @@
-//! Connections: which clients may connect, how many, and their end.
+//! Connections: which clients may connect, how many, and how connections end.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -37,7 +37,7 @@ async fn no_more_than_max_connections() {
     assert!(rig.client().await.is_closed().await);
     drop(two);
     until("the place is free", || rig.stats.modbus_tcp.connections() == 1).await;
-    // The place is given back a moment after the count.
+    // The place is freed a moment after the count changes.
     let mut three = loop {
         let mut client = rig.client().await;
         client.request(1, &words(3, &[2102, 1])).await;
@@ -57,7 +57,7 @@ async fn connections_are_kept_alive() {
     let mut client = rig.client().await;
     client.ask(1, &words(3, &[2102, 1])).await;
     let ends = [rig.address(), client.stream.local_addr().unwrap()].map(|end| format!(":{:04X}", end.port()));
-    // The timer of the server's side, as in proc(5): its kind (02 is keepalive) and its rest in 1/100 s.
+    // The timer of the server's socket as in proc(5): its kind (02 is keepalive) and the remaining time in 1/100 s.
     let timer = || {
         let table = std::fs::read_to_string("/proc/net/tcp").unwrap();
         let mut rows = table.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
@@ -101,7 +101,8 @@ async fn an_ipv4_client_of_an_ipv6_listener() {
     rig.end().await;
 }
 
-/// A runtime that is busy with other things does not hold clients up: this one has a single thread, which waits.
+/// A runtime that is busy with other work does not delay Modbus TCP clients: this one has a single thread, which is
+/// blocked.
 #[tokio::test]
 async fn nothing_else_keeps_clients_waiting() {
     use std::io::{Read, Write};
@@ -183,7 +184,7 @@ async fn each_listener_has_its_own_rights_and_buses() {
     assert_eq!(two.ask(4, &relay).await, relay);
     assert_eq!(all.ask(1, &speed).await, registers(3, &[5000]));
     assert_eq!(all.ask(4, &current).await, registers(4, &[77]));
-    // Unit 255: the blocks keep their addresses, those of other buses are not there.
+    // Unit 255: the blocks keep their addresses, and those of other buses are missing.
     assert_eq!(one.ask(255, &words(4, &[1, 1])).await, registers(4, &[3]));
     assert_eq!(one.ask(255, &words(4, &[17, 1])).await, [0x84, 2]);
     assert_eq!(two.ask(255, &words(4, &[1, 1])).await, [0x84, 2]);
@@ -203,7 +204,7 @@ async fn each_listener_has_its_own_rights_and_buses() {
     rig.end().await;
 }
 
-/// The last word that a client may write; the first that it may not.
+/// The register that only a client with the right may write, with a value.
 const WRITE: [u16; 2] = [0x8101, 5000];
 
 async fn may_write(client: &mut Client) -> bool {

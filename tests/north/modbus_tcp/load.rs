@@ -77,7 +77,7 @@ async fn a_thousand_connections() {
         assert_eq!(worker.ask(1, &words(6, &[2003, value])).await, words(6, &[2003, value]));
     }
     until("all are in", || rig.stats.modbus_tcp.connections() == 1000).await;
-    // Every third client is in the middle of a frame, for the ten seconds that it has for the rest.
+    // Every third client is in the middle of a frame, and has ten seconds for the rest.
     for client in idle.iter_mut().skip(2).step_by(3) {
         client.send(&[0, 1, 0]).await;
     }
@@ -138,8 +138,8 @@ async fn an_idle_client_makes_room() {
     rig.end().await;
 }
 
-/// All tasks on one thread, so that what one client gets while another waits can be counted: a request is answered
-/// before the flood has got more than a few turns.
+/// All tasks run on one thread, so that the service of one client while another waits can be counted: a request is
+/// answered before the flood has had more than a few turns.
 #[tokio::test]
 async fn a_flood_is_served_fairly() {
     let rig = Rig::new().await;
@@ -169,7 +169,8 @@ async fn a_flood_is_served_fairly() {
         between.push((flooded.load(Ordering::SeqCst) - before) / 31);
     }
     between.sort_unstable();
-    // A turn is 128 requests; with four that flood, and the kernel's buffers between, a request waits for some turns of each.
+    // A turn is 128 requests; with four flooding clients, and the kernel's buffers in between, a request waits for
+    // several turns of each.
     assert!(between[100] < 4 * 128 * 8, "{between:?}");
     assert!(between[190] < 4 * 128 * 32, "{between:?}");
     rig.end().await;
@@ -184,7 +185,7 @@ async fn nothing_is_torn() {
         let (image, end, polls) = (rig.drive("pump-1"), end.clone(), polls.clone());
         std::thread::spawn(move || {
             while !end.load(Ordering::Relaxed) {
-                // All eleven words, and so both halves of every 32-bit value made of them, show the poll.
+                // All eleven words, and so both halves of every 32-bit value, contain the number of the poll.
                 let n = (polls.fetch_add(1, Ordering::Relaxed) % 10_000) as u16;
                 let now = Instant::now();
                 image.update(|s| {
@@ -197,7 +198,7 @@ async fn nothing_is_torn() {
     until("it is written", || polls.load(Ordering::Relaxed) > 2).await;
     let mut client = rig.client().await;
     let mut seen = std::collections::BTreeSet::new();
-    // As long as it takes to see many polls: on a busy machine the writer has its turns seldom.
+    // Runs until many polls were seen: on a busy machine the writer seldom runs.
     for round in 0.. {
         if round >= 3000 && seen.len() > 100 {
             break;
@@ -221,7 +222,7 @@ async fn nothing_is_torn() {
     rig.end().await;
 }
 
-/// Clients that come, send something or half of it, and go: by close, by reset, by silence.
+/// Clients that connect, send a request or half of one, and leave: by close, by reset, by silence.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn disorder_leaves_nothing_behind() {
     let rig = Rig::new().await;
@@ -315,7 +316,7 @@ fn few_files_mean_few_connections() {
     until_served(address, ask);
 }
 
-/// Places are given back soon, but not at once.
+/// Repeats the request until it is served, because places are freed with a short delay.
 fn until_served(address: SocketAddr, ask: impl Fn(&mut std::net::TcpStream) -> std::io::Result<u8>) {
     crate::support::process::until("an answer", || {
         ask(&mut std::net::TcpStream::connect(address).ok()?).ok()

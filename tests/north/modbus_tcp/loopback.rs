@@ -25,7 +25,7 @@ impl OfflineClient {
         OfflineClient {
             client: Loopback::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
             plant,
-            // A time in the future: no clock of this machine has reached it.
+            // A time in the future, which no clock of this machine has reached.
             now: Instant::now() + Duration::from_secs(600),
         }
     }
@@ -121,7 +121,7 @@ fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
     let mut other = session
         .client
         .beside(([10, 0, 0, 8], 4711).into(), None, Authority::Write);
-    // By the model and raw: the stop comes between the two halves.
+    // Over the model and raw: the stop comes between the two halves.
     for start in [&[0x8100, 1][..], &[2000, 1]] {
         let start = frame(7, 1, &words(6, start));
         let refused = [0, 7, 0, 0, 0, 3, 1, 0x86, 6];
@@ -138,7 +138,7 @@ fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
             session.now += Duration::from_millis(20);
             assert_eq!(session.receive(&start[cut..]), refused, "{cut}");
         }
-        // Sent again, the request is taken; the one after it in the same piece has its own time.
+        // When it is sent again, the request is accepted; the next one in the same piece has its own time.
         session.now += Duration::from_millis(20);
         assert!(session.receive(&start[..3]).is_empty());
         session.now += Duration::from_millis(20);

@@ -1,5 +1,5 @@
-//! The map is true: every register listed by `drivegate map` is answered under its unit, in every table that it names, and
-//! a write is accepted where the map says so.
+//! The register map is true: every register listed by `drivegate map` is answered under its unit id, in every table
+//! that it names, and a write is accepted where the map says so.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ fn configuration() -> String {
     text
 }
 
-/// The plant of these settings, with every register read a moment ago.
+/// The plant of these settings, with every register read just before.
 fn plant(settings: &Settings) -> Plant {
     let now = Instant::now();
     let buses = settings.buses.iter().map(|bus| {
@@ -89,7 +89,8 @@ async fn every_listed_register_is_answered() {
             );
             answered += 1;
         }
-        // Where a write is promised it is at least not turned away for lack of a right or an address; the rest is its value.
+        // Where the map promises a write, it must not be refused for lack of a right or an address; the rest
+        // depends on its value.
         if row["view"] == "command" && row["source"] != "none" {
             let value = if row["name"] == "command" { 0 } else { 100 };
             let request = words(6, &[address, value]);

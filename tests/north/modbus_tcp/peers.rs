@@ -11,7 +11,7 @@ use tokio_modbus::slave::{Slave, SlaveContext};
 use super::rig::Rig;
 use crate::support::tools;
 
-/// A request of `tests/peers/script.json`, and the result that it must have.
+/// A request of `tests/peers/script.json`, with the result that it must have.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Step {
@@ -33,7 +33,7 @@ fn script() -> Vec<Step> {
     serde_json::from_str(&text).unwrap()
 }
 
-/// Whether the client program ended with success, and what it printed.
+/// Whether the client program succeeded, and its output.
 async fn run(mut command: Command) -> (bool, String) {
     let output = tokio::task::spawn_blocking(move || {
         command

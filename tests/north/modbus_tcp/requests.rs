@@ -66,7 +66,7 @@ async fn a_client_that_may_not_write() {
 async fn offline_drives_and_closed_buses() {
     let rig = Rig::new().await;
     let mut client = rig.client().await;
-    // This drive never answered.
+    // This drive has never answered.
     assert_eq!(client.ask(3, &words(3, &[2100, 11])).await, [0x83, 0x0B]);
     assert_eq!(client.ask(3, &words(3, &[500, 1])).await, [0x83, 0x0B]);
     assert_eq!(client.ask(3, &words(6, &[0x8100, 1])).await, [0x86, 0x0B]);
@@ -79,7 +79,7 @@ async fn offline_drives_and_closed_buses() {
         client.ask(3, &words(3, &[0x8000, 5])).await,
         registers(3, &[0x4000, 0, 0xFFFF, 0xFFFF, 0x8000])
     );
-    // Gone.
+    // The drive goes offline.
     rig.drive("pump-1")
         .update(|s| s.link = Link::Offline(SystemTime::now()));
     assert_eq!(client.ask(1, &words(3, &[2100, 11])).await, [0x83, 0x0B]);
@@ -90,7 +90,7 @@ async fn offline_drives_and_closed_buses() {
         client.ask(1, &words(3, &[0x8100, 3])).await,
         registers(3, &[0xFFFF, 0x8000, 0xFFFF])
     );
-    // The bus is down: the drives behind it have no path, whatever is known of them.
+    // The bus is down: its drives cannot be reached, whatever is known about them.
     let plant = rig.plant.load_full();
     plant.buses[0].image.update_health(|h| h.up = false);
     for unit in [1, 2, 3] {

@@ -40,7 +40,7 @@ fn sh(dir: &Path, command: &str) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// The usual options with other clients: those of `ca`, without those that `crl` revokes.
+/// The usual options with other clients: those of `ca`, except those that `crl` revokes.
 fn admitting(ca: &Path, crl: Option<&Path>) -> Options {
     let [certificate, key] = ["own/gateway.crt", "own/gateway.key"].map(|name| WORKS.file(name));
     let mut options = tls_options();
@@ -77,7 +77,7 @@ async fn a_revoked_client_is_disconnected_and_refused() {
     rig.end().await;
 }
 
-/// A list that should have been replaced months ago still revokes, and still admits the others.
+/// A list that should have been replaced months ago still revokes its entries, and still admits the others.
 #[tokio::test]
 async fn an_old_list_stays_in_force() {
     let ca = copy(&["ca.crt", "ca.key", "hmi.crt"]);

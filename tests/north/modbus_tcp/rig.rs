@@ -1,4 +1,4 @@
-//! A plant built by hand with simulated buses behind it, a server in front of it, and a bare client.
+//! A hand-made plant with simulated buses, a server for it, and a minimal client.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -74,7 +74,7 @@ at = "input 5"
 class = "fast"
 "#;
 
-/// Action of a simulated bus on a command; `None` keeps it forever.
+/// Reaction of a simulated bus to a command; `None` never answers it.
 pub(crate) type Script = Box<dyn FnMut(&Command) -> Option<Outcome> + Send>;
 
 /// The other end of a command queue.
@@ -121,7 +121,7 @@ impl FakeBus {
         bus
     }
 
-    /// Answers commands in this way from now on.
+    /// Answers commands by this script from now on.
     pub(crate) fn answers(&self, script: impl FnMut(&Command) -> Option<Outcome> + Send + 'static) {
         *self.script.lock().unwrap() = Box::new(script);
     }
@@ -358,7 +358,7 @@ impl Client {
         Client::connect_from([127, 0, 0, 1], address).await
     }
 
-    /// Comes from another loopback address.
+    /// Connects from another loopback address.
     pub(crate) async fn connect_from(from: [u8; 4], address: SocketAddr) -> Client {
         let socket = TcpSocket::new_v4().unwrap();
         socket
@@ -416,7 +416,7 @@ pub(crate) fn frame(transaction: u16, unit: u8, pdu: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// A PDU of a function code and words.
+/// A PDU made of a function code and words.
 pub(crate) fn words(function: u8, words: &[u16]) -> Vec<u8> {
     let mut pdu = vec![function];
     words.iter().for_each(|w| pdu.extend_from_slice(&w.to_be_bytes()));

@@ -1,5 +1,5 @@
-//! tokio-modbus as a second opinion on frames: what it encodes is answered as the request that it means, what is answered
-//! it can decode, and what it cannot decode is refused here.
+//! tokio-modbus as a second opinion on frames: requests that it encodes are answered with their meaning, it can
+//! decode the answers, and what it cannot decode is refused here.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -14,7 +14,7 @@ use tokio_modbus::{Request, Response};
 
 use super::rig::{frame, options, plant};
 
-/// Any request that a client of tokio-modbus can send, with a number of items that fits a frame.
+/// Any request that a client of tokio-modbus can send, with a number of items that fits into a frame.
 fn request() -> impl Strategy<Value = Request<'static>> {
     let (address, count) = (any::<u16>(), 0u16..=300);
     let span = (address, count);
@@ -35,7 +35,7 @@ fn request() -> impl Strategy<Value = Request<'static>> {
     ]
 }
 
-/// The PDU that tokio-modbus makes of the request: its client writes it into a pipe.
+/// The PDU that tokio-modbus creates for the request: its client writes it into a pipe.
 fn encoded(request: Request<'static>) -> Vec<u8> {
     use tokio::io::AsyncReadExt;
     use tokio_modbus::client::Client;
@@ -142,8 +142,8 @@ proptest! {
         prop_assert!(understood(&answer(&pdu)));
     }
 
-    /// A byte changed, cut off or added: both sides take the same request out of it, or this one refuses it. (The other
-    /// one takes some that the specification forbids, such as a quantity of 0.)
+    /// A byte is changed, cut off or added: both libraries decode equal requests, or this one refuses. (The other
+    /// one accepts some that the specification forbids, such as a quantity of 0.)
     #[test]
     fn mutated_requests_are_never_taken_for_more(request in request(), place: prop::sample::Index, byte: u8, how in 0..3) {
         let mut pdu = encoded(request);
@@ -156,8 +156,7 @@ proptest! {
         if let Ok(own) = RequestPdu::decode(&pdu)
             && !matches!(own, RequestPdu::Diagnostics { .. } | RequestPdu::DeviceIdentification { .. })
         {
-            // tokio-modbus panics on some requests that are refused here (its issue 298), so it decodes only accepted
-            // ones.
+            // tokio-modbus panics on some requests that are refused here (its issue 298), so it decodes only accepted ones.
             let other = Request::try_from(bytes::Bytes::from(pdu.clone()));
             prop_assert_eq!(other.ok().and_then(|other| meant(&other)), Some(own));
         }

@@ -1,5 +1,5 @@
-//! Modbus/TCP Security: who is let in, who may write, and what becomes of the others. The certificates come from the
-//! script of the documentation.
+//! Modbus/TCP Security: which clients are admitted, which may write, and how the others are refused. The
+//! certificates come from the script in the documentation.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -51,7 +51,7 @@ fn sign_with_printable_role(dir: &Path, name: &str) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// Two CAs; below the first a server and clients of all kinds.
+/// Two CAs; the first has issued certificates for a server and clients of all kinds.
 pub(super) struct Works(TempDir, #[expect(dead_code, reason = "holds the pipe")] Child);
 
 pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
@@ -69,7 +69,7 @@ pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
     make(&own, &["client", "late", "operator"], "-1");
     make(&own, &["client", "malformed", "operator"], "30");
     sign_with_printable_role(&own, "malformed");
-    // Static values are never dropped, so the folder is removed when this process ends and its pipe closes.
+    // Static values are never dropped, so a child process removes the folder when this process ends and its pipe closes.
     let mut sweeper = Command::new("sh");
     sweeper.args(["-c", "cat >/dev/null; rm -rf \"$0\""]).arg(dir.path());
     let sweeper = sweeper
@@ -113,7 +113,7 @@ impl Works {
             .unwrap()
     }
 
-    /// A client that shows the certificate `own/NAME`, or none.
+    /// A client that presents the certificate `own/NAME`, or none.
     pub(super) fn client(&self, name: Option<&str>, version: &'static SupportedProtocolVersion) -> Arc<ClientConfig> {
         let mut roots = RootCertStore::empty();
         roots.add(self.chain("own/ca").remove(0)).unwrap();
@@ -133,7 +133,7 @@ impl Works {
 }
 
 pub(super) fn tls_options() -> Options {
-    // No listener without TLS may write, so a write can only come from a role.
+    // No client without TLS may write, so a write can only be granted by a role.
     let mut plain = listener();
     plain.write = Vec::new();
     Options {
@@ -146,7 +146,7 @@ pub(super) fn tls_options() -> Options {
 pub(super) struct TlsClient(tokio_rustls::client::TlsStream<TcpStream>);
 
 impl TlsClient {
-    /// A client after its handshake; with TLS 1.3 that does not prove its certificate yet.
+    /// A client after its handshake; with TLS 1.3 its certificate is not proven yet at that time.
     pub(super) async fn connect(address: SocketAddr, config: Arc<ClientConfig>) -> std::io::Result<TlsClient> {
         let stream = TcpStream::connect(address).await?;
         let name = ServerName::try_from("127.0.0.1").unwrap();
@@ -191,7 +191,7 @@ fn refused_for(rig: &Rig, reason: ConnectionRefusal) -> u64 {
         .1
 }
 
-/// Lets the server's clock jump ahead; then the clock goes on as before.
+/// Makes the server's clock jump ahead; afterwards the clock continues normally.
 async fn later(seconds: f32) {
     tokio::time::pause();
     tokio::time::advance(Duration::from_secs_f32(seconds)).await;
@@ -265,7 +265,7 @@ async fn who_is_not_known_is_refused() {
             until("it is counted", || refused(&rig) == count).await;
         }
     }
-    // Modbus without TLS, something else, and nothing at all.
+    // Bytes of Modbus without TLS, other bytes, and none at all.
     for bytes in [
         frame(1, 1, &words(3, &[2102, 1])),
         b"GET / HTTP/1.1\r\n\r\n".to_vec(),
@@ -322,8 +322,8 @@ async fn who_never_ends_the_handshake_is_closed() {
     rig.end().await;
 }
 
-/// Handshakes have places of their own, and one that takes long yields to a newer one: not even at the same address can
-/// silence keep out who has a certificate.
+/// Handshakes have separate places, and a slow one yields to a newer one: not even from one address can silent
+/// clients keep out a client with a certificate.
 #[tokio::test]
 async fn handshakes_keep_nobody_out() {
     let rig = Rig::with(Options {
@@ -343,11 +343,11 @@ async fn handshakes_keep_nobody_out() {
         }
     }
     assert!(refused_for(&rig, ConnectionRefusal::Displaced) > 100);
-    // Readers cannot take the place of who may write.
+    // Readers cannot take the place of clients that may write.
     let reader = || TlsClient::connect(address, WORKS.client(Some("own/screen"), &TLS13));
     let mut readers = [reader().await.unwrap(), reader().await.unwrap()];
-    // The server may complete the second handshake only after the first reader has its reply, and then gives the second reader
-    // the place of the first. Once the second was answered or closed, that is decided.
+    // The server may complete the second handshake only after the first reader has its reply, and then give the
+    // second reader the place of the first. When the second was answered or closed, that is decided.
     let mut answered = [0; 2];
     for answered in &mut answered {
         for reader in &mut readers {
@@ -400,7 +400,7 @@ async fn certificates_are_renewed_under_way() {
     rig.end().await;
 }
 
-/// openssl sends a request and prints what is answered: a TLS client that has nothing of rustls.
+/// openssl sends a request and prints the answer: a TLS client independent of rustls.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn openssl_as_a_client() {
     let rig = Rig::with(tls_options()).await;
@@ -430,7 +430,7 @@ async fn openssl_as_a_client() {
                 .stderr(Stdio::null())
                 .spawn()
                 .unwrap();
-            // The input stays open until the answer is there, as openssl leaves at its end.
+            // The input stays open until the answer has arrived, because openssl ends with its input.
             let mut input = child.stdin.take().unwrap();
             let _ = std::io::Write::write_all(&mut input, &frame(9, 1, &words(3, &[2102, 1])));
             let mut answer = vec![0; 11];
@@ -462,8 +462,8 @@ async fn pymodbus_with_tls() {
     rig.end().await;
 }
 
-/// SIGHUP with new certificates in the same files: who is connected stays, who comes sees the new one. A broken file
-/// changes nothing.
+/// SIGHUP with new certificates in the same files: connected clients stay, new ones get the new certificate. A
+/// broken file changes nothing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_daemon_takes_new_certificates() {
     let dir = tempfile::tempdir().unwrap();

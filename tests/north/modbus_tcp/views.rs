@@ -1,4 +1,4 @@
-//! Other views of a listener: a drive at units 0 and 255, the common model at 0, the drive's registers alone; and
+//! Other views of a listener: a drive at units 0 and 255, the common model at 0, only the drive's registers; and
 //! function 23, which writes and reads.
 
 use drivegate::codec::RequestPdu;
@@ -116,7 +116,7 @@ async fn the_common_model_at_0_is_the_one_at_0x8000() {
         let expected = usual.ask(1, &words(3, &[there, count])).await;
         assert_eq!(client.ask(1, &words(3, &[here, count])).await, expected, "{here:#x}");
     }
-    // The drive's own registers from 0x0300 on, and nothing between.
+    // The drive's own registers appear from 0x0300 on, and there is nothing in between.
     let own = client.ask(1, &words(3, &[2100, 1])).await;
     assert_eq!(own, usual.ask(1, &words(3, &[2100, 1])).await);
     for nowhere in [0x0100, 0x010F, 0x00FF, 0x8000] {
@@ -159,7 +159,7 @@ async fn registers_of_the_drive_alone_are_there_up_to_the_last() {
             2
         ))]
     );
-    // This is the control word of the drive, so a stop written to it is treated as a stop.
+    // Address 2000 is the control word of the drive, so a stop written to it is treated as a stop.
     assert_eq!(client.ask(1, &words(6, &[2000, 0])).await[0], 6);
     assert_eq!(
         rig.buses[0].orders(),
@@ -190,7 +190,7 @@ async fn function_23_writes_and_reads_behind_the_answer() {
     assert_eq!(answer, registers(23, &[300, 301]));
     let orders = rig.buses[0].orders();
     assert!(matches!(orders[..], [Order::Points(_), Order::Read(_)]), "{orders:?}");
-    // Neither part is done where the read is invalid, nor the read where the write failed.
+    // Neither part is executed if the read is invalid, nor is the read if the write failed.
     assert_eq!(
         client.ask(1, &write_and_read((0x8101, &[2000]), (0x8300, 2))).await,
         [0x97, 2]
@@ -203,7 +203,7 @@ async fn function_23_writes_and_reads_behind_the_answer() {
     );
     assert_eq!(rig.buses[0].orders().len(), 1);
     rig.buses[0].answers(|command| Some(super::rig::acknowledge(command)));
-    // A stop is carried out whatever is read.
+    // A stop is carried out whatever the read part is.
     assert_eq!(
         client.ask(1, &write_and_read((0x8100, &[0]), (0x8300, 2))).await,
         [0x97, 2]

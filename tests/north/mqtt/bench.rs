@@ -1,4 +1,4 @@
-//! Mosquitto and its clients, a line that can be cut, and a gateway with a bus made by hand.
+//! Mosquitto with its clients, a line that can be cut, and a gateway with a hand-made bus.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -61,10 +61,10 @@ pub(crate) fn wait_log(port: u16, text: &str) {
 }
 
 fn keep_log() {
-    // All but the first call fail: the log is kept already.
+    // All calls except the first one fail, because the log is already set up.
     let _ = tracing_subscriber::fmt()
         .with_ansi(false)
-        // Only messages of the MQTT server are needed, not those of other servers in this process.
+        // Only messages of the MQTT client are needed, not those of servers in this process.
         .with_env_filter("drivegate::north::mqtt=info")
         .with_writer(|| LogWriter)
         .try_init();
@@ -82,7 +82,7 @@ impl Broker {
         Broker::with("allow_anonymous true\n")
     }
 
-    /// With further lines of configuration, which may name files in `{dir}`.
+    /// A broker with further lines of configuration, which may name files in `{dir}`.
     pub(crate) fn with(settings: &str) -> Broker {
         let mut broker = Broker::prepared(TempDir::new().unwrap(), settings);
         broker.up();
@@ -93,7 +93,7 @@ impl Broker {
     pub(crate) fn prepared(dir: TempDir, settings: &str) -> Broker {
         let port = free_port();
         let settings = settings.replace("{dir}", &dir.path().display().to_string());
-        // Root gives up its rights otherwise, and with them the files of the test.
+        // As root, the broker would otherwise give up its rights, and with them its access to the files of the test.
         let conf = format!("user root\npersistence false\nlog_dest none\nlistener {port} 127.0.0.1\n{settings}");
         fs::write(dir.path().join("mosquitto.conf"), conf).unwrap();
         Broker { port, dir, child: None }
@@ -114,7 +114,7 @@ impl Broker {
         self.child = Some(child);
     }
 
-    /// kill -9
+    /// Kills the broker with SIGKILL.
     pub(crate) fn kill(&mut self) {
         let mut child = self.child.take().unwrap();
         child.kill().unwrap();
@@ -137,7 +137,7 @@ impl Broker {
         assert!(output.status.success(), "{output:?}");
     }
 
-    /// Publishes each of `payloads` on one topic over one connection, QoS 1, as fast as it goes.
+    /// Publishes each of `payloads` on one topic over one connection, with QoS 1, as fast as possible.
     pub(crate) fn publish_all(&self, topic: &str, payloads: &[&str]) {
         let mut command = client("mosquitto_pub", self.port);
         command.args(["-q", "1", "-t", topic, "-l"]).stdin(Stdio::piped());
@@ -188,7 +188,7 @@ impl Seen {
 
 static MARKERS: AtomicU64 = AtomicU64::new(0);
 
-/// `mosquitto_sub`, and all messages that it received.
+/// A running `mosquitto_sub` with all messages that it has received.
 pub(crate) struct Watcher {
     _client: Subscriber,
     seen: Arc<(Mutex<Vec<Seen>>, Condvar)>,
@@ -238,7 +238,7 @@ impl Watcher {
         self.seen.0.lock().unwrap().clone()
     }
 
-    /// All payloads of a topic.
+    /// All payloads received on a topic.
     pub(crate) fn payloads(&self, topic: &str) -> Vec<String> {
         let all = self.all().into_iter().filter(|m| m.topic == topic);
         all.map(|m| m.payload).collect()
@@ -352,7 +352,7 @@ pub(crate) fn runtime() -> Runtime {
 /// An order that reached the bus: drive, what, time to live.
 pub(crate) type Ordered = (usize, Vec<(String, Value)>, Duration);
 
-/// The MQTT client on a plant whose images the test fills, and whose commands a stand-in for the bus answers.
+/// The MQTT client on a plant whose images the test fills, and whose commands a substitute for the bus answers.
 pub(crate) struct Gateway {
     pub(crate) plant: SharedPlant,
     pub(crate) stats: Arc<NorthState>,
@@ -411,7 +411,7 @@ impl Gateway {
         time
     }
 
-    /// While `act` goes on the client gets no processor: all that comes meanwhile it finds at once.
+    /// Runs `act` while the client gets no processor time: afterwards the client finds everything at once.
     pub(crate) fn while_held<T>(&self, act: impl FnOnce() -> T) -> T {
         let (release, held) = std::sync::mpsc::channel::<()>();
         let held = Arc::new(Mutex::new(held));
@@ -441,7 +441,7 @@ impl Gateway {
         self.runtime.block_on(stopped).expect("it stops");
     }
 
-    /// As a reload that changes the options: the client ends, `meanwhile` goes on, another client begins.
+    /// Changes the options as a reload does: the client ends, `meanwhile` runs, another client starts.
     pub(crate) fn replace(mut self, options: Options, meanwhile: impl FnOnce(&Gateway)) -> Gateway {
         self.cancel.cancel();
         let idle = Mqtt::default();
@@ -456,7 +456,7 @@ impl Gateway {
         self
     }
 
-    /// As kill -9: everything stops where it is, sockets are closed without a word.
+    /// Stops like a kill -9: everything stops at once, and sockets are closed without a message.
     pub(crate) fn kill(self) {
         self.runtime.shutdown_background();
     }
@@ -473,7 +473,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
                 let name = |index: PointIndex| drive.spec.profile.points.get(index).unwrap().name.clone();
                 if let Order::Points(points) = &command.intent.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
-                    // The command may have come after `now`.
+                    // The command may have arrived after `now`.
                     let life = command.intent.window.expires.saturating_duration_since(Instant::now());
                     orders
                         .lock()

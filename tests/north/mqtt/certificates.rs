@@ -154,7 +154,7 @@ fn a_refused_certificate_is_told_with_cause_and_remedy() {
     gateway.stop();
 }
 
-/// Shows a certificate, but signs with a key that does not belong to it.
+/// A server that presents a certificate, but signs with a key that does not belong to it.
 #[derive(Debug)]
 struct Impostor(Arc<CertifiedKey>);
 

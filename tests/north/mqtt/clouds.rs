@@ -1,5 +1,5 @@
-//! Needs of cloud brokers and of plants with a single way out: WebSocket, a proxy, a token that another program renews,
-//! a limit of messages.
+//! Features for cloud brokers and for plants with restricted access: WebSocket, a proxy, a token that another
+//! program renews, a limit of messages.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -31,7 +31,7 @@ fn a_broker_behind_websocket_has_values_and_commands() {
     });
 }
 
-/// An HTTP proxy that knows only CONNECT, and the requests it received.
+/// An HTTP proxy that only knows CONNECT, and the requests that it received.
 fn proxy() -> (u16, Arc<Mutex<Vec<String>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
@@ -119,7 +119,7 @@ fn no_second_has_more_messages_than_the_limit_and_none_of_qos_1_is_lost() {
     assert!(took >= Duration::from_secs(1), "{took:?}");
 }
 
-/// Gives the user `hall` that password.
+/// Sets this password for the user `hall`.
 fn users(broker: &Broker, password: &str) {
     let file = broker.dir.path().join("users");
     let mut command = std::process::Command::new("mosquitto_passwd");
@@ -181,7 +181,7 @@ fn packet(client: &mut TcpStream) -> Option<(u8, Vec<u8>, Vec<u8>)> {
     Some((raw[0], body, raw))
 }
 
-/// What AWS IoT Core does not take, or `None`: a retained message, a topic with more than seven slashes, a ninth filter.
+/// The violated limit of AWS IoT Core, or `None`: a retained message, a topic with more than seven slashes, a ninth filter.
 fn beyond_limits(first: u8, body: &[u8]) -> Option<String> {
     let text = |at: usize| -> Option<(String, usize)> {
         let length = usize::from(u16::from_be_bytes([*body.get(at)?, *body.get(at + 1)?]));
@@ -239,7 +239,8 @@ fn limited(broker: u16) -> (u16, Arc<Mutex<Vec<String>>>) {
     (port, closed)
 }
 
-/// The recipe of docs/mqtt.md for such a broker; without `retain = false` the log names what it closed the connection over.
+/// The recipe of docs/mqtt.md for such a broker; without `retain = false`, the log names the message that made the
+/// broker close the connection.
 #[test]
 fn a_broker_that_closes_at_a_ninth_filter_or_a_retained_message_is_served() {
     let broker = Broker::start();

@@ -18,7 +18,7 @@ struct CommandedGateway {
     watcher: Watcher,
 }
 
-/// Drives `p1`, which may be commanded, and `m1`, which may not; connected.
+/// Drives `p1`, which may be commanded, and `m1`, which may not; the client is connected.
 fn rig() -> CommandedGateway {
     let broker = Broker::start();
     let watcher = Watcher::new(&broker, "#");
@@ -175,7 +175,7 @@ fn expiry_by_field_and_by_message() {
     rig.gateway.stop();
 }
 
-/// Below `drivegate/hall/drive`: topic, payload, code of the refusal, and a part of its text.
+/// Columns: topic below `drivegate/hall/drive`, payload, code of the refusal, and a part of its text.
 const REFUSED: &str = r#"p1/set                 | run                             | bad_value    | is not JSON
 p1/set                 |                                 | bad_value    | is not JSON
 p1/set                 | [true]                          | bad_value    | is not a JSON object
@@ -275,7 +275,7 @@ fn without_commands_nothing_is_listened_to() {
     watcher.wait_payload("drivegate/hall/status", "online");
     broker.publish(SET, r#"{"run": true}"#, &[]);
     broker.publish(&format!("{SET}/run"), "true", &[]);
-    // An event published afterwards arrives: had there been an answer to the commands, it would be here.
+    // An event published afterwards arrives: an answer to the commands would have arrived before it.
     gateway.publish_event("p1", EventKind::Online, "afterwards");
     watcher.wait("the event", |m| m.payload.contains("afterwards"));
     assert_eq!((gateway.ordered().len(), watcher.payloads(RESULT).len()), (0, 0));

@@ -1,4 +1,4 @@
-//! Brokers that go away and come back.
+//! Brokers that disconnect and return.
 
 use std::time::{Duration, SystemTime};
 
@@ -222,7 +222,7 @@ fn the_values_of_an_outage_come_afterwards() {
     watcher.clear();
     for value in 3000..3120 {
         gateway.read("p1", value);
-        // Two arrays are full, and kept.
+        // Two arrays are full and stored.
         wait_for("the value to be recorded", || {
             std::thread::sleep(Duration::from_millis(3));
             Some(())

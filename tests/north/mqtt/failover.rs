@@ -1,4 +1,4 @@
-//! Several brokers: the next one when one is gone, and messages of an old one that comes back.
+//! Several brokers: the next one is used when one fails, and an old one returns with old messages.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -31,7 +31,7 @@ fn of_ports(ports: &[u16], state_dir: &Path, primary_host: &str) -> Options {
     }
 }
 
-/// Sees all topics; payloads are in hex, as births are no text.
+/// Receives all topics; payloads are shown in hex, since births are not text.
 fn all_of(broker: &Broker) -> Watcher {
     Watcher::with(broker, "#", &["-F", "%r|%q|%t|%x"])
 }
@@ -115,7 +115,7 @@ fn a_silent_broker_is_left() {
     gateway.stop();
 }
 
-/// Retained messages of a broker that comes back from its disk `later` while the gateway uses another one.
+/// Retained messages of a broker that returns with its stored data `later` while the gateway uses another one.
 fn after_return(message_expiry: Option<Duration>, later: Duration) -> [Option<String>; 2] {
     let state = TempDir::new().unwrap();
     let mut first = Broker::prepared(
@@ -157,7 +157,7 @@ fn a_broker_that_comes_back_does_not_say_that_a_gateway_elsewhere_is_online() {
         after_return(Some(expiry), expiry + Duration::from_secs(1)),
         [None, None]
     );
-    // Without an expiry the old messages are still there.
+    // Without an expiry the old messages still exist.
     let [status, state] = after_return(None, Duration::ZERO);
     assert_eq!((status.as_deref(), state.is_some()), (Some("online"), true));
 }
@@ -202,7 +202,7 @@ fn the_edge_node_looks_for_its_primary_host() {
     let gateway = Gateway::start(of_ports(&ports, state.path(), "scada"), plant(&["p1"]));
     on_first.wait_payload(STATUS, &hex("online"));
     on_second.wait("the birth", |m| m.topic == BIRTH);
-    // The edge node is offline at the second broker and online at the first; the plain client stays where it is.
+    // The edge node's host is offline at the second broker and online at the first; the plain client stays where it is.
     second.publish(HOST, &host(false, 2_000), &["-r"]);
     on_second.wait("the death", |m| m.topic == DEATH);
     first.publish(HOST, &host(true, 2_000), &["-r"]);

@@ -1,4 +1,4 @@
-//! Discovery for Home Assistant, as a broker and its clients see it. The real Home Assistant runs in `make interop`.
+//! Discovery for Home Assistant as a broker and its clients receive it. The real Home Assistant runs in `make interop`.
 
 use std::collections::BTreeSet;
 
@@ -21,7 +21,7 @@ fn topic(device: &str) -> String {
     format!("{DEVICES}/{device}/config")
 }
 
-/// Keys of the entities of a message, without those that are only taken away.
+/// Keys of the entities of a message, except those that are only removed.
 fn entities(message: &Value) -> BTreeSet<String> {
     let all = message["cmps"].as_object().unwrap().iter();
     let described = all.filter(|(_, entity)| entity.get("uniq_id").is_some());

@@ -1,4 +1,4 @@
-//! A broker that refuses, limits and takes over: what it does to one topic or connection, the gateway survives.
+//! A broker that refuses, limits and takes over: effects on one topic or connection must not end the gateway's service.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -18,7 +18,7 @@ const STATE: &str = "drivegate/hall/drive/p1/state";
 struct Manners {
     /// Properties of the broker's CONNACK.
     properties: Vec<u8>,
-    /// Topics below this one receive this reason code, this number of times.
+    /// Topics that start like this are refused with this reason code, this number of times.
     refused: Option<(&'static str, u8, usize)>,
     /// Whether the broker sends each byte separately.
     piecemeal: bool,
@@ -28,7 +28,7 @@ struct Manners {
     farewell: Option<Vec<u8>>,
     /// Whether the broker leaves subscriptions unanswered.
     deaf: bool,
-    /// Whether the broker answers nothing from the first ping on.
+    /// Whether the broker stops answering at the first ping.
     mute: bool,
     /// Whether the broker refuses a last will with QoS 1, and one that is retained.
     no_will: bool,
@@ -54,7 +54,7 @@ struct Seen {
     by_alias: usize,
     refusals: usize,
     filters: Vec<String>,
-    /// Last messages of the gateway when it leaves.
+    /// Last messages of the gateway before it disconnects.
     farewells: Vec<Vec<u8>>,
 }
 
@@ -240,7 +240,7 @@ impl Session {
         let code = refused.map_or(0, |(_, code, _)| code);
         seen.most_in_flight = seen.most_in_flight.max(in_flight);
         drop(seen);
-        // An event waits for another event only: telemetry in between does not end the wait, so that no event is left over.
+        // An event only waits for another event: telemetry in between does not end the wait, so that no event is left over.
         if self.manners.backwards && is_event && self.owed.is_empty() {
             self.owed.push((packet, code));
             return Some(());
@@ -353,7 +353,8 @@ fn odd_brokers_are_served() {
     }
 }
 
-/// The gateway ends the connection to a silent broker with a message, so that the broker can tell this from a failure.
+/// The gateway ends the connection to a silent broker with a message, so that the broker can distinguish this from
+/// a failure.
 #[test]
 fn a_broker_that_falls_silent_is_told_goodbye() {
     let keep_alive = with(vec![0x13, 0, 2]);
@@ -365,7 +366,8 @@ fn a_broker_that_falls_silent_is_told_goodbye() {
     wait_for("the farewell", || {
         (!broker.seen.lock().unwrap().farewells.is_empty()).then_some(())
     });
-    // "Disconnect with Will Message": clients of this broker must learn that the gateway is away until it is back.
+    // The code is "Disconnect with Will Message": clients of this broker must learn that the gateway is away until
+    // it is back.
     assert_eq!(
         broker.seen.lock().unwrap().farewells.first().unwrap().first(),
         Some(&0x04)
@@ -466,7 +468,7 @@ fn packets_beyond_the_limit_are_not_sent() {
 
 #[test]
 fn a_session_taken_over_loses_no_event() {
-    // DISCONNECT: session taken over, server shutting down, quota exceeded, and none at all.
+    // DISCONNECT with different reasons: session taken over, server shutting down, quota exceeded; and none at all.
     for farewell in [vec![0x8E, 0], vec![0x8B, 0], vec![0x97, 0], vec![0xFF; 40]] {
         let broker = Hostile::start(Manners {
             farewell: Some(farewell),

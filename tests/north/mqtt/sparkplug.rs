@@ -1,4 +1,4 @@
-//! The edge node on Mosquitto, as the decoder of Eclipse Tahu (npm `sparkplug-payload`) sees it, held against the rules of the
+//! The edge node on Mosquitto, as decoded by Eclipse Tahu (npm `sparkplug-payload`), compared with the rules of the
 //! specification (`tck-id-…`, in `tests/peers/sparkplug.js`).
 
 use std::io::Write as _;
@@ -108,7 +108,7 @@ impl Seen {
     }
 }
 
-/// Waits until what was published is as wanted.
+/// Waits until the published messages are as wanted.
 fn wait_seen(what: &str, watcher: &Watcher, wanted: impl Fn(&Seen) -> bool) -> Seen {
     wait_for(what, || {
         let seen = Seen::of(watcher);
@@ -424,7 +424,7 @@ fn the_primary_host_is_waited_for() {
     }
     let gateway = Gateway::start(options, plant(&["p1"]));
     gateway.wait_connected(true);
-    // Neither a message for another host nor an older message counts.
+    // Neither a message for another host nor an older message has an effect.
     broker.publish("spBv1.0/STATE/other", &state_message(true, 2_000), &["-r"]);
     broker.publish(STATE, &state_message(true, 999), &[]);
     assert!(Seen::of(&watcher).messages().is_empty(), "nothing before the host");

@@ -75,7 +75,7 @@ fn nothing_is_retained_where_that_is_not_wanted() {
     watcher.wait("the bus", |m| m.topic == "drivegate/hall/bus/line1");
     gateway.stop();
     watcher.wait_payload("drivegate/hall/status", "offline");
-    // A broker that has anything retained sends it before it answers to a new message.
+    // A broker that has retained messages sends them before it acknowledges a new message.
     let late = Watcher::new(&broker, "drivegate/#");
     let gateway = Gateway::start(self::options(broker.port), plant(&["p2"]));
     late.wait_payload("drivegate/hall/status", "online");

@@ -98,7 +98,7 @@ fn users_passwords_and_rights() {
         let made = Command::new("mosquitto_passwd").args(arguments).status();
         assert!(made.expect("mosquitto_passwd of the package mosquitto").success());
     }
-    // The gateway may not publish its events, nor see the set topics of single points.
+    // The gateway may neither publish its events nor subscribe to the set topics of single points.
     let acl = "user all\ntopic readwrite #\nuser hall\ntopic write drivegate/hall/status\n\
         topic write drivegate/hall/drive/p1/state\ntopic write drivegate/hall/drive/+/result\n\
         topic read drivegate/hall/drive/+/set\n";

@@ -18,28 +18,28 @@ use drivegate::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedR
 use super::super::plant::{self, STALE_AFTER};
 use drivegate::drive::DriveIndex;
 
-/// The past that it has.
+/// Length of the recorded past of the plant.
 const PAST: Duration = Duration::from_secs(3900);
-/// Each drive is read that often lately; before, every second.
+/// Interval at which each drive was read recently; before that, every second.
 const POLL: Duration = Duration::from_millis(200);
 const LATELY: Duration = Duration::from_secs(600);
-/// Before the end of the past, pump-2 trips.
+/// Time before the end of the past at which pump-2 trips.
 const TRIP: Duration = Duration::from_secs(75);
 
-/// What a drive of the plant does.
+/// The behaviour of a drive of the plant.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Play {
     /// Runs with changing references, with that phase.
     Runs(u64),
     /// Runs, then trips with an overcurrent.
     Trips,
-    /// Is ready, and its panel is the control place.
+    /// The drive is ready, and its panel is the control place.
     Local,
     /// Answered until a minute ago.
     Gone,
 }
 
-/// Name, bus, profile and what it does.
+/// Columns: name, bus, profile and behaviour.
 const DRIVES: [(&str, &str, &str, Play); 7] = [
     ("pump-1", "line1", "vacon-nx", Play::Runs(0)),
     ("pump-2", "line1", "vacon-nx", Play::Trips),
@@ -50,17 +50,17 @@ const DRIVES: [(&str, &str, &str, Play); 7] = [
     ("mixer-1", "line2", "vacon-nx", Play::Runs(5)),
 ];
 
-/// The images of a plant with what they do.
+/// The drive images of a plant with their behaviour.
 pub(super) type Cast = Vec<(Arc<DriveImage>, Play)>;
 
-/// The plant, and who makes it go on.
+/// The plant, and the task that keeps it moving.
 pub(super) struct Lively {
     pub(super) plant: Plant,
     pub(super) stats: Arc<NorthState>,
     pub(super) going_on: GoingOn,
 }
 
-/// The drives go on with what they did last, and their past with them. Also what must live as long as the plant.
+/// Lets the drives continue their last behaviour, and their past with it; also owns what must live as long as the plant.
 pub(super) struct GoingOn {
     buses: Vec<Arc<BusImage>>,
     cast: Cast,
@@ -70,13 +70,13 @@ pub(super) struct GoingOn {
 }
 
 impl GoingOn {
-    /// All drives but the one that is gone answer now.
+    /// Lets all drives except the missing one answer now.
     pub(super) fn answer(&mut self) {
         let clock = Clock::read();
         answer(&self.cast, clock.now);
         for bus in &self.buses {
             poll(bus, &self.cast, PAST, clock);
-            // So many exchanges a line has in between.
+            // Number of transactions that a line has in between.
             for image in &bus.drives[..2] {
                 (0..33).for_each(|_| image.count(Outcome::Ok));
             }
@@ -340,7 +340,7 @@ fn poll(bus: &BusImage, cast: &Cast, t: Duration, clock: Clock) {
                 frames(bus, place, image.spec.address, (read.start, &words), clock.now);
             }
         }
-        // A line that is disturbed now and then, one drive of it more.
+        // A line that is disturbed now and then, and one of its drives more than the others.
         let minute = t.as_secs() / 60;
         let troubled = (minute * 7919 + 31 * place.place() as u64) % 13 < place.place() as u64
             && t.as_secs() % 20 < 1 + minute % 3;

@@ -1,4 +1,4 @@
-//! The pictures of the documentation: made anew on request (`DRIVEGATE_WRITE_PICTURES=1`), else only looked at.
+//! The pictures of the documentation: created on request (`DRIVEGATE_WRITE_PICTURES=1`), otherwise only checked.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -8,7 +8,7 @@ use super::lively::Lively;
 use super::{browse, keep_answering, url};
 use crate::support::tools::root;
 
-/// Pictures are looked at over slow lines, too.
+/// Size limit, because pictures are also viewed over slow lines.
 const MOST_BYTES: u64 = 200 * 1024;
 
 /// The pages of the pictures render; with `DRIVEGATE_WRITE_PICTURES=1` they are written to `docs/pictures`.
@@ -45,7 +45,7 @@ async fn pictures_show_the_pages() {
     }
 }
 
-/// Every picture is shown somewhere, and what is shown is there.
+/// Every picture is used in a document, and every used picture exists.
 #[test]
 fn pictures_are_those_of_the_documents() {
     let mut shown = BTreeSet::new();
