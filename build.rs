@@ -1,4 +1,4 @@
-//! An optimised build knows its commit, which `--version`, the log and the metrics state.
+//! Gives an optimised build its commit, which `--version`, the log and the metrics show.
 
 use std::env;
 use std::path::Path;
@@ -15,7 +15,7 @@ fn main() {
     }
 }
 
-/// The commit of the checkout, unless the caller says which it is.
+/// The commit of the checkout, unless the caller sets it.
 fn commit() {
     println!("cargo::rerun-if-env-changed={COMMIT}");
     if env::var_os(COMMIT).is_some() || !Path::new(HEAD_LOG).exists() {

@@ -1,4 +1,4 @@
-//! How near the gateway comes to the limit of the wire, compared with other masters on the same simulated line.
+//! Measures how close the gateway comes to the limit of the wire, compared with other masters on one simulated line.
 //!
 //! `cargo bench --bench bus` (options: `-- --seconds 2 --runs 7 --baud 38400`). Ten drives, reads of the eleven process
 //! data registers, 8N1, turnaround 0.5 ms, 3.5 characters of silence. The gateway runs whole, and its Modbus TCP and HTTP
@@ -31,7 +31,7 @@ const DRIVES: std::ops::RangeInclusive<u8> = 1..=10;
 const BAUDS: [u32; 5] = [9_600, 19_200, 38_400, 57_600, 115_200];
 /// Time for a reply.
 const TIMEOUT: Duration = Duration::from_millis(100);
-/// Part of a pause in which a master watches the clock: the kernel wakes it late by some ten microseconds.
+/// Last part of a pause in which a master spins on the clock, since the kernel wakes it about ten microseconds late.
 const SPIN: Duration = Duration::from_micros(60);
 
 /// The master that polls the line.
@@ -82,7 +82,7 @@ struct Run {
     /// Requests that began before 3.5 characters of silence, or during a reply.
     too_early: u64,
     unanswered: u64,
-    /// Median lateness of the simulator itself when it hands over its replies.
+    /// Median lateness of the simulator itself when it delivers its replies.
     late: Duration,
 }
 
@@ -129,7 +129,7 @@ fn print(format: LineFormat, results: &[(Master, Vec<Run>)]) {
     let bare = results.first().map(|(_, runs)| rates(runs)).unwrap_or_default();
     for (master, runs) in results.iter().filter(|(_, runs)| !runs.is_empty()) {
         let all = rates(runs);
-        // Turn by turn, so that what slows the machine for a while slows both.
+        // The masters take turns, so that a temporary slowdown of the machine affects both.
         let of_bare: Vec<f64> = all.iter().zip(&bare).map(|(rate, bare)| 100.0 * rate / bare).collect();
         let share = |of: fn(&Run) -> u64| {
             let requests: u64 = runs.iter().map(|run| run.requests).sum();
@@ -188,7 +188,7 @@ fn run(
         Master::Gateway => {}
         Master::Bare => {
             let requests: Vec<Request> = DRIVES.map(request).collect();
-            // In a thread of its own, which takes the precedence that it gives itself with it.
+            // A separate thread is used, whose raised priority ends with it.
             let measured =
                 std::thread::spawn(move || bare_master::run(Path::new(&port), &rod(format), &requests, time));
             measured.join().map_err(|_| "the bare master panicked")??;
@@ -205,7 +205,7 @@ fn run(
 
 /// Begins to record the line for `time`; returns the counters before that.
 fn record(line: &SimulatedBus, time: Duration, format: LineFormat) -> Statistics {
-    // A frame cannot be shorter than its characters: room for all that can come.
+    // A frame cannot be shorter than its characters, so this capacity is enough for all frames.
     let frames = 2.0 * time.as_secs_f64() / format.chars(8).as_secs_f64();
     line.record(frames as usize + 100);
     line.statistics()

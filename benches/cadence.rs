@@ -18,7 +18,7 @@ use common::{median, option, quantile, silences};
 
 /// Cadence aimed at.
 const CYCLE: f64 = 0.010;
-/// Read of the process data of drive 1.
+/// A read of the process data of drive 1.
 const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
 
 fn main() -> ExitCode {
@@ -38,7 +38,8 @@ fn measure() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Runs the whole gateway on simulated drives for `time`; the frames, and the requests that came too early.
+/// Runs the whole gateway on simulated drives for `time`; returns the frames, and the number of requests that came
+/// too early.
 fn record(baud: u32, drives: u8, time: Duration) -> Result<(Vec<Recorded>, u64), Box<dyn Error>> {
     let line = line(baud, drives)?;
     let bus = Bus {
@@ -72,7 +73,7 @@ fn grid(frames: &[Recorded], time: Duration) {
         .map(|frame| frame.start.as_secs_f64())
         .collect();
     let first = rounds.first().copied().unwrap_or_default();
-    // Where each start lies between the grid lines of the first one, -0.5..0.5 cycles.
+    // Offset of each start from the grid of the first one, -0.5..0.5 cycles.
     let phase = |at: &f64| ((at - first) / CYCLE + 0.5).rem_euclid(1.0) - 0.5;
     let middle = median(&rounds.iter().map(phase).collect::<Vec<_>>());
     let off: Vec<f64> = rounds

@@ -1,8 +1,9 @@
 //! How long a command waits for the wire on a saturated line.
 //!
-//! `cargo bench --bench commands` (options: `-- --commands 300 --baud 38400`). Ten drives of profile `vacon-nx`, 8N1, `cycle`
-//! far below what the line carries. A command may go as soon as the running transaction is over, so its time from
-//! queue to wire (the first byte of its request) is printed beside the time of the transactions.
+//! `cargo bench --bench commands` (options: `-- --commands 300 --baud 38400`). Ten drives of profile `vacon-nx`,
+//! 8N1, `cycle` far below what the line can carry. A command may be sent as soon as the running transaction is
+//! over, so its time from queue to wire (the first byte of its request) is printed next to the duration of the
+//! transactions.
 
 mod common;
 
@@ -46,7 +47,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
         let mut waits: Vec<Duration> = Vec::new();
         let mut failed = 0;
         for value in 1..=commands.min(9_999) {
-            // The pauses vary, so that they are not in step with the line.
+            // The pauses vary, so that they do not synchronise with the line.
             tokio::time::sleep(Duration::from_micros(30_000 + u64::from(value) * 7_919 % 17_000)).await;
             let drive = plant.drive(&format!("line-{}", value % 10 + 1)).ok_or("no drive")?;
             let point = drive

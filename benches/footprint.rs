@@ -1,11 +1,12 @@
 //! Load of a gateway on a small machine: processor time, wake-ups, memory, and instructions per transaction, with 1 and 4
 //! buses of a 10 ms cycle and 4 saturated buses.
 //!
-//! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The daemon and
-//! the simulator are processes of their own. Instructions are counted by callgrind in a run of its own, as they do not depend on how busy the
-//! machine is; the processor time of the other runs does. `--program` names another build of the daemon, such as an older one.
-//! `--emulator qemu-aarch64 --program PATH` counts the instructions of a program for ARM under qemu-user 8 or later. Only for the
-//! first plant: with its log, qemu executes a million blocks a second, too few for the others at their full rate.
+//! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The
+//! daemon and the simulator are separate processes. Instructions are counted by callgrind in a separate run,
+//! because they do not depend on how busy the machine is, while the processor time of the other runs does.
+//! `--program` names another build of the daemon, such as an older one. `--emulator qemu-aarch64 --program PATH`
+//! counts the instructions of a program for ARM under qemu-user 8 or later, for the first plant only: with its log,
+//! qemu executes a million blocks a second, too few for the others at their full rate.
 
 mod common;
 
@@ -140,7 +141,7 @@ fn instructions(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<f64
     let before = site.exchanges()?;
     control(&["-i", "on"])?;
     std::thread::sleep(time);
-    // With the counting switched off, the counts would be gone.
+    // Counting is switched off without a reset, which would delete the counts.
     control(&["-d"])?;
     let exchanges = site.exchanges()? - before;
     let dump = fs::read_dir(directory.path())?
@@ -190,8 +191,9 @@ fn emulated(emulator: &str, program: &Path, spin: &str, time: Duration) -> Resul
     Ok(())
 }
 
-/// Counts instructions in the log of qemu: it lists those of each block when it translates it (`0xADDRESS: ...` below `IN:`), and
-/// has a line for each time a block is executed (`Trace 0: ... [.../ADDRESS/...]`).
+/// Counts instructions from the log of qemu: qemu lists the instructions of each block when it translates it
+/// (`0xADDRESS: ...` below `IN:`), and writes a line each time a block is executed (`Trace 0: ...
+/// [.../ADDRESS/...]`).
 #[derive(Default)]
 struct Blocks {
     lengths: HashMap<u64, u64>,
@@ -264,7 +266,7 @@ impl Site {
         Ok(site)
     }
 
-    /// The daemon may not be ready yet.
+    /// Starts the daemon, which may not be ready yet when this returns.
     fn start_with(plant: &Plant<'_>, mut program: Command, log: Stdio) -> Result<Site, Box<dyn Error>> {
         let directory = tempfile::tempdir()?;
         let config = directory.path().join("drivegate.toml");
@@ -316,7 +318,7 @@ impl Site {
         self.get("/readyz").is_ok_and(|reply| reply.starts_with("HTTP/1.1 200"))
     }
 
-    /// Exchanges so far. Not from the metrics: what they tell of the process is hidden by valgrind.
+    /// Number of transactions so far. The metrics are not used, because valgrind hides what they report about the process.
     fn exchanges(&self) -> Result<f64, Box<dyn Error>> {
         let reply = self.get("/api/v1/buses")?;
         let (_, body) = reply.split_once("\r\n\r\n").ok_or("no body")?;

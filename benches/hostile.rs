@@ -1,10 +1,10 @@
-//! Effects of clients without rights on clients that have them.
+//! Effects of clients without rights on clients that have rights.
 //!
-//! `cargo bench --bench hostile` (option: `-- --seconds 8`, the time of each attack). One gateway with ten drives; an
-//! operator at 127.0.0.2, the only one who may write, opens a connection for each command, one a second; a SCADA client at
-//! 127.0.0.3 polls every 20 ms over one connection. Attackers at 127.0.0.9 may connect and nothing else. For each attack:
-//! commands answered, the audit of them, the latency of the SCADA client and the cadence of the line, next to the same
-//! figures without an attack.
+//! `cargo bench --bench hostile` (option: `-- --seconds 8`, the time of each attack). One gateway with ten drives;
+//! an operator at 127.0.0.2, the only one who may write, opens a connection for each command, one a second; a SCADA
+//! client at 127.0.0.3 polls every 20 ms over one connection. Attackers at 127.0.0.9 may only connect. For each
+//! attack, the bench prints commands answered, their audit, the latency of the SCADA client and the cadence of the
+//! line, next to the figures without an attack.
 
 mod common;
 
@@ -259,7 +259,7 @@ impl Attack {
         }
     }
 
-    /// One turn of an attacker.
+    /// One action of an attacker.
     async fn run(self, north: North, number: usize) -> io::Result<()> {
         match self {
             Attack::None => {}
@@ -277,7 +277,7 @@ impl Attack {
             Attack::ReadsNothing => {
                 let mut stream = connect(ATTACKER, north.modbus).await?;
                 let many = [0, 1, 0, 0, 0, 6, 1, 3, 0x80, 0, 0, 19].repeat(100);
-                // The attacker sends until its own buffers and the gateway's are full.
+                // The attacker sends until its own buffers and those of the gateway are full.
                 while timeout(PATIENCE, stream.write_all(&many))
                     .await
                     .is_ok_and(|sent| sent.is_ok())
@@ -312,7 +312,7 @@ impl Attack {
     }
 }
 
-/// Sends `request` again and again over one connection, without waiting for answers.
+/// Sends `request` repeatedly over one connection, without waiting for answers.
 async fn repeat(modbus: SocketAddr, request: &[u8]) -> io::Result<()> {
     let stream = connect(ATTACKER, modbus).await?;
     let (mut read, mut write) = stream.into_split();

@@ -72,7 +72,7 @@ fn speed(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
                 let (Some(server), Some(found)) = (servers.get(place), found.get_mut(place)) else {
                     continue;
                 };
-                // pymodbus answers one request of a batch and forgets the others: once is enough.
+                // pymodbus answers one request of a batch and drops the others, so one try is enough.
                 if found.iter().take(run).any(Option::is_none) {
                     continue;
                 }

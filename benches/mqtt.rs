@@ -234,7 +234,7 @@ impl Broker {
         let (sender, arrived) = channel();
         let (ready, is_ready) = channel();
         runtime.spawn(async move {
-            // The client lives as long as somebody receives.
+            // The client exists as long as its receiver does.
             let _client = client;
             while let Ok(event) = eventloop.poll().await {
                 match event {

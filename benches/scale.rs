@@ -1,7 +1,7 @@
 //! Costs of many buses: processor time per transaction, memory, and the rate of each bus, compared with a single bus.
 //!
 //! `cargo bench --bench scale` (options: `-- --seconds 10 --runs 3 --baud 38400 --buses 32`). The daemon
-//! (`drivegate run`) and the simulator (`drivegate simulate`) are processes of their own, so that the processor time of
+//! (`drivegate run`) and the simulator (`drivegate simulate`) are separate processes, so that the processor time of
 //! each is known; the system counts it in hundredths of a second.
 
 mod common;
@@ -18,7 +18,7 @@ use common::{Readers, median, option, processor_time, resident_memory, scrape, w
 
 /// Drives of each bus.
 const DRIVES: u8 = 31;
-/// Pause between two scrapes of the metrics. There are more drives than Modbus TCP has units, so HTTP is the north side.
+/// Pause between two scrapes of the metrics. HTTP is used because there are more drives than Modbus TCP has unit ids.
 const SCRAPE: Duration = Duration::from_secs(1);
 const PROGRAM: &str = env!("CARGO_BIN_EXE_drivegate");
 
@@ -112,7 +112,7 @@ fn run(buses: usize, baud: u32, time: Duration) -> Result<Run, Box<dyn Error>> {
     let daemon = Process::start(&["run"], &config)?;
     wait("the daemon", || ready(http))?;
     let readers = Readers::start(None, http, 0, SCRAPE);
-    // During this time the class `once` is read, and the clients reach their usual pace.
+    // During this time the class `once` is read, and the clients reach their steady pace.
     std::thread::sleep(Duration::from_secs(4));
     let before = (
         exchanges(http, buses)?,

@@ -1,8 +1,8 @@
-//! Many gateways' sessions with a broker in one process: the real MQTT and Sparkplug clients, each with a plant of its own.
+//! Sessions of many gateways with a broker in one process: the real MQTT and Sparkplug clients, each with a separate plant.
 //!
-//! `tests/fleet/thousand.py` starts it: `cargo bench --bench sessions -- --port 8883 --sessions 900 --drives 10 --ca ca.crt --dir DIR`.
-//! `--cycle` (s): each drive has new values so often; `--min-interval` (s) as in `[mqtt.publish]`; `--primary` is the id of the
-//! host that births wait for. Ends with its standard input.
+//! `tests/fleet/thousand.py` starts this bench: `cargo bench --bench sessions -- --port 8883 --sessions 900
+//! --drives 10 --ca ca.crt --dir DIR`. `--cycle` (s): interval of new values of each drive; `--min-interval` (s) as
+//! in `[mqtt.publish]`; `--primary` is the id of the host that births wait for. Ends with its standard input.
 
 mod common;
 
@@ -21,7 +21,7 @@ use tokio_util::sync::CancellationToken;
 
 use common::{option, session};
 
-/// First number of the sessions: the names of those before are taken by processes.
+/// First number of the sessions: the names with lower numbers are used by real processes.
 const FIRST: usize = 1000;
 
 fn main() -> ExitCode {

@@ -5,10 +5,10 @@
 //!  drives ◀─line─── codec ◀── bus ◀────── command queue ◀────────────── north
 //! ```
 //!
-//! Values go up: the thread of a bus ([`bus`]) owns its [`mod@line`], sends one request after the other and puts each reply
-//! into the process image ([`process_image`]) as a whole. The servers ([`north`]) read the image whenever they like.
-//! Commands go down: a server gives a command to the drive's handle ([`plant`]), which checks authority, limits and presence
-//! ([`mod@command`]) and queues it for the bus; the client gets exactly one result.
+//! Values go up: the thread of a bus ([`bus`]) owns its [`mod@line`], sends one request after the other and puts
+//! each reply into the process image ([`process_image`]) as a whole. The servers ([`north`]) read the image at any
+//! time. Commands go down: a server gives a command to the drive's handle ([`plant`]), which checks authority,
+//! limits and presence ([`mod@command`]) and queues it for the bus; the client gets exactly one result.
 //!
 //! The package holds `main` and gives every crate of `crates/` the name of its room; Cargo enforces which may use which. From the bottom:
 //! [`codec`] (`drivegate-proto`), [`bacnet`] (`-bacnet`), [`drive`] and [`document`] (`-model`), [`command`], [`process_image`],

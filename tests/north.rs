@@ -1,4 +1,4 @@
-//! The servers over real sockets, with plants made by hand behind them, and clients that were written elsewhere.
+//! The servers over real sockets, with hand-made plants behind them, and independently written clients.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

@@ -1,8 +1,9 @@
 //! A measuring rod: the least that a Modbus RTU master can do on a port. Write, read until the expected length, keep
 //! 3.5 characters of silence, next.
 //!
-//! The bare master schedules nothing, retries nothing and accepts any reply; its rate on a simulated line is what
-//! operating system and pseudo-terminal leave of the wire's limit, and so the rate that a bus task is measured against.
+//! The bare master schedules nothing, retries nothing and accepts any reply. Its rate on a simulated line is what
+//! operating system and pseudo-terminal leave of the wire's limit, and is therefore the reference for the rate of a
+//! bus task.
 
 use drivegate::codec::{Decoded, LineFormat, Request, rtu};
 use drivegate::line::{poll_until, sharpen_timers, wait_until};
@@ -22,7 +23,7 @@ pub(crate) struct BareOptions {
     pub(crate) silence: Duration,
     /// Time for a reply after the request's last character.
     pub(crate) timeout: Duration,
-    /// Part of the silence in which the master watches the clock instead of sleeping.
+    /// Part of the silence during which the master spins on the clock instead of sleeping.
     pub(crate) spin: Duration,
 }
 
@@ -37,7 +38,7 @@ pub(crate) fn wire_limit(options: &BareOptions, request: &Request, turnaround: D
 /// Sends `requests` in turn for `time`.
 ///
 /// # Errors
-/// The port cannot be opened, or it is gone.
+/// If the port cannot be opened, or was lost.
 pub(crate) fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Duration) -> io::Result<()> {
     sharpen_timers();
     let flags = rustix::fs::OFlags::NOCTTY | rustix::fs::OFlags::NONBLOCK;

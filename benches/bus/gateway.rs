@@ -1,4 +1,4 @@
-//! The whole gateway as a master on the simulated line, its north sides being read.
+//! The whole gateway as a master on the simulated line, while its servers are read by clients.
 
 use std::error::Error;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! Masters made by others, doing the same work: tokio-modbus, and libmodbus where it is installed.
+//! Masters by other authors that do equal work: tokio-modbus, and libmodbus if it is installed.
 
 use std::error::Error;
 use std::io;
@@ -32,7 +32,7 @@ pub(crate) fn tokio_modbus(port: &str, baud: u32, pause: Duration, time: Duratio
                 let patience = TIMEOUT + Duration::from_secs_f64(270.0 / f64::from(baud));
                 // A read that fails shows in the transcript of the line, which is what is measured.
                 let _ = tokio::time::timeout(patience, client.read_holding_registers(2100, 11)).await;
-                // The timer of the runtime ticks once a millisecond, so the pause blocks the thread.
+                // The timer of the runtime ticks once a millisecond, so the pause blocks the thread instead.
                 wait_until(Instant::now() + pause, SPIN);
             }
             Ok(())

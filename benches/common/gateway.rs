@@ -23,14 +23,14 @@ pub fn line(baud: u32, drives: u8) -> Result<SimulatedBus, Box<dyn Error>> {
     Ok(SimulatedBus::start(SimulatedBusOptions::new("bench", rules, drives))?)
 }
 
-/// A bus of the configuration; its drives have its name and a number: `line-1`.
+/// A bus of the configuration; its drives are named after it with a number: `line-1`.
 pub struct Bus<'a> {
     pub name: &'a str,
     pub port: &'a str,
     pub baud: u32,
     pub drives: u8,
     pub profile: &'a str,
-    /// More keys of the bus, and of each drive.
+    /// Further keys of the bus, and of each drive.
     pub keys: &'a str,
     pub drive_keys: &'a str,
 }
@@ -48,7 +48,7 @@ impl Bus<'_> {
     }
 }
 
-/// Both north sides that are read, on free ports.
+/// Modbus TCP and HTTP, the servers that are read, on free ports.
 pub const NORTH: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\n[http]\nlisten = \"127.0.0.1:0\"\n";
 
 /// Settings with a `[gateway]` section that has a name, and with the given rest.
@@ -66,7 +66,7 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// Starts it; returns when all drives of its first bus are online, or after 20 s.
+    /// Starts the gateway; returns when all drives of its first bus are online, or after 20 s.
     pub fn start(settings: Settings) -> Result<Gateway, Box<dyn Error>> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)

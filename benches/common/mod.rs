@@ -1,4 +1,4 @@
-//! Parts that the benches share: the gateway under test, clients of its north sides, medians, and the evaluation of a
+//! Parts that the benches share: the gateway under test, clients of its servers, medians, and the evaluation of a
 //! transcript.
 // Each bench uses only some of these parts.
 #![allow(dead_code, unreachable_pub)]
@@ -52,7 +52,7 @@ pub fn compile(source: &str, program: &Path) -> Result<(), String> {
 /// Processor time of a process so far, s.
 pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
     let stat = fs::read_to_string(format!("/proc/{process}/stat"))?;
-    // Behind the name, which may contain anything: utime and stime are the fields 14 and 15.
+    // The fields after the name, which may contain anything: utime and stime are the fields 14 and 15.
     let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
     let ticks = |index: usize| {
         fields
@@ -123,7 +123,7 @@ pub fn starts(frames: &[Recorded], direction: Direction) -> Vec<f64> {
     wanted.map(|frame| frame.start.as_secs_f64()).collect()
 }
 
-/// Frames a second, from the first to the last: not a whole exchange more or less, whatever the time measured over.
+/// Frames per second from the first to the last: an incomplete transaction at either end does not change the result.
 pub fn rate(starts: &[f64]) -> f64 {
     match (starts.first(), starts.last()) {
         (Some(first), Some(last)) if last > first => (starts.len() - 1) as f64 / (last - first),
@@ -144,15 +144,15 @@ pub fn silences(frames: &[Recorded]) -> Vec<f64> {
     silences
 }
 
-/// Clients of the north sides: 100 Modbus TCP reads, where there is such a server, and one scrape of the metrics, again
-/// and again.
+/// Clients of the servers that continuously make 100 Modbus TCP reads, if there is such a server, and one scrape of
+/// the metrics.
 pub struct Readers {
     end: Arc<AtomicBool>,
     thread: std::thread::JoinHandle<u64>,
 }
 
 impl Readers {
-    /// Reads `units` from unit 1 on, with a pause before the next turn.
+    /// Reads `units` unit ids from 1 on, with a pause before the next round.
     pub fn start(modbus: Option<SocketAddr>, http: SocketAddr, units: u8, pause: Duration) -> Readers {
         let end = Arc::new(AtomicBool::new(false));
         let ended = end.clone();

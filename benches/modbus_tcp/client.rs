@@ -1,5 +1,5 @@
-//! A client that sends the next request as soon as it is answered: one thread, any number of connections, batches of
-//! any depth.
+//! A client that sends the next request as soon as one is answered: one thread, any number of connections, batches
+//! of any depth.
 
 use std::error::Error;
 use std::io::{ErrorKind, Read, Write};
@@ -33,7 +33,7 @@ struct Connection {
     missing: usize,
 }
 
-/// Keeps a batch of `depth` requests under way on each connection for `time`.
+/// Keeps a batch of `depth` requests in progress on each connection for `time`.
 pub(crate) fn load(
     address: SocketAddr,
     connections: usize,
@@ -87,7 +87,7 @@ pub(crate) fn load(
                 Err(why) if why.kind() == ErrorKind::WouldBlock => continue,
                 Err(why) => return Err(why.into()),
             };
-            // Function 3 and not its exception stands where the first answer of the batch begins.
+            // The first answer of the batch must begin with function 3, not with its exception.
             if connection.missing == depth * ANSWER && buffer.get(7) != Some(&3) {
                 return Err(format!("an exception: {:?}", buffer.get(..count.min(20))).into());
             }

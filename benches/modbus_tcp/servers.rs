@@ -1,4 +1,4 @@
-//! The servers, each a process of its own that prints its port and ends with its standard input.
+//! The servers, each in a separate process that prints its port and ends with its standard input.
 
 use std::error::Error;
 use std::io::{BufRead, BufReader, Write};
@@ -221,8 +221,9 @@ async fn tokio_modbus() -> Result<(), Box<dyn Error>> {
 /// The request of a round.
 const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
 
-/// The whole daemon on a simulated line; a line of input begins a measurement of its rounds, the next ends it and is
-/// answered with median and 99 % of the time between two, as the daemon gave them to its port and as the drives heard them.
+/// The whole daemon on a simulated line. A line of input starts a measurement of its rounds, the next one ends it
+/// and is answered with median and 99 % of the interval between rounds, both as the daemon gave them to its port
+/// and as the drives received them.
 fn rounds() -> Result<(), Box<dyn Error>> {
     let line = line(115_200, 1)?;
     let gateway = Gateway::start(one_drive(&line.address())?)?;

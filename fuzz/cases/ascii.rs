@@ -1,4 +1,5 @@
-//! Modbus ASCII, from both ends: what a drive may answer to a request, what a slave may hear, and a whole exchange.
+//! Modbus ASCII in both directions: answers that a drive may send to a request, frames that a slave may receive,
+//! and a whole transaction.
 //!
 //! Input: a byte of choices; length and bytes of a request PDU; then what comes from the line. By choice the line is
 //! made of sound frames, one of each 16 bytes, or the fuzzer would hardly get past digits and check code; and the
@@ -64,7 +65,7 @@ fn master(request: &Request, line: &[u8]) {
         Decoded::Reply { used, .. } => {
             assert!(line[..used].ends_with(b"\r\n"));
             assert_eq!(open_frame(&line[..used]).map(|(address, _)| address), Some(1));
-            // A frame is the same whatever follows it, and in whatever case.
+            // A frame is decoded alike whatever follows it, in upper and lower case.
             assert_eq!(decode_reply(request, &line[..used]), decode_reply(request, line));
             assert_eq!(decode_reply(request, &line[..used].to_ascii_lowercase()), decode_reply(request, line));
         }

@@ -1,4 +1,4 @@
-//! An audit file, as a crash or somebody may have left it.
+//! An audit file in any state in which a crash or a person may have left it.
 //!
 //! Input: the file.
 
@@ -25,7 +25,7 @@ pub(crate) fn run(data: &[u8]) {
     if let Some(chain) = was_whole {
         assert_eq!((end.chain, end.fragment, end.ended), (chain.unwrap_or_default(), None, true));
     }
-    // What the gateway does when it starts.
+    // Repairs the file as the gateway does when it starts.
     let mut repaired = data.to_vec();
     if !end.ended {
         repaired.push(b'\n');

@@ -1,8 +1,8 @@
-//! What hosts may send to the BACnet server, and what drives may answer meanwhile.
+//! Datagrams that hosts may send to the BACnet server, and replies that drives may send meanwhile.
 //!
-//! Input: steps of a kind, a length and as many bytes. A step is a datagram as it is, an APDU to the gateway or to a drive, by one host or
-//! by all, from behind a router, or lets time pass. Everything that comes out must be a datagram of BACnet/IP, and no more than eight
-//! times what came in, and 16 kB a second.
+//! Input: steps of a kind, a length and as many bytes. A step is a raw datagram, an APDU to the gateway or to a
+//! drive, by one host or by all, from behind a router, or lets time pass. All output must be BACnet/IP datagrams,
+//! in total no more than eight times the input and 16 kB a second.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -127,6 +127,6 @@ pub(crate) fn run(data: &[u8]) {
         assert!(server.counters().subscriptions <= 4096);
     }
     let notifications = server.counters().notifications as usize * 3 * 200;
-    // Four hosts; what is waiting when a second ends leaves in the next one.
+    // There are four hosts; datagrams that wait at the end of a second are sent in the next one.
     assert!(left <= 8 * came + 4 * 16 * 1024 * seconds as usize + notifications, "{left} of {came} in {seconds} s");
 }

@@ -19,11 +19,11 @@ pub(crate) fn run(data: &[u8]) {
     };
     let bytes: usize = packets.iter().map(|packet| packet.bytes.len()).sum();
     assert!(bytes <= data.len() && packets.iter().all(|packet| !packet.bytes.is_empty()));
-    // What is cut off takes nothing with it.
+    // Cutting off the end must not affect the packets before it.
     if let Ok(cut) = capture::read(&data[..data.len() - 1]) {
         assert!(packets.starts_with(&cut.packets));
     }
-    // What the listener makes of it.
+    // Passes the packets to the listener.
     let began = Instant::now();
     let format = LineFormat::new(9600, "8N1").unwrap();
     for protocol in Protocol::ALL {

@@ -1,4 +1,4 @@
-//! A client certificate: trust was decided before, the role in it grants authority.
+//! A client certificate: trust was decided before; the role in the certificate grants authority.
 //!
 //! Input: the certificate in DER.
 
@@ -6,7 +6,7 @@ use drivegate::north::modbus_tcp::certificate_role;
 
 pub(crate) fn run(data: &[u8]) {
     let Some(role) = certificate_role(data) else { return };
-    // DER has one form only: nothing may follow, and nothing may be cut.
+    // DER has exactly one form: no byte may be added or cut off.
     let mut longer = data.to_vec();
     longer.push(0);
     assert_eq!(certificate_role(&longer), None);

@@ -6,7 +6,7 @@ use drivegate::config::Settings;
 
 pub(crate) fn run(data: &[u8]) {
     let text = String::from_utf8_lossy(data);
-    // Such a value would name files and devices of this machine.
+    // Such a value would name files and devices of this machine, so it is skipped.
     if ["password_file", "profile_dirs", "certificate", "key", "ca=", "ca =", "\"ca\""].iter().any(|word| text.contains(word)) {
         return;
     }

@@ -1,6 +1,6 @@
 //! Path and query of an HTTP request.
 //!
-//! Input: both, as they stand in the head of the request.
+//! Input: host and token as they appear in the head of the request.
 
 use std::sync::{Arc, LazyLock};
 

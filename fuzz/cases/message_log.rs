@@ -1,4 +1,4 @@
-//! A file of the MQTT buffer, as a crash or a bad disk may leave it.
+//! A file of the MQTT buffer in any state in which a crash or a bad disk may leave it.
 //!
 //! Input: the file.
 
@@ -7,7 +7,7 @@ use drivegate::north::mqtt::whole_records;
 pub(crate) fn run(data: &[u8]) {
     let (records, bytes) = whole_records(data);
     assert!(bytes <= data.len() && records * 21 <= bytes);
-    // What is whole stays whole, whatever precedes it.
+    // Complete records stay readable, whatever precedes them.
     let more = [&[0; 9][..], data].concat();
     assert_eq!(whole_records(&more), (records, bytes));
 }

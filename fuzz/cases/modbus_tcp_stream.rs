@@ -1,8 +1,8 @@
-//! What a Modbus TCP client may send, and what the bus may answer meanwhile.
+//! Bytes that a Modbus TCP client may send, and answers that the bus may give meanwhile.
 //!
-//! Input: whether the client may write and whether uncached reads are forwarded; then steps of a kind, a length and as
-//! many bytes. A step sends the bytes as they are or as the PDU of a frame, or lets the bus answer commands.
-//! Every frame must be answered once, with its own transaction id, unit and function.
+//! Input: whether the client may write and whether uncached reads are forwarded; then steps of a kind, a length and
+//! as many bytes. A step sends the bytes raw or as the PDU of a frame, or lets the bus answer commands. Every frame
+//! must be answered once, with its own transaction id, unit id and function.
 
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
@@ -175,7 +175,7 @@ pub(crate) fn run(data: &[u8]) {
         *left -= 1;
         assert!(*left >= 0, "an answer to nothing: {frame:?}");
     }
-    // On a connection that is closed for its nonsense, what waits for the bus is not answered.
+    // On a connection that is closed because of invalid input, requests that wait for the bus are not answered.
     assert!(client.is_closed() || asked.len() == answered.len(), "{asked:?} {answered:?}");
     let whole: usize = answers.len();
     let mut length = 0;

@@ -1,6 +1,6 @@
 //! A message on a set topic. Input: flags, length and bytes of the topic below the base, then the payload.
 //!
-//! Whatever it is, it has one result, and only a sound command reaches the queue of the bus.
+//! Any message gets one result, and only a valid command reaches the queue of the bus.
 
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};

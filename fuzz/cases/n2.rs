@@ -1,7 +1,7 @@
-//! N2 frames, from both ends: what a drive may answer to a request, and what a board may hear.
+//! N2 frames in both directions: answers that a drive may send to a request, and frames that a board may receive.
 //!
-//! Input: what is asked, options, then what comes from the line. The last bit has the checksum of the line put right, or
-//! the fuzzer would hardly get past it.
+//! Input: the request, options, then the bytes from the line. The last bit of the options corrects the checksum of
+//! the line, since the fuzzer would hardly find it by chance.
 
 use drivegate::codec::n2::{Command, RegionWidth, Session, command::checksum, decode_reply, encode_request, reply_chars};
 use drivegate::codec::{Decoded, Reply, Request, RequestPdu, Table};
@@ -46,7 +46,7 @@ pub(crate) fn run(data: &[u8]) {
     match decode_reply(&request, &sealed) {
         Decoded::Reply { used, reply } => {
             assert!((2..=sealed.len()).contains(&used));
-            // A frame is the same whatever follows it.
+            // A frame is decoded alike whatever follows it.
             assert_eq!(
                 decode_reply(&request, &sealed[..used]),
                 Decoded::Reply { used, reply: reply.clone() }
@@ -66,7 +66,7 @@ pub(crate) fn run(data: &[u8]) {
     }
     let mut frame = Vec::new();
     encode_request(&request, &mut frame);
-    // The echo of a request is nobody's answer.
+    // The echo of a request is not an answer.
     if !frame.is_empty() {
         assert_eq!(decode_reply(&request, &frame), Decoded::Foreign { used: frame.len() });
     }

@@ -1,7 +1,7 @@
-//! RTU frames, from both ends: what a drive may answer to a request, and what a slave may hear.
+//! RTU frames in both directions: answers that a drive may send to a request, and frames that a slave may receive.
 //!
-//! Input: length and bytes of a request PDU, then what comes from the line. The last bit of the length has the check
-//! code of the frame put right, or the fuzzer would hardly get past it.
+//! Input: length and bytes of a request PDU, then the bytes from the line. The last bit of the length corrects the
+//! check code of the frame, since the fuzzer would hardly find it by chance.
 
 use drivegate::codec::rtu::{
     LONGEST, decode_reply, decode_request, encode_frame, encode_request, open_frame, request_len,
@@ -34,7 +34,7 @@ pub(crate) fn run(data: &[u8]) {
         match decode_reply(&request, line) {
             Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                 assert!((4..=line.len()).contains(&used));
-                // A frame is the same whatever follows it.
+                // A frame is decoded alike whatever follows it.
                 assert_eq!(decode_reply(&request, &line[..used]), decode_reply(&request, line));
             }
             Decoded::Incomplete => assert!(line.len() < LONGEST, "nothing is that long"),

@@ -1,4 +1,4 @@
-//! Device servers that close their connection: after each reply, after ten, upon a request, after a pause.
+//! Device servers that close their connection: after each reply, after ten, on a request, after a pause.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -14,15 +14,15 @@ use super::rig::{Rig, Setup};
 /// When the device server closes the connection of its client.
 #[derive(Debug, Clone, Copy)]
 enum Rule {
-    /// After this number of replies.
+    /// The server closes after this number of replies.
     Behind(u32),
-    /// At the request that follows this number of replies; the request is lost.
+    /// The server closes at the request that follows this number of replies; the request is lost.
     Upon(u32),
-    /// After a pause of this length without requests.
+    /// The server closes after a pause of this length without requests.
     Pause(Duration),
 }
 
-/// A device server in front of the simulated line at `to`; it keeps its connection to the line open.
+/// A device server in front of the simulated line at `to`; it keeps its own connection to the line open.
 fn device_server(to: &str, rule: Rule) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("tcp://{}", listener.local_addr().unwrap());
@@ -150,7 +150,7 @@ async fn a_server_that_closes_after_replies_or_pauses_is_no_lost_port() {
     }
 }
 
-/// A device that answers every read at once with zeros, by one connection after the other.
+/// A device that answers every read at once with zeros, over one connection after the other.
 fn at_once(listener: &TcpListener, until: Instant) {
     listener.set_nonblocking(true).unwrap();
     let mut open: Vec<TcpStream> = Vec::new();

@@ -77,8 +77,8 @@ async fn an_n2_slave_in_python() {
         is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
         assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
         is_good(&rig, ModelPoint::SpeedReference, Value::Number(50.0)).await;
-        // The slave answers faster than a line could, so a doubtful answer is requested again and requests are not counted
-        // here. A test in virtual time proves that nothing is written twice.
+        // The slave answers faster than a line could, so a doubtful answer is requested again, and requests are not
+        // counted in this test. A test in virtual time proves that nothing is written twice.
         let frames = ["0111020388", "0112020288", "017203014248000020", "017303018F"];
         let heard = || lines().split_off(1);
         until("all frames", || {

@@ -70,7 +70,7 @@ async fn a_command_that_loses_its_port_is_answered_once() {
     for _ in 0..3 {
         rig.until("the drive answers", |r| r.bus_up() && r.state(1) == State::Ready)
             .await;
-        // The drive does not answer, so the command is on the line when the port goes.
+        // The drive does not answer, so the command is on the line when the port disappears.
         let met = rig.line.statistics().faults;
         rig.line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
         let before: u64 = rig.plant.writes.results().values().sum();
@@ -232,7 +232,7 @@ async fn a_connection_that_is_cut_is_made_anew() {
         rig.until("it answers again", |r| r.bus_up() && r.state(1) == State::Ready)
             .await;
     }
-    // The server had answered by each connection: none was a lost port.
+    // The server had answered over each connection, so none counts as a lost port.
     let presence = [EventKind::BusDown, EventKind::BusUp, EventKind::Offline];
     let events = std::iter::from_fn(|| events.try_recv().ok()).filter(|e| presence.contains(&e.kind));
     assert_eq!(events.map(|e| e.text.clone()).collect::<Vec<_>>(), Vec::<String>::new());
@@ -265,7 +265,7 @@ async fn a_server_that_says_nothing() {
     })
     .await;
     assert_eq!(rig.set(1, &[("run", 1.0)]).await, Outcome::Offline);
-    // Two tries of 8 bytes, then probes; how seldom they come is proved in virtual time.
+    // Two attempts of 8 bytes are made, then probes; a test in virtual time proves how rare probes are.
     rig.until("it is probed", |_| heard.load(Ordering::Relaxed) > 24).await;
     assert!(rig.bus_up(), "a server that is mute is there");
 }
@@ -317,8 +317,8 @@ fn a_format_that_the_port_does_not_take_is_warned_about() {
     assert!(opened(&pty.1, &plain).1.is_empty());
 }
 
-/// Opens the port once it is free: a process started by another test has inherited the open files until it executes its
-/// program.
+/// Opens the port once it is free: a process started by another test has inherited the open files until it executes
+/// its program.
 fn opened(path: &str, format: &LineFormat) -> (Line, Vec<String>) {
     until("the port", || Line::open(path, format, &LineOptions::default()).ok())
 }
@@ -332,7 +332,7 @@ pub(crate) fn rustix_pty() -> (OwnedFd, String) {
     (master, name)
 }
 
-/// Opens a port as a user that may not open what another has exclusively; root may.
+/// Whether a user without root's rights could open the port; root may open a port that another has opened exclusively.
 fn opens_for_others(path: &str) -> bool {
     use std::os::unix::process::CommandExt;
     let mut other = std::process::Command::new("python3");
@@ -346,7 +346,7 @@ fn opens_for_others(path: &str) -> bool {
 
 #[test]
 fn a_port_that_is_closed_is_free_at_once() {
-    // The other end stays open, as a driver does that still sends: the kernel keeps the exclusive mode as long.
+    // The other end stays open, like a driver that is still sending: the kernel keeps the exclusive mode that long.
     let (_master, path) = rustix_pty();
     std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
     assert!(opens_for_others(&path));

@@ -1,4 +1,4 @@
-//! A device server that is set up over the network, against the one of pyserial; and servers of other kinds.
+//! A device server that is set up over the network, tested with pyserial; and servers of other kinds.
 
 use std::net::TcpListener;
 use std::time::Duration;
@@ -30,7 +30,7 @@ async fn drives_behind_a_server_that_is_set_up_over_the_network() {
     });
     let server = server(&rig.line.address(), port);
     rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
-    // 0xFFFF, so that bytes 255 go both ways: to telnet they are commands unless they are doubled.
+    // 0xFFFF makes bytes 255 travel in both directions: to telnet they are commands unless they are doubled.
     let outcome = rig.set(1, &[("speed_reference", -0.01)]).await;
     assert!(outcome.is_ok(), "{outcome:?}");
     rig.until("the drive has it", |r| {

@@ -1,4 +1,4 @@
-//! A bus with its thread on a real port, and simulated drives behind it.
+//! A bus with its thread on a real port, connected to simulated drives.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -21,14 +21,14 @@ use drivegate_testkit as testkit;
 
 use crate::support::process::PATIENCE;
 
-/// A reply that comes late on a busy machine still comes in time.
+/// Response timeout so long that a reply delayed by a busy machine is still in time.
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A bus, its simulated line, and the plant around it.
+/// A bus with its simulated line, and the plant around it.
 pub(crate) struct Rig {
     pub(crate) plant: Plant,
     pub(crate) events: Events,
-    // Dropped first, so that the bus ends before its line.
+    // This field is dropped first, so that the bus ends before its line.
     pub(crate) bus: BusTask,
     pub(crate) line: SimulatedBus,
     _link: tempfile::TempDir,
@@ -124,7 +124,7 @@ impl Rig {
         }
     }
 
-    /// Waits until something holds.
+    /// Waits until a condition holds.
     pub(crate) async fn until(&self, what: &str, holds: impl Fn(&Rig) -> bool) {
         let deadline = Instant::now() + PATIENCE;
         while !holds(self) {
@@ -137,7 +137,7 @@ impl Rig {
         self.plant.drive(&drive(address)).unwrap()
     }
 
-    /// State of a drive; offline as long as it is not known.
+    /// State of a drive; offline as long as the state is unknown.
     pub(crate) fn state(&self, address: u8) -> State {
         let state = self.handle(address).reading(Instant::now()).state();
         state.unwrap_or(State::Offline)
@@ -171,7 +171,7 @@ impl Rig {
     }
 }
 
-/// Why the bus is down.
+/// The reason why the bus is down.
 pub(crate) fn reason(rig: &Rig) -> String {
     rig.bus.handle().image.health().reason.unwrap_or_default()
 }

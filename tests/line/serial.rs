@@ -1,5 +1,5 @@
-//! The program itself on serial lines: Modbus ASCII and Modbus RTU against an independent slave (pymodbus), and Modbus
-//! ASCII against `drivegate simulate`, with faults on the line.
+//! The program itself on serial lines: Modbus ASCII and Modbus RTU against an independent slave (pymodbus), and
+//! Modbus ASCII against `drivegate simulate`, with faults on the line.
 
 use std::path::{Path, PathBuf};
 
@@ -73,7 +73,7 @@ point = [
 ]
 "#;
 
-/// Two pseudo-terminals joined by socat, with a pymodbus slave behind one of them.
+/// Two pseudo-terminals joined by socat, with a pymodbus slave on one of them.
 fn slave(site: &Site, framer: &str) -> (Running, Running) {
     let end = |name: &str| format!("pty,raw,echo=0,link={}", site.path(name));
     let socat = Running::start(&tool("socat"), &[&end("line1"), &end("far")]);
@@ -92,7 +92,7 @@ fn reads_and_writes_pymodbus(protocol: &str, framer: &str, format: &str) {
     let _line = slave(&site, framer);
     let file = site.config();
 
-    // Alone: the command opens the line itself.
+    // Without a gateway, the command opens the line itself.
     let read = |points: &[&str]| -> Value {
         let arguments = [&["read", "--config", &file, "drive", "--json"], points].concat();
         let output = until("values", || {
@@ -183,7 +183,7 @@ fn simulated_drives_in_ascii_run_and_meet_faults() {
     let gap: u64 = replied.split_whitespace().nth(1).unwrap().parse().unwrap();
     assert!(gap > 14_000, "the turnaround stands as the gap: {replied}");
 
-    // The line goes away and comes back with faults; reads and commands still work.
+    // The line disappears and returns with faults; reads and commands still work.
     line.signal("TERM");
     line.ended();
     until("the drive to be missed", || {

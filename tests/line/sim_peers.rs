@@ -1,5 +1,5 @@
-//! Independent masters on the simulated line: mbpoll (libmodbus, which has no Modbus ASCII) and pymodbus. What they read
-//! proves the simulated drive, and the frames they send and get are the worked frames of the reference.
+//! Independent masters on the simulated line: mbpoll (libmodbus, without Modbus ASCII) and pymodbus. Their readings
+//! prove the simulated drive, and their frames are the worked frames of the reference.
 
 use drivegate::codec::{LineFormat, Protocol};
 use drivegate::sim::half_duplex::LineRules;
@@ -36,7 +36,7 @@ fn line_of(protocol: Protocol, format: &str) -> SimulatedBus {
     SimulatedBus::start(options).unwrap()
 }
 
-/// Output of a program, stdout first, whatever its exit code.
+/// Output of a program, stdout first, whatever its exit code is.
 fn printed(program: &Path, arguments: &[&str]) -> String {
     let output = run(program, arguments);
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
@@ -72,7 +72,7 @@ fn frames(line: &SimulatedBus) -> Vec<String> {
     line.transcript().iter().map(frame).collect()
 }
 
-/// Waits until drive 1 is at its reference, and the torque of its ramp is gone.
+/// Waits until drive 1 has reached its reference, and the torque of the ramp has disappeared.
 fn until_at_reference(line: &SimulatedBus) {
     let status = || line.with_drive(1, |drive, _| drive.as_nx().unwrap().state().status);
     until("the reference", || {
@@ -196,7 +196,7 @@ fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
     assert_eq!(line.statistics().broadcasts, 1);
 }
 
-/// A simulated drive 1 of this model, and what pymodbus reads from it.
+/// A simulated drive 1 of this model, and the values that pymodbus reads from it.
 fn pymodbus(name: &str, protocol: Protocol, format: &str) -> (SimulatedBus, Vec<String>) {
     let drive = DriveOptions::new(1, ModelOptions::by_name(name).unwrap());
     let rules = LineRules::of(protocol, LineFormat::new(19_200, format).unwrap());

@@ -21,7 +21,7 @@ struct SlotSite {
 }
 
 impl SlotSite {
-    /// Two drives and a slot with that access.
+    /// Two drives and a slot with this access.
     fn new(access: &str) -> SlotSite {
         let (raw, rfc2217) = (free_port(), free_port());
         let slot = format!(
@@ -56,7 +56,7 @@ fn frame(address: u8, pdu: &[u8]) -> Vec<u8> {
     frame
 }
 
-/// A request, repeated until it is answered: on a busy machine the gateway may stay silent rather than be late.
+/// Sends a request until it is answered: on a busy machine the gateway may stay silent rather than answer late.
 fn ask(stream: &mut TcpStream, request: &[u8]) -> Vec<u8> {
     until("an answer", || {
         stream.write_all(request).unwrap();
@@ -191,7 +191,8 @@ fn tools_that_misbehave_harm_nobody() {
     });
     let abandoned = rig.counted("abandoned");
     assert!(abandoned >= 1.0, "the flood gave its own requests up");
-    // The gateway takes no more from the tool than a fast line brings, 50,000 bytes a second, and what one read takes.
+    // The gateway accepts no more bytes from the tool than a fast line carries, 50,000 a second, plus the bytes of
+    // one read.
     let most = (begun.elapsed().as_secs_f64() * 50_000.0 + 1024.0) / request.len() as f64;
     assert!(abandoned <= most, "{abandoned} of {most}");
     rig.site.until_state("pump-1", "ready");

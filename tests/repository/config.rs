@@ -172,8 +172,8 @@ fn fenced(text: &str) -> Vec<String> {
     blocks
 }
 
-/// Errors to fix in a configuration that ships. Secrets, certificates and profile directories exist only on the machine
-/// it is made for.
+/// Errors to fix in a shipped configuration. Secrets, certificates and profile directories exist only on the
+/// machine it is made for.
 fn faults(path: &Path, source: &str) -> Vec<String> {
     let elsewhere = [
         ".password_file",

@@ -74,7 +74,7 @@ fn every_configuration_that_ships_is_valid() {
             }
             let name = document.file_stem().unwrap().to_string_lossy().into_owned();
             let path = dir.path().join(format!("{name}-{i}.toml"));
-            // A block that shows one section stands in a file that has the others.
+            // A block that shows one section is completed to a file with the other sections.
             let head = if block.contains("[gateway]") {
                 ""
             } else {
@@ -158,8 +158,8 @@ fn every_profile_that_is_shown_is_sound() {
     }
 }
 
-/// Puts `text` between the comment `<!-- name -->` and the next `<!-- end -->` of a page, or fails where it is not
-/// there. `DRIVEGATE_WRITE_DOCS=1` writes the page instead.
+/// Puts `text` between the comment `<!-- name -->` and the next `<!-- end -->` of a page, or fails if the page
+/// differs. `DRIVEGATE_WRITE_DOCS=1` writes the page instead.
 fn generated(page: &str, name: &str, text: &str) {
     let path = root().join("docs").join(page);
     let old = read(&path);
@@ -177,7 +177,7 @@ fn generated(page: &str, name: &str, text: &str) {
     }
 }
 
-/// The four examples at the beginning of the page are profiles, read and commanded as it says.
+/// The four examples at the start of the page are valid profiles, which read and command as the page says.
 #[test]
 fn the_page_of_profiles_begins_with_four_profiles() {
     use drivegate::drive::control::Run;
@@ -213,7 +213,7 @@ fn the_page_of_profiles_begins_with_four_profiles() {
         (reads(meter, PollClass::Slow), reads(meter, PollClass::Once)),
         (vec![(8, 4)], vec![(20, 8)])
     );
-    // The counter's parts, and both bytes, come in one request.
+    // The counter's parts, and both bytes, are read in one request.
     assert_eq!(reads(ratios, PollClass::Slow), [(31, 3)]);
     let control = |profile: &Profile| profile.control.clone().unwrap();
     let at = control(bits).at;
@@ -321,7 +321,7 @@ fn links_lead_somewhere() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// The lines of all examples for a shell, a command that goes over several lines as one.
+/// The lines of all shell examples, with a command that continues over several lines as one.
 fn examples() -> Vec<(PathBuf, String)> {
     let mut examples = Vec::new();
     for document in documents() {
@@ -337,7 +337,7 @@ fn examples() -> Vec<(PathBuf, String)> {
     examples
 }
 
-/// Every example that is pasted whole must be a command: a description stands behind `#` or on a line of its own.
+/// Every example that is pasted whole must be a command: a description follows `#` or has a separate line.
 #[test]
 fn examples_can_be_pasted_whole() {
     let examples = examples();
@@ -346,7 +346,7 @@ fn examples_can_be_pasted_whole() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// The words of a command of this program in a line for a shell; of `docker run IMAGE drivegate` those behind it.
+/// The words of a command of this program in a shell line; for `docker run IMAGE drivegate`, the words after it.
 fn own_words(line: &str) -> Option<Vec<String>> {
     let (mut words, mut quote) = (vec![String::new()], None);
     for c in line.chars() {
@@ -383,7 +383,7 @@ fn the_options_of_all_examples_exist() {
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 
-/// Words behind two blanks or more, that are neither a comment nor inside quotes nor the rest of a continued line.
+/// Words after two blanks or more that are neither a comment nor inside quotes nor the rest of a continued line.
 fn has_trailing_prose(line: &str) -> bool {
     let mut quote = None;
     // The beginning of the line counts as a blank.

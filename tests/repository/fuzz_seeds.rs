@@ -2,7 +2,7 @@
 
 use crate::support::tools::root;
 
-/// Declares the targets and runs the one of that name.
+/// Declares the fuzz targets, and runs the one with this name.
 macro_rules! targets {
     ($($name:ident $file:literal,)*) => {
         $(#[path = $file] mod $name;)*

@@ -1,5 +1,5 @@
-//! The packages and the image, as far as it can be seen without building them; `make test-package`, `make test-static` and
-//! `make test-image` do that.
+//! The packages and the image, as far as they can be checked without a build; `make test-package`, `make
+//! test-static` and `make test-image` do the rest.
 
 #[path = "../../deploy/package/manual/pages.rs"]
 mod pages;
@@ -88,7 +88,7 @@ fn what_the_package_names_is_there() {
     }
 }
 
-/// The unit starts the program, reads the configuration and names the page where the package puts them.
+/// The systemd unit uses the paths of program, configuration and page at which the package installs them.
 #[test]
 fn the_package_puts_files_where_the_unit_looks_for_them() {
     let unit = read("systemd/drivegate.service");
@@ -137,7 +137,7 @@ fn the_image_says_what_it_is_and_whether_it_is_well() {
     }
     assert!(image.contains("\nHEALTHCHECK "));
     assert!(image.contains("CMD [\"/drivegate\", \"health\", \"--config\", \"/etc/drivegate/drivegate.toml\"]"));
-    // The base of the build can be named by its digest, and the compiler runs on the builder's own processor.
+    // The base image of the build can be given by its digest, and the compiler runs on the builder's own processor.
     assert!(text.contains("\nARG RUST_IMAGE="));
     assert!(text.contains("\nFROM --platform=$BUILDPLATFORM $RUST_IMAGE AS build\n"));
     let compose = read("deploy/compose.yaml");

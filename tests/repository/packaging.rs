@@ -11,7 +11,7 @@ use crate::support::tools::{python, root, run_well, tool};
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// The metrics of the public contract; dashboards and alerts of users hang on these names.
+/// The metrics of the public contract, on whose names dashboards and alerts of users depend.
 const METRICS: [&str; 53] = [
     "drivegate_listener_up",
     "drivegate_parameters_changed_total",
@@ -226,7 +226,7 @@ fn dashboards_and_alerts_use_metrics_that_exist() {
     let missing: Vec<_> = SHOWN.iter().filter(|metric| !shown.contains(**metric)).collect();
     assert!(missing.is_empty(), "the dashboards do not show {missing:?}");
 
-    // Label values such as a file name may begin like a metric; expressions are what counts.
+    // Label values such as a file name may begin like a metric, so only expressions are checked.
     let expressions: Vec<String> = rules_of(ALERTS).iter().map(|rule| rule["expr"].to_string()).collect();
     let unknown: Vec<_> = metrics_in(&expressions.join("\n"))
         .into_iter()
@@ -257,7 +257,7 @@ fn the_dashboards_are_those_of_their_script() {
     run_well(&python(), &["deploy/compose/grafana/make_dashboards.py", "--check"]);
 }
 
-/// The types of Grafana itself: keys that it would ignore and values that it does not know fail here.
+/// The types of Grafana itself detect keys that Grafana would ignore and values that it does not know.
 #[test]
 fn grafana_knows_all_of_the_dashboards() {
     let check = |files: &[String]| {
@@ -271,7 +271,7 @@ fn grafana_knows_all_of_the_dashboards() {
     };
     let checked = check(&DASHBOARDS.map(dashboard_path));
     assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stderr));
-    // The check itself sees a value that Grafana does not know.
+    // The check itself must detect a value that Grafana does not know.
     let dir = TempDir::new().unwrap();
     let wrong = dir.path().join("wrong.json");
     let text = read(&dashboard_path("drive"));

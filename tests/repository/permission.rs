@@ -1,11 +1,12 @@
-//! The gate is the only place: refusals of an order for the state of its drive are built in `core/permit` alone.
+//! The gate is the only place where orders are refused because of the state of their drive: such refusals are built
+//! in `core/permit` only.
 
 use std::path::Path;
 
 use super::documents::{files, read};
 use crate::support::tools::root;
 
-/// Refusals that say that an order may not move a motor now (`docs/decisions/commands.md`).
+/// Refusals which mean that an order may not move a motor now (`docs/decisions/commands.md`).
 const OF_THE_GATE: [&str; 4] = ["HeldByOther", "NeedsTake", "Guarded", "Interlocked"];
 
 /// The lines that are no tests.
@@ -14,8 +15,7 @@ fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
     lines.take_while(|(_, line)| !line.starts_with("#[cfg(test)]"))
 }
 
-/// Whether a line builds such a refusal with something in it. Patterns name what they match, and lists of all codes hold empty
-/// ones.
+/// Whether a line builds such a refusal with content. Patterns only name it, and lists of all codes contain empty ones.
 fn builds(line: &str) -> bool {
     let is_pattern = ["=>", "matches!", "if let ", "let "]
         .iter()

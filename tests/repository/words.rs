@@ -6,7 +6,7 @@ use std::process::Command;
 
 use crate::support::tools::root;
 
-/// Words that no page and no message has, and what to write instead.
+/// Words that must not occur in pages and messages, with their replacements.
 const INSTEAD: [(&str, &str); 31] = [
     ("told", "reported, shown"),
     ("tells", "reports, shows, says"),
@@ -44,7 +44,7 @@ const INSTEAD: [(&str, &str); 31] = [
 /// Limit for README and docs, without decisions.
 const MOST_WORDS: usize = 50_000;
 
-/// Phrases that are right although a part of them is refused.
+/// Phrases that are allowed although a part of them is refused.
 const RIGHT: [&str; 9] = [
     "there is no",
     "there are no",
@@ -112,7 +112,7 @@ fn literals(code: &str) -> Vec<(usize, String)> {
     found
 }
 
-/// Where a string literal ends, of which `text` is what follows its first mark.
+/// Index of the end of a string literal; `text` begins after its opening quotation mark.
 fn closing(text: &str) -> usize {
     let mut escaped = false;
     let end = text.char_indices().find(|(_, c)| {
@@ -142,7 +142,7 @@ fn said(literal: &str) -> String {
         .join("`")
 }
 
-/// All Rust files below the folders, tests included.
+/// All Rust files below the folders, including tests.
 fn rust_files(folders: &[&str]) -> Vec<PathBuf> {
     let mut open: Vec<PathBuf> = folders.iter().map(|folder| root().join(folder)).collect();
     let mut found = Vec::new();
@@ -160,7 +160,7 @@ fn rust_files(folders: &[&str]) -> Vec<PathBuf> {
     found
 }
 
-/// Whether a file, or a folder that it is in, has only tests.
+/// Whether a file, or a folder that contains it, has only tests.
 fn is_test(path: &Path) -> bool {
     let parts = path.strip_prefix(root()).unwrap().iter();
     parts
@@ -176,7 +176,7 @@ fn the_messages_are_in_plain_words() {
             continue;
         }
         for (number, literal) in literals(&fs::read_to_string(&file).unwrap()) {
-            // A single word is a name or a part of a format.
+            // A single word is a name or a part of a format, so it is skipped.
             let text = said(&literal);
             if text.split_whitespace().count() < 2 {
                 continue;
@@ -202,7 +202,8 @@ fn messages_are_found_in_code() {
     assert_eq!(said("a {told} b `told` c"), "a  b ` c");
 }
 
-/// The words of a line in lower case, with a blank at each end; a sign is a word, so that nothing matches across it.
+/// The words of a line in lower case, with a blank at each end; a punctuation mark counts as a word, so that no
+/// phrase matches across it.
 fn words(line: &str) -> String {
     let mut apart = String::new();
     for c in line.to_lowercase().chars() {
@@ -241,7 +242,7 @@ fn the_pages_are_in_plain_words() {
 /// Beginnings of a comment whose subject is somewhere else.
 const WITHOUT_SUBJECT: [&str; 5] = ["It", "Its", "The same", "Of", "Those"];
 
-/// Comments below here are the text of `docs/configuration.md`, which a test of its own compares.
+/// Comments below this path are the text of `docs/configuration.md`; another test compares the two.
 const KEYS: &str = "crates/gateway/src/config/keys";
 
 /// The first line of each paragraph of comments, with its number.
@@ -348,7 +349,7 @@ fn unwanted_words_are_noticed() {
     assert_eq!(prose(text), [(1, "a ` b".to_string()), (5, "end".to_string())]);
 }
 
-/// Spelling, by an independent program; `typos.toml` has the names that it does not know.
+/// Checks spelling with an independent program; `typos.toml` lists the names that it does not know.
 #[test]
 fn the_pages_are_spelled_right() {
     let typos = root().join(".tools/venv/bin/typos");

@@ -17,7 +17,7 @@ pub(crate) fn client(name: &str, port: u16) -> Command {
     client_of("5", name, port)
 }
 
-/// Output of `mosquitto_sub` for the next message of a topic; empty when none comes within 10 s.
+/// Output of `mosquitto_sub` for the next message of a topic; empty if none arrives within 10 s.
 pub(crate) fn next_message(port: u16, topic: &str, more: &[&str]) -> Output {
     let mut command = client("mosquitto_sub", port);
     command.args(["-t", topic, "-C", "1", "-W", "10"]).args(more);
@@ -33,7 +33,7 @@ pub(crate) fn next_json(port: u16, topic: &str) -> Option<serde_json::Value> {
 pub(crate) struct Subscriber(Child);
 
 impl Subscriber {
-    /// Starts the client; `on_line` receives each line when it is printed.
+    /// Starts the client; `on_line` receives each printed line.
     pub(crate) fn start(command: &mut Command, mut on_line: impl FnMut(String) + Send + 'static) -> Subscriber {
         let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn();
         let mut child = child.unwrap();

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use super::tools::tool;
 
-/// Longest wait for something that must happen, even on a very busy machine.
+/// Longest wait for an event that must happen, even on a very busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(240);
 
 /// A running process; killed when dropped.
@@ -80,7 +80,7 @@ impl Running {
         );
     }
 
-    /// Stops it with all its threads: on a busy machine that takes a moment.
+    /// Stops all threads of the process (SIGSTOP); on a busy machine that takes a moment.
     pub(crate) fn stand(&self) {
         self.signal("STOP");
         let tasks = format!("/proc/{}/task", self.child.id());
@@ -110,7 +110,7 @@ impl Drop for Running {
     }
 }
 
-/// The program, with runtime files away from those of gateways on this machine, and a state directory of its own.
+/// The program, with runtime files separate from those of gateways on this machine, and with its own state directory.
 pub(crate) fn drivegate(arguments: &[&str]) -> Command {
     static STARTED: AtomicU32 = AtomicU32::new(0);
     let number = STARTED.fetch_add(1, Ordering::Relaxed);
@@ -181,9 +181,9 @@ pub(crate) fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A TCP port that is free now, and that no other test gets, of this process or of another, as long as this process runs:
-/// without this a socket that is closed to be bound again could collide with another test. The port is outside the range that
-/// the kernel assigns, so that no other program gets it by chance.
+/// A free TCP port that no other test gets, of this process or another one, as long as this process runs: otherwise
+/// a socket that is closed and bound again could collide with another test. The port is outside the range that the
+/// kernel assigns, so that no other program gets it by chance.
 pub(crate) fn free_port() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     static CLAIMED: Mutex<Vec<UnixListener>> = Mutex::new(Vec::new());
@@ -223,7 +223,7 @@ pub(crate) fn until_ready(http: u16) {
     });
 }
 
-/// A drive as `/api/v1/drives` shows it; a gateway that polls its drives already may open its HTTP server a moment later.
+/// A drive as `/api/v1/drives` shows it. A gateway that already polls its drives may open its HTTP server a moment later.
 pub(crate) fn api(http: u16, drive: &str) -> serde_json::Value {
     let (status, body) = until("an answer over HTTP", || get(http, &format!("/api/v1/drives/{drive}")));
     assert_eq!(status, 200, "{body}");
@@ -265,7 +265,7 @@ pub(crate) fn mbpoll_write(port: u16, unit: u8, start: u16, values: &[u16]) -> R
     if text.contains("Written") { Ok(()) } else { Err(text) }
 }
 
-/// Reads registers, again until they are read: on a busy machine the time of a request may run out.
+/// Reads registers, and repeats the request until it succeeds: on a busy machine a request may time out.
 pub(crate) fn read_registers(port: u16, unit: u8, start: u16, count: u16) -> Vec<u16> {
     until("registers", || mbpoll_read(port, unit, start, count).ok())
 }

@@ -15,7 +15,7 @@ use super::mqtt::client;
 use super::process::{Running, api, free_port, get, until, until_ready};
 use super::tools::{feed, root, run, tool};
 
-/// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
+/// The gateway and its bus `line1`; its time limits tolerate replies that a busy machine delays.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
      [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nsilence = \"chars\"\nresponse_timeout = \"2s\"\n";
 /// With this limit, no value becomes stale because the test machine is busy.
@@ -66,7 +66,7 @@ impl Site {
         }
     }
 
-    /// A site whose configuration is made of these parts.
+    /// A site whose configuration consists of these parts.
     pub(crate) fn of(parts: &[&str]) -> Site {
         let site = Site::new();
         site.configure(parts);
@@ -103,7 +103,7 @@ impl Site {
         self.write("drivegate.conf", &text);
     }
 
-    /// Replaces a part of the configuration and writes it; returns the configuration as it was before.
+    /// Replaces a part of the configuration and writes it; returns the previous configuration.
     pub(crate) fn change(&self, from: &str, to: &str) -> String {
         let text = std::fs::read_to_string(self.config()).unwrap();
         assert!(text.contains(from), "{from} does not stand in\n{text}");
@@ -130,12 +130,12 @@ impl Site {
         })
     }
 
-    /// Simulated drives at the port of `line1`, at 38400; the traffic on their line is recorded.
+    /// Simulated drives at the port of `line1`, at 38400 baud; the traffic on their line is recorded.
     pub(crate) fn line(&self, addresses: &[u8]) -> SimulatedBus {
         line_of(&self.file("line1"), addresses)
     }
 
-    /// Simulates the line in a process of its own.
+    /// Simulates the line in a separate process.
     pub(crate) fn simulate(&self, arguments: &[&str]) -> Running {
         let line = self.path("line1");
         let running = Running::drivegate(&[&["simulate", "--link", &line], arguments].concat());
@@ -204,7 +204,7 @@ impl Site {
         assert!(published.status.success(), "{published:?}");
     }
 
-    /// The response to a message to a set topic of a drive, by a client of its own.
+    /// The response to a message to a set topic of a drive, received by a separate client.
     pub(crate) fn ask(&self, topic: &str, payload: &str) -> serde_json::Value {
         self.respond(&format!("drivegate/test/drive/{topic}"), payload)
     }
@@ -217,7 +217,7 @@ impl Site {
         serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{topic} {payload}: {error}: {output:?}"))
     }
 
-    /// Repeats the command until it is carried out: on a busy machine its time may expire.
+    /// Repeats the command until it is carried out: on a busy machine it may expire.
     pub(crate) fn order(&self, topic: &str, payload: &str) -> serde_json::Value {
         until(payload, || {
             Some(self.ask(topic, payload)).filter(|result| result["ok"] == true)
@@ -237,7 +237,7 @@ pub(crate) fn curl(arguments: &[&str]) -> (u16, serde_json::Value) {
     (status.parse().unwrap(), reply)
 }
 
-/// Simulated drives at the port `link`, at 38400; the traffic on their line is recorded.
+/// Simulated drives at the port `link`, at 38400 baud; the traffic on their line is recorded.
 pub(crate) fn line_of(link: &Path, addresses: &[u8]) -> SimulatedBus {
     let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
     let drives = addresses.iter().map(|address| DriveOptions::nx(*address)).collect();

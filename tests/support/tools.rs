@@ -9,7 +9,7 @@ pub(crate) fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The path of a program: of those in `.tools`, of those on the `PATH`, or of the daemons in `/usr/sbin`.
+/// The path of a program in `.tools`, on the `PATH`, or among the daemons in `/usr/sbin`.
 pub(crate) fn tool(name: &str) -> PathBuf {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let own = [".tools/venv/bin", ".tools/bin"].map(|dir| root().join(dir));

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use drivegate::drive::Step;
 use drivegate::drive::profile::{Profile, Profiles};
 
-/// Each family that is not based on another, and the one that it is compared with.
+/// Each family that is not based on another, with the one that it is compared with.
 const FAMILIES: [(&str, Option<&str>); 8] = [
     ("vacon-nx", None),
     ("vacon-nx-n2", Some("vacon-nx")),
@@ -33,8 +33,8 @@ pub(crate) fn lists() -> String {
     text + "\n"
 }
 
-/// All steps, or those that differ from the other family; of such a step the lines that it lacks, or all where it has
-/// lines that do not hold here.
+/// All steps of a family, or those that differ from the other family: the lines missing there, or all lines of a
+/// step if some of the other family's lines do not apply.
 fn family(profile: &Profile, other: Option<&Profile>) -> String {
     let but = other.map_or(String::new(), |other| format!(", as `{}` except", other.name));
     let mut text = format!("\n### `{}`{but}\n\n", profile.name);

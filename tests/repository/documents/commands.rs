@@ -32,7 +32,7 @@ fn rows(text: &mut String, path: &str, command: &Command) {
     }
 }
 
-/// A position, in brackets where it may be left out, or an option that is required; `--help` has the others.
+/// A positional argument, in brackets if optional, or a required option; `--help` has the others.
 fn argument(arg: &Arg) -> Option<String> {
     if arg.is_hide_set() || (arg.get_long().is_some() && !arg.is_required_set()) {
         return None;

@@ -58,7 +58,7 @@ fn unverified(profiles: &Profiles) -> (String, usize) {
     (text, all.len())
 }
 
-/// Which points of the common model and which commands they have.
+/// The points of the common model and the commands that these profiles have.
 fn common_points(profiles: &[&std::sync::Arc<Profile>]) -> String {
     let names: Vec<&str> = profiles.iter().map(|profile| profile.name.as_str()).collect();
     let mut text = format!(
@@ -199,7 +199,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     }
 }
 
-/// Points that are read on request only, up to which all of them are listed.
+/// Most points read on request only for which all are listed.
 const MOST_ON_REQUEST: usize = 30;
 
 /// The points of a family beyond the common model.
@@ -299,7 +299,7 @@ fn faults(profiles: &Profiles, profile: &Profile) -> String {
     text
 }
 
-/// The points by which application profiles differ from the profiles that they are based on.
+/// The points by which application profiles differ from the profiles on which they are based.
 fn applications(profiles: &Profiles) -> String {
     let mut text = String::from(
         "\n## Profiles of one application\n\nWhat process data in means depends on the application, and no read shows which one \

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use drivegate::drive::Step;
 use drivegate::drive::profile::Profiles;
 
-/// Text of a profile whose timeout counts unknown requests; the page has it once.
+/// Text of a profile whose timeout counts unknown requests, which the page states only once.
 const UNKNOWN: &str = "; which requests count is not known";
 
 /// A row for each timeout, with the families that have it and are not based on another of these families.
