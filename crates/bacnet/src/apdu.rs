@@ -6,19 +6,19 @@ use crate::types::{Abort, Error, Reject};
 /// Longest message that fits into a datagram of BACnet/IP.
 pub const MAX_APDU: usize = 1476;
 
-/// The responses that a client accepts.
+/// The kinds and sizes of responses that a client accepts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Accepts {
-    /// Segments, and at most how many.
+    /// Maximum number of segments; `None` without segmentation.
     pub segments: Option<usize>,
-    /// Longest message, octets.
+    /// Longest message in octets.
     pub size: usize,
 }
 
 /// A message of the application layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Apdu<'a> {
-    /// A request that is answered.
+    /// A request that must be answered.
     Confirmed {
         /// Whether the request comes in segments.
         segmented: bool,
@@ -35,9 +35,9 @@ pub enum Apdu<'a> {
     Unconfirmed(u8, &'a [u8]),
     /// A request of ours was carried out.
     SimpleAck(u8),
-    /// A request of ours was answered.
+    /// The answer to a request of the server.
     ComplexAck(u8),
-    /// Segments arrived.
+    /// Acknowledgement of received segments.
     SegmentAck {
         /// A negative acknowledgement: segments arrived out of order.
         negative: bool,
@@ -45,16 +45,16 @@ pub enum Apdu<'a> {
         server: bool,
         /// The invoke id of the transaction whose segments are acknowledged.
         invoke: u8,
-        /// The last one that arrived.
+        /// Sequence number of the last received segment.
         sequence: u8,
         /// Number of segments that may follow before the next acknowledgement.
         window: u8,
     },
-    /// A request of ours failed.
+    /// Error answer to a request of the server.
     Error(u8),
     /// A request of ours was not understood.
     Reject(u8),
-    /// An exchange ended.
+    /// A transaction was aborted.
     Abort {
         /// Whether the sender acts as the server of the transaction.
         server: bool,
@@ -137,7 +137,7 @@ pub fn unconfirmed(service: u8, content: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// The request was carried out.
+/// Acknowledgement that the request was carried out.
 pub fn simple_ack(invoke: u8, service: u8) -> Vec<u8> {
     vec![0x20, invoke, service]
 }
@@ -149,7 +149,7 @@ pub fn complex_ack(invoke: u8, service: u8, content: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// A segment of an answer.
+/// A segment of a segmented answer.
 pub fn segment(invoke: u8, service: u8, (sequence, window): (u8, u8), more: bool, content: &[u8]) -> Vec<u8> {
     let mut bytes = vec![0x38 | u8::from(more) << 2, invoke, sequence, window, service];
     bytes.extend(content);
@@ -159,7 +159,7 @@ pub fn segment(invoke: u8, service: u8, (sequence, window): (u8, u8), more: bool
 /// Octets of a segment before its content.
 pub const SEGMENT_HEADER: usize = 5;
 
-/// The request failed.
+/// Answer to a request that failed.
 pub fn error(invoke: u8, service: u8, error: Error) -> Vec<u8> {
     let mut writer = Writer::default();
     writer.raw(&[0x50, invoke, service]);
@@ -167,12 +167,12 @@ pub fn error(invoke: u8, service: u8, error: Error) -> Vec<u8> {
     writer.into_bytes()
 }
 
-/// The request is not understood.
+/// Answer to a request that cannot be parsed.
 pub fn reject(invoke: u8, reason: Reject) -> Vec<u8> {
     vec![0x60, invoke, reason as u8]
 }
 
-/// The exchange ends.
+/// Message that ends a transaction.
 pub fn abort(invoke: u8, reason: Abort) -> Vec<u8> {
     vec![0x71, invoke, reason as u8]
 }
@@ -181,7 +181,7 @@ pub fn abort(invoke: u8, reason: Abort) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    /// Frames of annex F.
+    /// Example frames from annex F of the standard.
     #[test]
     fn frames_of_the_standard() {
         let read = [0x00, 0x00, 0x01, 0x0C, 0x0C, 0, 0, 0, 5, 0x19, 0x55];

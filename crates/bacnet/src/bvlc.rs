@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 /// First octet of every BACnet/IP datagram.
 const BACNET_IP: u8 = 0x81;
 
-/// A datagram.
+/// A BACnet/IP datagram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bvlc<'a> {
     /// The result of a request to a BBMD.
@@ -18,7 +18,7 @@ pub enum Bvlc<'a> {
     Forwarded(SocketAddrV4, &'a [u8]),
     /// A foreign device registers for this number of seconds.
     Register(u16),
-    /// A question for the foreign devices.
+    /// A request for the list of foreign devices.
     ReadForeign,
     /// A foreign device is to be forgotten.
     DeleteForeign(SocketAddrV4),
@@ -124,7 +124,7 @@ fn octets(host: SocketAddrV4) -> [u8; 6] {
     [a, b, c, d, high, low]
 }
 
-/// The result of a request.
+/// The result message for a BVLC request.
 pub fn result(code: u16) -> Vec<u8> {
     datagram(0x00, &code.to_be_bytes())
 }

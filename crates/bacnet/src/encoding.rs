@@ -6,7 +6,7 @@ mod writer;
 pub use reader::{Read, Reader, Tag, text_of, u32_of};
 pub use writer::Writer;
 
-/// Application tags.
+/// Application tag numbers.
 mod tag {
     pub(super) const NULL: u8 = 0;
     pub(super) const BOOLEAN: u8 = 1;

@@ -2,9 +2,9 @@
 
 use crate::types::Mac;
 
-/// The network that means all networks.
+/// Network number that means all networks.
 pub const GLOBAL: u16 = 0xFFFF;
-/// Hops that a message may make.
+/// Maximum number of routers that a message may pass.
 const HOPS: u8 = 0xFF;
 
 /// A message of the network layer.
@@ -14,7 +14,7 @@ pub struct Npdu<'a> {
     pub to: Option<(u16, Mac, u8)>,
     /// Network and station that sent the message; `None` if the host itself sent it.
     pub from: Option<(u16, Mac)>,
-    /// An answer is expected.
+    /// Whether the sender expects an answer.
     pub expects: bool,
     /// The message itself: to an application, or between routers.
     pub payload: Payload<'a>,

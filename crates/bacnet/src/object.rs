@@ -9,7 +9,7 @@ use crate::types::{Address, DateTime, Mac, ObjectId, ObjectType};
 
 pub(crate) use properties::{Context, Environment, Port, cov_value, list, property};
 
-/// A device.
+/// A BACnet device with its objects.
 #[derive(Debug, PartialEq)]
 pub struct Device {
     /// Instance number of the device, 0..=4194302, unique in the network.
@@ -27,7 +27,7 @@ pub struct Device {
     revision: u32,
 }
 
-/// An object of a device.
+/// An object of a BACnet device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Object {
     /// Identifier of the object, unique in the device.
@@ -56,7 +56,7 @@ pub enum Access {
 /// The kind of an object's values.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
-    /// Numbers.
+    /// The values are numbers.
     Analog {
         /// The unit by the number of the standard.
         units: u32,
@@ -67,7 +67,7 @@ pub enum Kind {
         /// The change that is worth a notification, unless a client sets another.
         increment: f32,
     },
-    /// Inactive or active.
+    /// The values are inactive and active.
     Binary {
         /// Texts of the two states.
         texts: [Arc<str>; 2],
@@ -77,11 +77,11 @@ pub enum Kind {
         /// Texts of the states.
         texts: Arc<[String]>,
     },
-    /// A text.
+    /// The values are texts.
     Text,
 }
 
-/// A value.
+/// The value of an object.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Datum {
     /// Value of an analog object.
@@ -97,7 +97,7 @@ pub enum Datum {
 /// Whether a value can be relied on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reliability {
-    /// The value can be relied on.
+    /// The value is reliable.
     NoFault = 0,
     /// The source gives no valid value.
     UnreliableOther = 7,
@@ -116,13 +116,13 @@ pub struct Sample {
     pub at: Option<DateTime>,
 }
 
-/// The writer of a value.
+/// The source that wrote a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ValueSource {
     /// The writer is not known.
     #[default]
     None,
-    /// A client.
+    /// A client with this address wrote the value.
     Address(Address),
     /// A device given by its instance.
     Device(u32),
@@ -139,7 +139,7 @@ pub struct Slot {
     pub at: DateTime,
 }
 
-/// The priorities of an object.
+/// The priority array of an object.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Commands {
     /// The value of each slot, priority 1 first.
@@ -201,7 +201,7 @@ impl Device {
         own.into_iter().chain(self.objects.iter().map(|object| object.id))
     }
 
-    /// The object of that name.
+    /// The object with this name.
     pub(crate) fn named(&self, name: &str) -> Option<ObjectId> {
         if name == self.name {
             return Some(self.id());
@@ -221,7 +221,7 @@ impl Device {
     }
 }
 
-/// The name of the port.
+/// Name of the Network Port object.
 pub(crate) const PORT_NAME: &str = "network_port";
 
 /// FNV-1a over what identifies the objects.

@@ -3,7 +3,7 @@
 use crate::encoding::{Read, Reader, Tag, text_of, u32_of};
 use crate::types::{Data, ObjectId, PropertyId, Reject};
 
-/// Confirmed services.
+/// Numbers of the confirmed services.
 #[allow(missing_docs)]
 pub mod confirmed {
     pub const COV_NOTIFICATION: u8 = 1;
@@ -17,7 +17,7 @@ pub mod confirmed {
     pub const SUBSCRIBE_COV_PROPERTY: u8 = 28;
 }
 
-/// Unconfirmed services.
+/// Numbers of the unconfirmed services.
 #[allow(missing_docs)]
 pub mod unconfirmed {
     pub const I_AM: u8 = 0;
@@ -37,13 +37,13 @@ pub const SUPPORTED: [usize; 11] = [5, 12, 14, 15, 16, 17, 32, 33, 34, 36, 38];
 /// A property, or one element of an array property.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PropertyRef {
-    /// The property.
+    /// The property that is meant.
     pub property: PropertyId,
     /// The element of an array; 0 is the number of elements.
     pub index: Option<u32>,
 }
 
-/// Instances that a question is for.
+/// Device instances to which a request is addressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Range(pub Option<(u32, u32)>);
 
@@ -65,10 +65,10 @@ impl Range {
     }
 }
 
-/// Reads Who-Is.
+/// Parses a Who-Is request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn who_is(data: &[u8]) -> Read<Range> {
     let mut reader = Reader::new(data);
     let range = Range::read(&mut reader)?;
@@ -85,10 +85,10 @@ pub enum Sought {
     Name(String),
 }
 
-/// Reads Who-Has.
+/// Parses a Who-Has request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn who_has(data: &[u8]) -> Read<(Range, Sought)> {
     let mut reader = Reader::new(data);
     let range = Range::read(&mut reader)?;
@@ -100,10 +100,10 @@ pub fn who_has(data: &[u8]) -> Read<(Range, Sought)> {
     Ok((range, sought))
 }
 
-/// Reads ReadProperty.
+/// Parses a ReadProperty request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn read_property(data: &[u8]) -> Read<(ObjectId, PropertyRef)> {
     let mut reader = Reader::new(data);
     let object = reader.context_object(0)?;
@@ -119,10 +119,10 @@ fn property_ref(reader: &mut Reader<'_>, property: u8, index: u8) -> Read<Proper
     })
 }
 
-/// Reads ReadPropertyMultiple.
+/// Parses a ReadPropertyMultiple request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRef>)>> {
     let mut reader = Reader::new(data);
     let mut all = Vec::new();
@@ -145,12 +145,12 @@ pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRe
     }
 }
 
-/// One write of a request.
+/// One of the writes in a request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WriteItem {
-    /// The object.
+    /// The object to write.
     pub object: ObjectId,
-    /// The property.
+    /// The property to write.
     pub property: PropertyRef,
     /// The value; `None` if it is not a single primitive value.
     pub value: Option<Data>,
@@ -158,10 +158,10 @@ pub struct WriteItem {
     pub priority: Option<u32>,
 }
 
-/// Reads WriteProperty.
+/// Parses a WriteProperty request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn write_property(data: &[u8]) -> Read<WriteItem> {
     let mut reader = Reader::new(data);
     let object = reader.context_object(0)?;
@@ -177,10 +177,10 @@ pub fn write_property(data: &[u8]) -> Read<WriteItem> {
     })
 }
 
-/// Reads WritePropertyMultiple.
+/// Parses a WritePropertyMultiple request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn write_property_multiple(data: &[u8]) -> Read<Vec<WriteItem>> {
     let mut reader = Reader::new(data);
     let mut all = Vec::new();
@@ -238,7 +238,7 @@ fn value(reader: &mut Reader<'_>, number: u8) -> Read<Option<Data>> {
 pub struct Subscribe {
     /// The number that the client gives the subscription.
     pub process: u32,
-    /// The object.
+    /// The object that is subscribed to.
     pub object: ObjectId,
     /// Whether notifications are confirmed, and the lifetime in seconds, 0 without end; `None` ends the subscription.
     pub terms: Option<(bool, u32)>,
@@ -254,10 +254,10 @@ fn terms(confirmed: Option<bool>, lifetime: Option<u32>) -> Read<Option<(bool, u
     }
 }
 
-/// Reads SubscribeCOV.
+/// Parses a SubscribeCOV request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn subscribe_cov(data: &[u8]) -> Read<Subscribe> {
     let mut reader = Reader::new(data);
     let (process, object) = (reader.context_u32(0)?, reader.context_object(1)?);
@@ -271,7 +271,7 @@ pub fn subscribe_cov(data: &[u8]) -> Read<Subscribe> {
     })
 }
 
-/// Reads SubscribeCOVProperty.
+/// Parses a SubscribeCOVProperty request.
 ///
 /// # Errors
 /// The encoding is not valid, or the increment is negative or not finite.
@@ -302,14 +302,14 @@ pub struct Control {
     pub minutes: Option<u32>,
     /// 0 enable, 1 disable, 2 disable initiation.
     pub wanted: u32,
-    /// The password.
+    /// The password in the request.
     pub password: Option<String>,
 }
 
-/// Reads DeviceCommunicationControl.
+/// Parses a DeviceCommunicationControl request.
 ///
 /// # Errors
-/// The encoding is not valid.
+/// If the encoding is not valid.
 pub fn device_communication_control(data: &[u8]) -> Read<Control> {
     let mut reader = Reader::new(data);
     let minutes = reader.optional_u32(0)?;
@@ -332,7 +332,7 @@ mod tests {
     use crate::encoding::Writer;
     use crate::types::ObjectType;
 
-    /// Requests of annex F.
+    /// Example requests from annex F of the standard.
     #[test]
     fn requests_of_the_standard() {
         assert_eq!(who_is(&[0x09, 3, 0x19, 3]), Ok(Range(Some((3, 3)))));

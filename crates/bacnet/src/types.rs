@@ -9,26 +9,26 @@ pub const MAX_INSTANCE: u32 = 4_194_302;
 /// The instance that stands for the addressed device.
 pub const WILDCARD: u32 = 4_194_303;
 
-/// Type of an object.
+/// Number of a BACnet object type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ObjectType(pub u16);
 
 impl ObjectType {
-    /// Analog Input.
+    /// Object type Analog Input.
     pub const ANALOG_INPUT: ObjectType = ObjectType(0);
-    /// Analog Value.
+    /// Object type Analog Value.
     pub const ANALOG_VALUE: ObjectType = ObjectType(2);
-    /// Binary Input.
+    /// Object type Binary Input.
     pub const BINARY_INPUT: ObjectType = ObjectType(3);
-    /// Binary Value.
+    /// Object type Binary Value.
     pub const BINARY_VALUE: ObjectType = ObjectType(5);
-    /// Device.
+    /// Object type Device.
     pub const DEVICE: ObjectType = ObjectType(8);
-    /// Multi-state Input.
+    /// Object type Multi-state Input.
     pub const MULTI_STATE_INPUT: ObjectType = ObjectType(13);
-    /// CharacterString Value.
+    /// Object type CharacterString Value.
     pub const CHARACTERSTRING_VALUE: ObjectType = ObjectType(40);
-    /// Network Port.
+    /// Object type Network Port.
     pub const NETWORK_PORT: ObjectType = ObjectType(56);
 
     /// Types that a server of this crate can show.
@@ -43,7 +43,7 @@ impl ObjectType {
         ObjectType::NETWORK_PORT,
     ];
 
-    /// The usual short name.
+    /// The usual abbreviation of the object type.
     pub fn short(self) -> &'static str {
         match self {
             ObjectType::ANALOG_INPUT => "AI",
@@ -59,7 +59,7 @@ impl ObjectType {
     }
 }
 
-/// Identifier of an object.
+/// Identifier of a BACnet object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ObjectId {
     /// Type of the object.
@@ -79,7 +79,7 @@ impl ObjectId {
         (u32::from(self.kind.0) << 22) | (self.instance & 0x3F_FFFF)
     }
 
-    /// The identifier that these bits encode.
+    /// Decodes an object identifier from 32 bits.
     pub fn from_bits(bits: u32) -> ObjectId {
         let kind = ObjectType(u16::try_from(bits >> 22).unwrap_or_default());
         ObjectId::new(kind, bits & 0x3F_FFFF)
@@ -97,7 +97,7 @@ impl fmt::Display for ObjectId {
 
 macro_rules! properties {
     ($($name:ident $number:literal,)*) => {
-        /// A property of an object.
+        /// Number of a property.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub struct PropertyId(pub u32);
 
@@ -127,7 +127,7 @@ properties! {
     VALUE_TIME 512,
 }
 
-/// Class of an error.
+/// Class of a BACnet error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum ErrorClass {
@@ -182,7 +182,7 @@ pub enum Reject {
     UnrecognizedService = 9,
 }
 
-/// The reason why an exchange ends.
+/// The reason why a transaction is aborted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Abort {
@@ -202,7 +202,7 @@ pub struct Mac {
 }
 
 impl Mac {
-    /// The address that means all stations.
+    /// The MAC address that means all stations.
     pub const ALL: Mac = Mac { len: 0, octets: [0; 8] };
 
     /// A MAC address with these octets; `None` if there are more than eight.
@@ -222,9 +222,9 @@ impl Mac {
 /// Sender or destination of a message: a host of this network, or a station behind a router at that host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Address {
-    /// The host.
+    /// UDP address of the host.
     pub host: SocketAddrV4,
-    /// Network and station, behind a router.
+    /// Network and station, if behind a router.
     pub remote: Option<(u16, Mac)>,
 }
 
@@ -245,7 +245,7 @@ impl Address {
         text.split_once(' ').map_or(String::new(), |(_, rest)| rest.to_string())
     }
 
-    /// The host as six octets.
+    /// The host's address and port as six octets.
     pub fn host_octets(host: SocketAddrV4) -> [u8; 6] {
         let [a, b, c, d] = host.ip().octets();
         let [high, low] = host.port().to_be_bytes();
@@ -267,7 +267,7 @@ impl fmt::Display for Address {
 impl FromStr for Address {
     type Err = ();
 
-    /// Reads what `Display` has written.
+    /// Parses the text that `Display` writes.
     fn from_str(text: &str) -> Result<Address, ()> {
         let mut words = text.split(' ');
         let host = words.next().and_then(|host| host.parse().ok()).ok_or(())?;
@@ -346,19 +346,19 @@ pub enum Data {
     Null,
     /// BOOLEAN.
     Bool(bool),
-    /// Unsigned.
+    /// An Unsigned value.
     Unsigned(u64),
     /// INTEGER.
     Signed(i64),
     /// REAL.
     Real(f32),
-    /// Double.
+    /// A Double value.
     Double(f64),
-    /// CharacterString.
+    /// A CharacterString value.
     Text(String),
     /// ENUMERATED.
     Enumerated(u32),
-    /// BACnetObjectIdentifier.
+    /// A BACnetObjectIdentifier value.
     Object(ObjectId),
     /// A valid value of another type, which nothing here takes.
     Other,

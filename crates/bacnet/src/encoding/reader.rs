@@ -1,22 +1,22 @@
-//! Reads tagged values.
+//! Reads values with BACnet tags.
 
 use super::tag;
 use crate::types::{Data, ObjectId, PropertyId, Reject};
 
-/// A tag as read.
+/// A BACnet tag as read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tag {
     /// A primitive value with its application tag and its length; for BOOLEAN the second number is the value itself.
     App(u8, usize),
     /// A primitive value with its context tag and its length.
     Context(u8, usize),
-    /// Begins a constructed value.
+    /// Opening tag with this number.
     Open(u8),
     /// Closing tag with this number.
     Close(u8),
 }
 
-/// The result of reading.
+/// The result of reading a tagged value.
 pub type Read<T> = Result<T, Reject>;
 
 /// Reads tagged values; anything unexpected is an error that states how the request is rejected.
@@ -66,7 +66,7 @@ impl<'a> Reader<'a> {
         Ok(*first)
     }
 
-    /// The next tag, which stays.
+    /// The next tag, without consuming it.
     ///
     /// # Errors
     /// If there is no further tag.
@@ -121,7 +121,7 @@ impl<'a> Reader<'a> {
         self.peek() == Ok(Tag::Close(number))
     }
 
-    /// Opens a constructed value.
+    /// Reads the opening tag of a constructed value.
     ///
     /// # Errors
     /// If the next tag is another one.
@@ -162,7 +162,7 @@ impl<'a> Reader<'a> {
     /// Reads a value like [`Reader::context`], if that context comes next.
     ///
     /// # Errors
-    /// The encoding is not valid.
+    /// If the encoding is not valid.
     pub fn optional(&mut self, number: u8) -> Read<Option<&'a [u8]>> {
         match self.is_context(number) {
             true => self.context(number).map(Some),
@@ -189,7 +189,7 @@ impl<'a> Reader<'a> {
     /// Reads a BOOLEAN in a context, if that context comes next.
     ///
     /// # Errors
-    /// The encoding is not valid.
+    /// If the encoding is not valid.
     pub fn optional_bool(&mut self, number: u8) -> Read<Option<bool>> {
         match self.optional(number)? {
             None => Ok(None),
@@ -199,7 +199,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// BACnetObjectIdentifier in a context.
+    /// Reads a BACnetObjectIdentifier with a context tag.
     ///
     /// # Errors
     /// If the next tag or length is another one.
@@ -211,7 +211,7 @@ impl<'a> Reader<'a> {
         Ok(ObjectId::from_bits(u32::from_be_bytes(bytes)))
     }
 
-    /// Property identifier in a context.
+    /// Reads a property identifier with a context tag.
     ///
     /// # Errors
     /// If the next tag or value is another one.
@@ -222,7 +222,7 @@ impl<'a> Reader<'a> {
     /// Reads a REAL in a context, if that context comes next.
     ///
     /// # Errors
-    /// The encoding is not valid.
+    /// If the encoding is not valid.
     pub fn optional_real(&mut self, number: u8) -> Read<Option<f32>> {
         let Some(bytes) = self.optional(number)? else {
             return Ok(None);
@@ -234,7 +234,7 @@ impl<'a> Reader<'a> {
     /// A primitive value with its application tag; `None` if a constructed one, or one with a context tag, follows.
     ///
     /// # Errors
-    /// The encoding is not valid.
+    /// If the encoding is not valid.
     pub fn data(&mut self) -> Read<Option<Data>> {
         let (number, len) = match self.tag()? {
             Tag::App(number, len) => (number, len),

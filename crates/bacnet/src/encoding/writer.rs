@@ -1,9 +1,9 @@
-//! Writes tagged values.
+//! Writes values with BACnet tags.
 
 use super::tag;
 use crate::types::{DateTime, ObjectId, PropertyId};
 
-/// Writes tagged values.
+/// Writes values with BACnet tags.
 #[derive(Debug, Default, Clone)]
 pub struct Writer {
     bytes: Vec<u8>,
@@ -16,12 +16,12 @@ fn minimal(bytes: &[u8]) -> &[u8] {
 }
 
 impl Writer {
-    /// The bytes written.
+    /// The bytes written so far.
     pub fn bytes(&self) -> &[u8] {
         &self.bytes
     }
 
-    /// The bytes written.
+    /// The bytes that were written.
     pub fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }
@@ -65,7 +65,7 @@ impl Writer {
         self.raw(bytes)
     }
 
-    /// Opens a constructed value.
+    /// Writes the opening tag of a constructed value.
     pub fn open(&mut self, number: u8) -> &mut Writer {
         self.bytes.push(number << 4 | 0x0E);
         self
@@ -88,7 +88,7 @@ impl Writer {
         self
     }
 
-    /// Unsigned.
+    /// Writes an Unsigned.
     pub fn unsigned(&mut self, value: u64) -> &mut Writer {
         self.app(tag::UNSIGNED, minimal(&value.to_be_bytes()))
     }
@@ -131,22 +131,22 @@ impl Writer {
         self.app(tag::ENUMERATED, minimal(&value.to_be_bytes()))
     }
 
-    /// Date.
+    /// Writes a Date.
     pub fn date(&mut self, value: [u8; 4]) -> &mut Writer {
         self.app(tag::DATE, &value)
     }
 
-    /// Time.
+    /// Writes a Time.
     pub fn time(&mut self, value: [u8; 4]) -> &mut Writer {
         self.app(tag::TIME, &value)
     }
 
-    /// BACnetDateTime.
+    /// Writes a BACnetDateTime.
     pub fn date_time(&mut self, value: DateTime) -> &mut Writer {
         self.date(value.date).time(value.time)
     }
 
-    /// BACnetObjectIdentifier.
+    /// Writes a BACnetObjectIdentifier.
     pub fn object(&mut self, value: ObjectId) -> &mut Writer {
         self.app(tag::OBJECT, &value.bits().to_be_bytes())
     }
@@ -176,12 +176,12 @@ impl Writer {
         self.context(number, value)
     }
 
-    /// BACnetObjectIdentifier in a context.
+    /// Writes a BACnetObjectIdentifier with a context tag.
     pub fn context_object(&mut self, number: u8, value: ObjectId) -> &mut Writer {
         self.context(number, &value.bits().to_be_bytes())
     }
 
-    /// Property identifier in a context.
+    /// Writes a property identifier with a context tag.
     pub fn context_property(&mut self, number: u8, value: PropertyId) -> &mut Writer {
         self.context_unsigned(number, value.0.into())
     }

@@ -15,13 +15,13 @@ pub(crate) struct Environment {
     pub(crate) vendor: u16,
     pub(crate) vendor_name: Arc<str>,
     pub(crate) version: Arc<str>,
-    /// The port of the host.
+    /// The Network Port object of the host.
     pub(crate) port: Port,
-    /// The virtual network.
+    /// Number of the virtual network.
     pub(crate) network: u16,
 }
 
-/// The port of the host.
+/// Data of the host's Network Port object.
 #[derive(Debug, Clone)]
 pub(crate) struct Port {
     pub(crate) address: SocketAddrV4,
@@ -250,7 +250,7 @@ pub(crate) fn property(
     }
 }
 
-/// The properties that are arrays.
+/// Writes properties that are arrays.
 fn arrays(
     out: &mut Writer,
     of: &Context<'_>,
@@ -336,7 +336,7 @@ fn of_device(
             out.bits(&bits(63, types))
         }
         P::MAX_APDU_LENGTH_ACCEPTED => out.unsigned(MAX_APDU as u64),
-        // Segmented transmit.
+        // The value means: segmented transmit.
         P::SEGMENTATION_SUPPORTED => out.enumerated(1),
         P::MAX_SEGMENTS_ACCEPTED => out.unsigned(1),
         P::APDU_SEGMENT_TIMEOUT | P::APDU_TIMEOUT => out.unsigned(3000),
@@ -379,7 +379,7 @@ fn of_port(out: &mut Writer, device: &Device, property: P, environment: &Environ
         P::RELIABILITY => out.enumerated(0),
         P::OUT_OF_SERVICE | P::CHANGES_PENDING => out.bool(false),
         P::NETWORK_TYPE => out.enumerated(if is_ip { 5 } else { 7 }),
-        // BACnet application.
+        // The value means: BACnet application.
         P::PROTOCOL_LEVEL => out.enumerated(2),
         // The number of the network of the port is not known here; that of the drives is configured.
         P::NETWORK_NUMBER => out.unsigned(if is_ip { 0 } else { environment.network.into() }),
@@ -558,7 +558,7 @@ impl Context<'_> {
         }
     }
 
-    /// The object.
+    /// The identifier of the object.
     pub(crate) fn object_id(&self) -> ObjectId {
         self.id()
     }

@@ -25,13 +25,13 @@ pub enum Registration {
     Refused(u16),
 }
 
-/// The registration.
+/// The registration of the server as a foreign device.
 #[derive(Debug)]
 pub(super) struct Foreign {
     bbmd: Option<SocketAddrV4>,
     next: Instant,
     pub(super) state: Registration,
-    /// Time since which no answer came.
+    /// Time since which a request has had no answer.
     asked: Option<Instant>,
 }
 
@@ -68,7 +68,7 @@ impl Foreign {
         self.next = now + RENEWED;
     }
 
-    /// The request that is due.
+    /// The registration request, if one is due.
     pub(super) fn poll(&mut self, now: Instant) -> Option<(SocketAddrV4, Vec<u8>)> {
         let bbmd = self.bbmd?;
         if now < self.next {

@@ -18,7 +18,7 @@ const TRIES: u8 = 3;
 /// Undelivered notifications in a row that end a subscription without a lifetime.
 const LOST: u8 = 3;
 
-/// The subscriber, and the subscribed object.
+/// The key of a subscription: subscriber and object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Key {
     pub(super) subscriber: Address,
@@ -28,7 +28,7 @@ pub(super) struct Key {
     pub(super) property: Option<PropertyRef>,
 }
 
-/// The last reported values.
+/// The values that were last reported to a subscriber.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Reported {
     /// The number, where the value is one.
@@ -51,7 +51,7 @@ impl Reported {
     }
 }
 
-/// A subscription.
+/// A subscription to changes of an object.
 #[derive(Debug)]
 pub(super) struct Subscription {
     pub(super) key: Key,
@@ -246,7 +246,7 @@ impl Cov {
         self.invoke
     }
 
-    /// A confirmed notification left.
+    /// Notes that a confirmed notification was sent.
     pub(super) fn sent(&mut self, device: u32, key: Key, invoke: u8, message: Vec<u8>, now: Instant) {
         let outstanding = Outstanding {
             device,

@@ -109,7 +109,7 @@ impl Server {
     fn i_am(&self, device: &Device) -> Vec<u8> {
         let mut content = Writer::default();
         content.object(device.id()).unsigned(MAX_APDU as u64);
-        // Segmented transmit.
+        // The value means: segmented transmit.
         content.enumerated(1).unsigned(self.environment.vendor.into());
         apdu::unconfirmed(unconfirmed::I_AM, content.bytes())
     }

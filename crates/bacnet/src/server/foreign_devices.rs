@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 /// Time after its registered time for which an entry remains.
 const GRACE: Duration = Duration::from_secs(30);
 
-/// A foreign device.
+/// An entry for a registered foreign device.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     host: SocketAddrV4,
@@ -55,7 +55,7 @@ impl ForeignDevices {
         self.entries.len() < before
     }
 
-    /// Whether a device is registered.
+    /// Whether a foreign device is registered.
     pub(super) fn has(&mut self, host: SocketAddrV4, now: Instant) -> bool {
         self.hosts(now).any(|known| known == host)
     }

@@ -45,7 +45,7 @@ pub struct Options {
     pub network: Option<u16>,
     /// Identifier and name of the vendor.
     pub vendor: (u16, Arc<str>),
-    /// The version of the program.
+    /// The program version that the device reports.
     pub version: Arc<str>,
     /// The BBMD at which the server registers as a foreign device.
     pub bbmd: Option<SocketAddrV4>,
@@ -86,22 +86,22 @@ pub trait Application {
     fn password(&self, given: &str) -> bool;
 }
 
-/// Counters of events.
+/// Counters of the server's traffic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counters {
-    /// Datagrams that came from admitted hosts.
+    /// Datagrams received from admitted hosts.
     pub received: u64,
     /// Datagrams that were not understood, or of hosts that are not admitted.
     pub discarded: u64,
     /// Requests that were answered with an error, a reject or an abort.
     pub refused: u64,
-    /// Requests that were carried out.
+    /// Number of requests that were carried out.
     pub done: u64,
     /// Datagrams that were not sent because the share of their address was used up.
     pub dropped: u64,
     /// Notifications sent.
     pub notifications: u64,
-    /// Subscriptions at the moment.
+    /// Present number of subscriptions.
     pub subscriptions: u64,
 }
 
@@ -183,7 +183,7 @@ impl Server {
         self.increments.retain(|(instance, object), _| has(*instance, *object));
     }
 
-    /// The device of that instance.
+    /// The device with this instance.
     fn device(&self, instance: u32) -> Option<Arc<Device>> {
         self.by_instance
             .get(&instance)
@@ -199,7 +199,7 @@ impl Server {
         }
     }
 
-    /// Does what time has made due.
+    /// Does everything that is due at this time.
     pub fn poll(&mut self, app: &dyn Application, now: Instant) {
         if let Some((bbmd, request)) = self.foreign.poll(now) {
             self.traffic.exempt(bbmd, request);
@@ -235,12 +235,12 @@ impl Server {
         self.jobs.pop_front()
     }
 
-    /// Whether a write is under way.
+    /// Whether a write is in progress.
     pub fn is_busy(&self) -> bool {
         self.exchanges.is_busy()
     }
 
-    /// Devices to which somebody subscribes.
+    /// Devices to which a client has subscribed.
     pub fn subscribed(&self) -> Vec<u32> {
         self.cov.devices()
     }
@@ -266,7 +266,7 @@ impl Server {
         }
     }
 
-    /// The increment of an object.
+    /// The COV increment of an object.
     fn increment(&self, device: u32, object: &crate::object::Object) -> f32 {
         let own = match object.kind {
             crate::object::Kind::Analog { increment, .. } => increment,

@@ -249,7 +249,7 @@ impl Server {
         bvlc::unicast(&npdu::encode(to.remote, self.station(device), expects, payload))
     }
 
-    /// Answers from a device.
+    /// Sends an answer of a device.
     pub(super) fn send(&mut self, to: Address, device: u32, apdu: &[u8], now: Instant) {
         let message = self.message(to, device, apdu, false);
         self.traffic.answer(to.host, message, now);
@@ -263,7 +263,7 @@ impl Server {
         }
     }
 
-    /// Sends what was subscribed to.
+    /// Sends a notification that was subscribed to.
     pub(super) fn send_exempt(&mut self, to: Address, device: u32, apdu: &[u8], expects: bool) {
         let message = self.message(to, device, apdu, expects);
         self.traffic.exempt(to.host, message);

@@ -164,7 +164,7 @@ impl Server {
         }
     }
 
-    /// Active_COV_Subscriptions.
+    /// Writes the property Active_COV_Subscriptions.
     pub(super) fn list_subscriptions(&self, instance: u32, out: &mut Writer, now: Instant) {
         for subscription in self.cov.of(instance) {
             let key = &subscription.key;

@@ -10,7 +10,7 @@ use crate::object::{Context, Device, list, property};
 use crate::services::{self, PropertyRef, confirmed};
 use crate::types::{Abort, Address, Error, ObjectId, ObjectType, PropertyId, Reject, WILDCARD};
 
-/// Longest answer, all segments together.
+/// Longest answer in octets, all segments together.
 const LONGEST: usize = 64 * 1024;
 /// Longest time for which a device sends no notification by itself.
 const QUIET: Duration = Duration::from_secs(300);
@@ -264,7 +264,7 @@ impl Server {
         all
     }
 
-    /// DeviceCommunicationControl: only what blocks no stop.
+    /// Executes DeviceCommunicationControl, unless it would block a stop.
     fn control(&mut self, device: &Device, data: &[u8], app: &dyn Application, now: Instant) -> Answered {
         let control = services::device_communication_control(data)?;
         if !app.password(control.password.as_deref().unwrap_or("")) {

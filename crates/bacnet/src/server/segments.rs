@@ -1,11 +1,11 @@
-//! Answers in segments (clause 5.4).
+//! Segmented answers (clause 5.4).
 
 use std::time::{Duration, Instant};
 
 use crate::apdu::{self, SEGMENT_HEADER};
 use crate::types::Address;
 
-/// Segments that follow without an acknowledgement.
+/// Most segments sent without an acknowledgement.
 const WINDOW: u8 = 4;
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
@@ -13,7 +13,7 @@ const TRIES: u8 = 3;
 const MOST_ANSWERS: usize = 32;
 const MOST_OF_ONE: usize = 8;
 
-/// An answer that is being sent.
+/// A segmented answer that is being sent.
 #[derive(Debug)]
 struct Sending {
     to: Address,
@@ -100,7 +100,7 @@ impl Segments {
         true
     }
 
-    /// Segments arrived at the client.
+    /// Notes segments that the client has acknowledged.
     pub(super) fn acknowledged(
         &mut self,
         (from, device): (Address, u32),

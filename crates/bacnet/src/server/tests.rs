@@ -254,7 +254,7 @@ fn read(object: ObjectId, property: u32) -> Vec<u8> {
     })
 }
 
-/// WriteProperty of a Present_Value.
+/// A WriteProperty request for a Present_Value.
 fn write(object: ObjectId, priority: Option<u64>, value: impl FnOnce(&mut Writer)) -> Vec<u8> {
     written(|w| {
         w.context_object(0, object).context_unsigned(1, PV.into()).open(3);

@@ -13,7 +13,7 @@ const GRANT: u64 = 16 * 1024;
 const WAITING: usize = 64 * 1024;
 /// Octets that may wait for all addresses together.
 const WAITING_IN_ALL: usize = 1024 * 1024;
-/// Broadcasts within a second.
+/// Most broadcasts sent within a second.
 const BROADCASTS: u64 = 100;
 /// Most addresses that are tracked at a time.
 const ADDRESSES: usize = 1024;
@@ -30,11 +30,11 @@ pub enum To {
     Broadcast,
 }
 
-/// Sums over the last second.
+/// Sums of traffic over the last second.
 #[derive(Debug, Clone, Default)]
 struct Window {
     steps: [u32; STEPS],
-    /// The step that was counted last.
+    /// The step of the second that was last counted.
     last: u64,
 }
 
@@ -81,7 +81,7 @@ impl Known {
     }
 }
 
-/// The outgoing messages, in order, within the limits.
+/// Octets that wait until they may be sent.
 #[derive(Debug)]
 pub(super) struct Traffic {
     begun: Instant,
@@ -93,7 +93,7 @@ pub(super) struct Traffic {
     octets: usize,
     sent: Window,
     ready: VecDeque<(To, Vec<u8>)>,
-    /// Datagrams that found no room.
+    /// Datagrams dropped for lack of room.
     pub(super) dropped: u64,
 }
 
@@ -218,7 +218,7 @@ impl Traffic {
         }
     }
 
-    /// The next datagram that leaves.
+    /// The next datagram to send.
     pub(super) fn next(&mut self) -> Option<(To, Vec<u8>)> {
         self.ready.pop_front()
     }

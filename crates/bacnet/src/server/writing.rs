@@ -29,15 +29,15 @@ const FOR_STOPS: usize = 256;
 pub struct Job {
     /// Identifies the job in [`Server::written`].
     pub token: u64,
-    /// The writer.
+    /// The client that writes.
     pub from: Address,
     /// Instance of the device that is written.
     pub device: u32,
     /// The object to write, by its index in the device.
     pub place: usize,
-    /// The object.
+    /// The object to write.
     pub object: ObjectId,
-    /// The value; `None` releases the slot.
+    /// The value to write; `None` releases the slot.
     pub value: Option<Datum>,
     /// The slot, of an object with priorities.
     pub priority: Option<u8>,
@@ -63,7 +63,7 @@ struct Exchange {
     request: Box<[u8]>,
     asked: Instant,
     rest: VecDeque<WriteItem>,
-    /// The write that is under way.
+    /// The write in progress.
     current: Option<(ObjectId, PropertyRef)>,
     failed: Option<(Failure, Option<(ObjectId, PropertyRef)>)>,
     /// The client has since sent another request with the same invoke id: the answer is not sent.
@@ -71,7 +71,7 @@ struct Exchange {
     state: State,
 }
 
-/// Writes under way and remembered.
+/// Writes in progress, and remembered results.
 #[derive(Debug, Default)]
 pub(super) struct Exchanges {
     all: VecDeque<Exchange>,
@@ -222,7 +222,7 @@ impl Server {
         self.go_on(token, app, now);
     }
 
-    /// The result of a job.
+    /// Reports the result of a job.
     pub fn written(&mut self, token: u64, result: Result<(), Error>, app: &dyn Application, now: Instant) {
         let Some(exchange) = self.exchanges.running(token) else {
             return;

@@ -2,7 +2,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Frames that are nearly right.
+/// Frames that are almost valid.
 fn nearly() -> impl Strategy<Value = Vec<u8>> {
     let service = prop_oneof![
         Just(5u8),

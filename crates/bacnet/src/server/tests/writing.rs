@@ -75,7 +75,7 @@ fn what_comes_twice_is_done_once() {
     rig.write(5, 3, &run(1, 8));
     let job = rig.job().expect("forgotten");
     rig.done(&job, Ok(()));
-    // A stop is carried out again.
+    // A repeated stop is carried out again.
     rig.write(5, 5, &run(0, 8));
     let job = rig.job().unwrap();
     rig.write(5, 5, &run(0, 8));
@@ -184,7 +184,7 @@ fn those_that_may_not_write_are_refused_and_a_silent_device_can_be_stopped() {
     );
 }
 
-/// WritePropertyMultiple of Present_Values at priority 8.
+/// A WritePropertyMultiple of Present_Values at priority 8.
 fn several(items: &[(ObjectId, f32)]) -> Vec<u8> {
     written(|w| {
         for (object, value) in items {
