@@ -34,10 +34,10 @@ use crate::order::{
 /// Most stops to a drive that are sent before the end of a pulse in progress.
 const MOST_STOPS: u32 = 8;
 
-/// The next step of a command.
+/// The next thing a command needs.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next {
-    /// The next request for the line.
+    /// The next request to send on the line.
     Send(Step),
     /// Nothing is sent before this time.
     Wait(Instant),
@@ -68,7 +68,7 @@ enum OnWire {
 /// Steps that are left to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// The steps as ordered.
+    /// The steps are sent as ordered.
     Steps,
     /// The last word of a start sequence was sent, which starts the motor: if the rest fails, a stop follows.
     MotorStarted,
@@ -80,7 +80,7 @@ enum Phase {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Doubt {
     No,
-    /// A write was not acknowledged.
+    /// A write of the command was not acknowledged.
     Unanswered,
     /// The acknowledgement may have been a late reply to another request: the write is repeated only when no late reply
     /// can arrive any more.
@@ -95,9 +95,9 @@ struct Tries {
     /// [`Outcome::Unknown`].
     unanswered: Outcome,
     doubt: Doubt,
-    /// Consecutive "busy" replies.
+    /// Number of consecutive "busy" replies.
     busy: u32,
-    /// Pause before the next try.
+    /// Pause before the next attempt; `None` without one.
     pause: Option<Duration>,
 }
 
@@ -297,7 +297,7 @@ impl CommandRun {
         self.renews && self.is_of_client()
     }
 
-    /// The clients that gave the command.
+    /// The clients that wait for the command.
     pub fn origins(&self) -> impl Iterator<Item = &Origin> {
         self.tickets.iter().map(Ticket::origin)
     }

@@ -20,11 +20,11 @@ const UNREAD: u32 = 5;
 /// The effect that a read must show.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Effect {
-    /// The motor runs.
+    /// Effect: the motor runs.
     Runs,
     /// The motor does not run, or is at standstill.
     Stops,
-    /// No fault is active.
+    /// Effect: no fault is active.
     NoFault,
     /// The point (index in the profile) reads back as written.
     ReadBack(PointIndex, Value),
@@ -40,7 +40,7 @@ impl Effect {
         }
     }
 
-    /// The missing effect, as text.
+    /// The missing effect as text.
     fn missing(self, profile: &Profile) -> String {
         match self {
             Effect::Runs => "the motor does not run".to_string(),
@@ -156,7 +156,7 @@ fn speed(reading: &Reading<'_>) -> Option<Speed> {
     })
 }
 
-/// The magnitude of a speed.
+/// The magnitude of a motor's speed.
 #[derive(Debug, Clone, Copy)]
 struct Speed {
     value: f64,
@@ -164,7 +164,7 @@ struct Speed {
     unit: &'static str,
 }
 
-/// An effect that is waited for.
+/// An effect that a read must show.
 #[derive(Debug, Clone, Copy)]
 struct Awaited {
     effect: Effect,
@@ -172,7 +172,7 @@ struct Awaited {
     was_read: bool,
 }
 
-/// An acknowledged command that awaits confirmation.
+/// An acknowledged command that waits for confirmation.
 #[derive(Debug)]
 struct Watch {
     effects: Vec<Awaited>,
@@ -228,7 +228,7 @@ impl Watch {
         missing
     }
 
-    /// The missing effects, as text.
+    /// The missing effects of a command as text.
     fn report(&self, missing: &[Awaited], profile: &Profile, now: Instant) -> String {
         let Watch { what, within, .. } = self;
         if missing.iter().all(|awaited| !awaited.was_read) {
@@ -276,7 +276,7 @@ impl Watch {
 /// A command that showed no effect in time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unconfirmed {
-    /// The missing effects, as text.
+    /// The missing effects as text.
     pub text: String,
     /// The motor was to run, and does not.
     pub does_not_run: bool,

@@ -21,7 +21,7 @@ use crate::plant::BusHandle;
 use crate::process_image::Taping;
 use crate::stalls::Stalls;
 
-/// Next action on the port.
+/// What the bus does next with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Action {
     /// Read the received bytes; if there are none, write the frame that [`BusCore::sending`] returns to the port.
@@ -32,7 +32,7 @@ pub enum Action {
         until: Instant,
         /// Whether an arriving command ends the wait.
         commands: bool,
-        /// Whether tens of microseconds count.
+        /// Whether the wake-up must be exact to some tens of microseconds.
         precise: bool,
     },
 }
@@ -44,7 +44,7 @@ pub enum Closed {
     Reconnect,
     /// Reconnect when there is something to send.
     ReconnectToAsk,
-    /// The port is lost.
+    /// The port must be given up as lost.
     Lost,
 }
 
@@ -94,7 +94,7 @@ pub struct BusCore {
     tap: Option<Tap>,
     counters: DriveCounters,
     writes: Arc<WriteStats>,
-    /// Empty list, kept for its memory.
+    /// An empty list, kept to reuse its memory.
     news: Vec<News>,
     /// Stalls of the bus thread; `None` before it runs.
     stalls: Option<Stalls>,
@@ -176,7 +176,7 @@ impl BusCore {
         }
     }
 
-    /// The port was opened.
+    /// Notes that the port was opened.
     pub fn opened(&mut self, now: Instant) {
         self.line.reset(now);
         self.connection = Connection::default();
@@ -219,7 +219,7 @@ impl BusCore {
         Closed::Lost
     }
 
-    /// The port was reconnected.
+    /// Notes that the port was reconnected.
     pub fn reconnected(&mut self) {
         let Connection { to_ask, vain, .. } = self.connection;
         self.connection = Connection {
@@ -253,7 +253,7 @@ impl BusCore {
         }
     }
 
-    /// The action due now.
+    /// What to do with the port now.
     pub fn poll(&mut self, now: Instant) -> Action {
         loop {
             if self.line.is_underway() {
@@ -334,7 +334,7 @@ impl BusCore {
         None
     }
 
-    /// The remains of faults and commands.
+    /// State left over from faults and commands, for tests.
     pub fn remains(&self, now: Instant) -> Remains {
         self.master.remains(now)
     }
@@ -383,7 +383,7 @@ impl BusCore {
         self.line.frame()
     }
 
-    /// Bytes were received.
+    /// Processes received bytes.
     pub fn received(&mut self, bytes: &[u8], now: Instant) {
         if !self.line.is_underway() {
             if !bytes.is_empty() {

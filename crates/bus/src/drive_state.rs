@@ -24,7 +24,7 @@ pub(super) const FRESH: Duration = Duration::from_secs(2);
 pub(super) struct DriveState {
     /// A status older than that does not show whether the motor runs.
     pub(super) fresh: Duration,
-    /// Command words of the drive.
+    /// Known command words of the drive.
     pub(super) words: KnownWords,
     /// Registers that orders write, and the register of the command word if the drive reports its own word: these
     /// are learned from every read.
@@ -32,9 +32,9 @@ pub(super) struct DriveState {
     /// Replies that the drive may still send.
     pub(super) late: LateReplies,
     pub(super) repeated_stops: RepeatedStops,
-    /// Lease of the drive.
+    /// Lease and supervision of the drive.
     pub(super) supervision: Supervision,
-    /// Refresh for the drive's own timeout.
+    /// Refresh of orders for the drive's own timeout.
     pub(super) refresh: Refresh,
     /// Why the refresh ended; `None` after that was reported.
     pub(super) refresh_ended: Option<End>,
@@ -44,9 +44,9 @@ pub(super) struct DriveState {
     runs: [Option<CommandRun>; 3],
     /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
-    /// Stops without a reply.
+    /// Stops that the drive left without a reply.
     pub(super) vain_stops: VainStops,
-    /// The longest recent transaction.
+    /// Duration of the longest recent transaction.
     pub(super) answers_within: Duration,
     /// Whether the drive was read since its confirmations were checked.
     pub(super) was_read: bool,
@@ -116,7 +116,7 @@ impl DriveState {
         self.answers_within = took.max(self.answers_within - self.answers_within / 64);
     }
 
-    /// The started command of that rank.
+    /// The started command of this rank.
     pub(super) fn run(&mut self, urgency: Urgency) -> Option<&mut CommandRun> {
         self.runs.get_mut(slot(urgency))?.as_mut()
     }
@@ -203,7 +203,7 @@ impl DriveState {
         run.answered(step, reply, &mut self.words)
     }
 
-    /// A started command has ended.
+    /// Ends a started command with its outcome.
     pub(super) fn end(&mut self, urgency: Urgency, outcome: &Outcome, image: &DriveImage, now: Instant) {
         let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) else {
             return;

@@ -105,7 +105,7 @@ impl LateReplies {
                 late.until = until;
                 late.since.get_or_insert(began);
                 late.settled = false;
-                // Reads are true in any order.
+                // The replies to reads are true in any order.
                 if pdu.is_write() {
                     late.count = (late.count + 1).min(KEPT);
                 }
@@ -228,7 +228,7 @@ pub fn are_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
 /// The part of a request that can be recognised in its reply.
 #[derive(Debug, PartialEq, Eq)]
 enum ReplyShape<'r> {
-    /// Function and length of a read.
+    /// A read: its reply shows function and length.
     Read(u8, usize),
     /// Function, first address and count of a write of several items.
     Several(u8, u16, usize),

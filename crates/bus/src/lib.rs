@@ -79,7 +79,7 @@ use crate::line::LineOptions;
 pub struct BusOptions {
     /// Time for the first byte of a reply; wire time is added.
     pub response_timeout: Duration,
-    /// Tries after the first.
+    /// Number of retries after a failed attempt.
     pub retries: u32,
     /// Silence before each request.
     pub silence: Silence,
@@ -94,7 +94,7 @@ pub struct BusOptions {
 /// Role of the gateway on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Mode {
-    /// The gateway is the master.
+    /// The gateway is the master of the line.
     #[default]
     Master,
     /// The bus belongs to another master: the gateway listens and never sends.

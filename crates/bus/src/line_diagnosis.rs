@@ -84,7 +84,7 @@ impl LineDiagnosis {
         drive.is_some_and(|drive| failed.iter().any(|sign| drive.sum(*sign) > 0))
     }
 
-    /// The drive's own counters were read.
+    /// Notes counters that were read from a drive.
     pub(super) fn counted_by_drive(&mut self, drive: DriveIndex, counted: CountedByDrive) {
         if let Some(known) = self.by_drive.get_mut(drive) {
             // A drive that was switched off counts from 0 again.

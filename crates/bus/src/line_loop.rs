@@ -27,7 +27,7 @@ const LAST_EXCHANGE: Duration = Duration::from_secs(1);
 /// Longest time between two signs of life of the thread, even while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
 
-/// A running bus.
+/// The handle of a running bus.
 #[derive(Debug)]
 pub struct BusTask {
     handle: BusHandle,
@@ -186,7 +186,7 @@ impl Default for ReopenPauses {
 }
 
 impl ReopenPauses {
-    /// The device is back.
+    /// Starts the pauses again because the device is back.
     fn begin_anew(&mut self) {
         self.next = REOPEN.0;
     }

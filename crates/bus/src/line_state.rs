@@ -55,7 +55,7 @@ pub struct Sending {
 pub struct Exchanged {
     /// A transaction with its result and all received bytes.
     pub transaction: Transaction,
-    /// How the transaction ended.
+    /// Result of the transaction.
     pub ended: Ended,
     /// When the request was given to the line.
     pub began: Instant,
@@ -144,7 +144,7 @@ impl LineState {
         };
     }
 
-    /// The findings from the transactions.
+    /// What the transactions have shown about the line.
     pub fn learned(&self) -> Learned {
         self.learned
     }
@@ -276,7 +276,7 @@ impl LineState {
         self.quiet_since = now.max(self.quiet_since);
     }
 
-    /// Time went by.
+    /// Ends the transaction if its time limit has passed.
     ///
     /// # Errors
     /// Ends the transaction if its time limit has passed; otherwise returns the time until which more bytes are

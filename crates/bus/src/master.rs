@@ -62,7 +62,7 @@ const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
 /// One in this number of probes waits as long as any other request, because the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
-/// A transaction: drive, purpose and request.
+/// A transaction to send: drive, purpose and request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
     /// Index of the drive on the bus.
@@ -75,7 +75,7 @@ pub struct Turn {
 /// The purpose of a transaction.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Purpose {
-    /// A read of the plan.
+    /// A poll of the drive.
     Poll(Poll),
     /// A step of the started command in that slot, competing with that rank.
     Command {
@@ -83,7 +83,7 @@ pub enum Purpose {
         slot: Urgency,
         /// Rank with which the command competes for the line.
         rank: Urgency,
-        /// The purpose of the step.
+        /// The purpose of the command's step.
         step: StepPurpose,
     },
     /// The background request that is next to be sent.
@@ -97,14 +97,14 @@ pub enum Purpose {
 /// Continuation after a step of an N2 session.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Before {
-    /// A read of the plan.
+    /// A poll of the drive.
     Poll(Poll),
     /// A step of a started command: slot and rank.
     Command(Urgency, Urgency),
 }
 
 impl Turn {
-    /// The request.
+    /// The request to send.
     pub fn pdu(&self) -> &RequestPdu {
         &self.pdu
     }
@@ -128,7 +128,7 @@ impl Turn {
 /// The result of a turn.
 #[derive(Debug)]
 pub struct TurnEnd {
-    /// How the transaction ended.
+    /// Result of the transaction.
     pub ended: Ended,
     /// When the request was given to the line.
     pub began: Instant,
@@ -149,9 +149,9 @@ pub struct TurnEnd {
 /// State of a drive that continues over a reload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Carried {
-    /// Lease of the drive.
+    /// Lease of the drive at the handover.
     pub lease: Lease,
-    /// Refresh for the drive's own timeout.
+    /// Refresh of orders for the drive's own timeout.
     pub repeated: Repeated,
     /// The stops that are to be written again.
     pub stops: RepeatedStops,
@@ -184,11 +184,11 @@ pub struct Handover {
     pub leases: Vec<Carried>,
     /// Time until which a reply to its last request may arrive; `None` if no bus used the line before.
     pub quiet_until: Option<Instant>,
-    /// Findings about the line.
+    /// What the line has shown to the previous bus.
     pub learned: Option<Learned>,
 }
 
-/// The master of a line.
+/// The master of a line: chooses and evaluates all transactions.
 #[derive(Debug)]
 pub struct Master {
     bus: BusHandle,
@@ -360,7 +360,7 @@ impl Master {
         }
     }
 
-    /// The next transaction.
+    /// The next transaction to send.
     ///
     /// # Errors
     /// The time until which nothing does, always after `now`.
@@ -457,7 +457,7 @@ impl Master {
         }
     }
 
-    /// The turn is sent at `now`.
+    /// Notes that the turn is sent at `now`.
     pub fn sending(&mut self, turn: &Turn, now: Instant) -> Sending {
         if let Purpose::Command { slot, step, .. } = &turn.purpose
             && let Some(drive) = self.drives.get_mut(turn.drive)

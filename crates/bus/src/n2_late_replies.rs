@@ -25,12 +25,12 @@ const KEPT: usize = 16;
 #[derive(Debug, Clone, Default)]
 pub struct N2LateReplies(Vec<Late>);
 
-/// A request to a drive.
+/// A request to a drive whose reply may come late.
 #[derive(Debug, Clone, Copy)]
 pub struct Asked<'r> {
     /// The address of the drive.
     pub address: u8,
-    /// The request.
+    /// The request that was sent.
     pub pdu: &'r RequestPdu,
     /// The device type with which the drive identifies itself.
     pub device: u8,
@@ -229,7 +229,7 @@ fn has_form(form: Form, answer: &Answer) -> bool {
         Form::State | Form::Identity => digits == 2,
         Form::Integer => matches!(digits, 4 | 6),
         Form::Float => matches!(digits, 8 | 10),
-        // Records have five digits or thirteen.
+        // Change records have five digits or thirteen.
         Form::Changes => digits == 0 || digits >= 5,
         Form::Any => true,
     }

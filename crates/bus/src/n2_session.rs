@@ -5,7 +5,7 @@
 //! unknown, values are read), and then it is read. `N00` at any time means that the drive has restarted, so the
 //! session begins again.
 //!
-//! Late replies are recognised in `n2_late_replies`.
+//! `n2_late_replies` recognises late replies; this module only follows sessions.
 
 use std::time::Instant;
 
@@ -26,7 +26,7 @@ enum Phase {
     Waiting,
     /// The drive is reporting its changes: number of polls left, and whether the next one acknowledges the previous report.
     Reporting { left: u8, again: bool },
-    /// The drive is read and commanded.
+    /// The drive can be read and commanded.
     Ready,
 }
 
@@ -41,10 +41,10 @@ struct Drive {
     device: Option<u8>,
 }
 
-/// The result of a transaction.
+/// The effect of a transaction on the session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
-    /// The next step is decided again.
+    /// The session continues; the next step is chosen again.
     Going,
     /// The drive has another device type than its profile; reported once.
     Unlike(u8),
@@ -63,7 +63,7 @@ pub struct N2Sessions {
 }
 
 impl N2Sessions {
-    /// Sessions with drives of these options.
+    /// Sessions with drives that have these options.
     pub fn new(drives: impl IntoIterator<Item = N2Options>) -> N2Sessions {
         let drive = |options: N2Options| Drive {
             phase: first(&options),
@@ -186,7 +186,7 @@ impl Drive {
         self.polled.is_none_or(|at| since(at) >= self.options.poll)
     }
 
-    /// Polls the drive for changes.
+    /// Starts to poll the drive for changes.
     fn report(&mut self) {
         self.phase = Phase::Reporting {
             left: MOST_POLLS,

@@ -19,7 +19,7 @@ pub enum News {
     Read {
         /// Index of the drive on the bus.
         drive: DriveIndex,
-        /// The read.
+        /// The read that the drive answered.
         read: PlannedRead,
         /// The reply, a word for each item.
         words: Vec<u16>,
@@ -44,7 +44,7 @@ pub enum News {
     ActionRefused {
         /// Index of the drive on the bus.
         drive: DriveIndex,
-        /// The command in one line.
+        /// The command as one line of text.
         what: String,
         /// Reason of the refusal.
         refusal: Refusal,
@@ -53,12 +53,12 @@ pub enum News {
     ActionFailed {
         /// Index of the drive on the bus.
         drive: DriveIndex,
-        /// Reason of the failure, as text.
+        /// Reason of the failure as text.
         why: Option<String>,
     },
     /// The action of an expired lease was acknowledged after this number of failed tries.
     ActionTaken {
-        /// Index of the drive on the bus.
+        /// Number of earlier failures.
         drive: DriveIndex,
         /// Number of failures before.
         failures: u32,
@@ -69,7 +69,7 @@ pub enum News {
     RefreshEnded {
         /// Index of the drive on the bus.
         drive: DriveIndex,
-        /// Reason of the end, as text.
+        /// Reason of the end as text.
         why: String,
     },
     /// A waiting or started command was refused.
@@ -91,6 +91,6 @@ pub enum News {
 pub enum Adopted {
     /// The lease of the drive runs from now on.
     Yes,
-    /// The drive waits for a client.
+    /// The lease is not started; the drive waits for a client.
     No,
 }

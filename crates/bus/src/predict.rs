@@ -40,13 +40,13 @@ const TOLERANCE: f64 = 0.001;
 pub struct PredictedRequest {
     /// Index of the drive on the bus.
     pub drive: DriveIndex,
-    /// The request.
+    /// The planned read.
     pub read: PlannedRead,
     /// Duration of the whole transaction: request, its recognition by the drive, turnaround, reply, silence.
     pub wire: Duration,
 }
 
-/// The predicted performance of a bus.
+/// The predicted cadence and load of a bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prediction {
     /// All requests, drive by drive, fast ones first.
@@ -76,12 +76,12 @@ pub struct Shortage {
     pub remedies: Vec<Remedy>,
 }
 
-/// A cadence that is missed.
+/// A configured cadence that the line misses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Missed {
-    /// Cadence aimed at.
+    /// Cadence that was configured.
     pub wanted: Duration,
-    /// Cadence that the line carries.
+    /// Cadence that the line can carry.
     pub achieved: Duration,
     /// Number of requests in one round.
     pub requests: usize,
@@ -96,16 +96,16 @@ pub enum Remedy {
     Baud(u32),
     /// Least number of buses to deal the drives to.
     Split {
-        /// Number of buses.
+        /// Number of buses to split the drives over.
         buses: usize,
-        /// Baud rate of each.
+        /// Baud rate of each bus; `None` keeps the present one.
         baud: Option<u32>,
     },
     /// The shortest cadence of the fast class, whole milliseconds.
     Cycle {
-        /// The cadence.
+        /// The longer cadence to configure.
         cycle: Duration,
-        /// Baud rate.
+        /// The higher baud rate to configure.
         baud: Option<u32>,
     },
     /// The shortest cadence of the slow class, whole milliseconds.
@@ -162,7 +162,7 @@ impl Rounds {
         }
     }
 
-    /// Mean time of a slow request.
+    /// Mean duration of a slow request.
     fn mean_slow(&self) -> f64 {
         self.slow / self.slow_requests.max(1.0)
     }
@@ -413,7 +413,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Whether a cadence is missed.
+/// Whether the achieved cadence misses the wanted one.
 fn late(achieved: f64, wanted: Duration) -> bool {
     achieved > wanted.as_secs_f64() * (1.0 + TOLERANCE)
 }

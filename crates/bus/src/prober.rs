@@ -19,16 +19,16 @@ pub struct Prober<'l> {
     unasked: usize,
 }
 
-/// The result of a request.
+/// The result of a single request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Answer {
-    /// How the transaction ended.
+    /// Result of the transaction.
     pub ended: Ended,
     /// Observed time until the reply started; only for replies with values.
     pub turnaround: Option<Duration>,
-    /// The adapter sent the request back.
+    /// Whether the adapter echoed the request.
     pub echoed: bool,
-    /// Received bytes, without such an echo.
+    /// Number of received bytes, without an echo.
     pub bytes: usize,
     /// Form of the received bytes.
     pub shape: Shape,
@@ -97,7 +97,7 @@ impl Prober<'_> {
         LineState::new(protocol, format, silence, Instant::now()).patience(request, timeout)
     }
 
-    /// Bytes received without a request.
+    /// Number of bytes received without a request.
     pub fn unasked(&self) -> usize {
         self.unasked
     }

@@ -39,7 +39,7 @@ pub struct Proof {
 /// A case in which a command does something that it must not do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Counterexample {
-    /// The fault.
+    /// What the command did wrong, as text.
     pub what: String,
     /// State of the drive before the command.
     pub state: String,
@@ -116,7 +116,7 @@ const COMMANDS: [Sets; 10] = [
 /// commands needs no proof.
 ///
 /// # Errors
-/// A counterexample.
+/// If the profile fails the proof; contains a counterexample.
 pub fn prove(profile: &Profile) -> Result<Proof, Box<Counterexample>> {
     let Some(control) = &profile.control else {
         return Ok(Proof::default());
@@ -196,13 +196,13 @@ struct Case<'p> {
     order: Order,
 }
 
-/// The progress of a case.
+/// The progress of a proof's case.
 struct Progress<'p> {
     drive: Drive<'p>,
     words: KnownWords,
     now: Instant,
     frames: Vec<Frame>,
-    /// When the reset was set.
+    /// When the reset bit was set.
     reset_at: Option<Instant>,
     /// Whether the motor ran when the command was given, or was running at a stop in between.
     ran: bool,

@@ -35,7 +35,7 @@ enum Beginner {
     Action,
 }
 
-/// A refresh that has started.
+/// The state of a refresh in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Going {
     does: InForce,
@@ -46,7 +46,7 @@ struct Going {
     due: Instant,
     /// Whether the motor was seen to run by its run command, or to stand by its stop.
     seen: bool,
-    /// The drive has not answered since.
+    /// Since when the drive has not answered.
     lost: Option<Instant>,
     /// Origin of the order that started the refresh.
     by: Beginner,
@@ -62,9 +62,9 @@ pub struct Repeated {
 /// Result of an order, as far as a refresh depends on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OrderEnd {
-    /// A client's order was acknowledged.
+    /// A client's order was acknowledged by the drive.
     Done,
-    /// A drill gave the order.
+    /// A drill gave the order that ended.
     Drill,
     /// The speed reference of a lease that expired was.
     Action,
@@ -81,9 +81,9 @@ pub(super) enum OrderEnd {
 pub(super) struct Around {
     /// Stops of the drive that were accepted so far.
     pub(super) stops: u64,
-    /// The last one waits by `min_run`.
+    /// Whether `min_run` delays the last stop.
     pub(super) delayed: bool,
-    /// The lease runs.
+    /// Whether the lease of the drive is running.
     pub(super) held: bool,
 }
 
@@ -181,7 +181,7 @@ impl Refresh {
         }
     }
 
-    /// Whether the reference alone is written.
+    /// Whether the refresh writes only the reference.
     fn is_fed_by_reference(&self, control: &Control, repeats: Repeats) -> bool {
         !repeats.word || (control.refresh_with_reference && self.repeated.ordered.reference.is_some())
     }

@@ -31,7 +31,7 @@ const LOAD_WINDOW: Duration = Duration::from_secs(1);
 /// Older readings show neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
 
-/// Reports what a bus does.
+/// Reports the results of a bus to image, events and metrics.
 #[derive(Debug)]
 pub(super) struct Report {
     image: Arc<BusImage>,
@@ -59,9 +59,9 @@ pub(super) struct Report {
 /// Reads that the master must make because of a result.
 #[derive(Debug, Default)]
 pub(super) struct Wanted {
-    /// The drive with a new fault.
+    /// The drive that has a new fault.
     pub(super) fault: Option<DriveIndex>,
-    /// Drive, monitoring point and time.
+    /// Comparisons to make: drive, monitoring point and time.
     pub(super) monitors: Vec<(DriveIndex, PointIndex, Instant)>,
 }
 
@@ -70,7 +70,7 @@ pub(super) struct Wanted {
 struct Response {
     /// Whether the response was evaluated since the drive came online.
     looked_at: bool,
-    /// Whether the missing response was reported.
+    /// Whether the missing own response was reported.
     told: bool,
 }
 

@@ -49,13 +49,13 @@ const MOST_CREDIT: f64 = 1.5;
 pub struct Poll {
     /// Index of the drive on the bus.
     pub drive: DriveIndex,
-    /// The read.
+    /// The planned read.
     pub read: PlannedRead,
     /// Whether the poll is a probe, which finds out whether the drive replies (again).
     pub probe: bool,
 }
 
-/// The next action of the bus.
+/// The next action that the schedule chooses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Decision {
     /// Take a command of at least that rank.
@@ -69,17 +69,17 @@ pub enum Decision {
 /// Result of a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Polled {
-    /// The drive replied.
+    /// The drive replied to the poll.
     Ok,
     /// The drive refused the read.
     Refused(Exception),
-    /// The drive gave no answer.
+    /// The drive gave no valid answer.
     Failed,
     /// An invalid reply: retried, but the drive does not count as absent so soon.
     Garbled,
 }
 
-/// The change caused by a poll.
+/// The change of a drive's state caused by a poll.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
     /// The result of the poll does not change the state of the drive.
@@ -92,12 +92,12 @@ pub enum Change {
     Unavailable(PlannedRead, Exception),
 }
 
-/// Cadence of a bus.
+/// Cadence of the poll classes of a bus.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cadence {
-    /// Aimed at for the fast class.
+    /// Configured cadence of the fast class.
     pub fast: Duration,
-    /// Aimed at for the slow class.
+    /// Configured cadence of the slow class.
     pub slow: Duration,
     /// Number of retries for a drive without a setting of its own.
     pub retries: u32,
@@ -106,7 +106,7 @@ pub struct Cadence {
 /// A round of the fast class that was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoundStart {
-    /// When the round started.
+    /// When the round of fast polls started.
     pub at: Instant,
     /// Time since the start of the round before.
     pub cycle: Option<Duration>,
@@ -118,11 +118,11 @@ enum Turn {
     Due,
     /// A slow poll that goes before fast ones.
     OnCredit,
-    /// Requested by a command.
+    /// The poll was requested by a command.
     Asked,
 }
 
-/// The schedule of a bus.
+/// The schedule of all requests on a bus.
 #[derive(Debug)]
 pub struct Schedule {
     cadence: Cadence,
@@ -278,7 +278,7 @@ impl Schedule {
         self.share.polled(took);
     }
 
-    /// A poll has ended.
+    /// Notes the result of a poll.
     pub(crate) fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {

@@ -61,7 +61,7 @@ enum Trust {
     Differs(u8),
 }
 
-/// The result of one comparison.
+/// The result of comparing two values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Verdict {
     Agrees,
@@ -70,7 +70,7 @@ enum Verdict {
     Nothing,
 }
 
-/// The consequences of a read.
+/// What follows from a read of process data.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Findings {
     /// Monitoring points to be read, and when.
@@ -79,7 +79,7 @@ pub(super) struct Findings {
     pub(super) monitored: Option<Vec<PointIndex>>,
     /// Points now known to differ, with both values: the first ones of the drive.
     pub(super) differ: Vec<(PointIndex, f64, f64)>,
-    /// Points that match the profile again.
+    /// Points whose process data matches the profile again.
     pub(super) restored: Vec<PointIndex>,
 }
 

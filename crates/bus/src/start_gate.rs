@@ -30,17 +30,17 @@ pub(super) struct StartGate {
     guards: Arc<BusGuards>,
     /// Until when the thread was last stalled.
     stood: Option<Instant>,
-    /// Results to report.
+    /// Results that are to be reported.
     told: Vec<News>,
     trips: PerDrive<Trip>,
 }
 
-/// The start that a command causes.
+/// The start of a motor that a command causes.
 #[derive(Debug, Clone)]
 pub(crate) struct Start {
     /// The number of the command.
     pub number: u64,
-    /// The client that gave the start.
+    /// The client that caused the start.
     pub client: Arc<str>,
 }
 
@@ -74,7 +74,7 @@ impl StartGate {
         })
     }
 
-    /// The thread was stalled.
+    /// Notes that the thread was stalled.
     pub(super) fn after_stall(&mut self, stall: Stall) {
         self.stood = Some(stall.ended);
     }
@@ -95,7 +95,7 @@ impl StartGate {
         }
     }
 
-    /// Updates the state of a drive.
+    /// Updates the starts of a drive from a reading.
     pub(super) fn update(&self, index: DriveIndex, drive: &mut DriveState, reading: &Reading<'_>) {
         if let Some(run) = drive.acknowledged.take() {
             self.guards.acknowledged(index, run, reading.now);
@@ -127,7 +127,7 @@ impl StartGate {
             return;
         };
         trip.note_answer(now);
-        // A first reading since decides.
+        // The first reading after the stall decides.
         let stood = self.stood.filter(|until| now < *until + FIRST_READ);
         let unmet = self.guards.tripped(index, stood, now);
         if unmet.is_empty() || !may_run(reading, words) {

@@ -42,7 +42,7 @@ enum State {
     Unheard,
     /// No client has commanded the drive since the gateway started, and it was reported that the drive runs.
     RunsUnheard,
-    /// The lease runs since this time.
+    /// The lease has been running since this time.
     Held(Instant),
     /// The lease expired while the drive ran, and the action is not acknowledged yet.
     RanOut,
@@ -95,7 +95,7 @@ pub(super) struct Orders {
     pub(super) held_until: Option<Instant>,
 }
 
-/// Request of supervision.
+/// The action that supervision requires.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Demand {
     /// Supervision requires no action.
@@ -110,7 +110,7 @@ pub(super) enum Demand {
 #[derive(Debug, Default)]
 pub(super) struct Supervision {
     lease: Lease,
-    /// The pending result of the action.
+    /// Receiver of the action's pending result.
     answer: Option<Receiver<Answer>>,
     next_try: Option<Instant>,
     /// The reported reason why the action could not be written.
@@ -132,12 +132,12 @@ impl Supervision {
         self.lease = lease;
     }
 
-    /// The lease, for the next bus.
+    /// The lease for the handover to the next bus.
     pub(super) fn lease(&self) -> Lease {
         self.lease
     }
 
-    /// Whether the lease runs.
+    /// Whether the lease is running.
     pub(super) fn is_held(&self) -> bool {
         matches!(self.lease.state, State::Held(_))
     }
@@ -178,7 +178,7 @@ impl Supervision {
         self.reasons.clear();
     }
 
-    /// The action due at `now`.
+    /// The action that is due at `now`.
     pub(super) fn due_action(
         &mut self,
         reading: &Reading<'_>,
@@ -335,7 +335,7 @@ impl Supervision {
         self.answer = None;
     }
 
-    /// The action is written again.
+    /// Schedules the action again after a failure.
     fn not_acknowledged(&mut self, outcome: Outcome, now: Instant) {
         self.next_try = Some(now + AGAIN);
         self.failure = Some(outcome).filter(has_failed);

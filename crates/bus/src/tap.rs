@@ -46,7 +46,7 @@ impl Tap {
         }
     }
 
-    /// Publishes the request.
+    /// Publishes the request to trace subscribers.
     pub(super) fn sent(&self, quiet_since: Instant, began: Instant) {
         self.image.trace.publish(|| FrameRecord {
             time: time_of_day(began),
@@ -59,7 +59,7 @@ impl Tap {
         });
     }
 
-    /// Bytes arrived.
+    /// Notes received bytes.
     pub(super) fn received(&mut self, bytes: &[u8], now: Instant) {
         self.hearing.add(bytes, now);
     }

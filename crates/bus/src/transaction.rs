@@ -29,7 +29,7 @@ pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 /// Reason why a transaction has no reply if the device server closed the connection after its request.
 pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply arrived over the next one";
 
-/// How a transaction ended.
+/// The result of a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ended {
     /// The drive replied, perhaps with an exception: it is alive.
@@ -40,7 +40,7 @@ pub enum Ended {
     Corrupt(&'static str),
 }
 
-/// Next action of the transaction.
+/// What to do next in a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Step {
     /// Wait for bytes until this time.
@@ -170,7 +170,7 @@ impl Transaction {
         &self.request
     }
 
-    /// Bytes were received.
+    /// Processes received bytes.
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
         self.first_byte.get_or_insert(now);
         self.behind_doubted |= self.doubted && !bytes.is_empty();
@@ -305,7 +305,7 @@ impl Transaction {
         frame.get(before..).unwrap_or_default()
     }
 
-    /// A complete reply after garbage.
+    /// Accepts a complete reply after garbage.
     fn behind_garbage(&mut self, now: Instant) -> Option<Step> {
         if self.echo && !self.echo_seen {
             // The frame could be the echo of a write.
@@ -337,7 +337,7 @@ impl Transaction {
         self.reply_time * missing / expected as u32
     }
 
-    /// Time went by.
+    /// Processes the passage of time.
     pub fn on_time(&mut self, now: Instant) -> Step {
         let until = self
             .garbage
@@ -394,7 +394,7 @@ impl Transaction {
         self.first_byte
     }
 
-    /// Frames that were not the reply.
+    /// Number of frames that were not the reply.
     pub fn foreign(&self) -> u32 {
         self.foreign
     }

@@ -12,7 +12,7 @@ const IN_TURN: f64 = 8.0;
 /// Pause after further stops, as a multiple of the duration of the last one, up to the time for a reply.
 const PAUSE: u32 = 10;
 
-/// The unanswered stops of one drive.
+/// The stops of one drive without a reply.
 #[derive(Debug, Default)]
 pub(super) struct VainStops {
     /// Number of useless stops in a row; one less for each pause.
@@ -46,7 +46,7 @@ impl VainStops {
         self.count <= IN_TURN
     }
 
-    /// The drive replied.
+    /// Notes that the drive replied.
     pub(super) fn answered(&mut self) {
         *self = VainStops::default();
     }

@@ -35,9 +35,9 @@ pub(super) enum Word {
     Sequence(usize, Option<bool>),
     /// Prepares a pulse of these bits, usually a reset: clears the bits, and the run command if the motor stands.
     ResetLow(Setting),
-    /// The pulse.
+    /// Sets the bits of a reset pulse.
     ResetHigh(Setting),
-    /// The word after a reset pulse.
+    /// Writes the word after a reset pulse.
     ResetEnd(Setting),
     /// Bits that are no command of `[control]`.
     Others(Setting),
@@ -66,10 +66,10 @@ impl Word {
     }
 }
 
-/// The result of making a word.
+/// The result of building a control word.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Made {
-    /// The request to send.
+    /// This request must be sent.
     Send(Step),
     /// Nothing is sent because the drive already has the word.
     Nothing,
@@ -84,7 +84,7 @@ pub(super) enum Made {
 /// A state for which a sequence waits.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct AwaitedState {
-    /// The register.
+    /// The register that shows the awaited state.
     raw: Raw,
     name: String,
     mask: Mask,
@@ -94,7 +94,7 @@ pub(super) struct AwaitedState {
     step: String,
     /// When the wait for this state began.
     pub(super) since: Option<Instant>,
-    /// The last reading.
+    /// The value last read from the register.
     seen: Option<u64>,
 }
 
@@ -460,7 +460,7 @@ fn stops_by_reset(control: &Control, reset: Setting) -> bool {
 /// read. `released` is the known control word without a reset.
 ///
 /// # Errors
-/// The word is not made.
+/// If the word must not be written; contains the result instead.
 fn may_stand(
     word: Word,
     control: &Control,

@@ -123,7 +123,7 @@ impl CommandRun {
         (self.effects, receipts)
     }
 
-    /// Ends the command with that outcome.
+    /// Ends the command with this outcome.
     pub fn finish(self, outcome: &Outcome, now: Instant) {
         self.tickets
             .into_iter()

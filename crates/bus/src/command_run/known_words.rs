@@ -32,7 +32,7 @@ pub struct KnownWords {
 }
 
 impl KnownWords {
-    /// A word that the drive reports.
+    /// Remembers a word that the drive reports.
     pub(crate) fn learn(&mut self, table: Table, address: u16, word: u16) {
         if matches!(table, Table::Holding | Table::Coil) {
             self.words.insert((table, address), word);

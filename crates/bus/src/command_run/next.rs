@@ -10,9 +10,9 @@ use crate::codec::Exception;
 use crate::drive::Profile;
 use crate::order::{Interruption, Outcome};
 
-/// Result of evaluating the first action.
+/// Result of evaluating a command's first action.
 enum First {
-    /// The step is sent.
+    /// This step must be sent.
     Step(Box<Step>),
     /// The action changes nothing: the next one is evaluated.
     Nothing,

@@ -13,7 +13,7 @@ use crate::order::{Outcome, ParameterOrder, Refusal};
 /// Reads of a value that was acknowledged until it counts as not taken.
 const LOOKS: u32 = 3;
 
-/// Stage of setting the parameter.
+/// Stage of a parameter write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     /// The value is read from the drive.
@@ -22,23 +22,23 @@ enum Stage {
     Running,
     /// The motor stands: the write must be the next transaction on the line.
     Write,
-    /// Releases the N2 override.
+    /// Releases the N2 override of the parameter.
     Release,
     /// The value is read from the drive again.
     ReadBack,
 }
 
-/// The next step after a reply.
+/// What follows a reply to a parameter step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Then {
-    /// The next step.
+    /// The next step follows at once.
     Go,
-    /// The next step, after a pause.
+    /// The next step follows after a pause.
     Pause,
     Over(Outcome),
 }
 
-/// A parameter that is being set.
+/// A parameter write in progress.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ParameterRun {
     order: ParameterOrder,
@@ -103,7 +103,7 @@ impl ParameterRun {
         }
     }
 
-    /// The write is on the line.
+    /// Notes that the write is on the line.
     pub(super) fn written(&mut self) {
         self.in_doubt = true;
     }
@@ -121,7 +121,7 @@ impl ParameterRun {
         self.in_doubt
     }
 
-    /// The override was released, or stays.
+    /// Notes that the override was released, or could not be.
     pub(super) fn released(&mut self) {
         self.stage = Stage::ReadBack;
     }

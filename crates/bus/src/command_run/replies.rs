@@ -221,7 +221,7 @@ impl CommandRun {
         let over = self.tries.failures > retries;
         if let Some(run) = self.parameter() {
             if step.purpose == StepPurpose::Release && over {
-                // The value remains written.
+                // The override stays, so the written value remains in force.
                 run.released();
                 self.tries.failures = 0;
                 return None;

@@ -22,7 +22,7 @@ pub(crate) enum Motor {
 /// The run command in the drive's word, as far as it is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum KnownRun {
-    /// The run command is set.
+    /// The run command of the word is set.
     Run,
     /// The word is neither a run command nor a stop.
     Other,
@@ -32,11 +32,11 @@ pub(super) enum KnownRun {
 /// Kind of a write that does not decide whether the motor is to run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wants {
-    /// The direction, within the control word.
+    /// The direction as part of the control word.
     Direction,
     /// The direction, which has a separate register.
     DirectionElsewhere,
-    /// A reset within the control word.
+    /// A reset as part of the control word.
     Reset,
     /// The control word before a reset that has a separate register.
     ResetElsewhere,
@@ -51,7 +51,7 @@ pub(super) enum Wants {
 pub(super) enum Verdict {
     /// The word is written with its present run command.
     AsItStands,
-    /// The word without a run command.
+    /// The word is written without a run command.
     WithoutRun,
     /// Write nothing: the direction is kept for the next start.
     AtNextStart,

@@ -59,7 +59,7 @@ pub(crate) struct StateRead {
     remote: Option<Shown>,
     first: RequestPdu,
     more: Vec<RequestPdu>,
-    /// Number of requests that were answered.
+    /// Number of answered requests in this series.
     answered: usize,
     words: BTreeMap<(Table, u16), u16>,
 }
@@ -101,7 +101,7 @@ impl StateRead {
         })
     }
 
-    /// The next request.
+    /// The next read of this series.
     pub(crate) fn request(&self) -> RequestPdu {
         let more = self.answered.checked_sub(1).and_then(|number| self.more.get(number));
         more.unwrap_or(&self.first).clone()

@@ -30,7 +30,7 @@ pub(super) enum Action {
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
     /// Clears a pulse bit outside the control word, if it is set.
     PulseLow { raw: Raw, bit: u8, invert: bool },
-    /// Sets the bit of a pulse.
+    /// Sets the bit of a pulse outside the control word.
     PulseHigh { raw: Raw, bit: u8, invert: bool },
     /// Clears the bit at the end of a pulse.
     PulseEnd { raw: Raw, bit: u8, invert: bool },
@@ -44,7 +44,7 @@ pub(super) enum Action {
     ResetElsewhere(RequestPdu),
     /// Clears the reset in its separate register.
     ResetOver(RequestPdu),
-    /// A parameter, with several steps.
+    /// A write of a parameter, in several steps.
     Parameter(Box<ParameterRun>),
 }
 
@@ -67,12 +67,12 @@ pub enum StepPurpose {
     ReadBack,
 }
 
-/// A request of a command.
+/// A request that is a step of a command.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Step {
-    /// Purpose of the request.
+    /// Purpose of the step.
     pub purpose: StepPurpose,
-    /// The request.
+    /// The request to send.
     pub pdu: RequestPdu,
 }
 
@@ -112,7 +112,7 @@ pub(super) enum Check {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) check: Check,
-    /// The word cannot be read.
+    /// Whether the control word cannot be read.
     pub(super) blind: bool,
     /// Whether the command decides whether the motor is to run.
     pub(super) names_run: bool,

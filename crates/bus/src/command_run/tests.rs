@@ -284,7 +284,7 @@ fn exceptions_and_silence_end_it() {
     assert_eq!(command.success(), Outcome::Garbled);
 }
 
-/// The next step of the command.
+/// The next step of the command, which must be a request.
 fn sends(bench: &ObedientDrive, command: &mut CommandRun) -> Step {
     match command.next(&bench.words, &bench.profile, bench.running, bench.now) {
         Next::Send(step) => step,

@@ -416,7 +416,7 @@ proptest! {
             prop_assert!(stood || !confirmed);
             prop_assert!(reported.is_empty() || (reported.len() == 1 && !confirmed));
         }
-        // A fall ends some day.
+        // The deceleration ends after some time.
         rig.now += Duration::from_secs(3);
         reported.append(&mut rig.expired());
         prop_assert!(rig.confirmations.is_empty() && reported.len() <= 1);

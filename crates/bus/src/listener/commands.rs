@@ -20,11 +20,11 @@ const KEPT: usize = 256;
 /// A command of the other master that must be reported.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Commanded {
-    /// The command in one line.
+    /// The command as one line of text.
     pub what: String,
-    /// The changed values.
+    /// The values that the command changes.
     pub changes: Vec<Change>,
-    /// The result.
+    /// The outcome of the command.
     pub outcome: Outcome,
     /// When the request of the command began on the line.
     pub began: Instant,
@@ -36,7 +36,7 @@ pub struct Commanded {
 #[derive(Debug, Default)]
 pub struct Commands {
     words: BTreeMap<(Table, u16), u16>,
-    /// Code of the last outcome.
+    /// Code of the last reported outcome.
     outcome: Option<&'static str>,
     told: Option<Instant>,
     waiting: Option<Commanded>,
@@ -88,7 +88,7 @@ impl Commands {
         None
     }
 
-    /// The pending report, if due.
+    /// The pending report, if its time has come.
     pub fn due(&mut self, now: Instant) -> Option<Commanded> {
         let told = self.told.filter(|told| now >= *told + PAUSE)?;
         let waiting = self.waiting.take()?;

@@ -90,7 +90,7 @@ impl ListenCore {
         }
     }
 
-    /// The port was opened.
+    /// Notes that the port was opened.
     pub fn opened(&mut self, now: Instant) {
         self.decoder = decoder(&self.bus);
         self.heard_any = false;
@@ -135,7 +135,7 @@ impl ListenCore {
         }
     }
 
-    /// Bytes came in at `now`.
+    /// Processes bytes received at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant) {
         self.heard_any |= !bytes.is_empty();
         let mut heard = std::mem::take(&mut self.heard);

@@ -40,12 +40,12 @@ const BEHIND_MANGLED: &str = "it may be the late reply to a damaged request";
 /// A piece of received traffic.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Traffic {
-    /// A request, and the result.
+    /// A transaction: a request and its result.
     Exchange(Box<Exchange>),
     /// Bytes that belong to no transaction.
     Stray {
         bytes: Vec<u8>,
-        /// When the bytes had come.
+        /// When the bytes had arrived.
         at: Instant,
         /// Since when the line had been silent before these bytes.
         quiet_since: Instant,
@@ -71,7 +71,7 @@ pub struct Exchange {
     pub heard: Vec<u8>,
     /// When the first byte of the reply began; `None` if no bytes arrived.
     pub replied: Option<Instant>,
-    /// When the transaction was over.
+    /// When the transaction ended.
     pub at: Instant,
     /// The latest time the replied request was sent: earlier than `at`, if the reply may belong to an earlier attempt.
     pub asked_by: Instant,
@@ -139,7 +139,7 @@ impl Decoder {
         }
     }
 
-    /// When [`Decoder::on_time`] has something to do.
+    /// When [`Decoder::on_time`] must be called next.
     pub fn wake_at(&self) -> Option<Instant> {
         let over = self.open.as_ref().map(|open| open.sent + PATIENCE);
         over.into_iter().chain(self.frames.patience()).min()
@@ -153,7 +153,7 @@ impl Decoder {
         self.cut(now, heard);
     }
 
-    /// Time went by.
+    /// Processes the passage of time.
     pub fn on_time(&mut self, now: Instant, heard: &mut Vec<Traffic>) {
         self.cut(now, heard);
         if self.open.as_ref().is_some_and(|open| now >= open.sent + PATIENCE) {

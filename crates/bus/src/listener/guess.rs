@@ -13,7 +13,7 @@ use crate::codec::{LineFormat, Parity, Protocol};
 /// Number of requests that decide the guess.
 const ENOUGH: u64 = 3;
 
-/// A protocol that is tried.
+/// A protocol that is being tried.
 #[derive(Debug)]
 struct Try {
     protocol: Protocol,
@@ -52,7 +52,7 @@ impl Guess {
         }
     }
 
-    /// Bytes arrived at `now`.
+    /// Processes bytes received at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant) {
         self.bytes += bytes.len() as u64;
         self.even += bytes.iter().filter(|byte| byte.count_ones().is_multiple_of(2)).count() as u64;
@@ -70,7 +70,7 @@ impl Guess {
         }
     }
 
-    /// Number of bytes so far.
+    /// Number of bytes received so far.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }

@@ -22,9 +22,9 @@ pub struct N2Survey {
     sums: [u64; 2],
     /// Regions of overrides and releases by their digits.
     widths: Seen,
-    /// Status bytes of binary objects.
+    /// Status bytes of binary objects that were seen.
     states: Seen,
-    /// Device types.
+    /// Device types that were seen.
     devices: Seen,
     /// Times at which a drive wanted to be identified.
     unidentified: u64,
@@ -41,12 +41,12 @@ pub struct N2Survey {
     integers: Seen,
     /// Number of refusals, by their form.
     refusals: Seen,
-    /// Floats that are no number.
+    /// Received floats that are not numbers.
     no_numbers: Seen,
     /// Objects of number 0, and the others.
     numbers: [u64; 2],
     times: u64,
-    /// Number of other commands.
+    /// Number of commands of other kinds.
     others: u64,
 }
 
@@ -289,7 +289,7 @@ mod tests {
         survey.report()
     }
 
-    /// The report's text about an assumption.
+    /// The part of the report about an assumption.
     fn said<'r>(report: &'r str, assumption: &str) -> &'r str {
         let mut lines = report.lines().skip_while(|line| !line.contains(assumption));
         lines.nth(1).map_or("no such line", str::trim)

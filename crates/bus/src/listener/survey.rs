@@ -15,7 +15,7 @@ const MOST_REQUESTS: usize = 256;
 /// A request, each time it was received.
 #[derive(Debug, Clone)]
 pub struct Asked {
-    /// The request, as text.
+    /// The request as text.
     pub what: String,
     /// Table, first address and count of a read.
     pub read: Option<(Table, u16, u16)>,
@@ -23,7 +23,7 @@ pub struct Asked {
     pub count: u64,
     /// Number of answers with values or an acknowledgement.
     pub answered: u64,
-    /// Number of refusals.
+    /// Number of refusals of this request.
     pub refused: u64,
     first: Instant,
     last: Instant,
@@ -37,14 +37,14 @@ impl Asked {
     }
 }
 
-/// The traffic of one address.
+/// The observed traffic of one address.
 #[derive(Debug, Clone, Default)]
 pub struct Address {
     /// Each request of the other master, keyed by its text.
     pub requests: BTreeMap<String, Asked>,
     /// Requests that got an answer, perhaps a refusal.
     pub answered: u64,
-    /// Requests without an answer.
+    /// Number of requests without an answer.
     pub silent: u64,
     /// Damaged replies, or replies to an uncertain request.
     pub doubtful: u64,
@@ -91,12 +91,12 @@ impl Address {
     }
 }
 
-/// The traffic of a line.
+/// The observed traffic of a line.
 #[derive(Debug, Default)]
 pub struct Survey {
     /// The drives by address; 0 is the broadcast.
     pub addresses: BTreeMap<u8, Address>,
-    /// Requests received.
+    /// Number of requests received.
     pub requests: u64,
     /// Bytes that belong to no transaction.
     pub stray: u64,

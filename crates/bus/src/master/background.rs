@@ -434,7 +434,7 @@ impl Master {
 
     fn background_outcome(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Outcome {
         let reply = match end.ended {
-            // The drive ignored the request.
+            // An ignored request looks like a silent drive.
             Ended::Silent
             | Ended::Corrupt(CONNECTION_CLOSED)
             | Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => return Outcome::TimedOut,

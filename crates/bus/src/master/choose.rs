@@ -19,7 +19,7 @@ const IN_A_ROW: u32 = 8;
 /// answered.
 const MOST_DECISIONS: usize = 1000;
 
-/// The ranks, the highest first.
+/// The ranks of commands, highest first.
 const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
 
 /// How often each rank went before waiting lower ones.
@@ -62,7 +62,7 @@ struct NextStep {
 /// What all started commands need at one time.
 #[derive(Default)]
 struct Commands {
-    /// Next steps by rank.
+    /// Next steps of commands by rank.
     ready: [Option<NextStep>; 3],
     queued: [Option<Chosen>; 3],
     /// When further commands may be sent.

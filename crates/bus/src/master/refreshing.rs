@@ -16,7 +16,7 @@ use crate::transaction::Ended;
 /// Limit for the time of refreshes that polls get back.
 const MOST_DEBT: Duration = Duration::from_secs(2);
 
-/// Whether a refresh may write.
+/// Whether a refresh may write now.
 enum May {
     Yes,
     NotNow,
@@ -78,7 +78,7 @@ impl Master {
         }
     }
 
-    /// When the next round is due.
+    /// When the next refresh round is due.
     pub(super) fn next_refresh(&self) -> Option<Instant> {
         self.due_refreshes().map(|(due, _)| due).min()
     }

@@ -23,14 +23,14 @@ pub struct Remains {
     pub held_stops: usize,
     /// Leases that expired and whose action is not acknowledged.
     pub owed_actions: usize,
-    /// Drives that do not answer.
+    /// Number of drives that do not answer.
     pub away: usize,
     /// Reads that wait behind failures: not answered, or requested by a command and not done.
     pub held_reads: usize,
 }
 
 impl Master {
-    /// The remains at `now`.
+    /// The state left over from faults and commands at `now`.
     pub fn remains(&self, now: Instant) -> Remains {
         let (away, held_reads) = self.schedule.held(now);
         let late = self.drives.iter().map(|drive| drive.late.owed(now));

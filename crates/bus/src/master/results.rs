@@ -89,7 +89,7 @@ impl Master {
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
             Ended::Corrupt(_) if came_mangled => {
-                // A valid reply may still follow.
+                // A valid reply may follow the damaged one.
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
             Ended::Silent | Ended::Corrupt(_) if self.bus.image.spec.tells_replies_apart() => {
@@ -475,7 +475,7 @@ impl Master {
         self.schedule.read_soon(index, covers, now);
     }
 
-    /// Schedules reading back written registers.
+    /// Schedules the read-back of written registers.
     fn read_back(&mut self, index: DriveIndex, step: &Step, now: Instant) {
         if let RequestPdu::MaskWrite { address, or_mask, .. } = step.pdu {
             self.note_write(index, Table::Holding, &[(address, or_mask)], now);

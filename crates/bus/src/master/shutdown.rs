@@ -48,9 +48,9 @@ enum State {
     Due(Instant),
     /// The stop is ordered, and its answer awaited.
     Ordered(Receiver<Answer>),
-    /// The stop was acknowledged.
+    /// The drive acknowledged its stop.
     Acknowledged,
-    /// The stop cannot be ordered.
+    /// The stop cannot be ordered, for this reason.
     Refused(String),
 }
 

@@ -28,9 +28,9 @@ mod shutdown;
 mod stop_all;
 mod timing;
 
-/// Silence before each request.
+/// Silence before each request in these tests.
 const SILENCE: Duration = Duration::from_micros(1750);
-/// Time of a transaction.
+/// Duration of a transaction in these tests.
 const COST: Duration = Duration::from_millis(20);
 /// Time of a transaction without an answer.
 const TIMEOUT: Duration = Duration::from_millis(110);
@@ -40,13 +40,13 @@ const TIMEOUT: Duration = Duration::from_millis(110);
 struct Registers {
     holding: BTreeMap<u16, u16>,
     silent: bool,
-    /// How the next write ends.
+    /// The result of the next write.
     next_write: Option<Ended>,
     /// Number of writes that get this exception.
     to_writes: Option<(u32, Exception)>,
-    /// Exception for every read.
+    /// Exception that answers every read.
     to_reads: Option<Exception>,
-    /// The drive is of another family.
+    /// Set if the drive is of another family.
     family: Option<family_drive::FamilyDrive>,
 }
 
@@ -153,7 +153,7 @@ impl Rig {
         rig
     }
 
-    /// A rig without any request sent.
+    /// A rig that has not sent any request.
     fn empty(
         drives: u8,
         profile: &str,
@@ -281,7 +281,7 @@ impl Rig {
         }
     }
 
-    /// An order of a client.
+    /// Gives an order of a client.
     fn order(&self, drive: usize, who: &str, point: ModelPoint, value: Value) -> Receiver<Answer> {
         let image = &self.bus.image.drives[drive];
         let index = image.spec.profile.model_index(point).unwrap();

@@ -36,7 +36,7 @@ impl Waits {
         drives: &mut PerDrive<DriveState>,
         now: Instant,
     ) -> Option<Instant> {
-        // A poll identifies the drive.
+        // Only a poll may identify the drive.
         if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
             return Some(now + super::LOOK_ROUND);
         }

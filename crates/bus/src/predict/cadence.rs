@@ -7,11 +7,11 @@ use super::predict;
 use crate::codec::wire::Silence;
 use crate::process_image::{BusSpec, DriveSpec};
 
-/// Cadences to choose from, ms.
+/// Cadences to choose from, in ms.
 const STEPS: [u64; 17] = [
     10, 20, 30, 40, 50, 75, 100, 150, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 5000,
 ];
-/// Slow cadences to choose from, ms.
+/// Slow cadences to choose from, in ms.
 const SLOW_STEPS: [u64; 7] = [1000, 2000, 5000, 10_000, 20_000, 30_000, 60_000];
 /// Greatest ratio of a slow cycle to the fast one, unless the slow cycle is the shortest possible.
 const MOST_RATIO: u32 = 10;

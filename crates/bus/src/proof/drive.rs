@@ -13,7 +13,7 @@ use crate::order::written;
 pub(super) enum Start {
     /// Just switched on: every register holds 0.
     PoweredUp,
-    /// Stopped by the gateway.
+    /// The drive was stopped by the gateway.
     Stopped,
     /// The drive has received all words of its start sequence except the last.
     Prepared,

@@ -5,7 +5,7 @@ use std::fmt;
 use crate::codec::{Exception, RequestPdu};
 use crate::order::written;
 
-/// The fate of a request.
+/// What happens to a request of the proof.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Fate {
     RequestLost,

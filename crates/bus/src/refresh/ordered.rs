@@ -6,17 +6,17 @@ use crate::codec::Table;
 use crate::drive::control::{Control, ControlItem};
 use crate::process_image::Reading;
 
-/// Registers of the longest reference.
+/// Most registers of a reference.
 const LONGEST: usize = 2;
 
-/// The command that is in force.
+/// The command in force: run or stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum InForce {
     Run,
     Stop,
 }
 
-/// The registers of a reference.
+/// The registers of a reference with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Reference {
     pub(super) start: u16,
@@ -34,12 +34,12 @@ impl Reference {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Ordered {
     pub(super) does: Option<InForce>,
-    /// The control word, without a reset.
+    /// The control word last written, without a reset.
     pub(super) word: Option<u16>,
     pub(super) reference: Option<Reference>,
     /// The last write of what feeds the timeout.
     pub(super) fed: Option<Instant>,
-    /// When the reference was written last.
+    /// When the reference was last written.
     pub(super) referred: Option<Instant>,
     /// Whether the drive was seen to report this reference.
     pub(super) tells_reference: bool,

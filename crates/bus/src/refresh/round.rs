@@ -9,7 +9,7 @@ use crate::command_run::{Motor, StateRead};
 use crate::drive::Profile;
 use crate::drive::control::Control;
 
-/// A step of a round.
+/// A step of a refresh round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     /// A reference that is not adjacent to the control word.
@@ -21,7 +21,7 @@ enum Stage {
     Write,
 }
 
-/// A round that has started.
+/// A refresh round in progress.
 #[derive(Debug)]
 pub(super) struct Round {
     stage: Stage,
@@ -88,7 +88,7 @@ impl Refresh {
         }
     }
 
-    /// The write behind the reads.
+    /// The write that follows the reads of the round.
     fn write(&self, profile: &Profile, control: &Control) -> Option<RequestPdu> {
         let (_, repeats) = self.settings?;
         let ordered = &self.repeated.ordered;
@@ -142,7 +142,7 @@ impl Refresh {
         }
     }
 
-    /// The drive answered the present step.
+    /// Processes the drive's reply to the present step.
     ///
     /// # Errors
     /// If the refresh must end; contains the reason.
@@ -266,7 +266,7 @@ impl Refresh {
     }
 }
 
-/// The first read of a round.
+/// The first read of a refresh round.
 fn first_read(profile: &Profile) -> Stage {
     match profile.control.as_ref().is_some_and(Control::is_read) && profile.repeats().is_ok_and(|r| r.word) {
         true => Stage::Own,

@@ -36,25 +36,25 @@ pub(super) const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
     ),
 ];
 
-/// Changes that are reported at once.
+/// Changes of a bit that are reported at once.
 const BURST: u32 = 10;
-/// Time after which one more is.
+/// Time after which one more change is reported.
 const EVERY: Duration = Duration::from_secs(10);
 
-/// A bit whose changes are reported.
+/// A bit whose changes become events.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Watched {
     /// Value as last reported; `None` before the first read.
     reported: Option<bool>,
     /// The value last read, and when it changed to that.
     seen: Option<(bool, Option<Instant>)>,
-    /// Changes since the last report.
+    /// Number of changes since the last report.
     changes: u64,
     /// Recent reports, and since when they are counted.
     spent: Option<(u32, Instant)>,
 }
 
-/// A change to be reported.
+/// A change of a bit to be reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Change {
     /// Present value of the bit.
@@ -186,7 +186,7 @@ mod tests {
         let (mut bit, start) = (Watched::default(), Instant::now());
         let mut reported = Vec::new();
         for second in 0..100u32 {
-            // The first read is no change.
+            // The first read is not a change.
             let value = second / 20 % 2 == 0;
             if let Some(change) = bit.read(value, start + SECOND * second) {
                 reported.push((second, change));

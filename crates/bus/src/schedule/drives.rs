@@ -54,10 +54,10 @@ pub(super) struct Item {
     pub(super) refused: bool,
     /// Whether the drive answers other reads but not this one, which does not make the drive offline.
     pub(super) mute: bool,
-    /// Number of refusals in a row.
+    /// Number of consecutive refusals.
     pub(super) refusals: u32,
     pub(super) failures: u32,
-    /// Time of the last failed poll.
+    /// Time of the last failed poll of this item.
     pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one for a fault, that is still to be done.
     pub(super) wanted: bool,
@@ -79,7 +79,7 @@ pub(super) enum Presence {
 
 #[derive(Debug)]
 pub(super) struct DriveSchedule {
-    /// Tries after the first.
+    /// Number of retries after a failed attempt.
     pub(super) retries: u32,
     pub(super) presence: Presence,
     /// Until when a drill lets nothing be sent to the drive.
@@ -135,7 +135,7 @@ impl Default for EarlyProbes {
 }
 
 impl EarlyProbes {
-    /// The drive answers again.
+    /// Notes that the drive answers again.
     pub(super) fn answers_again(&mut self, now: Instant) {
         (self.online_since, self.outage) = (Some(now), None);
     }

@@ -25,7 +25,7 @@ mod found;
 mod suspended;
 mod unknown;
 
-/// A drive that answers.
+/// The image of a drive that answers.
 fn image(spec: DriveSpec) -> DriveImage {
     let drive = DriveImage::new(spec, Duration::from_secs(1));
     online(&drive);
@@ -81,7 +81,7 @@ impl SupervisedDrive {
         self.image().renew_lease(self.now);
     }
 
-    /// The lease is looked at.
+    /// Evaluates the lease.
     fn supervise(&mut self) {
         let (bus, now) = (self.bus.clone(), self.now);
         supervise(
@@ -102,7 +102,7 @@ impl SupervisedDrive {
         self.supervise();
     }
 
-    /// The next command of the queue.
+    /// Takes the next command of the queue.
     fn take(&self) -> Option<Command> {
         next_command(&mut self.bus.queue.lock(), Urgency::Read, self.now)
     }
@@ -116,7 +116,7 @@ impl SupervisedDrive {
         action
     }
 
-    /// The drive has that value now.
+    /// Lets the drive show this value now.
     fn shows(&self, point: ModelPoint, value: Value) {
         self.knows(point.name(), value);
     }
@@ -164,7 +164,7 @@ impl SupervisedDrive {
         self.news.iter().filter(ran_out).count()
     }
 
-    /// Results of the gateway's own orders.
+    /// Audit results of the gateway's own orders.
     fn own_results(&self) -> Vec<serde_json::Value> {
         let audit = audited(self.stats.audit());
         let own = audit.iter().filter(|r| r["source"] == SourceKind::Supervision.name());
@@ -189,7 +189,7 @@ impl SupervisedDrive {
         answer
     }
 
-    /// Starts the waiting command.
+    /// Starts the waiting command on the line.
     fn begin(&mut self) {
         let command = self.take().expect("an order");
         self.drive.begin(CommandRun::new(command, &self.image().spec.profile));
@@ -490,7 +490,7 @@ fn a_motor_that_may_start_by_itself_gets_its_action() {
         let acted = (0..100).any(|_| rig.after(100, false).is_some());
         assert_eq!(acted, acts, "{word:?}");
     }
-    // The run command was taken away.
+    // The run command was taken away at the drive.
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     rig.heartbeat();
     rig.shows(ModelPoint::Run, Value::Bool(true));

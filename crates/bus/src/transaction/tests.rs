@@ -145,7 +145,7 @@ fn garbage_ends_the_exchange_once_no_more_of_it_can_come() {
     };
     assert!(until - now > char_time * 5, "{:?}", until - now);
     assert!(until - now < char_time * 7, "{:?}", until - now);
-    // The wait never exceeds the deadline.
+    // The wait must never exceed the deadline.
     let deadline = now + Duration::from_millis(105);
     assert_eq!(
         transaction.on_bytes(deadline - char_time, &[0x99]),

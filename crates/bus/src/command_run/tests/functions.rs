@@ -116,7 +116,7 @@ fn the_profile_may_say_it() {
     let run = stop(&bench);
     let (asked, outcome) = drive.carries_out(&mut bench, run);
     assert_eq!((asked, outcome.is_ok()), (vec![(3, 1), (16, 0)], true));
-    // Coils.
+    // The drive accepts only function 15 for coils.
     let mut drive = Drive::new(&[15]);
     bench.profile = Profiles::built_in().get("vacon-cx").unwrap().clone();
     let run = stop(&bench);

@@ -4,7 +4,7 @@ use super::*;
 use crate::drive::DriveIndex;
 use crate::order::{BackgroundRequest, Pace};
 
-/// A register that no poll reads.
+/// Address of a register that no poll reads.
 const REGISTER: u16 = 700;
 
 impl Rig {

@@ -91,7 +91,7 @@ fn a_drive_that_goes_on_turning_fails() {
 enum Meanwhile {
     /// The first replies after a silence are lost; the motor stops before any reply arrives.
     Lost,
-    /// The process is stalled.
+    /// The whole process is stalled.
     Pause,
     /// The task that evaluates drills is stalled, and the bus continues.
     PauseOfDrills,

@@ -86,7 +86,7 @@ impl FamilyDrive {
         self.show(ModelPoint::Running, true);
     }
 
-    /// Stops the motor.
+    /// Stops the motor at once.
     pub(super) fn stand(&mut self) {
         self.runs = false;
         self.show(ModelPoint::Running, false);

@@ -156,7 +156,7 @@ fn what_waits_when_a_hold_is_broken_is_not_sent() {
 #[test]
 fn what_has_begun_goes_no_further_when_a_hold_is_broken() {
     let (mut rig, plant) = guarded(1, Mode::Exclusive);
-    // A reference and run: two steps.
+    // A reference and a run command need two steps.
     let handle = drive(&plant, 0);
     let profile = handle.image.spec.profile.clone();
     let index = |point| profile.model_index(point).unwrap();

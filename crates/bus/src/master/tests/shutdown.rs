@@ -1,4 +1,4 @@
-//! The stops of a shutdown.
+//! The stops at a shutdown of the gateway.
 
 use super::*;
 

@@ -27,7 +27,7 @@ fn order(rig: &Rig, plant: &Plant, stop_all: &StopAll, scope: &Scope) -> StopOrd
     stop_all.order(plant, scope, &origin, WAIT, rig.now).unwrap()
 }
 
-/// Steps until the order is answered.
+/// Runs until the order is answered.
 fn answered(rig: &mut Rig, plant: &Plant, stop_all: &StopAll, order: &mut StopOrder) -> StopReport {
     let begin = rig.now;
     loop {

@@ -131,7 +131,7 @@ impl Commands {
                 1..=14 => Urgency::Command,
                 _ => Urgency::Read,
             };
-            // The queue is bounded.
+            // The queue has room for 64 commands.
             if self.waiting.len() < 64 {
                 self.waiting.push_back(urgency);
             }

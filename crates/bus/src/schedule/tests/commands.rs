@@ -1,4 +1,4 @@
-//! Commands and polls share the line.
+//! How commands and polls share the line.
 
 use super::*;
 use crate::drive::DriveIndex;

@@ -36,7 +36,7 @@ fn dead_drives_cost_two_percent_each() {
     let mut some = PolledLine::new(10, Duration::from_millis(10));
     some.dead = vec![2, 5, 9];
     for rig in [&mut all, &mut some] {
-        // The first probes may cost more.
+        // The first probes may cost more than the limit.
         rig.run(Duration::from_secs(10));
         rig.log.clear();
         rig.run(Duration::from_secs(60));

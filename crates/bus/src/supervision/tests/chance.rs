@@ -32,7 +32,7 @@ fn event() -> impl Strategy<Value = Event> {
 struct Client {
     /// When the client was last known to be alive.
     heard: Option<Instant>,
-    /// The action was acknowledged since.
+    /// Whether the action was acknowledged since.
     acted: bool,
     /// Until when the waiting and the started command keep the lease alive, and whether the started one is on the wire.
     queued: Option<Instant>,
