@@ -223,10 +223,10 @@ impl EventKind {
 pub struct Event {
     /// Running number within a run of the process, from 1.
     pub id: u64,
-    /// The run.
+    /// The run of the gateway that had the event.
     #[schema(value_type = String)]
     pub boot: Boot,
-    /// Time of the event.
+    /// Time at which the event happened.
     #[serde(serialize_with = "rfc3339")]
     #[schema(value_type = String)]
     pub time: SystemTime,
@@ -240,7 +240,7 @@ pub struct Event {
     /// The drive, unless the whole bus is meant.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub drive: Option<String>,
-    /// Fault code, where there is one.
+    /// Fault code; `None` for other events.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fault_code: Option<i64>,
     /// Refused commands only: number of refusals of one client that the event covers.
@@ -249,7 +249,7 @@ pub struct Event {
     /// Only for starts and stops: the client whose command caused the event, if a command through this gateway did.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub by: Option<String>,
-    /// Description for people.
+    /// Description of the event for people.
     pub text: String,
     /// The recording that was made.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -292,7 +292,7 @@ impl Event {
 pub struct Boot(Option<Arc<str>>);
 
 impl Boot {
-    /// The run of that name.
+    /// The run with this name.
     pub fn named(name: &str) -> Boot {
         Boot(Some(name).filter(|name| *name != boot()).map(Arc::from))
     }
@@ -326,14 +326,14 @@ pub fn rfc3339<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result
 /// A command that was refused.
 #[derive(Debug)]
 pub struct RefusedCommand<'r> {
-    /// The client, as shares are calculated.
+    /// The client under the name by which shares are counted.
     pub client: &'r Arc<str>,
-    /// Code of the reason.
+    /// Code of the reason for the refusal.
     pub reason: &'static str,
     /// Names of the bus and the drive; both empty if the event concerns no particular one.
     pub bus: &'r str,
     pub drive: &'r str,
-    /// Description for people.
+    /// Description of the refusal for people.
     pub text: String,
 }
 

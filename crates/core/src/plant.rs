@@ -40,9 +40,9 @@ const STOPS_OF_ONE: u64 = 1 << 32;
 /// A bus with its image and its command queue.
 #[derive(Debug, Clone)]
 pub struct BusHandle {
-    /// The process image.
+    /// The process image of the bus.
     pub image: Arc<BusImage>,
-    /// The command queue.
+    /// The command queue of the bus.
     pub queue: Arc<CommandQueue>,
     /// Drives that the names and units of the bus meant before reloads.
     pub formerly: Arc<Formerly>,
@@ -97,9 +97,9 @@ pub struct Plant {
 #[derive(Debug, Clone)]
 pub struct DriveHandle {
     pub bus: BusHandle,
-    /// Index on the bus.
+    /// Index of the drive on its bus.
     pub index: DriveIndex,
-    /// The process image.
+    /// The process image of the drive.
     pub image: Arc<DriveImage>,
     stale_after: Duration,
     events: Events,
@@ -220,7 +220,7 @@ impl DriveHandle {
         explanation
     }
 
-    /// Whether the bus is open.
+    /// Whether the port of the bus is open.
     pub fn bus_up(&self) -> bool {
         self.bus.image.is_up()
     }

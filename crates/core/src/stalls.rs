@@ -71,7 +71,7 @@ impl Stall {
     }
 }
 
-/// The date of what was read.
+/// When bytes read from a connection arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Dated {
     /// Earliest time at which the bytes may have arrived.
@@ -144,12 +144,12 @@ impl Stalls {
         });
     }
 
-    /// When the thread ran last.
+    /// When the thread last ran.
     pub fn last_run(&self) -> Instant {
         self.ran
     }
 
-    /// The last stall.
+    /// The last stall of the thread.
     pub fn last(&self) -> Option<Stall> {
         self.last
     }

@@ -3,7 +3,7 @@
 use std::f32::consts::TAU;
 use std::time::{Duration, Instant};
 
-/// Steps that are remembered: a minute.
+/// Number of steps that are remembered: one minute.
 pub const STEPS: usize = 12;
 /// Part of the counters without steps that is left after each step: half in two minutes.
 pub(super) const FADE: f32 = 0.97;
@@ -16,7 +16,7 @@ pub const MAINS: [f32; 2] = [50.0, 60.0];
 /// Longest time for which the phase of the mains is kept; their frequency differs by some hundredths of a Hz.
 const IN_PHASE: Duration = Duration::from_secs(3);
 
-/// Counters in steps.
+/// Counters for each step of the last minute.
 #[derive(Debug, Clone)]
 pub(super) struct Window<const N: usize> {
     pub(super) steps: [[u16; N]; STEPS],
@@ -37,7 +37,7 @@ impl<const N: usize> Window<N> {
         }
     }
 
-    /// Keeps the greatest.
+    /// Keeps the greatest count of the step.
     pub(super) fn most(&mut self, place: usize, count: u16) {
         if let Some(counter) = self.steps.get_mut(self.now).and_then(|step| step.get_mut(place)) {
             *counter = count.max(*counter);
@@ -80,7 +80,7 @@ impl InPhase {
             } else {
                 for (sums, hertz) in self.sums.iter_mut().zip(MAINS) {
                     let [bad, bad_cosines, good, good_cosines] = sums;
-                    // The mean over the whole length.
+                    // The mean of the cosine over the whole length.
                     let half = TAU / 2.0 * hertz * length.as_secs_f32();
                     let mean = if half > 0.0 { half.sin() / half } else { 1.0 };
                     let cosine = mean * (TAU * (hertz * since.as_secs_f32()).fract()).cos();
@@ -100,7 +100,7 @@ impl InPhase {
     }
 }
 
-/// Requests and failures under two conditions.
+/// Requests and failures under two conditions, for comparison.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Contrast {
     /// Transactions under each condition.

@@ -7,7 +7,7 @@ const GOES_AFTER: u32 = 12;
 /// Most verdicts of one line that are kept at a time.
 const MOST_VERDICTS: usize = 24;
 
-/// A finding that is held.
+/// A finding with the time for which its rule holds.
 #[derive(Debug, Clone, PartialEq)]
 struct Debounced {
     finding: Finding,
@@ -18,18 +18,18 @@ struct Debounced {
     shown: bool,
 }
 
-/// A change of a verdict.
+/// A change of the shown verdicts.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Change {
-    /// The finding holds from now on.
+    /// The finding is shown from now on.
     Came(Finding),
     /// The finding is more certain than before.
     Firmer(Finding),
-    /// The finding no longer holds.
+    /// The finding is no longer shown.
     Went(Finding),
 }
 
-/// The findings that are held.
+/// The findings of a line and how long they hold.
 #[derive(Debug, Clone, Default)]
 pub struct Debounce {
     held: Vec<Debounced>,

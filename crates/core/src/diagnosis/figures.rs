@@ -31,14 +31,14 @@ const LOSSES_FOR: Duration = Duration::from_secs(600);
 /// Usual baud rates in rising order. A reply that is too early for all of them did not come over a serial wire.
 pub const BAUDS: [u32; 8] = [2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
-/// How a transaction ended.
+/// The result of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum End {
     /// The drive replied, perhaps with an exception.
     Answered,
-    /// No reply in time.
+    /// No reply arrived in time.
     Silent,
-    /// An invalid reply.
+    /// The reply was invalid.
     Damaged,
     /// A reply that may belong to another request, so it says nothing about the line.
     Doubtful,
@@ -48,30 +48,30 @@ pub enum End {
 pub struct Exchange<'e> {
     /// Index of the drive on the bus.
     pub drive: DriveIndex,
-    /// The request.
+    /// The request of the transaction.
     pub request: &'e Request,
     pub frame: &'e [u8],
     /// All bytes received in this transaction.
     pub seen: &'e [u8],
-    /// Bytes after the reply.
+    /// Bytes received after the reply.
     pub behind: &'e [u8],
     /// Whether foreign frames or stray bytes are among `seen`.
     pub foreign: bool,
-    /// How the transaction ended.
+    /// Result of the transaction.
     pub end: End,
     /// Silence before the request.
     pub gap: Duration,
     /// When the request was started.
     pub began: Instant,
-    /// When the transaction was over.
+    /// When the transaction ended.
     pub at: Instant,
     /// When the last bytes arrived; irrelevant if none did.
     pub heard_at: Instant,
-    /// Time until the reply started.
+    /// Time until the reply started; `None` without a reply.
     pub turnaround: Option<Duration>,
 }
 
-/// How the line is set up.
+/// The settings of a line.
 #[derive(Debug, Clone, Copy)]
 pub struct Line {
     pub protocol: Protocol,
@@ -86,7 +86,7 @@ pub struct Line {
 /// The counters of a line.
 #[derive(Debug, Clone)]
 pub struct Figures {
-    /// How the line is set up.
+    /// Settings of the line.
     pub line: Line,
     pub drives: PerDrive<Drive>,
     /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
@@ -99,7 +99,7 @@ pub struct Figures {
     wrong: Window<1>,
     idle: Vec<u8>,
     last: Option<(DriveIndex, End)>,
-    /// When the previous transaction was over.
+    /// When the previous transaction ended.
     last_at: Instant,
     epoch: Instant,
     step_ends: Instant,
@@ -147,7 +147,7 @@ impl Figures {
         }
     }
 
-    /// The port was opened.
+    /// Notes that the port was opened.
     pub fn port_opened(&mut self, now: Instant) {
         self.opened = Some(now);
         self.answered_since_opened = false;
@@ -187,7 +187,7 @@ impl Figures {
         std::array::from_fn(|place| self.early.sum(place))
     }
 
-    /// Losses of the port lately.
+    /// Number of recent losses of the port.
     pub fn losses(&self, now: Instant) -> usize {
         let lately = |at: &&Instant| now.saturating_duration_since(**at) < LOSSES_FOR;
         self.losses.iter().flatten().filter(lately).count()
@@ -209,7 +209,7 @@ impl Figures {
         self.running.change(runs);
     }
 
-    /// Whether any drive runs.
+    /// Whether any drive of the line runs.
     pub fn runs(&self) -> bool {
         self.running.runs
     }
@@ -229,7 +229,7 @@ impl Figures {
         self.wrong.sum(0)
     }
 
-    /// A transaction has ended.
+    /// Counts a transaction that has ended.
     pub fn exchange(&mut self, exchange: &Exchange<'_>) {
         self.settle_idle(exchange.began);
         let protocol = self.line.protocol;
@@ -414,7 +414,7 @@ impl Figures {
         (at.saturating_duration_since(self.epoch).as_millis() % LATENCY as u128) as usize
     }
 
-    /// Bytes arrived without a request.
+    /// Counts bytes that arrived without a request.
     pub fn stray(&mut self, bytes: &[u8]) {
         let room = MOST_IDLE.saturating_sub(self.idle.len());
         self.idle.extend(bytes.iter().take(room));
@@ -466,7 +466,7 @@ impl Figures {
         now >= self.step_ends
     }
 
-    /// Begins the next step.
+    /// Starts the next step of the last minute.
     pub fn next_step(&mut self, now: Instant) {
         let missed = now.saturating_duration_since(self.step_ends).as_secs() / STEP.as_secs();
         for _ in 0..=missed.min(STEPS as u64) {

@@ -18,7 +18,7 @@ pub(super) const ENOUGH: f64 = 6.0;
 /// A drive is bad if its errors are this many times as frequent as those of the other drives.
 const TIMES: f64 = 5.0;
 
-/// The known rates of one drive.
+/// The known failure rates of one drive.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) place: DriveIndex,

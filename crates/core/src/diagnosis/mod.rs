@@ -36,7 +36,7 @@ pub use figures::{Drive, End, Exchange, Figures, Line};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
-    /// No drive answers.
+    /// No drive of the line answers.
     AllSilent,
     /// A single drive is bad, the others are good.
     OneDrive,
@@ -46,15 +46,15 @@ pub enum Cause {
     NeverAnswered,
     /// Two drives reply to the same address.
     AddressTwice,
-    /// Errors only while drives run.
+    /// Errors occur only while drives run.
     WhileRunning,
-    /// Errors in phase with the mains.
+    /// Errors occur in phase with the mains.
     Mains,
     /// Stray bytes while the line is idle.
     Bias,
-    /// The beginning of replies is lost.
+    /// The first bytes of replies are lost.
     ReplyStartLost,
-    /// Requests do not arrive whole.
+    /// The last bytes of requests are lost.
     RequestEndLost,
     /// The adapter receives the requests that it sends.
     Echo,
@@ -72,7 +72,7 @@ pub enum Cause {
     RegisterUnanswered,
     /// A drive was tripped by its own communication timeout soon after a command.
     OwnTimeout,
-    /// Errors without a pattern.
+    /// Errors occur without a pattern.
     Noise,
 }
 
@@ -100,7 +100,7 @@ impl Cause {
         Cause::Noise,
     ];
 
-    /// The word in payloads and metrics.
+    /// The word for the cause in payloads and metrics.
     pub const fn name(self) -> &'static str {
         match self {
             Cause::AllSilent => "all_silent",
@@ -126,7 +126,7 @@ impl Cause {
     }
 }
 
-/// How far the evidence goes.
+/// How certain a verdict is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Certainty {
@@ -155,9 +155,9 @@ pub struct Finding {
     pub cause: Cause,
     /// The drive, if the cause concerns a single one.
     pub drive: Option<DriveIndex>,
-    /// How far the evidence goes.
+    /// How certain the finding is.
     pub certainty: Certainty,
-    /// The evidence, as text.
+    /// The evidence for the cause, as text.
     pub evidence: String,
     /// The remedy for this finding, if it is more specific than the remedy of its cause.
     pub remedy: Option<String>,
@@ -173,20 +173,20 @@ impl Finding {
 /// A cause with its evidence, as the gateway shows it to people.
 #[derive(Debug, Clone, PartialEq, Serialize, serde::Deserialize, utoipa::ToSchema)]
 pub struct Verdict {
-    /// The cause.
+    /// The cause of the errors.
     #[schema(value_type = String)]
     pub verdict: Cause,
     /// The drive, if the cause concerns a single one.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub drive: Option<String>,
-    /// How far the evidence goes.
+    /// How certain the verdict is.
     #[schema(value_type = String)]
     pub certainty: Certainty,
     /// Meaning of the cause, in a few words.
     pub meaning: String,
-    /// The evidence.
+    /// The evidence for the cause.
     pub evidence: String,
-    /// The remedy.
+    /// The remedy for the cause.
     pub remedy: String,
     /// What to check and set on drives of the affected families, from their profiles.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
@@ -215,9 +215,9 @@ pub struct Counted {
     pub drive: String,
     /// Transactions with a valid reply.
     pub answered: u32,
-    /// Requests without a reply.
+    /// Requests to the drive without a reply.
     pub silent: u32,
-    /// Invalid replies.
+    /// Invalid replies of the drive.
     pub damaged: u32,
     /// Replies, damaged or valid, with a stray byte before them.
     pub stray_before: u32,
@@ -225,9 +225,9 @@ pub struct Counted {
     pub start_lost: u32,
     /// Replies after the time limit.
     pub late: u32,
-    /// Further replies after the valid one.
+    /// Further replies to one request after the valid one.
     pub second: u32,
-    /// Slowest beginning of a reply, ms.
+    /// Longest time to the start of a reply, ms.
     pub slowest_ms: f64,
     /// The error counters that the drive keeps itself, if it has any and counted errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -240,11 +240,11 @@ pub struct Counted {
 pub struct CountedByDrive {
     /// Valid messages that the drive saw on the line, for any address.
     pub messages: u16,
-    /// Damaged messages.
+    /// Damaged messages that the drive saw.
     pub damaged: u16,
     /// Exceptions that the drive sent.
     pub exceptions: u16,
-    /// Messages to the drive.
+    /// Messages addressed to the drive.
     pub own: u16,
     /// Messages to the drive without an answer; broadcasts are among them [inference].
     pub unanswered: u16,
@@ -277,7 +277,7 @@ impl CountedByDrive {
         })
     }
 
-    /// The difference since `before`.
+    /// The increase of the counters since `before`.
     #[must_use]
     pub fn since(&self, before: &CountedByDrive) -> CountedByDrive {
         CountedByDrive {
@@ -328,7 +328,7 @@ impl fmt::Display for CountedByDrive {
     }
 }
 
-/// How often the rules are applied.
+/// Interval at which the rules are applied.
 pub const STEP: Duration = Duration::from_secs(5);
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ const MOST_STRAY: usize = 3;
 /// First bytes of a reply that are restored to check whether the rest is valid.
 const MOST_LOST: usize = 2;
 
-/// The shape of the received bytes.
+/// The form of the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
     /// No bytes were received.
@@ -20,15 +20,15 @@ pub enum Shape {
     StartLost,
     /// The echo of the request was received without its last bytes.
     CutEcho,
-    /// Longer than the reply could be.
+    /// More bytes than the reply could have.
     Overlong,
     /// The reply breaks off.
     EndLost,
-    /// The bytes have any other form.
+    /// The reply ends too early.
     Garbled,
 }
 
-/// The findings of a transaction.
+/// What the bytes of a transaction show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signature {
     /// The request was echoed before the reply; `None` if unclear.
@@ -148,7 +148,7 @@ fn is_sound(protocol: Protocol, request: &Request, bytes: &[u8]) -> bool {
 /// The drive that unrequested bytes are a reply of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Answering {
-    /// The drive at this address.
+    /// Only the drive at this address may have answered.
     Address(u8),
     /// Any drive may have sent the reply: N2 replies have no address.
     Anybody,

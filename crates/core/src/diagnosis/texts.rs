@@ -1,4 +1,4 @@
-//! The texts of causes.
+//! Texts of the causes and remedies.
 
 use std::collections::BTreeSet;
 

@@ -26,7 +26,7 @@ use crate::process_image::{Access, DriveSpec, Machine};
 pub const ARMED: Duration = Duration::from_secs(60);
 /// Interval at which a drill in progress is evaluated.
 pub const LOOK: Duration = Duration::from_millis(20);
-/// Drills that are kept.
+/// Most drill reports that are kept.
 const MOST_REPORTS: usize = 200;
 /// Machines and ways whose last proof is kept.
 const MOST_PROOFS: usize = 16_384;
@@ -91,7 +91,7 @@ struct State {
     unpublished: Vec<Ended>,
     /// Whether drills are kept on disk.
     keeps: bool,
-    /// Counts what is to be kept.
+    /// Counter of changes that must be saved.
     generation: u64,
     kept: u64,
 }
@@ -106,7 +106,7 @@ impl Drills {
         self.state().options = options;
     }
 
-    /// The options, where drills are possible.
+    /// The options; `None` if drills are off.
     pub fn options(&self) -> Option<DrillOptions> {
         self.state().options
     }
@@ -236,7 +236,7 @@ impl Drills {
         current.chain(state.ended.iter().rev().cloned()).collect()
     }
 
-    /// The report of one drill.
+    /// The report of the drill with this id.
     pub fn report(&self, id: &str) -> Option<DrillReport> {
         self.state().report(id)
     }
@@ -306,7 +306,7 @@ impl Drills {
         Some((state.generation, SavedDrills::new(reports, state.proofs.clone())))
     }
 
-    /// Whether everything is on disk.
+    /// Whether everything was saved to disk.
     pub fn is_kept(&self) -> bool {
         let state = self.state();
         state.kept == state.generation

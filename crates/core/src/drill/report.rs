@@ -10,7 +10,7 @@ use crate::process_image::Machine;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// A stop command.
+    /// Stop by a stop command.
     Order,
     /// The client of the drill stops sending: the lease of the drive's supervision expires.
     Client,
@@ -38,13 +38,13 @@ impl Kind {
 pub enum DrillState {
     /// The drill is armed and waits for its start.
     Armed,
-    /// Running.
+    /// The drill is running.
     Running,
     /// The motor stopped in time each way.
     Passed,
     /// The motor did not stop in time.
     Failed,
-    /// Ended early.
+    /// The drill ended early.
     Aborted,
     /// Standstill could not be observed, or the test could not be made.
     NotProven,
@@ -72,7 +72,7 @@ impl DrillState {
 /// The test of one way to stop, as a step of a drill.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillStep {
-    /// Way to stop that is tried.
+    /// The way to stop that is tested.
     pub kind: Kind,
     /// Progress or result of the step; `armed` until the step starts.
     pub state: DrillState,
@@ -85,17 +85,17 @@ pub struct DrillStep {
     /// `took_ms` is an upper bound: the drive was not read before.
     #[serde(default)]
     pub upper_bound: bool,
-    /// The observation.
+    /// What the drill observed.
     #[serde(default)]
     pub seen: String,
 }
 
-/// A drill.
+/// The report of a drill.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DrillReport {
-    /// Name of the report.
+    /// Id of the drill, and name of its report.
     pub id: String,
-    /// The drive.
+    /// Name of the drive.
     pub drive: String,
     /// Bus of the drive.
     pub bus: String,
@@ -107,7 +107,7 @@ pub struct DrillReport {
     pub profile: String,
     /// Client that armed the drill.
     pub who: String,
-    /// Progress or result.
+    /// Progress or result of the drill.
     pub state: DrillState,
     /// The reason for the result, or the current action.
     pub text: String,
@@ -122,18 +122,18 @@ pub struct DrillReport {
     /// When the motor was started.
     #[serde(default)]
     pub started_at: Option<String>,
-    /// When the drill was over.
+    /// When the drill ended.
     #[serde(default)]
     pub ended_at: Option<String>,
     /// The result of the stop with which every drill ends.
     #[serde(default)]
     pub last_stop: Option<String>,
-    /// The tests.
+    /// The tests of the drill.
     pub steps: Vec<DrillStep>,
 }
 
 impl DrillReport {
-    /// The machine.
+    /// The machine on which the drill ran.
     pub fn machine(&self) -> Machine {
         Machine {
             port: self.port.clone(),
@@ -190,14 +190,14 @@ impl Proof {
 
 /// The year 9999, in which no clock is.
 const LATEST_MS: u64 = 253_370_764_800_000;
-/// Form of the file.
+/// Version of the file format.
 const VERSION: u32 = 1;
 
 /// State of drills that survives a restart.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SavedDrills {
     drivegate_drills: u32,
-    /// The last ones, the oldest first.
+    /// The last reports, oldest first.
     pub reports: Vec<DrillReport>,
     /// The last proofs, for each machine and way to stop.
     pub proofs: Vec<Proof>,
@@ -224,7 +224,7 @@ impl SavedDrills {
         kinds.iter().filter(|kind| !proven(kind)).copied().collect()
     }
 
-    /// Reads the file.
+    /// Parses the file of saved drills.
     ///
     /// # Errors
     /// The file is damaged or of another version: the reason.

@@ -78,11 +78,11 @@ enum Step {
     Keeping(u64),
     /// The start was refused and is retried.
     Waiting,
-    /// The start was queued.
+    /// The start command of the motor was given.
     Starting(Placed),
     /// The drive acknowledged the start; when the motor was first seen turning.
     SpeedingUp(Option<Instant>),
-    /// The motor runs at its speed.
+    /// The motor runs at the speed of the drill.
     Steady,
     /// The stop was caused at this time; the motor must now come to a standstill.
     Caused(Instant, Cause),
@@ -577,7 +577,7 @@ impl Run {
     }
 }
 
-/// A drill that is over.
+/// A drill that has ended.
 #[derive(Debug)]
 pub(super) struct Ended {
     who: Origin,

@@ -14,7 +14,7 @@ pub enum Before {
     Event(Boot, u64),
 }
 
-/// A search.
+/// The filter of a search for events.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Search {
     /// Kinds to search for; empty for all kinds.

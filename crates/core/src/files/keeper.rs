@@ -6,7 +6,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 
 use tokio::sync::watch;
 
-/// The thread, at work.
+/// A running thread that writes to disk.
 #[derive(Debug)]
 pub struct Keeper {
     dir: PathBuf,
@@ -19,7 +19,7 @@ impl Keeper {
     /// Starts a thread that works in this directory until the other end of its channel is dropped.
     ///
     /// # Errors
-    /// The system gives no thread.
+    /// If the system cannot create a thread.
     pub fn start(name: &str, dir: &Path, work: impl FnOnce(&Receiver<()>) + Send + 'static) -> io::Result<Keeper> {
         let ((end, to_end), (running, ended)) = (channel(), watch::channel(()));
         std::thread::Builder::new().name(name.to_string()).spawn(move || {

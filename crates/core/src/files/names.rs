@@ -2,7 +2,7 @@
 
 /// File of events; older files have a number behind this name.
 pub const EVENTS: &str = "events.jsonl";
-/// Run hours and starts.
+/// File of run hours and starts.
 pub const COUNTERS: &str = "counters.json";
 /// Starts of the last hour of drives with a guard.
 pub const STARTS: &str = "starts.json";
@@ -12,9 +12,9 @@ pub const MQTT_EVENTS: &str = "mqtt-events";
 pub const MQTT_HISTORY: &str = "mqtt-history";
 /// Retained MQTT topics of the last run.
 pub const MQTT_TOPICS: &str = "mqtt-topics";
-/// Number of the Sparkplug session.
+/// File with the number of the Sparkplug session.
 pub const SPARKPLUG: &str = "sparkplug-bdseq";
-/// Reservations that stops left behind.
+/// File of the reservations that stops left.
 pub const RESERVATIONS: &str = "reservations.json";
 /// Drills, and when each way was proven last.
 pub const DRILLS: &str = "drills.json";

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-/// Longest wait for a file.
+/// Longest wait for the disk.
 pub const DISK: Duration = Duration::from_secs(2);
 /// Longest wait for a file while another one is overdue.
 const NEXT: Duration = Duration::from_millis(100);
@@ -89,7 +89,7 @@ mod tests {
         let (other, hangs) = oneshot::channel::<()>();
         assert_eq!(patience.wait(hangs).await, None);
         assert_eq!(begun.elapsed(), DISK + NEXT);
-        // The disk answers again.
+        // The disk answers again from here on.
         drop((answer, other));
         tokio::time::sleep(Duration::from_millis(1)).await;
         let begun = Instant::now();

@@ -11,9 +11,9 @@ use rustix::fs::{FlockOperation, flock};
 #[derive(Debug)]
 pub struct Rotated {
     path: PathBuf,
-    /// Size of one file, bytes.
+    /// Maximum size of one file, bytes.
     most: u64,
-    /// Files at most.
+    /// Maximum number of files.
     files: u64,
     open: Option<Open>,
 }
@@ -116,7 +116,7 @@ impl Rotated {
     /// Flushes the appended bytes to disk, so that they survive a power failure.
     ///
     /// # Errors
-    /// The disk does not take it.
+    /// If the disk does not accept the data.
     pub fn sync(&mut self) -> io::Result<()> {
         if let Some(open) = self.open.as_mut().filter(|open| open.unsynced) {
             open.file.sync_data()?;

@@ -1,4 +1,4 @@
-//! Memory of the rings. Pure.
+//! Memory for the rings of the recorder. Pure.
 
 use std::time::Duration;
 
@@ -23,11 +23,11 @@ const RINGS: usize = MOST_BYTES / 4 * 3;
 /// Memory that the recorder takes for a bus at most.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Budget {
-    /// Samples of each drive, bytes.
+    /// Memory for samples of each drive, bytes.
     pub samples: Vec<usize>,
     /// Events and commands of each drive, bytes.
     pub notes: usize,
-    /// Frames of the line, bytes.
+    /// Memory for frames of the line, bytes.
     pub frames: usize,
 }
 

@@ -3,13 +3,13 @@
 
 use std::time::Duration;
 
-/// LINKTYPE_RTAC_SERIAL.
+/// Link type LINKTYPE_RTAC_SERIAL of pcap files.
 const RTAC_SERIAL: u32 = 250;
 /// LINKTYPE_USER0 to USER15.
 const USER: std::ops::RangeInclusive<u32> = 147..=162;
 /// Header of RTAC_SERIAL in front of the bytes: time, event, control lines, footer.
 const RTAC_HEADER: usize = 12;
-/// Blocks of pcapng.
+/// Block types of pcapng files.
 const SECTION: u32 = 0x0A0D_0D0A;
 const INTERFACE: u32 = 1;
 const SIMPLE: u32 = 3;
@@ -99,7 +99,7 @@ impl Bytes<'_> {
         self.number(at).map(u16::from_le_bytes)
     }
 
-    /// A plausible length.
+    /// Checks that a length is plausible.
     fn length(self, at: usize) -> Result<usize, CaptureError> {
         let length = self.u32(at)? as usize;
         if length > LONGEST {
@@ -323,7 +323,7 @@ mod tests {
                 0x4D, 0x3C, 0x2B, 0x1A, 1, 0, 0, 0, 255, 255, 255, 255, 255, 255, 255, 255,
             ],
         );
-        // Nanoseconds: option 9 with 9.
+        // Option 9 with value 9 means nanoseconds.
         let interface = block(
             INTERFACE,
             &[250, 0, 0, 0, 0, 0, 0, 0, 9, 0, 1, 0, 9, 0, 0, 0, 0, 0, 0, 0],

@@ -41,7 +41,7 @@ impl Totals {
     }
 }
 
-/// Counts.
+/// Counters of starts, run time and energy of a drive.
 #[derive(Debug, Default)]
 pub struct Counters {
     totals: Totals,
@@ -60,7 +60,7 @@ impl Counters {
         self.totals = self.totals.after(before);
     }
 
-    /// The counters.
+    /// The present totals.
     pub fn totals(&self) -> Totals {
         self.totals
     }

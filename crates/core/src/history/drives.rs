@@ -28,7 +28,7 @@ struct Known {
     absent: BTreeMap<String, Totals>,
 }
 
-/// The past of a drive.
+/// The history of a drive: counters and trends.
 #[derive(Debug)]
 pub struct DriveHistory {
     /// The machine of the trends: another drive of that name has other trends.
@@ -69,7 +69,7 @@ impl History {
         all
     }
 
-    /// Adds the counts of earlier runs.
+    /// Adds the totals of earlier runs.
     pub(crate) fn count_on(&self, totals: BTreeMap<String, Totals>) {
         let known = &mut *lock(&self.known);
         for (name, before) in totals {
@@ -136,7 +136,7 @@ impl DriveHistory {
         lock(&self.trend)
     }
 
-    /// The counters.
+    /// The present totals of the drive.
     pub fn totals(&self) -> Totals {
         lock(&self.counters).totals()
     }

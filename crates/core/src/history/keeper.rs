@@ -26,11 +26,11 @@ const TICK: Duration = Duration::from_secs(1);
 const COUNTERS_EVERY: Duration = Duration::from_secs(45);
 /// Size of all files of events, bytes, and their number.
 pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);
-/// Events that wait for the disk.
+/// Most events that wait for the disk.
 const WAITING: usize = 4096;
 /// Counters of drives in a file at most; more are none of ours.
 const MOST_DRIVES: usize = 16_384;
-/// Form of the file of counters.
+/// Version of the counter file's format.
 const VERSION: u32 = 1;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -45,7 +45,7 @@ struct CounterFile {
 /// the events of earlier runs; later calls yield none.
 ///
 /// # Errors
-/// The system gives no thread.
+/// If the system cannot create a thread.
 pub fn keep(
     dir: &Path,
     first: bool,
@@ -74,9 +74,9 @@ struct Writer {
     history: Arc<History>,
     /// The counts of earlier runs are in memory.
     counted_on: bool,
-    /// The content of the counter file.
+    /// The counters as last written to the file.
     written: Option<BTreeMap<String, Totals>>,
-    /// Logged once, until a write succeeds.
+    /// Whether writing fails at present, which is logged once.
     failing: bool,
 }
 
@@ -125,7 +125,7 @@ impl Writer {
         let (mut earlier, mut wrong) = (Vec::new(), 0u64);
         for path in self.events.all() {
             let Ok(bytes) = fs::read(&path) else {
-                // Rotated files need not all exist.
+                // Some of the rotated files may not exist.
                 continue;
             };
             for line in bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {

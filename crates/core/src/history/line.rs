@@ -18,12 +18,12 @@ pub const LOOK: Duration = Duration::from_secs(1);
 /// Memory of a line, and of each of its drives, bytes.
 pub const BYTES: (usize, usize) = (2 * STEPS * size_of::<Bucket>(), STEPS * size_of::<Option<Exchanges>>());
 
-/// Transactions of a step.
+/// Number of transactions in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exchanges {
     /// Number of all transactions.
     pub all: u32,
-    /// Transactions without a valid reply.
+    /// Number of transactions without a valid reply.
     pub failed: u32,
 }
 
@@ -50,7 +50,7 @@ pub type Figures = (f32, f32, f32);
 /// The last hour, oldest step first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LastHour {
-    /// Beginning of the first step.
+    /// Start of the first step.
     pub from: SystemTime,
     /// Share of the time that the line was in use, 0..=1.
     pub load: Vec<Option<Figures>>,

@@ -65,7 +65,7 @@ pub struct RecorderOptions {
 }
 
 impl RecorderOptions {
-    /// Whether anything is recorded.
+    /// Whether the recorder is on.
     pub fn is_on(&self) -> bool {
         self.max_count > 0
     }
@@ -80,12 +80,12 @@ impl RecorderOptions {
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
     pub now: Instant,
-    /// The time of day.
+    /// The time of day at the instant.
     pub wall: SystemTime,
 }
 
 impl Clock {
-    /// Reads both clocks.
+    /// Reads both clocks now.
     pub fn read() -> Clock {
         Clock {
             now: Instant::now(),

@@ -14,14 +14,14 @@ use crate::process_image::{TapedFrame, TapedRead, Verdict};
 const HEAD: usize = 4 + 8;
 /// Number of steps in which the memory grows to its limit.
 pub(super) const STEPS: usize = 16;
-/// The place of no drive.
+/// Index that stands for no drive.
 const NO_DRIVE: u32 = u32::MAX;
 
 /// Something with a time that can be packed into bytes.
 pub(super) trait Packed: Sized {
     /// Time of the entry.
     fn at(&self) -> Instant;
-    /// Appends all but the time.
+    /// Appends everything except the time.
     fn pack(&self, bytes: &mut Vec<u8>);
     /// Restores an entry from the bytes that [`Packed::pack`] appended.
     fn unpack(at: Instant, bytes: &[u8]) -> Option<Self>;
@@ -161,7 +161,7 @@ impl<T: Packed> PackedRing<T> {
         }
     }
 
-    /// Oldest first.
+    /// The entries, oldest first.
     pub(super) fn iter(&self) -> impl Iterator<Item = T> {
         let mut place = 0;
         std::iter::from_fn(move || {

@@ -8,12 +8,12 @@ use super::recording::{Frame, Recording};
 use crate::codec::{Protocol, RequestPdu, describe};
 use crate::process_image::Verdict;
 
-/// LINKTYPE_RTAC_SERIAL.
+/// Link type LINKTYPE_RTAC_SERIAL of pcap files.
 const LINK_TYPE: u16 = 250;
 /// Event types of the packet header.
 const SENT: u8 = 1;
 const RECEIVED: u8 = 2;
-/// Blocks of pcapng.
+/// Block types of pcapng files.
 const SECTION: u32 = 0x0A0D_0D0A;
 const INTERFACE: u32 = 1;
 const PACKET: u32 = 6;

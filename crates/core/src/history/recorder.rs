@@ -32,7 +32,7 @@ pub struct Note {
     pub body: NoteBody,
 }
 
-/// The content of a note.
+/// The content of a recorder note.
 #[derive(Debug, Clone, PartialEq)]
 pub enum NoteBody {
     /// An event of the drive or of its bus.
@@ -47,7 +47,7 @@ pub enum NoteBody {
         source: &'static str,
         /// Client that gave the command.
         client: String,
-        /// The command, as text.
+        /// The command as text.
         command: String,
         /// The result code.
         result: &'static str,
@@ -92,7 +92,7 @@ pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Ins
     Reading::new(spec, snapshot.clone(), at, ANY_AGE, Duration::ZERO)
 }
 
-/// The material of a recording.
+/// The data from which a recording is made.
 #[derive(Debug, Clone)]
 pub struct Capture {
     pub id: String,

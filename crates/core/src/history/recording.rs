@@ -14,9 +14,9 @@ use crate::codec::Table;
 use crate::codec::checksum::crc16;
 use crate::process_image::Verdict;
 
-/// Version of the form.
+/// Version of the recording format.
 pub const VERSION: u32 = 1;
-/// Ending of the files.
+/// File name extension of recordings.
 pub const ENDING: &str = "dgrec";
 
 /// The subject of a recording, and its summary.
@@ -40,9 +40,9 @@ pub struct Header {
     pub more: Vec<Further>,
     pub drive: Drive,
     pub bus: Bus,
-    /// Beginning and end.
+    /// Start of the recording, s from the trigger.
     pub from: f64,
-    /// See `from`.
+    /// End of the recording, s from the trigger.
     pub to: f64,
     /// The points, in the order of `values` here.
     pub points: Vec<Column>,
@@ -91,7 +91,7 @@ pub struct Bus {
     pub drives: Vec<String>,
 }
 
-/// A point.
+/// A point of the recording.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedColumn)]
 pub struct Column {
@@ -100,7 +100,7 @@ pub struct Column {
     pub unit: String,
 }
 
-/// A read that samples are of.
+/// A read of the plan to which samples refer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[schema(as = RecordedRead)]
 pub struct Read {
@@ -108,7 +108,7 @@ pub struct Read {
     pub table: Table,
     /// First PDU address.
     pub start: u16,
-    /// Items.
+    /// Number of registers or bits.
     pub count: u16,
     /// The points of this read, by their index in the header.
     pub points: Vec<usize>,
@@ -129,7 +129,7 @@ pub struct Sample {
 pub struct EventNote {
     /// Time of the event, s from the trigger.
     pub t: f64,
-    /// Kind.
+    /// Kind of the event.
     pub event: String,
     /// Text of the event.
     pub text: String,
@@ -144,7 +144,7 @@ pub struct CommandNote {
     pub source: String,
     /// Client that gave the command.
     pub client: String,
-    /// The command, as text.
+    /// The command as text.
     pub command: String,
     /// Result code.
     pub result: String,
@@ -160,7 +160,7 @@ pub struct Frame {
     pub t: f64,
     /// Place of the drive that was addressed.
     pub drive: Option<usize>,
-    /// Verdict on the frame.
+    /// How the transaction of the frame ended.
     #[schema(value_type = String)]
     pub verdict: Verdict,
     /// The bytes; in the file two hexadecimal digits each.
@@ -206,7 +206,7 @@ struct SampleLine<'l> {
     values: Cow<'l, [Json]>,
 }
 
-/// The last line.
+/// The last line of a recording, which completes it.
 #[derive(Debug, Serialize, Deserialize)]
 struct End {
     /// Number of lines before this one.
@@ -237,7 +237,7 @@ pub struct Recording {
 pub struct RecordingError {
     /// Offset of the fault in the file.
     pub offset: usize,
-    /// The fault.
+    /// The defect, as text.
     pub what: String,
 }
 
@@ -334,7 +334,7 @@ impl Recording {
         bytes
     }
 
-    /// Reads the bytes of a file.
+    /// Parses the bytes of a recording file.
     ///
     /// # Errors They are not an intact recording of this version: the fault and its position.
     pub fn parse(bytes: &[u8]) -> Result<Recording, RecordingError> {

@@ -10,7 +10,7 @@ pub const STORM: Duration = Duration::from_secs(60);
 /// Recordings of a storm that are kept first.
 pub const FIRST_OF_STORM: usize = 8;
 
-/// Counts the recordings of a storm.
+/// Counts recordings that follow closely.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Storm {
     last: Option<SystemTime>,

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 pub(super) trait Timed {
     /// Time of the entry.
     fn at(&self) -> Instant;
-    /// Bytes of memory.
+    /// Bytes of memory that the entry takes.
     fn size(&self) -> usize;
 }
 

@@ -20,14 +20,14 @@ const MOST_HEADER: u64 = 1 << 20;
 /// Largest file that is read.
 const MOST_BYTES: u64 = 1 << 30;
 
-/// A recording in short.
+/// A recording on disk with its summary.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Entry {
     /// Id of the recording.
     pub id: String,
     /// Time of the trigger, RFC 3339.
     pub time: String,
-    /// The drive.
+    /// Name of the drive.
     pub drive: String,
     /// Bus of the drive.
     pub bus: String,
@@ -60,10 +60,10 @@ impl Entry {
 /// Why a recording cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// The file cannot be read.
+    /// If the file cannot be read.
     #[error("cannot read {path}: {error}")]
     File {
-        /// The file.
+        /// Path of the file.
         path: String,
         /// Reason why the file cannot be read.
         error: io::Error,
@@ -71,14 +71,14 @@ pub enum ReadError {
     /// The content of the file is not a recording.
     #[error("{path}: {error}")]
     Content {
-        /// The file.
+        /// Path of the file.
         path: String,
         /// The defect of the recording, and its place in the file.
         error: RecordingError,
     },
 }
 
-/// Reads a recording.
+/// Reads a recording from a file.
 ///
 /// # Errors
 /// If the file cannot be read, or is not a recording.
@@ -136,7 +136,7 @@ fn entry(path: &Path) -> Result<Entry, ReadError> {
     Ok(Entry::new(&header.0, size))
 }
 
-/// The file of a recording.
+/// Path of the file for a recording.
 pub fn path_of(dir: &Path, id: &str) -> PathBuf {
     dir.join(format!("{id}.{ENDING}"))
 }

@@ -32,7 +32,7 @@ pub enum NotRecorded {
     /// The recorder is off.
     #[error("the recorder is off (max_count of [recordings] is 0)")]
     Off,
-    /// No drive has this name.
+    /// There is no drive with this name.
     #[error("there is no drive `{0}`")]
     UnknownDrive(String),
 }
@@ -51,7 +51,7 @@ pub struct Recordings {
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// Counts the recorders that were started.
+    /// Number of recorders that were started.
     recorder: u64,
     options: Option<RecorderOptions>,
     control: Option<Sender<Control>>,
@@ -138,7 +138,7 @@ impl RecorderTask {
     /// recordings on disk are known.
     ///
     /// # Errors
-    /// The system gives no thread.
+    /// If the system cannot create a thread.
     pub fn start(
         options: RecorderOptions,
         recordings: Arc<Recordings>,
@@ -250,7 +250,7 @@ impl Taker {
                 }
                 Ok(Control::Stop) | Err(RecvTimeoutError::Disconnected) => {
                     for capture in self.recorder.end(clock) {
-                        // The writer ends after this thread.
+                        // The writer ends after the thread that takes the tapes.
                         let _ = self.captures.send(capture);
                     }
                     return;
@@ -346,7 +346,7 @@ fn shortened(text: &str) -> String {
     text.chars().take(MOST_TEXT).collect()
 }
 
-/// Writes files.
+/// The thread that writes recordings to disk.
 struct Writer {
     store: Store,
     recordings: Arc<Recordings>,

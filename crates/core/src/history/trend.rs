@@ -15,7 +15,7 @@ use crate::process_image::{Reading, TapedRead};
 /// A span of time, and the length of the steps for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Range {
-    /// Length of the span before now.
+    /// Length of time that the range covers.
     pub span: Duration,
     /// Length of a bucket.
     pub step: Duration,
@@ -142,11 +142,11 @@ impl Bucket {
 pub struct Step {
     /// Start of the step, ms since 1970.
     pub at: u64,
-    /// The least value.
+    /// The smallest value of the step.
     pub min: f32,
-    /// The greatest value.
+    /// The greatest value of the step.
     pub max: f32,
-    /// The last value.
+    /// The last value of the step.
     pub last: f32,
 }
 
@@ -158,9 +158,9 @@ pub struct Part {
     pub unit: &'static str,
     /// Length of a step.
     pub step: Duration,
-    /// Beginning of the first step.
+    /// Start of the first step.
     pub from: SystemTime,
-    /// End of the last one.
+    /// End of the last step.
     pub to: SystemTime,
     /// One entry for each step, oldest first; `None` if nothing good was read in it.
     pub steps: Vec<Option<Step>>,
@@ -172,17 +172,17 @@ type Registers = (Table, RangeInclusive<u16>);
 #[derive(Debug)]
 struct PointTrend {
     point: ModelPoint,
-    /// Index in the profile.
+    /// Index of the point in the profile.
     index: PointIndex,
     /// Registers from which the value is read.
     registers: Vec<Registers>,
     /// Whether the point is derived from points that are read elsewhere, too.
     derived: bool,
-    /// `None` before the first value.
+    /// The trend's values; `None` before the first one.
     kept: Option<Kept>,
 }
 
-/// The values of a point.
+/// The kept values of a point's trend.
 #[derive(Debug)]
 struct Kept {
     ranges: [Buckets<Bucket>; RANGES.len()],

@@ -1,4 +1,4 @@
-//! Triggers of recordings. Pure.
+//! Triggers that start recordings. Pure.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -98,7 +98,7 @@ impl TriggerKind {
     }
 }
 
-/// A trigger at a time.
+/// A trigger that occurred at a time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trigger {
     pub kind: TriggerKind,
@@ -194,7 +194,7 @@ impl Watch {
     }
 }
 
-/// Failed transactions of a line.
+/// Counts failed transactions of a line.
 #[derive(Debug, Default)]
 pub(super) struct LineErrors {
     /// Times of the recent errors, each with its drive.

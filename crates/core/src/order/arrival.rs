@@ -47,7 +47,7 @@ impl PartialEq for Connection {
     }
 }
 
-/// How and when an order came.
+/// How and when an order arrived.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Arrival {
     /// Earliest time at which the first byte of the order may have arrived.

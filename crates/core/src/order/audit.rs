@@ -27,7 +27,7 @@ const UNSENT_KEPT: usize = 500;
 /// Name of the log events for commands that were sent: the log treats them separately.
 pub const SENT: &str = "sent command";
 
-/// A value that a command sets.
+/// A point that a command sets, with its values.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 #[schema(as = AuditChange)]
 pub struct Change {
@@ -44,7 +44,7 @@ pub struct Change {
     /// Effect on the run command: run or stop, if any.
     #[serde(skip)]
     pub run: Option<bool>,
-    /// Whether the value resets a fault.
+    /// Whether the value is a fault reset.
     #[serde(skip)]
     pub resets: bool,
 }
@@ -60,15 +60,15 @@ pub struct AuditRecord {
     pub source: &'static str,
     /// Address, name in the certificate, or topic.
     pub client: String,
-    /// Drive.
+    /// Name of the drive.
     pub drive: String,
-    /// The command in one line.
+    /// The command as one line of text.
     pub command: String,
     /// The points that the command sets, with their previous values; empty if it was refused before it was parsed.
     pub points: Vec<Change>,
     /// Result code; `confirmed` is an acknowledged command whose effect was read back.
     pub result: &'static str,
-    /// The outcome as text.
+    /// The outcome of the command as text.
     pub text: String,
     /// Time from acceptance to result.
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
@@ -106,7 +106,7 @@ pub fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: 
     }
 }
 
-/// How far a command got.
+/// How far a command got towards the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Reach {
     /// The command was sent to the drive, or started.
@@ -172,15 +172,15 @@ pub struct Audit {
 /// A command to run or to stop that was sent to a drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunOrdered {
-    /// Run, or stop.
+    /// Whether the order was to run; otherwise to stop.
     pub run: bool,
-    /// Source and client of the order.
+    /// Source and client of the order, as text.
     pub who: String,
     /// When the result of the order arrived, or the wait was given up.
     pub at: Instant,
 }
 
-/// Records a listener may lag behind.
+/// Number of records by which a listener may lag behind.
 const IN_FLIGHT: usize = 4096;
 
 #[derive(Debug)]

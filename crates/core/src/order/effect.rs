@@ -44,11 +44,11 @@ impl Asks {
 pub struct Effect {
     /// Whether the command takes the run command away, with the rights of a stop.
     pub stops: bool,
-    /// The run command.
+    /// The run command that the effect sets.
     pub run: Option<bool>,
-    /// The direction.
+    /// The direction that the effect sets.
     pub reverse: Option<bool>,
-    /// A reference.
+    /// Whether the effect sets a reference.
     pub reference: bool,
     /// Whether the order writes a raw word to the register of the run command that is not a stop.
     pub word: bool,

@@ -13,7 +13,7 @@ use crate::process_image::Reading;
 pub struct FrequencyRange {
     minimum: Bound,
     maximum: Bound,
-    /// Lowest and highest frequency, Hz.
+    /// Lowest and highest frequency in Hz at the admission.
     was: (f64, f64),
 }
 

@@ -1,4 +1,4 @@
-//! Why a start must wait. Pure.
+//! Reasons why a start must wait. Pure.
 
 use std::time::Duration;
 
@@ -39,7 +39,7 @@ impl Reason {
     }
 }
 
-/// A start that must wait.
+/// A start that a rule does not permit yet.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Guarded {
     /// Rule that refused the start.

@@ -13,7 +13,7 @@ pub struct LastStops {
 }
 
 impl LastStops {
-    /// A stop was taken in.
+    /// Notes an accepted stop.
     pub fn note(&mut self, connection: &Connection, at: Instant) {
         let at = self.time().map_or(at, |last| last.max(at));
         match &mut self.last {

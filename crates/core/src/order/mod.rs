@@ -61,14 +61,14 @@ pub const CAPACITY: usize = 64;
 /// The result code of an acknowledged command whose effect a read showed.
 pub const CONFIRMED: &str = "confirmed";
 
-/// A command's content.
+/// The content of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Order {
     /// Points set as one command: index in the profile, value in engineering units.
     Points(Vec<(PointIndex, Value)>),
     /// A raw write that is passed on unchanged (except bits of a control word).
     Write(RequestPdu),
-    /// A raw read outside the plan.
+    /// A raw read that is not polled.
     Read(RequestPdu),
     /// A parameter that a restore sets, while the motor is stopped.
     Parameter(ParameterOrder),
@@ -81,7 +81,7 @@ pub enum Urgency {
     Stop,
     /// The order is a command other than a stop.
     Command,
-    /// Forwarded read.
+    /// A read that was forwarded.
     Read,
 }
 
@@ -148,9 +148,9 @@ pub struct Set {
 pub enum Work {
     /// The command takes the run command away.
     Stop(Stop),
-    /// The command sets anything else.
+    /// The command sets something else.
     Set(Set),
-    /// The command reads outside the plan.
+    /// The command reads registers that are not polled.
     Read,
     /// A tool's write, or a broadcast, which reaches every drive that listens to its address.
     PassedOn(PassedOn),
@@ -174,7 +174,7 @@ pub struct Intent {
     pub number: u64,
     /// Index of the drive on its bus.
     pub drive: DriveIndex,
-    /// Content of the order.
+    /// Content of the command.
     pub order: Order,
     /// Effects on each drive that the order reaches.
     pub effects: Effects,
@@ -193,7 +193,7 @@ pub struct Command {
     pub intent: Intent,
     /// Kind of the command among the commands of its bus.
     pub work: Work,
-    /// Ticket of the command.
+    /// Ticket that gives the command its result.
     pub ticket: Ticket,
     /// Number of younger commands that were sent first.
     pub(crate) overtaken: usize,
@@ -206,7 +206,7 @@ fn next_number() -> u64 {
 }
 
 impl Intent {
-    /// Intent of a new command.
+    /// The intent of a new command.
     pub fn new(drive: DriveIndex, order: Order, effects: Effects, window: Window) -> Intent {
         Intent {
             number: next_number(),

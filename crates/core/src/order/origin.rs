@@ -1,4 +1,4 @@
-//! The origin of a command.
+//! The origin of a command: client, rights and role.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -12,17 +12,17 @@ pub enum SourceKind {
     ModbusTcp,
     /// MQTT topic.
     Mqtt,
-    /// Command of a Sparkplug host.
+    /// A command of a Sparkplug host.
     Sparkplug,
     /// HTTP: the status page, or a program.
     Http,
     /// The lease of a drive that expired.
     Supervision,
-    /// The gateway stops.
+    /// The gateway's stop when it ends.
     Shutdown,
     /// `drivegate write` through the socket of the gateway.
     LocalSocket,
-    /// `drivegate write`, without a gateway.
+    /// `drivegate write` without a running gateway.
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
@@ -30,9 +30,9 @@ pub enum SourceKind {
     Schedule,
     /// A tool at a slot of the bus.
     Slot,
-    /// BACnet client.
+    /// A command of a BACnet client.
     Bacnet,
-    /// Interlock that does not hold.
+    /// A stop because an interlock no longer holds.
     Interlock,
 }
 
@@ -115,7 +115,7 @@ pub enum Proof {
     Uid(u32),
     /// WHO in the MQTT topic `as/WHO`, which the broker's access rules secure.
     Topic(Arc<str>),
-    /// A Sparkplug host.
+    /// The client is a Sparkplug host.
     Sparkplug,
     /// The address of a BACnet client, and the priority of its write.
     Bacnet(IpAddr, u8),
@@ -126,7 +126,7 @@ pub enum Proof {
 /// The role in which a client acts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Acting {
-    /// The client acts as itself.
+    /// The client acts for itself.
     #[default]
     Usual,
     /// Each stop of this client counts as a new one, even if the client repeats its command word continuously.
@@ -224,7 +224,7 @@ impl Origin {
         &self.right
     }
 
-    /// The proof of the client's connection.
+    /// What the client's connection proves about its identity.
     pub fn proof(&self) -> &Proof {
         &self.proof
     }

@@ -10,9 +10,9 @@ use crate::codec::{Exception, Reply};
 /// Event that interrupted a started command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Interruption {
-    /// A stop arrived.
+    /// A stop arrived meanwhile.
     Stop,
-    /// The time of the command expired.
+    /// The command expired meanwhile.
     Expired,
     /// The port was lost during the transaction.
     BusDown,
@@ -61,11 +61,11 @@ pub enum Outcome {
     StopFailed(Box<Outcome>),
     /// The port is not open.
     BusDown,
-    /// The drive is offline.
+    /// The drive is offline, so nothing was sent.
     Offline,
     /// 64 commands wait already.
     QueueFull,
-    /// The gateway stops.
+    /// The gateway is shutting down.
     ShuttingDown,
 }
 
@@ -125,7 +125,7 @@ impl Outcome {
         }
     }
 
-    /// Whether the drive took the command.
+    /// Whether the drive accepted the command.
     pub fn is_ok(&self) -> bool {
         matches!(self, Outcome::Acknowledged(_))
     }
@@ -234,13 +234,13 @@ pub enum Refusal {
     /// A guard does not let the motor start yet.
     #[error("{0}; it was not sent")]
     Guarded(Box<Guarded>),
-    /// An interlock is not satisfied.
+    /// An interlock of the drive is not satisfied.
     #[error("{0}; it was not sent")]
     Interlocked(String),
     /// A client refused after a stop repeats run, or renews a hold it does not have.
     #[error("{0}")]
     NeedsTake(Box<Holder>),
-    /// No drive has this name.
+    /// There is no drive with this name.
     #[error("{0}")]
     UnknownDrive(String),
     /// The drive reports that its motor runs: no parameter is written.
@@ -274,7 +274,7 @@ impl fmt::Display for Holder {
 impl Refusal {
     pub(super) const UNKNOWN_DRIVE: &str = "unknown_drive";
 
-    /// The code in results.
+    /// The code of the outcome in results.
     pub fn code(&self) -> &'static str {
         match self {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => "not_allowed",
@@ -296,7 +296,7 @@ impl Refusal {
         }
     }
 
-    /// The Modbus exception.
+    /// The Modbus exception for the outcome.
     pub fn exception(&self) -> Exception {
         match self {
             Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
@@ -310,7 +310,7 @@ impl Refusal {
     }
 }
 
-/// The one result of a command.
+/// The single result of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Answer {
     /// How the command ended.

@@ -1,4 +1,4 @@
-//! The order that sets one parameter.
+//! The order that writes one parameter.
 
 use crate::codec::{RequestPdu, Table};
 use crate::drive::parameters::RawValue;
@@ -29,7 +29,7 @@ impl ParameterOrder {
         }
     }
 
-    /// The write.
+    /// The write of the parameter.
     pub fn write(&self) -> RequestPdu {
         match self.to {
             RawValue::Word(value) => RequestPdu::WriteRegister {

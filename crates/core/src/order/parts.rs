@@ -21,7 +21,7 @@ pub enum Parts {
 enum Role {
     /// The point takes the run command away.
     Stop,
-    /// The point sets the run command.
+    /// The point sets the run command to run.
     Run,
     /// The point takes another command away (direction, reset), as the control word of a stop does; such a write
     /// alone is not a stop.

@@ -14,7 +14,7 @@ use crate::drive::DriveIndex;
 pub enum Pace {
     /// 18 %: someone waits for the reply.
     Brisk,
-    /// 1.5 %: unnoticeable.
+    /// Slow pace: 1.5 % of a busy line, which is unnoticeable.
     Slow,
 }
 
@@ -52,7 +52,7 @@ pub struct PassedOn {
 pub struct BackgroundRequest {
     /// Index of the drive on its bus, or [`NO_DRIVE`].
     pub drive: DriveIndex,
-    /// The request.
+    /// The request to send.
     pub pdu: RequestPdu,
     /// Share of a busy line that the request may take.
     pub pace: Pace,

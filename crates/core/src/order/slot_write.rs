@@ -9,13 +9,13 @@ use crate::drive::{ModelPoint, Value};
 /// A point that is commanded by priorities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Commanded {
-    /// The run command.
+    /// The array of the run command.
     Run,
-    /// The direction.
+    /// The array of the direction.
     Reverse,
-    /// The speed reference.
+    /// The array of the speed reference.
     SpeedReference,
-    /// The frequency reference.
+    /// The array of the frequency reference.
     FrequencyReference,
 }
 
@@ -28,7 +28,7 @@ impl Commanded {
         Commanded::FrequencyReference,
     ];
 
-    /// The point.
+    /// The point of the common model.
     pub fn point(self) -> ModelPoint {
         match self {
             Commanded::Run => ModelPoint::Run,
@@ -50,20 +50,20 @@ impl Commanded {
     }
 }
 
-/// The entry in a slot.
+/// The entry in a slot of a priority array.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// The value, in the unit of the point.
     pub value: Value,
     /// The client that wrote the entry.
     pub origin: Origin,
-    /// Time of the entry.
+    /// When the entry was written.
     pub at: Instant,
     pub(crate) number: u64,
 }
 
 impl Entry {
-    /// An entry written by that client.
+    /// An entry written by this client.
     pub fn new(value: Value, origin: Origin, at: Instant) -> Entry {
         Entry {
             value,

@@ -19,17 +19,17 @@ pub struct WriteStats {
 }
 
 impl WriteStats {
-    /// Commands by source and result code.
+    /// Number of commands by source and result code.
     pub fn results(&self) -> BTreeMap<(SourceKind, &'static str), u64> {
         self.results.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Time from acceptance to result.
+    /// Histogram of the times from acceptance to result.
     pub fn seconds(&self) -> HistogramSnapshot {
         self.seconds.snapshot()
     }
 
-    /// The last commands.
+    /// The audit records of the last commands.
     pub fn audit(&self) -> &Audit {
         &self.audit
     }
@@ -133,7 +133,7 @@ impl Ticket {
         &self.origin
     }
 
-    /// The command, as text.
+    /// The command as text.
     pub fn what(&self) -> &str {
         &self.what
     }
@@ -228,7 +228,7 @@ impl Drop for Ticket {
 pub struct Receipt(Ticket);
 
 impl Receipt {
-    /// A read showed the effect.
+    /// Confirms the command after a read showed its effect.
     pub fn confirm(mut self, now: Instant) {
         let time = now.saturating_duration_since(self.0.accepted);
         self.0.confirmed = Some(time);
@@ -257,7 +257,7 @@ impl Receipt {
         !self.0.origin.kind.is_client()
     }
 
-    /// The command in one line.
+    /// The command as one line of text.
     pub fn what(&self) -> &str {
         &self.0.what
     }

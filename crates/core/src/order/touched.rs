@@ -8,10 +8,10 @@ use crate::drive::{PointIndex, Profile, Raw};
 /// A register or coil of a drive.
 type Item = (Table, u16);
 
-/// The registers of a command.
+/// The registers that a command sets or uses.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Touched {
-    /// The registers are not known.
+    /// The registers are unknown: any may be affected.
     #[default]
     Anything,
     /// Only these registers are set or used.

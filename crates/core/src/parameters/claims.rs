@@ -4,7 +4,7 @@
 use super::journal::{JournalFile, Owner};
 use crate::process_image::Machine;
 
-/// Why a journal concerns a drive.
+/// Why a journal concerns a configured drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Claim {
     /// The journal belongs to this machine.

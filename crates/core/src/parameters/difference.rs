@@ -3,7 +3,7 @@
 use super::file::{Entry, Id, ParameterFile};
 use crate::drive::parameters::RawValue;
 
-/// A parameter that differs.
+/// A parameter with different values in two files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Difference {
     /// Id of the parameter.

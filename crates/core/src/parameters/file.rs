@@ -83,7 +83,7 @@ impl fmt::Display for Id {
     }
 }
 
-/// A parameter in a file.
+/// The entry of a parameter in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// Value of the parameter, or why it was not read.
@@ -115,7 +115,7 @@ pub enum FileError {
     /// The text is not a parameter file.
     #[error("it is not a parameter file: its first line is not `{HEAD}`")]
     Other,
-    /// A line is not understood.
+    /// The line with this number is not valid.
     #[error("line {0}: {1}")]
     Line(usize, String),
     /// Values were changed by hand, or the file is damaged.
@@ -141,7 +141,7 @@ impl ParameterFile {
         digest_of(&text, CHECKSUM)
     }
 
-    /// Parameters that were not read.
+    /// Number of parameters that were not read.
     pub fn missing(&self) -> usize {
         self.values.values().filter(|entry| entry.value.is_err()).count()
     }
@@ -157,7 +157,7 @@ impl ParameterFile {
             .filter_map(move |(id, entry)| Some((id, of((id, entry))?)))
     }
 
-    /// The file.
+    /// The text of the file.
     pub fn text(&self) -> String {
         let width = self
             .values
@@ -254,7 +254,7 @@ pub(super) fn text_of(value: RawValue) -> String {
     }
 }
 
-/// The value that [`text_of`] wrote down.
+/// The value in a text written by [`text_of`].
 pub(super) fn value_of(text: &str) -> Option<RawValue> {
     match text.parse::<u16>() {
         Ok(word) => Some(RawValue::Word(word)),

@@ -34,7 +34,7 @@ use super::plan::{Handling, Need, ParameterWrite, Plan};
 use crate::drive::Profile;
 use crate::process_image::Machine;
 
-/// The first line.
+/// The first line of a journal.
 const HEAD: &str = "# drivegate restore 2";
 /// First line of journals that contain the name of the drive but not its bus and address.
 const HEAD_WITHOUT_PLACE: &str = "# drivegate restore 1";
@@ -50,7 +50,7 @@ pub enum Phase {
     Writing,
     /// All new values are written; the drive is being ordered to save them.
     Saving,
-    /// The restore writes the former values.
+    /// The restore writes the former values back.
     TakingBack,
     /// All former values are written; the drive is being ordered to save them.
     SavingBack,
@@ -97,7 +97,7 @@ impl Owner {
         owner(&mut body_of(text)?.lines())
     }
 
-    /// Place of the machine, as text.
+    /// Bus and address of the machine, as text.
     pub fn place(&self) -> String {
         match &self.machine {
             Some(machine) => format!("`{}` at {machine}", self.drive),
@@ -165,7 +165,7 @@ pub const NO_IDENTIFICATION: &str = "none";
 /// The journal of a restore.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Journal {
-    /// The machine of the journal.
+    /// The machine to which the journal belongs.
     pub of: Owner,
     /// When the restore began, RFC 3339.
     pub begun: String,
@@ -177,7 +177,7 @@ pub struct Journal {
     pub done: usize,
     /// The drive may have been ordered to save values of this restore.
     pub saved: bool,
-    /// The plan of the first phase.
+    /// The plan of writing the new values.
     pub plan: Plan,
 }
 

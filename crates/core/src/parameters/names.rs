@@ -56,7 +56,7 @@ impl Names {
         Ok(Names(names))
     }
 
-    /// The label of a parameter.
+    /// The label of the parameter with this id.
     pub fn get(&self, id: &Id) -> Option<&Label> {
         self.0.get(id)
     }

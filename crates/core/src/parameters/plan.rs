@@ -18,7 +18,7 @@ pub struct ParameterWrite {
     pub id: Id,
     /// PDU address of the parameter's (first) holding register.
     pub address: u16,
-    /// The present value.
+    /// The present value in the drive.
     pub from: RawValue,
     /// The value to write.
     pub to: RawValue,

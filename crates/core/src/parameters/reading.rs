@@ -25,14 +25,14 @@ const BUSY_PAUSE: Duration = Duration::from_millis(200);
 /// Pause before a request to an absent drive is repeated.
 const AWAY_PAUSE: Duration = Duration::from_secs(1);
 
-/// The next step after a reply.
+/// What follows a reply during a reading.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
-    /// The next request.
+    /// The next request follows.
     Go,
     /// The next request follows after this time, for the reason given.
     Pause(Duration, String),
-    /// The reading cannot continue.
+    /// The reading cannot continue, for this reason.
     Failed(String),
 }
 

@@ -25,23 +25,23 @@ const NOTED: Duration = Duration::from_secs(1);
 /// Most saves of one restore: a drive that loses unsaved values is written and saved again.
 const MOST_SAVES: u32 = 3;
 
-/// The next step.
+/// What the restore needs next.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Wanted {
     /// The present state of the journal must be on disk before anything else.
     Record,
-    /// The next order for the bus.
+    /// This order must be given to the bus.
     Set(ParameterOrder),
-    /// The journal is removed.
+    /// The journal must be removed.
     Remove,
     /// Nothing is to be done, as the restore has ended.
     Nothing,
 }
 
-/// The next step after a reply.
+/// What follows an outcome during a restore.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Then {
-    /// The next step.
+    /// The next step follows at once.
     Go,
     /// The step is repeated after this time, for the reason given.
     Pause(Duration, String),
@@ -123,7 +123,7 @@ impl Restoration {
         }
     }
 
-    /// The next step.
+    /// What the restore needs next.
     pub fn wanted(&self) -> Wanted {
         match &self.state {
             State::Recording(_) => Wanted::Record,
@@ -154,7 +154,7 @@ impl Restoration {
         &self.journal
     }
 
-    /// Parameters that are done, and all.
+    /// Number of completed parameters, and of all.
     pub fn progress(&self) -> (usize, usize) {
         (self.journal.done, self.writes.len())
     }
@@ -307,7 +307,7 @@ impl Restoration {
         });
     }
 
-    /// The drive refused the order.
+    /// Handles an order that the drive refused.
     fn refused(&mut self, code: Exception, now: Instant) -> Then {
         let need = self.journal.plan.handling.needs.clone();
         match need.filter(|need| need.exception == Some(code.0)) {

@@ -9,12 +9,12 @@ use std::path::{Path, PathBuf};
 use super::file::{MOST_BYTES, ParameterFile};
 use crate::files;
 
-/// Readings kept of one drive.
+/// Most readings kept for one drive.
 const KEPT: usize = 100;
 /// The end of the name of a file.
 const EXTENSION: &str = "params";
 
-/// A directory of readings.
+/// A directory of parameter readings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Store {
     dir: PathBuf,
@@ -35,7 +35,7 @@ impl Store {
         Store { dir }
     }
 
-    /// The directory.
+    /// The directory of the store.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
@@ -43,7 +43,7 @@ impl Store {
     /// Keeps a reading. Of readings in a row with the same values the first and the last are kept, of all a hundred.
     ///
     /// # Errors
-    /// An error of the disk.
+    /// If the disk reports an error.
     pub fn keep(&self, file: &ParameterFile) -> io::Result<PathBuf> {
         let dir = self.dir.join(&file.drive);
         let name: String = file.time.chars().filter(|c| c.is_ascii_alphanumeric()).collect();
@@ -82,7 +82,7 @@ impl Store {
         Ok(paths)
     }
 
-    /// The last reading of a drive.
+    /// The last stored reading of a drive.
     ///
     /// # Errors
     /// If the file cannot be read; names the file and the reason.
@@ -96,7 +96,7 @@ impl Store {
     /// All readings, sorted by drive and then by age, oldest first.
     ///
     /// # Errors
-    /// If the directory cannot be read.
+    /// If the directory of readings cannot be read.
     pub fn list(&self) -> io::Result<Vec<Kept>> {
         let entries = match fs::read_dir(&self.dir) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -134,7 +134,7 @@ fn name_after(newest: &str, own: String) -> String {
     format!("{name}-{:06}", number.saturating_add(1))
 }
 
-/// Reads a file of parameters.
+/// Parses a parameter file from disk.
 ///
 /// # Errors The file and its fault.
 pub fn read(path: &Path) -> Result<ParameterFile, String> {

@@ -19,7 +19,7 @@ pub struct Status {
     pub number: u64,
     /// Number of addresses requested so far, and of all.
     pub progress: (usize, usize),
-    /// Estimated remaining time.
+    /// Estimated time until the reading ends.
     pub remaining: Option<Duration>,
     /// What is read now.
     pub now: Option<String>,
@@ -32,13 +32,13 @@ pub struct Status {
 /// The stage of a restore.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RestoreStage {
-    /// The drive is read.
+    /// The drive's present parameters are being read.
     Reading,
     /// The plan is ready; the requester decides.
     Prepared,
     /// The restore must not be carried out, for these reasons.
     Refused(Vec<String>),
-    /// Parameters are written.
+    /// The parameters are being written.
     Working,
     /// The restore has ended, with a summary.
     Ended(String),
@@ -46,10 +46,10 @@ pub enum RestoreStage {
     Failed(String),
 }
 
-/// The plan of a restore.
+/// The prepared plan of a restore.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Prepared {
-    /// The writes.
+    /// The writes of the restore.
     pub plan: Plan,
     /// The risks the user accepts.
     pub risks: Vec<String>,
@@ -166,7 +166,7 @@ impl Vault {
             .is_some_and(|reading| reading.result.is_none())
     }
 
-    /// A reading of that drive begins.
+    /// Notes that a reading of this drive begins.
     ///
     /// # Errors The number of the one already in progress.
     pub fn begin(&self, drive: &Machine) -> Result<u64, u64> {

@@ -126,7 +126,7 @@ fn listens(drive: &Reading<'_>) -> String {
 /// Whether a client may command the drive at all.
 ///
 /// # Errors
-/// The refusal.
+/// If the client may not write; contains the refusal.
 pub fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> {
     if drive.spec.access == Access::Listen {
         return Err(Refusal::NotAllowed(listens(drive)));

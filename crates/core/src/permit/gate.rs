@@ -25,7 +25,7 @@ const MOST_CLIENTS: usize = 64;
 /// A drill in progress on a drive: no other order to the drive is sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DrillLock {
-    /// The drill, as text.
+    /// The drill's client, as text.
     pub who: String,
     /// Until this time only stops are sent, so that the drive's own supervision of the fieldbus acts.
     pub quiet_until: Option<Instant>,
@@ -64,7 +64,7 @@ pub struct Gate {
     drives: BTreeMap<DriveIndex, DriveGate>,
     /// The last pause of the bus.
     pub(super) paused: Option<Stall>,
-    /// The start guards.
+    /// The guards of motor starts on the bus.
     pub(super) starts: Option<Arc<BusGuards>>,
     /// Commands in progress whose starts were cleared, with the drives that they start.
     cleared: Vec<(u64, Vec<DriveIndex>)>,

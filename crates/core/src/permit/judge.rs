@@ -20,7 +20,7 @@ pub enum Stage {
     Write,
 }
 
-/// Result of judging an order.
+/// The result of judging an order.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Verdict {
     /// The order may proceed.
@@ -70,17 +70,17 @@ impl Facts for () {
 /// The input of a rule: an order, one drive that it reaches, and the stage and time of the judgement.
 #[derive(Debug)]
 pub struct Ask<'a> {
-    /// The moment.
+    /// The stage at which the order is judged.
     pub stage: Stage,
     /// Time of the judgement.
     pub now: Instant,
     /// The drive that the rule judges, one of those that the order reaches.
     pub drive: DriveIndex,
-    /// The order.
+    /// The intent of the order.
     pub intent: &'a Intent,
     /// Origin of the order.
     pub origin: &'a Origin,
-    /// State of the drive.
+    /// State of the drive; `None` if unknown.
     pub seen: Option<&'a Seen<'a>>,
 }
 
@@ -107,7 +107,7 @@ pub(super) struct Rule {
     pub(super) stages: &'static [Stage],
     /// Whether the rule applies to stops, too.
     pub(super) binds_stops: bool,
-    /// The judgement.
+    /// The function that judges an order.
     pub(super) judge: fn(&Ask<'_>, &DriveGate, &Gate) -> Verdict,
 }
 

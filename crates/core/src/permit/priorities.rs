@@ -16,7 +16,7 @@ use crate::order::{Commanded, Effect, Entry, Origin, Outcome, SlotWrite, SourceK
 
 pub use void::VoidSlot;
 
-/// Priorities of an array.
+/// Number of priorities of an array.
 pub const PRIORITIES: usize = 16;
 /// Priorities up to this one protect people and refuse commands from other interfaces.
 pub const PROTECTING: u8 = 5;
@@ -35,7 +35,7 @@ pub enum Follows {
 /// How a write to a slot ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Settled {
-    /// The entry is in force.
+    /// The entry is in force at the drive.
     Done,
     /// The write was not carried out: the slot is unchanged.
     Failed,
@@ -104,7 +104,7 @@ impl Slot {
     }
 }
 
-/// The arrays of a drive.
+/// The priority arrays of a drive.
 #[derive(Debug, Clone, Default)]
 struct Arrays([[Slot; PRIORITIES]; 4]);
 
@@ -112,7 +112,7 @@ struct Arrays([[Slot; PRIORITIES]; 4]);
 #[derive(Debug, Clone, Default)]
 pub struct Priorities {
     arrays: Option<Box<Arrays>>,
-    /// Commands that were accepted so far.
+    /// Number of commands accepted so far.
     orders: u64,
     /// Origin and time of the last order.
     last: Option<(Origin, Instant)>,
@@ -121,7 +121,7 @@ pub struct Priorities {
 /// Slot that blocks commands from other interfaces.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Protects {
-    /// The client.
+    /// The client that wrote the slot.
     pub client: String,
     /// Priority of the slot.
     pub priority: u8,
@@ -157,7 +157,7 @@ impl Priorities {
         }
     }
 
-    /// Commands that were accepted so far.
+    /// Number of commands accepted so far.
     pub fn orders(&self) -> u64 {
         self.orders
     }
@@ -167,7 +167,7 @@ impl Priorities {
         self.last.as_ref()
     }
 
-    /// The entry in a slot.
+    /// The entry in force in a slot.
     pub fn entry(&self, what: Commanded, priority: u8) -> Option<&Entry> {
         self.slot(what, priority)?.stands.as_ref()
     }
@@ -393,7 +393,7 @@ impl Priorities {
         self.empty(&client);
     }
 
-    /// Empties the slots of a client.
+    /// Empties all slots of a client.
     pub fn empty(&mut self, client: &Arc<str>) {
         for (.., slot) in self.slots_mut() {
             slot.clear_if(|entry| entry.origin.client() == client);

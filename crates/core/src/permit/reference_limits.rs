@@ -13,13 +13,13 @@ use crate::process_image::Reading;
 /// When reference and range of a drive were written last; values read before that are not valid.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LastWritten {
-    /// A reference.
+    /// When a reference was last written.
     pub reference: Option<Instant>,
-    /// An end of the frequency range.
+    /// When an end of the frequency range was last written.
     pub range: Option<Instant>,
 }
 
-/// The relevant state of a drive.
+/// The state of a drive on which limits depend.
 struct Standing<'a> {
     drive: &'a Reading<'a>,
     /// The points with a register of their own that the command sets.
@@ -39,7 +39,7 @@ pub(super) fn keeps_limits(drive: &Reading<'_>, order: &Order) -> Result<(), Ref
 /// Repeats the check of the admission for an order that has started: another order may have been carried out since.
 ///
 /// # Errors
-/// The refusal.
+/// If a limit would no longer be kept; contains the refusal.
 pub(super) fn still_keeps_limits(drive: &Reading<'_>, order: &Order, last: LastWritten) -> Result<(), Refusal> {
     judge(drive, &set_by(drive, order), Some(last))
 }
@@ -98,7 +98,7 @@ fn set_by(drive: &Reading<'_>, order: &Order) -> Vec<(PointIndex, Value)> {
     }
 }
 
-/// The numbers that these registers are.
+/// The numeric points in these registers.
 fn points_of(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Vec<(PointIndex, Value)> {
     let word = |address: u16| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
     let numbers = profile

@@ -31,9 +31,9 @@ pub enum Target {
 /// A tool's request. The caller has checked that a write is allowed.
 #[derive(Debug, Clone)]
 pub struct Question {
-    /// Receiver of the request.
+    /// Drives that receive the request.
     pub target: Target,
-    /// The request.
+    /// The request to pass on.
     pub pdu: RequestPdu,
     /// Whether the request may change a value: then it is counted and audited as a command.
     pub may_write: bool,

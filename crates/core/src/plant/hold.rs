@@ -105,7 +105,7 @@ impl DriveHandle {
     /// published like that of a command.
     ///
     /// # Errors
-    /// The refusal.
+    /// If the hold refuses the action; contains the refusal.
     pub fn hold(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
         match self.act(verb, origin, authority, now) {
             Ok(view) => Ok(view),
@@ -174,7 +174,7 @@ impl DriveHandle {
         }
     }
 
-    /// Adds the reservation after a stop.
+    /// Adds a reservation after a stop to the explanation.
     pub(super) fn with_reservation(&self, mut why: Explanation, now: Instant) -> Explanation {
         let view = self.hold_view(None, now).map(|(view, _)| view);
         let Some(view) = view.filter(|view| view.state == HoldState::Reserved && why.runs == Some(false)) else {
@@ -210,7 +210,7 @@ impl DriveHandle {
     /// half done.
     ///
     /// # Errors
-    /// The refusal.
+    /// If the client may not restore; contains the refusal.
     pub fn may_begin_restore(&self, origin: &Origin, now: Instant) -> Result<(), Refusal> {
         let queue = self.bus.queue.lock();
         queue.gate.hold_lets(self.index, origin, Asks::Other, now)

@@ -170,7 +170,7 @@ pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
     }
 }
 
-/// Refuses a command; audited and counted.
+/// Refuses a command, which is audited and counted.
 pub fn turn_away(
     writes: &Arc<WriteStats>,
     drive: &str,

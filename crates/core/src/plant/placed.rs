@@ -63,7 +63,7 @@ impl Placed {
         self
     }
 
-    /// When the order was taken.
+    /// When the order was accepted.
     pub fn accepted(&self) -> Instant {
         self.accepted
     }
@@ -73,7 +73,7 @@ impl Placed {
         now(|cx| self.poll_answer(cx))
     }
 
-    /// Waits for the one answer.
+    /// Waits for the single answer to the command.
     pub async fn answered(&mut self) -> Answer {
         poll_fn(|cx| self.poll_answer(cx)).await
     }
@@ -175,7 +175,7 @@ impl<T: Clone> Arriving<T> {
     }
 }
 
-/// The immediate result of a poll.
+/// The result of a poll without waiting.
 fn now<T>(poll: impl FnOnce(&mut Context<'_>) -> Poll<T>) -> Option<T> {
     match poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(ready) => Some(ready),

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
-/// How a transaction ended.
+/// The result of a transaction, as counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
@@ -13,16 +13,16 @@ pub enum Outcome {
     Ok,
     /// The drive answered with an exception.
     Exception,
-    /// No answer within the deadline.
+    /// No answer arrived within the deadline.
     Timeout,
-    /// An invalid reply.
+    /// The reply was invalid.
     Corrupt,
 }
 
 impl Outcome {
     pub const ALL: [Outcome; 4] = [Outcome::Ok, Outcome::Exception, Outcome::Timeout, Outcome::Corrupt];
 
-    /// The label of metrics.
+    /// The outcome's label in metrics.
     pub fn name(self) -> &'static str {
         match self {
             Outcome::Ok => "ok",
@@ -33,12 +33,12 @@ impl Outcome {
     }
 }
 
-/// Cadence of a poll class.
+/// The measured cadence of a poll class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PollCycle {
     /// Time from the start of the round before the last one to the start of the last one, once two have started.
     pub last: Option<Duration>,
-    /// Rounds started.
+    /// Number of rounds started.
     pub rounds: u64,
 }
 
@@ -60,9 +60,9 @@ pub struct BusHealth {
     pub fast: PollCycle,
     /// Rounds of the slow class.
     pub slow: PollCycle,
-    /// Foreign frames.
+    /// Number of foreign frames received.
     pub foreign: u64,
-    /// Times the port was opened.
+    /// How often the port was opened.
     pub opened: u64,
     /// How often a device server closed its connection after it had answered over it, and was connected again at once.
     pub reconnects: u64,
@@ -76,7 +76,7 @@ const BOUNDS: [f64; 16] = [
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.020, 0.030, 0.050, 0.1, 0.25, 0.5, 1.0, 5.0,
 ];
 
-/// Upper bounds of turnarounds, s.
+/// Upper bounds of the turnaround histogram, s.
 pub(super) const TURNAROUNDS: [f64; BOUNDS.len()] = [
     0.000_25, 0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.050, 0.1, 0.5,
 ];
@@ -94,9 +94,9 @@ pub struct Histogram {
 pub struct HistogramSnapshot {
     /// Upper bound in seconds and own (not cumulated) count of each bucket; the last is unbounded.
     pub buckets: Vec<(f64, u64)>,
-    /// Sum of all times, s.
+    /// Sum of all observed times, s.
     pub sum: f64,
-    /// Number of all times.
+    /// Number of observed times.
     pub count: u64,
 }
 
@@ -121,7 +121,7 @@ impl Histogram {
         }
     }
 
-    /// Adds one time.
+    /// Adds an observed time.
     pub fn observe(&self, time: Duration) {
         let seconds = time.as_secs_f64();
         let bucket = self.bounds.partition_point(|bound| *bound < seconds);
@@ -132,7 +132,7 @@ impl Histogram {
             .fetch_add(u64::try_from(time.as_nanos()).unwrap_or(u64::MAX), Ordering::Relaxed);
     }
 
-    /// The figures now.
+    /// The present figures of the histogram.
     pub fn snapshot(&self) -> HistogramSnapshot {
         let bounds = self.bounds.iter().copied().chain([f64::MAX]);
         let buckets: Vec<_> = bounds

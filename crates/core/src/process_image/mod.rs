@@ -41,7 +41,7 @@ use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, Profile, Value
 pub struct DriveImage {
     /// Configuration of the drive.
     pub spec: DriveSpec,
-    /// The requests that read the drive.
+    /// The planned requests that read the drive.
     pub plan: Plan,
     /// Why the drive accepts only stops; empty if it accepts all commands.
     pub restore_lock: Arc<RestoreLock>,
@@ -50,12 +50,12 @@ pub struct DriveImage {
     /// Minimum age in ns at which process data becomes stale, for a line that cannot be faster; a reload may change it.
     stale_floor: AtomicU64,
     snapshot: ArcSwap<Snapshot>,
-    /// Woken by every update.
+    /// Listeners that every update wakes.
     listeners: ArcSwap<Vec<Weak<Notify>>>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 if there is no measurement yet.
     turnaround: AtomicU64,
-    /// Turnarounds measured.
+    /// Histogram of measured turnarounds.
     turnarounds: Histogram,
     /// The last heartbeat that the bus has not taken note of.
     heartbeat: Mutex<Option<Instant>>,
@@ -179,7 +179,7 @@ impl DriveImage {
             .with_restore_lock(&self.restore_lock)
     }
 
-    /// Counts a transaction.
+    /// Counts a transaction by its outcome.
     pub fn count(&self, outcome: Outcome) {
         if let Some(counter) = self.outcomes.get(outcome as usize) {
             counter.fetch_add(1, Ordering::Relaxed);
@@ -268,7 +268,7 @@ impl DriveImage {
         self.supervision_failures.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Tries that failed so far.
+    /// Number of failed attempts of supervision so far.
     pub fn supervision_failures(&self) -> u64 {
         self.supervision_failures.load(Ordering::Relaxed)
     }
@@ -291,7 +291,7 @@ pub struct BusImage {
     pub spec: BusSpec,
     /// The drives of the bus, in the order of the file.
     pub drives: PerDrive<Arc<DriveImage>>,
-    /// Time of whole transactions, s.
+    /// Histogram of transaction times, s.
     pub transactions: Histogram,
     /// Achieved cycle of the fast class, s.
     pub fast_cycles: Histogram,

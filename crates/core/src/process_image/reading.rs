@@ -21,7 +21,7 @@ pub struct Reading<'d> {
     pub spec: &'d DriveSpec,
     /// Why the drive accepts only stops; `None` if it accepts all commands, and for past states.
     pub restore_lock: Option<&'d RestoreLock>,
-    /// The snapshot.
+    /// The snapshot of the drive's registers.
     pub snapshot: Arc<Snapshot>,
     /// Time of the reading.
     pub now: Instant,

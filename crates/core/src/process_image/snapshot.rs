@@ -6,7 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 use crate::codec::{Exception, Table};
 use crate::drive::{Plan, PointIndex, PollClass};
 
-/// Whether a drive answers.
+/// Whether a drive answers, and since when.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
     /// No request was sent yet.
@@ -91,7 +91,7 @@ impl Span {
     }
 }
 
-/// The state of a drive.
+/// The state of a drive at one time.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     /// Whether the drive answers.
@@ -193,7 +193,7 @@ impl Snapshot {
         }
     }
 
-    /// The drive refused these addresses.
+    /// Notes that the drive refused these addresses.
     pub fn refuse(&mut self, table: Table, start: u16, count: u16, exception: Exception) {
         self.each(table, start, usize::from(count), |cell, _| {
             cell.refused = Some(exception)

@@ -18,7 +18,7 @@ pub enum Standstill {
     Stands,
     /// The motor turns, with the evidence.
     Turns(String),
-    /// Standstill is not known; the reason.
+    /// Standstill is unknown, for this reason.
     Unknown(String),
 }
 

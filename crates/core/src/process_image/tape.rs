@@ -25,7 +25,7 @@ pub enum Verdict {
     Exception,
     /// No reply arrived in time.
     Timeout,
-    /// An invalid reply.
+    /// The reply was invalid.
     Corrupt,
     /// Bytes between two transactions.
     Foreign,
@@ -70,7 +70,7 @@ pub struct TapedFrame {
     pub drive: Option<DriveIndex>,
     /// How the transaction of the frame ended.
     pub verdict: Verdict,
-    /// The bytes; empty if nothing arrived.
+    /// The bytes of the frame; empty if nothing arrived.
     pub bytes: Arc<[u8]>,
 }
 
@@ -93,7 +93,7 @@ impl Taped {
     }
 }
 
-/// Counters in front of shared bytes.
+/// Bytes of the counters that precede shared data.
 const SHARED: usize = 16;
 
 impl TapedRead {
@@ -117,13 +117,13 @@ struct Waiting {
     lost: u64,
 }
 
-/// Selects the entries of a tape.
+/// Which entries a tape records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum Taping {
     /// The tape records nothing.
     Off,
-    /// Readings: for trends and counters.
+    /// Only readings are recorded, for trends and counters.
     Reads,
     /// Readings and frames: also for the recorder.
     Everything,
@@ -132,7 +132,7 @@ pub enum Taping {
 /// The tape of one bus.
 #[derive(Debug, Default)]
 pub struct Tape {
-    /// A [`Taping`].
+    /// The present [`Taping`] as a number.
     taping: AtomicU8,
     waiting: Mutex<Waiting>,
 }

@@ -8,13 +8,13 @@ use tokio::sync::broadcast;
 /// Frames in flight for a listener; a listener that is further behind loses the oldest ones.
 const IN_FLIGHT: usize = 1024;
 
-/// Sender of a frame.
+/// The direction of a frame on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
-    /// The gateway.
+    /// From the gateway to a drive.
     Request,
-    /// A drive.
+    /// From a drive to the gateway.
     Reply,
 }
 
@@ -39,7 +39,7 @@ pub struct FrameRecord {
     pub verdict: String,
 }
 
-/// The tap of one line.
+/// The trace of the frames on one line.
 #[derive(Debug, Clone)]
 pub struct Trace(broadcast::Sender<Arc<FrameRecord>>);
 
@@ -50,7 +50,7 @@ impl Default for Trace {
 }
 
 impl Trace {
-    /// Whether someone listens.
+    /// Whether anyone has subscribed to the trace.
     pub fn has_listener(&self) -> bool {
         self.0.receiver_count() > 0
     }

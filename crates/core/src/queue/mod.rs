@@ -78,7 +78,7 @@ pub struct Denied {
     pub drive: DriveIndex,
     /// Origin of the order.
     pub origin: Origin,
-    /// The order, as text.
+    /// The order as text.
     pub what: String,
     /// Reason of the refusal.
     pub refusal: Refusal,
@@ -98,7 +98,7 @@ pub enum Ready {
 /// The commands that may be sent, and when to check again.
 #[derive(Debug, Default)]
 pub struct Choice {
-    /// The next command.
+    /// The next command that may be sent.
     pub chosen: Option<Chosen>,
     /// When another command may go.
     pub wake_at: Option<Instant>,

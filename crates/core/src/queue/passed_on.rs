@@ -85,7 +85,7 @@ impl Pending {
         number.map(|number| Chosen { rank, number })
     }
 
-    /// The command that was chosen.
+    /// The waiting command that was chosen.
     pub fn get(&self, chosen: Chosen) -> Option<&Command> {
         self.waiting.iter().find(|c| c.intent.number == chosen.number)
     }

@@ -94,7 +94,7 @@ impl CommandQueue {
         self.background.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The waiting commands, for the bus.
+    /// Locks the waiting commands.
     pub fn lock(&self) -> MutexGuard<'_, Pending> {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -149,7 +149,7 @@ impl CommandQueue {
         self.wake.as_fd()
     }
 
-    /// Clears the wake-up.
+    /// Clears the wake-up of the bus.
     pub fn clear_wake(&self) {
         let mut count = [0u8; 8];
         // A read without data only means that the bus was not woken.

@@ -65,7 +65,7 @@ impl Clients {
         }
     }
 
-    /// An order of that client.
+    /// Gives an order of this client.
     fn give(
         &mut self,
         (kind, who): (SourceKind, &str),

@@ -5,10 +5,10 @@ use std::time::Duration;
 /// Highest configurable number of starts per hour.
 pub const MOST_STARTS: u32 = 120;
 
-/// `guard` of a drive.
+/// The limits in `guard` of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Guard {
-    /// Starts within any hour.
+    /// Most starts within any hour.
     pub starts_per_hour: Option<u32>,
     /// Least time that the motor stands before another start.
     pub min_off: Duration,

@@ -20,7 +20,7 @@ pub enum Access {
     /// The drive is monitored: every write is refused.
     #[default]
     Monitor,
-    /// Writes are passed on.
+    /// The drive may be read and commanded.
     Control,
     /// Another master owns the line (`mode = "listen"` of the bus): nothing is ever sent.
     Listen,
@@ -60,7 +60,7 @@ pub struct Supervision {
 /// The action for a drive at shutdown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnShutdown {
-    /// At shutdown nothing is written.
+    /// Nothing is written at shutdown.
     #[default]
     LeaveRunning,
     /// At shutdown the stop is written and its acknowledgement awaited.
@@ -82,7 +82,7 @@ pub struct DriveSpec {
     pub profile: Arc<Profile>,
     /// Group of drives that are stopped together, and started one after the other.
     pub group: Option<String>,
-    /// Limits of the drive's starts.
+    /// Limits of the drive's starts (`guard`).
     pub guard: Option<Guard>,
     /// The interlocks for starts of this drive.
     pub interlocks: Vec<Interlock>,
@@ -119,7 +119,7 @@ pub struct Timing {
     pub response_timeout: Option<Duration>,
     /// Silence before each request to this drive, and after its reply before a request to any other drive.
     pub silence: Option<Duration>,
-    /// Tries after the first.
+    /// Number of retries after a failed attempt.
     pub retries: Option<u32>,
 }
 

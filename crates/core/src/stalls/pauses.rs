@@ -39,12 +39,12 @@ struct Beat {
 }
 
 impl Heartbeat {
-    /// The thread runs at `now`.
+    /// Notes that the thread runs at `now`.
     pub fn note_run(&self, now: Instant) {
         self.0.ran.store(self.since_base(now), Ordering::Relaxed);
     }
 
-    /// When the thread ran last.
+    /// When the thread last ran.
     pub fn last(&self) -> Instant {
         self.0.last()
     }

@@ -16,7 +16,7 @@ pub(super) struct Around {
     pub(super) stale_after: Duration,
 }
 
-/// A drive that interlocks look at.
+/// A drive on which interlocks depend.
 #[derive(Debug, Clone)]
 pub(super) struct Watched {
     machine: Machine,

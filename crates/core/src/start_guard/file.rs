@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::MOST_STARTS;
 use crate::process_image::Machine;
 
-/// Form of the file.
+/// Version of the file format.
 const VERSION: u32 = 1;
 /// Motors in a file at most; more are none of ours.
 const MOST_MOTORS: usize = 16_384;
@@ -54,7 +54,7 @@ impl Saved {
         }
     }
 
-    /// Each motor with its starts.
+    /// The saved motors with their starts.
     pub(super) fn motors(&self) -> impl Iterator<Item = (Machine, impl Iterator<Item = SystemTime> + '_)> + '_ {
         self.motors.iter().map(|motor| {
             let at = |millis: &u64| {
@@ -72,7 +72,7 @@ impl Saved {
         serde_json::to_vec(self).unwrap_or_default()
     }
 
-    /// The content of a file.
+    /// Parses the content of a file of starts.
     ///
     /// # Errors
     /// The file is not a list of starts of this version: the reason.

@@ -21,7 +21,7 @@ const LONGEST: u64 = 64 << 20;
 /// that they were read, guarded drives are not started.
 ///
 /// # Errors
-/// The system gives no thread.
+/// If the system cannot create a thread.
 pub fn keep(dir: &Path, guards: Arc<Guards>) -> io::Result<(Keeper, oneshot::Receiver<()>)> {
     let path = dir.join(STARTS);
     let (reading, read) = oneshot::channel();

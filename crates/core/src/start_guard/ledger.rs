@@ -27,7 +27,7 @@ pub struct Guards {
 #[derive(Debug, Default)]
 pub(super) struct Ledger {
     motors: BTreeMap<Machine, Entry>,
-    /// Counts changes that belong on disk.
+    /// Counter of changes that must be saved.
     generation: u64,
     disk: Disk,
 }
@@ -41,7 +41,7 @@ pub(super) struct Entry {
     refused: BTreeMap<Reason, u64>,
 }
 
-/// Whether starts are kept.
+/// Whether and how starts are saved.
 #[derive(Debug, Default)]
 enum Disk {
     /// Starts are kept in memory only.
@@ -58,7 +58,7 @@ enum Disk {
     },
 }
 
-/// The progress of a decided start.
+/// Whether a cleared start is on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Kept {
     Yes,
@@ -136,7 +136,7 @@ impl Guards {
         ledger.to_write(Instant::now(), SystemTime::now())
     }
 
-    /// The result of a write.
+    /// Notes the result of a write to disk.
     pub fn wrote(&self, generation: u64, done: Result<(), String>) {
         let mut ledger = self.lock();
         if let Disk::File { written, failed } = &mut ledger.disk {
@@ -289,7 +289,7 @@ impl Ledger {
         changed
     }
 
-    /// A start was refused.
+    /// Counts a refused start.
     pub(super) fn count_refused(&mut self, machine: &Machine, reason: Reason) {
         if let Some(entry) = self.motors.get_mut(machine) {
             *entry.refused.entry(reason).or_default() += 1;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::passage::{Besides, ByRun, Passage, Progress, SETTLES, Shown};
 use super::{Guard, Guarded, MOST_STARTS, Reason, Unable, shown};
 
-/// The window of `starts_per_hour`.
+/// The time window of `starts_per_hour`.
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
 /// Time after its start for which a motor counts as running without a reading.
 const UNREAD: Duration = Duration::from_secs(2);
@@ -22,7 +22,7 @@ pub struct Seen {
     pub running: bool,
     /// Run command as the drive has it, and when that was read.
     pub commanded: Option<(bool, Instant)>,
-    /// Whether the motor stands.
+    /// Whether the motor is at standstill.
     pub stands: bool,
     /// Why the motor does not run and cannot start, and when that was read.
     pub unable: Option<(Unable, Instant)>,
@@ -50,7 +50,7 @@ struct Started {
     by: Option<Arc<str>>,
 }
 
-/// A motor with its starts.
+/// A motor with the record of its starts.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Motor {
     /// The last starts, oldest first.
@@ -184,7 +184,7 @@ impl Motor {
         }
     }
 
-    /// A start is decided.
+    /// Reserves a cleared start.
     pub(super) fn reserve(&mut self, reserved: Reserved) {
         self.settle();
         self.reserved = Some(reserved);
@@ -207,7 +207,7 @@ impl Motor {
                 let counted = passage.counted;
                 self.discount(counted);
             }
-            // A repetition.
+            // The word repeats the same start.
             Some(passage) => {
                 passage.last = now;
                 return false;
@@ -243,7 +243,7 @@ impl Motor {
         self.progresses(Progress::Ran);
     }
 
-    /// A stop is sent.
+    /// Notes that a stop is being sent.
     pub(super) fn stop_written(&mut self, now: Instant) {
         self.stop_written = Some(now);
     }

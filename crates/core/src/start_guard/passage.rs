@@ -30,7 +30,7 @@ pub enum ByRun {
     /// The repetition of a run command that the drive could not follow; it does not count while the drive cannot
     /// follow.
     Vain,
-    /// A start.
+    /// The command starts the motor.
     Starts,
 }
 
@@ -41,7 +41,7 @@ pub(super) enum Progress {
     Awaited,
     /// The motor turns but does not count as running yet.
     Turns,
-    /// The motor was seen to run.
+    /// The motor was seen running.
     Ran,
     /// The start is over: the motor stands again, or the drive did not accept the command.
     Over,
@@ -60,11 +60,11 @@ pub(super) struct Passage {
     pub(super) written: Instant,
     /// When a run command was last written: the word of the start or a repetition.
     pub(super) last: Instant,
-    /// Date under which the start counts.
+    /// Time from which the start counts.
     pub(super) counted: Instant,
     /// The drive could not start before the word, nor in any reading since.
     pub(super) unable: bool,
-    /// The drive was away since.
+    /// Whether the drive was offline since.
     pub(super) away: bool,
     /// Since when the motor had been standing before the start.
     pub(super) stood: Option<Instant>,
@@ -73,9 +73,9 @@ pub(super) struct Passage {
 /// Effect of a reading of the running motor on the starts that count.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Shown {
-    /// The reading has no effect.
+    /// The reading changes nothing.
     Nothing,
-    /// The awaited start was made.
+    /// The expected start happened.
     Started,
     /// The expected start happened so late that it counts from now on.
     StartedLate,

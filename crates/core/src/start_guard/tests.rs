@@ -452,7 +452,7 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     assert_eq!(reason(rig.clear(&[0], 2, 2.0)), "wait");
     assert_eq!(reason(rig.clear(&[0], 2, 2.9)), "wait");
     assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "state_file");
-    // The disk works again.
+    // The disk works again from here on.
     let (generation, _) = rig.shared.to_write(rig.at(4.0), time).unwrap();
     rig.shared.wrote(generation, Ok(()));
     assert_eq!(reason(rig.clear(&[0], 3, 5.0)), "wait");

@@ -34,7 +34,7 @@ struct Guarding {
     tells_running: bool,
 }
 
-/// Whether a start may be written.
+/// Whether a cleared start may be written now.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Clearance {
     /// The start is permitted: counted, and on disk.
@@ -293,14 +293,14 @@ impl BusGuards {
         }
     }
 
-    /// A stop is sent.
+    /// Notes that a stop is being sent.
     pub fn stop_written(&self, drive: DriveIndex, now: Instant) {
         if let Some(of) = self.of_drive(drive) {
             self.shared.lock().with(&of.machine, |motor| motor.stop_written(now));
         }
     }
 
-    /// Updates the state of the drive.
+    /// Updates the motor's state from a reading.
     pub fn update(&self, drive: DriveIndex, reading: &Reading<'_>) {
         let Some(of) = self.of_drive(drive) else { return };
         let seen = seen(reading);

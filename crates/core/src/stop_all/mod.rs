@@ -34,7 +34,7 @@ const BROADCAST: Duration = Duration::from_millis(500);
 /// Most commands that wait for their answers; beyond that the oldest is answered with what is known.
 const MOST_ORDERS: usize = 256;
 
-/// The result of a drive.
+/// The result of the stop for a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
@@ -51,14 +51,14 @@ pub enum Stopped {
 pub struct StoppedDrive {
     /// Name of the drive.
     pub drive: String,
-    /// The result.
+    /// The result for this drive.
     pub outcome: Stopped,
     /// Why the drive is not known to stand still.
     #[serde(default)]
     pub reason: Option<String>,
 }
 
-/// The one answer to a command.
+/// The single answer to a command to stop all.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct StopReport {
     /// Whether every motor is known to stand.

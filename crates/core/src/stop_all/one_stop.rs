@@ -20,9 +20,9 @@ pub(crate) struct OneStop {
     drive: String,
     origin: Origin,
     step: Step,
-    /// The result of the last failure.
+    /// The reason of the last failed stop.
     failed: Option<String>,
-    /// Wait before the next try.
+    /// Wait before the stop is repeated.
     pause: Duration,
     /// A read after the acknowledgement showed that the motor stands, and no later read shows it turning.
     stood: bool,
@@ -45,7 +45,7 @@ enum Step {
 }
 
 impl OneStop {
-    /// Places the stop.
+    /// Gives the drive its stop.
     pub(crate) fn place(drive: &DriveHandle, machine: Machine, origin: &Origin, now: Instant) -> OneStop {
         let mut stop = OneStop {
             machine,

@@ -22,9 +22,9 @@ pub enum NothingToStop {
     /// No bus or group has this name.
     #[error("there is no {kind} `{name}`, so no stop was sent; known: {}", .known.join(", "))]
     Unknown {
-        /// `bus` or `group`.
+        /// Kind of the name: `bus` or `group`.
         kind: &'static str,
-        /// The requested name.
+        /// The name that was requested.
         name: String,
         /// The names that exist, for the message.
         known: Vec<String>,

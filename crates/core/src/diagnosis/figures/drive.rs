@@ -8,13 +8,13 @@ use crate::diagnosis::counters::{InPhase, Window};
 /// The counters per drive in each step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sign {
-    /// Sound replies.
+    /// Valid replies in time.
     Answered,
     /// Requests without a reply, while the drive is present.
     Silent,
     /// All requests that got no reply, whether the drive is present or not.
     Tried,
-    /// Replies that are damaged anywhere.
+    /// Replies damaged at any place.
     Damaged,
     /// Damaged replies that are longer than the reply could be.
     Overlong,
@@ -28,9 +28,9 @@ pub enum Sign {
     CutEcho,
     /// Stray bytes after a reply, while the line should be idle.
     Idle,
-    /// Further valid replies.
+    /// Further valid replies to one request.
     Second,
-    /// Sound replies after the time limit.
+    /// Valid replies after the time limit.
     Late,
     /// Replies that used more than half of the time limit.
     Slow,

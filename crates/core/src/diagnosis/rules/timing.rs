@@ -6,7 +6,7 @@ use crate::diagnosis::figures::{BAUDS, Sign};
 use crate::diagnosis::known::{FEW, LASTING, share, sums};
 use crate::diagnosis::{Cause, Certainty};
 
-/// Longest `response_timeout` that is accepted, ms.
+/// Longest `response_timeout` that a verdict proposes, ms.
 const MOST_PROPOSED: u32 = 5000;
 
 impl Rules<'_> {

@@ -17,7 +17,7 @@ use crate::stop_all::OneStop;
 /// on a sound line a reading takes no longer.
 const AT_ONCE: Duration = Duration::from_millis(500);
 
-/// The observation of a test.
+/// What a test of a drill has shown.
 enum Seen {
     Nothing,
     Stood { took: Duration, upper_bound: bool },

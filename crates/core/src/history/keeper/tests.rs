@@ -43,7 +43,7 @@ impl Run {
         told
     }
 
-    /// Texts, newest first.
+    /// Texts of the events, newest first.
     fn texts(&self) -> Vec<String> {
         let search = Search {
             kinds: Vec::new(),

@@ -42,7 +42,7 @@ fn a_recording_survives_its_file() {
 fn what_is_broken_is_told_of_with_its_place() {
     let bytes = recording().to_bytes();
     let told = |bytes: &[u8]| Recording::parse(bytes).unwrap_err();
-    // Cut short anywhere.
+    // The file may be cut off at any place.
     for length in [30, 500, bytes.len() / 2, bytes.len() - 1] {
         let RecordingError { offset, what } = told(&bytes[..length]);
         assert!(what.contains("truncated"), "{what} of {length}");
@@ -144,7 +144,7 @@ fn the_directory_keeps_its_limits_over_restarts() {
         ..options()
     };
     for n in 0..30 {
-        // An hour apart.
+        // The recordings are an hour apart.
         recording.header.time = format!("2026-02-{:02}T{:02}:00:00.000000Z", 1 + n / 24, n % 24);
         recording.header.id = format!("r{n:02}");
         let entry = Store::open(&limits).write(&mut recording, SystemTime::now()).unwrap();

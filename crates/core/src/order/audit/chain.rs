@@ -58,7 +58,7 @@ impl<'de> Deserialize<'de> for Hash {
     }
 }
 
-/// The kind of a line.
+/// The content of a line of the audit.
 #[derive(Debug, Serialize)]
 #[serde(tag = "entry", rename_all = "snake_case")]
 pub enum Entry<'e> {
@@ -66,24 +66,24 @@ pub enum Entry<'e> {
     Sent(&'e AuditRecord),
     /// A command that was not sent, or refusals of one client.
     NotSent(&'e AuditRecord),
-    /// Records that could not be written.
+    /// A notice of records that could not be written.
     Lost {
         /// When the loss was noticed.
         #[serde(serialize_with = "crate::event::rfc3339")]
         time: SystemTime,
-        /// Records of commands that were sent.
+        /// Number of lost records of sent commands.
         sent: u64,
         /// Records of commands that were not sent.
         not_sent: u64,
     },
     /// The bytes between the last entry and this one are the rest of a line that a crash cut off.
     Fragment {
-        /// When the bytes were found.
+        /// When the bytes of the fragment were found.
         #[serde(serialize_with = "crate::event::rfc3339")]
         time: SystemTime,
         /// Number of the bytes, without the line end.
         bytes: u64,
-        /// Hash of the bytes.
+        /// Hash of the fragment's bytes.
         sha256: Hash,
     },
 }
@@ -140,7 +140,7 @@ pub fn seq(line: &[u8]) -> Option<u64> {
     Head::read(line).map(|head| head.seq)
 }
 
-/// The end of a file.
+/// The end of an audit file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tail {
     /// Chain after the last entry.
@@ -198,9 +198,9 @@ pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
 /// A place where the file was changed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fault {
-    /// Whether the line before is meant.
+    /// Whether the fault concerns the line before.
     pub before: bool,
-    /// The fault.
+    /// The fault, as text.
     pub why: String,
 }
 

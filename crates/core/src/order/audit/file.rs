@@ -22,7 +22,7 @@ const WAITING: (usize, usize) = (8192, 1024);
 const SYNC: Duration = Duration::from_secs(1);
 /// Interval at which the hash of the last line is logged.
 const HASH_LOGGED: Duration = Duration::from_secs(60);
-/// Files that share `max_bytes`.
+/// Number of files that share `max_bytes`.
 const FILES: u64 = 8;
 /// Longest end of a file that is searched for its last entry, bytes.
 const LONGEST_TAIL: u64 = 64 << 20;
@@ -47,7 +47,7 @@ impl AuditFileOptions {
     }
 }
 
-/// Handle of the writing thread.
+/// Handle of the thread that writes the audit.
 #[derive(Debug)]
 pub struct AuditFile {
     options: AuditFileOptions,
@@ -71,7 +71,7 @@ struct Queues {
     unsent: VecDeque<Arc<AuditRecord>>,
     /// Records lost since the start: sent, unsent.
     lost: (u64, u64),
-    /// Losses that the file has.
+    /// Losses that are recorded in the file.
     recorded: (u64, u64),
     /// Number of started threads; only the newest continues.
     threads: u64,
@@ -119,7 +119,7 @@ impl Shared {
 }
 
 impl AuditFile {
-    /// Starts the thread that writes.
+    /// Starts the thread that writes the audit.
     ///
     /// # Errors
     /// The system does not provide a thread.
@@ -200,7 +200,7 @@ struct Writer {
     shared: Arc<Shared>,
     /// End of the chain of hashes; `None` until the file was opened for the first time.
     chain: Option<Chain>,
-    /// Logged once, until a write succeeds.
+    /// Whether writing fails at present, which is logged once.
     failing: bool,
     /// Number of this thread among the writers.
     thread: u64,

@@ -25,7 +25,7 @@ impl JournalFile {
     /// All journals below the directory, in the order of their names.
     ///
     /// # Errors
-    /// The directory cannot be read.
+    /// If the directory cannot be read.
     pub fn all(params: &Path) -> io::Result<Vec<JournalFile>> {
         let entries = match fs::read_dir(params) {
             Err(error) if is_absent(&error) => return Ok(Vec::new()),
@@ -85,7 +85,7 @@ impl JournalFile {
         self.dir.ancestors().take(3).try_for_each(sync)
     }
 
-    /// The journal, if there is one.
+    /// The text of the journal, if one exists.
     ///
     /// # Errors
     /// If it is unknown whether a journal exists, or it cannot be read.

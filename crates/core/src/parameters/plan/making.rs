@@ -8,7 +8,7 @@ use super::{Handling, Need, ParameterWrite, Plan, Risk, Wishes, order, text};
 use crate::drive::Profile;
 use crate::drive::parameters::{RawValue, has};
 
-/// A plan that is being made.
+/// A plan of a restore that is being made.
 pub(super) struct Making<'a> {
     profile: &'a Profile,
     wanted: &'a ParameterFile,
@@ -97,7 +97,7 @@ impl<'a> Making<'a> {
         self.wishes.only.is_empty() || self.is_named_singly(id)
     }
 
-    /// Identification, application and nameplate.
+    /// Compares identification, application and nameplate of both drives.
     fn compare_drives(&mut self) {
         let (profile, wanted, present) = (self.profile, self.wanted, self.present);
         if wanted.identification != present.identification {

@@ -40,7 +40,7 @@ fn file(
     file.named(profile, &Names::default())
 }
 
-/// Registers by id.
+/// A parameter file with register values by id.
 fn words(family: &Profile, drive: &str, values: &[(&str, u16)]) -> ParameterFile {
     let values = values.iter().map(|(id, word)| (Id::new(id), Ok(RawValue::Word(*word))));
     file(family, drive, values)
@@ -97,7 +97,7 @@ fn legal(profile: &Profile, parameter: Option<&Parameter>, seed: u16) -> RawValu
 
 type Values = BTreeMap<u16, RawValue>;
 
-/// Legal values, with all limits kept.
+/// Legal values that keep all limits.
 fn legal_values(profile: &Profile, seeds: &[u16]) -> Values {
     let list = &profile.parameters;
     let places = addresses(list);
@@ -181,7 +181,7 @@ proptest! {
                 let left_out = plan.left_out.iter().any(|(id, _)| profile.parameters.address(id.name()) == Some(*address));
                 prop_assert_eq!(left_out, *value != wanted[address]);
             }
-            // Back from anywhere.
+            // The restore is undone from any step.
             let done = usize::from(cut) % (plan.writes.len() + 1);
             let back = states_of(&plan.back(done), &states[done]);
             for (state, former) in back.iter().zip(states[..=done].iter().rev()) {

@@ -22,7 +22,7 @@ pub(super) fn with_counts(line: String, from: RawValue, to: RawValue) -> String 
     }
 }
 
-/// `5, 7, 9 and 3 more`.
+/// Text of a list: `5, 7, 9 and 3 more`.
 pub(super) fn list(ids: &[Id]) -> String {
     let named: Vec<&str> = ids.iter().take(NAMED).map(Id::name).collect();
     match ids.len().saturating_sub(NAMED) {

@@ -148,7 +148,7 @@ fn no_order_in_hertz_turns_a_motor_round_below_its_minimum_frequency() {
             )
         );
     }
-    // 0 % has no sign.
+    // A percentage of 0 has no sign.
     for hertz in [-10.0, -10.001] {
         let refusal = ordered(&[], "frequency_reference", hertz).unwrap_err();
         assert_eq!(refusal.code(), "bad_value", "{hertz} Hz");
@@ -398,7 +398,7 @@ fn no_command_rests_on_an_old_parameter() {
         let refusal = set(&image, at(6.0), name, 50.5).unwrap_err();
         assert_eq!(refusal.exception(), Exception::VALUE, "{name}");
     }
-    // A line that cannot be faster.
+    // A line that cannot be faster than its cycle.
     let image = of(20, None);
     assert_eq!(set(&image, at(22.5), "frequency_reference", 25.0), Ok(50.0));
     assert!(old(set(&image, at(22.6), "frequency_reference", 25.0)));

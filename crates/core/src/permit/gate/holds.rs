@@ -111,7 +111,7 @@ impl Gate {
     /// Checks whether a client may start an action that requires `asks` of the hold, before any order is given.
     ///
     /// # Errors
-    /// The refusal.
+    /// If the hold prevents it; contains the refusal.
     pub(crate) fn hold_lets(
         &self,
         drive: DriveIndex,
@@ -157,7 +157,7 @@ impl Gate {
         }
     }
 
-    /// A command is accepted.
+    /// Notes an accepted command of a client.
     pub(super) fn hold_accepted(&mut self, command: &Command, now: Instant) {
         // A stop accepted by another bus before a reload was recorded there.
         let Some(rules) = self.rules.clone().filter(|_| !command.is_inherited()) else {
@@ -308,7 +308,7 @@ impl Gate {
         self.drives.get(&drive).map_or(0, |drive| drive.unheld)
     }
 
-    /// The rules, where `[authority]` is on.
+    /// The rules of `[authority]`; `None` if it is off.
     pub fn rules(&self) -> Option<&Arc<Rules>> {
         self.rules.as_ref()
     }

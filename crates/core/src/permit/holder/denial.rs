@@ -8,7 +8,7 @@ use crate::order::{Holder, Refusal};
 /// Why a command, or an action on the hold, is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Denial {
-    /// The client is not a principal.
+    /// The client is not a principal of `[authority]`.
     Nobody,
     /// Another client holds the drive.
     Held(Claim, Duration),
@@ -31,7 +31,7 @@ pub(super) fn seconds(left: Duration) -> u64 {
 }
 
 impl Denial {
-    /// The refusal that the client gets.
+    /// The denial as the refusal for the client.
     pub fn refusal(&self, rules: &Rules) -> Refusal {
         let holder = |claim: &Claim, left: Duration, keeps: String| {
             Box::new(Holder {

@@ -19,7 +19,7 @@ const MOST_STOOD: usize = 256;
 pub enum Verb {
     /// Takes a free drive, or renews the client's own hold.
     Take,
-    /// Renews the client's hold.
+    /// Renews the hold that the client has.
     Renew,
     /// Releases the drive; without effect for a client that does not hold it.
     Release,
@@ -41,7 +41,7 @@ impl Verb {
         }
     }
 
-    /// The verb of that word.
+    /// The action with this name.
     pub fn of(name: &str) -> Option<Verb> {
         Verb::ALL.into_iter().find(|verb| verb.name() == name)
     }
@@ -52,9 +52,9 @@ impl Verb {
 pub enum HoldState {
     /// The drive has no holder.
     Free,
-    /// A client.
+    /// A client holds the drive.
     Held,
-    /// A stop reserved the drive.
+    /// A stop has reserved the drive for a client.
     Reserved,
     /// The drive is under local control.
     Local,
@@ -88,9 +88,9 @@ pub struct HoldView {
 /// A change of a hold, for an event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HoldChange {
-    /// The holder.
+    /// The client whose hold changed.
     pub who: Claim,
-    /// The change.
+    /// How the hold changed.
     pub what: What,
 }
 
@@ -162,7 +162,7 @@ impl Holding {
             .retain(|waiting| now.saturating_duration_since(waiting.tried) < time);
     }
 
-    /// A hold ends; a reservation stays.
+    /// Ends a hold; a reservation stays.
     fn ends(&mut self, why: &str, told: &mut Vec<HoldChange>) {
         if let State::Held(who, _) = &self.state {
             told.push(HoldChange {
@@ -454,7 +454,7 @@ impl Holding {
         self.repeater = None;
     }
 
-    /// Ends the hold, for that reason.
+    /// Ends the hold for this reason.
     pub fn end(&mut self, why: &str, told: &mut Vec<HoldChange>) {
         self.ends(why, told);
     }

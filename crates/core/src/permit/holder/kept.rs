@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 use super::{Claim, Rules};
 use crate::process_image::Machine;
 
-/// A reservation as kept on disk.
+/// A reservation as it is saved on disk.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeptReservation {
-    /// The machine.
+    /// The machine that is reserved.
     #[serde(flatten)]
     pub machine: Machine,
     /// Name of the client that stopped the drive.

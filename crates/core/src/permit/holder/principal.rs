@@ -186,7 +186,7 @@ impl Rules {
         rank.min(self.ranks.len().saturating_sub(1))
     }
 
-    /// The name of a rank.
+    /// The name of the rank with this index.
     pub fn rank(&self, rank: usize) -> Arc<str> {
         self.ranks.get(rank).cloned().unwrap_or_else(|| "?".into())
     }

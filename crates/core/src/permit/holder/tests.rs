@@ -327,7 +327,7 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
         drive.act("plc", Verb::Take);
         assert_eq!(drive.order("plc", Asks::Run), "ok");
     }
-    // A reference was no run.
+    // A reference does not count as a run command.
     let mut drive = Drive::new();
     drive.order("op", Asks::Stop);
     assert_eq!(drive.order("plc", Asks::Steer), "held_by_other");

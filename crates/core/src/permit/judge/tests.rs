@@ -33,7 +33,7 @@ enum Why {
     Guard,
 }
 
-/// The orders that are tried.
+/// The orders that each case tries.
 const ORDERS: [&str; 5] = ["start", "reference", "reset", "stop", "read"];
 
 struct Rig {
@@ -144,7 +144,7 @@ impl Rig {
                 rig.gate.set_drill(drive, Some(drill));
             }
             Why::Guard => {
-                // The one start of the hour.
+                // Uses up the one start allowed per hour.
                 let first = rig.command("start", "bob", asked);
                 let (mut gate, now) = (std::mem::take(&mut rig.gate), asked);
                 assert_eq!(gate.judge(Stage::Turn, &first, &rig, now), Verdict::Go);

@@ -33,7 +33,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, _: &Gate) -> Verdict {
 /// Judges a command at that stage; `may_write` is what its client is allowed now.
 ///
 /// # Errors
-/// The refusal.
+/// If the right is missing; contains the refusal.
 pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusal> {
     let why = match (stage, may_write) {
         (_, true) => return Ok(()),
@@ -49,7 +49,7 @@ pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusa
 /// Judges a command of this client for a drive of this bus.
 ///
 /// # Errors
-/// The refusal.
+/// If the client has no right to write; contains the refusal.
 pub fn client_access(stage: Stage, is_stop: bool, origin: &Origin, bus: &str) -> Result<(), Refusal> {
     access(stage, is_stop, origin.right().allows(bus))
 }

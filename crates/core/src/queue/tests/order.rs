@@ -114,7 +114,7 @@ fn a_stop_drops_a_broadcast_that_reaches_its_drive_but_for_one_that_stops_it() {
     let _stop = rig.push(2, Urgency::Stop, &[1], false);
     assert_eq!(outcome(&mut start), Some(Outcome::Purged));
     assert_eq!(outcome(&mut stops), None);
-    // Held up at the tool meanwhile.
+    // The order was delayed at the tool meanwhile.
     let asked = rig.now;
     rig.now += Duration::from_millis(5);
     let _stop = rig.push(1, Urgency::Stop, &[1], false);

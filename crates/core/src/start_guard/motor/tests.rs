@@ -1,6 +1,6 @@
 use super::*;
 
-/// A motor, and the time.
+/// A simulated motor and its time.
 struct Play {
     motor: Motor,
     began: Instant,

@@ -78,7 +78,7 @@ fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
     assert_eq!(rig.tripped(0, 30.4), None, "it held");
     assert!(rig.refused(0, 23.0) == Some("interlock"), "starts need a reading");
     assert!(rig.tripped(0, 30.5).is_some(), "ten seconds at most");
-    // The first reading decides.
+    // The first reading after the restart decides.
     rig.read(2, false, 24.0);
     assert!(rig.tripped(0, 24.1).is_some_and(|why| why.contains("but is false")));
     // The bus restarts again while the interlock does not hold.

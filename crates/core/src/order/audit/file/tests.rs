@@ -156,7 +156,7 @@ fn full_files_are_rotated_and_the_oldest_are_removed() {
     assert_eq!(kept.last().unwrap(), 800);
     assert!(kept.len() < 800 && kept.len() > 100);
     assert_eq!(faults(dir.path()), Vec::<String>::new());
-    // A crash between two renames.
+    // Imitates a crash between two renames.
     drop(writer);
     fs::rename(dir.path().join("audit.jsonl"), dir.path().join("audit.jsonl.1")).unwrap();
     let mut writer = self::writer(dir.path());
