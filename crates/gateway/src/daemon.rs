@@ -96,16 +96,16 @@ pub struct Daemon {
     slots: ServerSlot<slot::Server>,
     bacnet: ServerSlot<bacnet::Server>,
     local: ServerSlot<local::Local>,
-    /// Reads parameters every so often.
+    /// Task that reads parameters at intervals.
     reader: Option<tokio::task::JoinHandle<()>>,
     recorder: Option<RecorderTask>,
     /// Keeps events and counters on disk.
     keeper: Option<Keeper>,
-    /// The starts of all drives.
+    /// The guards that count the starts of all drives.
     guards: Arc<Guards>,
     /// Keeps the starts of drives on disk.
     starts: Option<Keeper>,
-    /// Reports refusals whose count is due.
+    /// Task that reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     /// Watches the serving threads, and reports their pauses.
     watcher: tokio::task::JoinHandle<()>,
@@ -132,7 +132,7 @@ impl Daemon {
     /// Starts like [`Daemon::start`]; `control` receives the commands of local clients to the gateway itself.
     ///
     /// # Errors
-    /// The errors of [`Daemon::start`].
+    /// If the gateway cannot start; see [`Daemon::start`].
     pub async fn start_with(settings: Settings, control: Option<Control>) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
         let drives = settings.buses.iter().map(|bus| bus.drives.len()).sum();
@@ -220,7 +220,7 @@ impl Daemon {
         self.local.server().map(local::Local::path)
     }
 
-    /// Whether the bus threads move.
+    /// Whether the bus threads make progress.
     pub fn pulse(&self) -> Pulse {
         self.pulse.clone()
     }

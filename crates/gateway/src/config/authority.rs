@@ -1,4 +1,4 @@
-//! `[authority]`: who holds a drive.
+//! Reads `[authority]`: the clients that may hold drives.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,7 +16,7 @@ use crate::permit::{Mode, Principal, Rules};
 /// File with the users of the system.
 const PASSWD: &str = "/etc/passwd";
 
-/// `[authority]` as read.
+/// The section `[authority]` as read.
 pub(super) struct Authority {
     /// The rules of authority; `None` if authority is off.
     pub(super) rules: Result<Option<Arc<Rules>>, Unusable>,

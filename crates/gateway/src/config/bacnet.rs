@@ -1,4 +1,4 @@
-//! `[bacnet]`.
+//! Reads the section `[bacnet]`.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -14,7 +14,7 @@ use crate::north::bacnet::{Options, Secret};
 /// Highest instance of a device.
 const MAX_INSTANCE: u32 = 4_194_302;
 
-/// `[bacnet]` as read.
+/// The section `[bacnet]` as read.
 pub(super) struct Bacnet {
     /// Absent when a part cannot be used, which is reported.
     pub(super) options: Option<Options>,

@@ -1,4 +1,4 @@
-//! `[[bus]]`: the line and its drives.
+//! Reads `[[bus]]`: the line and its drives.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -16,10 +16,10 @@ use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
 use crate::process_image::{Access, BusSpec, DriveSpec, is_modbus_tcp};
 
-/// A longer `response_timeout` causes a warning.
+/// `response_timeout` above which a warning is given.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The valid settings of a bus.
+/// The valid settings of a `[[bus]]`.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) port: Option<(String, Place)>,

@@ -11,7 +11,7 @@ use crate::document::{Reader, format_duration};
 /// A duration of the range; a longer one, up to what was allowed before, counts as the longest of the range.
 pub(super) struct Capped {
     pub(super) range: RangeInclusive<Duration>,
-    /// Value that was allowed before.
+    /// Largest value that an earlier version allowed.
     pub(super) before: Duration,
     /// The reason for the limit, as text that follows the value.
     pub(super) why: &'static str,

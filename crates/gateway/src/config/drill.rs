@@ -1,4 +1,4 @@
-//! `[drill]`: how stops are proven.
+//! Reads `[drill]`: how stops are proven.
 
 use super::keys::DRILL;
 use crate::document::Reader;

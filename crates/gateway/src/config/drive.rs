@@ -21,12 +21,12 @@ use crate::process_image::{
     Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
 };
 
-/// Points that a message names.
+/// Most points that a message names.
 const MOST_NAMED: usize = 4;
 
 type Limits = BTreeMap<String, RangeInclusive<f64>>;
 
-/// The valid settings of a drive.
+/// The valid settings of a `[[bus.drive]]`.
 pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
@@ -337,7 +337,7 @@ fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTr
     })
 }
 
-/// A polled numeric point.
+/// Checks that a trigger's point is numeric and polled.
 fn trigger_point(name: &str, profile: &Profile) -> Result<PointIndex, Finding> {
     let plan = Plan::of(profile);
     let is_number = |index: PointIndex| {

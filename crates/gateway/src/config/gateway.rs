@@ -1,4 +1,4 @@
-//! `[gateway]`.
+//! Reads the section `[gateway]`.
 
 use std::path::{Path, PathBuf};
 

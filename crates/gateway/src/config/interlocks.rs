@@ -1,4 +1,4 @@
-//! Interlocks and staggers across drives.
+//! Checks interlocks and staggers across all drives.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

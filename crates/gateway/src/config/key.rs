@@ -24,19 +24,19 @@ pub(super) struct Key<T: 'static> {
     pub(super) meaning: &'static str,
 }
 
-/// The value of an absent key.
+/// The value that an absent key has.
 pub(super) enum Preset {
-    /// The key is required.
+    /// The key is required, so it has no default.
     Required,
     /// A fixed default value, in notation that is both TOML and JSON.
     Value(&'static str),
     /// A default value for a bus of this protocol, in notation that is both TOML and JSON.
     ByProtocol(fn(Protocol) -> String),
-    /// Decided by the loader; as text.
+    /// The loader decides the default; described as text.
     Words(&'static str),
 }
 
-/// How a value is written.
+/// The form in which a value is written.
 pub(super) trait Form<T> {
     /// The value of `key`, which is present; an invalid one is reported.
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<T>;
@@ -177,7 +177,7 @@ pub(super) const fn key_name(field: &'static str) -> &'static str {
     }
 }
 
-/// Markdown without the targets of links.
+/// Markdown text without link targets.
 pub(super) fn plain(text: &str) -> String {
     let mut plain = String::new();
     let mut rest = text.trim();
@@ -308,7 +308,7 @@ impl Form<bool> for Flag {
     }
 }
 
-/// A number.
+/// A key that is a number.
 pub(super) struct Figure;
 
 impl Form<f64> for Figure {
@@ -351,7 +351,7 @@ impl<T: TryFrom<i64>> Form<T> for Number {
     }
 }
 
-/// A duration of the range.
+/// A duration within the range.
 pub(super) struct Time(pub(super) RangeInclusive<Duration>);
 
 impl Time {
@@ -381,7 +381,7 @@ impl Form<Duration> for Time {
     }
 }
 
-/// A size of the range, bytes.
+/// A size in bytes within the range.
 pub(super) struct Size(pub(super) RangeInclusive<u64>);
 
 impl Form<u64> for Size {
@@ -502,7 +502,7 @@ impl Form<Present> for Own {
 }
 
 impl Key<Present> {
-    /// The reader of the table.
+    /// The reader of the key's table.
     pub(super) fn table<'d>(&self, reader: &Reader<'d>) -> Option<Reader<'d>> {
         reader.table(self.name)
     }

@@ -23,7 +23,7 @@ use crate::process_image::Access;
 pub struct Loaded {
     /// The settings; absent if the configuration has any error.
     pub settings: Option<Settings>,
-    /// The errors.
+    /// The errors in the configuration.
     pub errors: Vec<Problem>,
     /// The warnings: valid, but probably not as intended.
     pub warnings: Vec<Problem>,

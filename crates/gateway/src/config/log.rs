@@ -1,4 +1,4 @@
-//! `[log]` and `[audit]`.
+//! Reads the sections `[log]` and `[audit]`.
 
 use std::path::Path;
 
@@ -14,7 +14,7 @@ pub struct LogSettings {
     /// Level, also per target: `info,drivegate::bus=debug`. Checked: every part is a level or
     /// `target=level`. Commands (target `audit`) are logged at any level but `off`.
     pub level: String,
-    /// Format of the lines.
+    /// Format of the log lines.
     pub format: LogFormat,
 }
 
@@ -54,7 +54,7 @@ fn first_below(dir: &Path, path: &Path) -> Option<String> {
     let real = |path: &Path| path.canonicalize().or_else(|_| std::path::absolute(path)).ok();
     let path = match path.canonicalize() {
         Ok(path) => path,
-        // The file does not exist yet.
+        // The file does not exist yet, so its directory is resolved.
         Err(_) => real(path.parent()?)?.join(path.file_name()?),
     };
     let first = path.strip_prefix(real(dir)?).ok()?.components().next()?;

@@ -20,7 +20,7 @@ const BACNET: (usize, usize) = (7 << 20, 24 << 10);
 /// `drivegate user add`.
 const LOGINS: usize = 14 << 20;
 
-/// Memory of a gateway at most.
+/// Maximum memory of a gateway, by use.
 #[derive(Debug)]
 pub struct Memory {
     /// How far back trends reach.
@@ -36,7 +36,7 @@ pub struct BusMemory {
     pub trends: usize,
     /// Trends of the drive with the most points, bytes.
     pub drive_trends: usize,
-    /// The recorder.
+    /// Memory of the recorder.
     pub recorder: Budget,
 }
 

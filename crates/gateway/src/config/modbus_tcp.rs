@@ -1,4 +1,4 @@
-//! `[modbus_tcp]`, `[[modbus_tcp.listener]]` and `[modbus_tcp.tls]`.
+//! Reads `[modbus_tcp]`, `[[modbus_tcp.listener]]` and `[modbus_tcp.tls]`.
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};

@@ -1,4 +1,4 @@
-//! `[mqtt]`.
+//! Reads the section `[mqtt]`.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};

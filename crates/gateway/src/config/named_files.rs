@@ -9,7 +9,7 @@ use super::settings::ENVIRONMENT;
 use super::values;
 use crate::document::{self, Document, Reader};
 
-/// The kind of a file.
+/// The kind of a file named in a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FileKind {
     /// The configuration file itself.
@@ -27,7 +27,7 @@ pub enum FileKind {
 pub struct NamedFile {
     /// Dotted path of the key; empty for the configuration itself.
     pub key: String,
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
     /// Kind of the file.
     pub kind: FileKind,

@@ -18,7 +18,7 @@ const KINDS: &str = "write the path of a serial device, or \"tcp://host:port\" (
 /// Path of a device, relative to the directory of the file, or the address of a device server.
 ///
 /// # Errors
-/// The text is neither.
+/// If the text is neither a path nor an address.
 pub fn check(text: &str, base: &Path) -> Result<String, Finding> {
     match text.split_once("://") {
         Some((scheme @ ("tcp" | "rfc2217" | "modbus-tcp" | "udp"), server)) => match values::host_port(server, None) {

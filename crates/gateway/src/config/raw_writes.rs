@@ -1,4 +1,4 @@
-//! `raw_writes` of `[[bus.drive]]`.
+//! Reads `raw_writes` of `[[bus.drive]]`.
 
 use std::ops::RangeInclusive;
 

@@ -51,13 +51,13 @@ pub struct Settings {
     pub buses: Vec<BusSettings>,
     /// Slots of all buses; absent if no bus has a slot.
     pub slots: Option<slot_server::Options>,
-    /// Absent: not started.
+    /// Options of Modbus TCP; absent if it is off.
     pub modbus_tcp: Option<modbus_tcp_server::Options>,
-    /// Absent: not started.
+    /// Options of MQTT; absent if it is off.
     pub mqtt: Option<mqtt_client::Options>,
-    /// Absent: not started.
+    /// Options of HTTP; absent if it is off.
     pub http: Option<http_server::Options>,
-    /// Absent: not started.
+    /// Options of BACnet; absent if it is off.
     pub bacnet: Option<bacnet_server::Options>,
     /// Rules for the holders of drives; absent: off.
     pub authority: Option<Arc<Rules>>,
@@ -80,7 +80,7 @@ impl Settings {
 /// A bus with the drives on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {
-    /// The part used by other crates.
+    /// The part of the bus that other crates use.
     pub spec: BusSpec,
     /// The settings that only the bus itself uses.
     pub options: BusOptions,

@@ -18,7 +18,7 @@ pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 /// How long the stops of one bus take, one after another, from the end of the current transaction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ShutdownTime {
-    /// Drives to stop.
+    /// Number of drives to stop.
     pub drives: usize,
     /// Time if every drive answers, after its turnaround.
     pub answered: Duration,

@@ -11,7 +11,7 @@ use crate::document::{Place, Reader};
 use crate::north::slot::{Slot, SlotAccess};
 use crate::process_image::Access;
 
-/// The valid settings of a slot.
+/// The valid settings of a `[[bus.slot]]`.
 pub(super) struct Found {
     pub(super) listeners: Vec<Listener>,
     pub(super) pty: Option<(PathBuf, Place)>,
@@ -30,7 +30,7 @@ pub(super) struct Surroundings<'s> {
     pub(super) drives: Vec<Access>,
 }
 
-/// The slots of a bus.
+/// Reads the slots of a bus.
 pub(super) fn read(reader: &Reader<'_>, base: &Path, around: &Surroundings<'_>) -> Vec<Found> {
     let tables = BUS.slot.tables(reader);
     if around.mode == Mode::Listen && !tables.is_empty() {

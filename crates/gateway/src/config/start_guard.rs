@@ -1,4 +1,4 @@
-//! `guard` and `interlocks` of a drive.
+//! Reads `guard` and `interlocks` of a drive.
 
 use super::keys::{DRIVE, GUARD, INTERLOCK};
 use crate::document::{Place, Reader};

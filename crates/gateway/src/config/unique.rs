@@ -26,7 +26,7 @@ pub(super) fn check(document: &Document, buses: &[Found]) {
     check_addresses(document, buses);
 }
 
-/// ` (line 7)`, or nothing.
+/// The line of a key as text: ` (line 7)`, or nothing.
 fn line(place: &Place) -> String {
     place.line.map_or_else(String::new, |line| format!(" (line {line})"))
 }

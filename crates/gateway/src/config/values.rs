@@ -46,7 +46,7 @@ pub(super) fn check_name(text: &str, joints: &str) -> Result<(), Finding> {
     ))
 }
 
-/// An address to listen on, for a server whose usual port is `PORT`.
+/// Parses an address to listen on.
 pub(super) fn socket<const PORT: u16>(text: &str) -> Result<SocketAddr, Finding> {
     text.parse().map_err(|_| {
         let port = text.rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
@@ -86,12 +86,12 @@ pub(super) fn network(text: &str) -> Result<IpNet, Finding> {
     })
 }
 
-/// Accepts any text.
+/// Accepts any text as a value.
 pub(super) fn any_text(text: &str) -> Result<String, Finding> {
     Ok(text.to_string())
 }
 
-/// Accepts any path.
+/// Accepts any path as a value.
 pub(super) fn path(text: &str) -> Result<PathBuf, Finding> {
     Ok(PathBuf::from(text))
 }

@@ -52,7 +52,7 @@ fn raise(wanted: usize) -> usize {
     }
 }
 
-/// The users of open files.
+/// Everything that needs open files.
 #[derive(Debug, Clone)]
 struct Wanted {
     buses: usize,

@@ -11,7 +11,7 @@ pub struct Pulse(Arc<Mutex<Vec<Watched>>>);
 struct Watched {
     bus: String,
     beats: Arc<AtomicU64>,
-    /// The counter at the last check.
+    /// The counter at the previous check.
     before: Option<u64>,
 }
 

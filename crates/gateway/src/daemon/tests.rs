@@ -47,7 +47,7 @@ fn first_packet(listener: &std::net::TcpListener, wanted: &'static str) -> std::
     let listener = listener.try_clone().unwrap();
     std::thread::spawn(move || {
         let (sender, found) = std::sync::mpsc::channel();
-        // The plain client and the node.
+        // The broker gets two connections: plain client and edge node.
         for stream in listener.incoming().take(2).map_while(Result::ok) {
             let sender = sender.clone();
             std::thread::spawn(move || {

@@ -102,7 +102,7 @@ fn a_file_that_holds_something_else_is_told_with_what_it_holds() {
             assert!(!text.contains("OtherError"), "{text}");
         }
     }
-    // Swapped files: each is reported.
+    // Each of two swapped files is reported.
     for found in said(dir, "good.key", "good.crt") {
         assert_eq!(found.len(), 2, "{found:#?}");
         assert!(

@@ -168,7 +168,7 @@ fn secrets_that_everybody_can_read() {
             .filter(|w| w.finding.what.contains("password is sent to"));
         assert_eq!(found.count(), warned, "{url}");
     }
-    // A password in the configuration itself.
+    // A password is in the configuration itself.
     let file = dir.path().join("t.toml");
     let text = "[gateway]\nname = \"g\"\n[mqtt]\nusername = \"me\"\npassword = \"x\"\n";
     std::fs::write(&file, text).unwrap();

@@ -1,4 +1,4 @@
-//! Listeners and certificates.
+//! Tests of listeners and certificates.
 
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -32,7 +32,7 @@ pub(super) fn certificates() -> &'static Path {
     DIR.0.path()
 }
 
-/// Runs the script of the documentation.
+/// Runs the certificate script of the documentation.
 pub(super) fn certificate(dir: &Path, arguments: &[&str], days: &str) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/modbus-tls-ca.sh");
     let output = Command::new(script)

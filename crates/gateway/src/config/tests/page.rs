@@ -46,7 +46,7 @@ fn with_tables(page: &str) -> String {
     page
 }
 
-/// `DRIVEGATE_WRITE_DOCS=1` writes the page instead.
+/// With `DRIVEGATE_WRITE_DOCS=1` the test writes the page instead of comparing it.
 #[test]
 fn the_page_is_made_from_the_keys() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/configuration.md");
