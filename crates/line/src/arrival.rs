@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::inotify::{self, CreateFlags, Reader, WatchFlags};
 
-/// Links of links that are followed.
+/// Most nested links that are followed.
 const MOST_LINKS: usize = 8;
 /// A node or link is created, or its permissions change, which is the last step of the system.
 const SEEN: WatchFlags = WatchFlags::CREATE
@@ -48,7 +48,7 @@ impl Arrival {
             .ok()
     }
 
-    /// Readable when something has appeared.
+    /// File descriptor that is readable when something has appeared.
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.inotify.as_fd()
     }

@@ -49,7 +49,7 @@ struct State {
     free_since: Option<Instant>,
 }
 
-/// The line of one bus.
+/// The entry of one bus's line.
 struct Entry {
     id: Vec<u8>,
     allow: Vec<IpNet>,

@@ -8,7 +8,7 @@ const ENOUGH: usize = 9;
 /// Most requests whose first bytes are remembered.
 const ASKED: usize = 32;
 
-/// The kind of server.
+/// The kind of server at the other end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Server {
     /// A serial port, or a server that is not recognised.
@@ -43,7 +43,7 @@ pub(super) struct FirstBytes {
 }
 
 impl FirstBytes {
-    /// A request is sent.
+    /// Notes that a request is sent.
     pub(super) fn sent(&mut self, frame: &[u8]) {
         if let [address, function, ..] = *frame
             && self.asked.len() < ASKED
@@ -53,7 +53,7 @@ impl FirstBytes {
         }
     }
 
-    /// The address in what came first.
+    /// The unit id in the first bytes.
     pub(super) fn unit(&self) -> u8 {
         self.came.first().copied().unwrap_or_default()
     }

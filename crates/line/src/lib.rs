@@ -61,15 +61,15 @@ pub enum OpenError {
     /// The path does not exist, is busy, is not a serial port, or may not be used.
     #[error("cannot open {port}: {reason}")]
     Serial {
-        /// Path.
+        /// Path of the port.
         port: String,
-        /// The system's error, and the remedy.
+        /// The system's error with the remedy.
         reason: String,
     },
     /// The device server cannot be reached.
     #[error("cannot reach {port}: {reason}; check address and port, and that the device server is on")]
     Tcp {
-        /// Address.
+        /// Address of the device server.
         port: String,
         /// The system's error.
         reason: io::Error,
@@ -77,15 +77,15 @@ pub enum OpenError {
     /// The device server answers, but cannot set up its port.
     #[error("cannot use {port}: {reason}")]
     Remote {
-        /// Address.
+        /// Address of the device server.
         port: String,
-        /// The reason and the remedy.
+        /// The reason with the remedy.
         reason: String,
     },
     /// Devices cannot connect to this address.
     #[error("cannot listen for {port}: {reason}; check the address, and which program has it")]
     Listen {
-        /// Address.
+        /// Address to listen on.
         port: String,
         /// The system's error.
         reason: io::Error,
@@ -93,15 +93,15 @@ pub enum OpenError {
     /// No device has dialled in.
     #[error("{port}: {reason}")]
     Nobody {
-        /// Address.
+        /// Address to listen on.
         port: String,
-        /// The reason and the remedy.
+        /// The reason with the remedy.
         reason: String,
     },
     /// The kernel cannot switch the direction of this port.
     #[error("{port}: the driver cannot switch RS-485 direction ({reason}); set rs485 = \"off\" or use another adapter")]
     Rs485 {
-        /// Path.
+        /// Path of the port.
         port: String,
         /// The system's error.
         reason: io::Error,
@@ -121,7 +121,7 @@ impl OpenError {
 #[derive(Debug, thiserror::Error)]
 #[error("the port is lost: {why}")]
 pub struct Lost {
-    /// The system's error.
+    /// The system's error, as text.
     pub why: String,
     /// A device server closed its connection, which some do after each reply or after a pause.
     pub closed: bool,
@@ -147,7 +147,7 @@ impl Lost {
     }
 }
 
-/// Event that ended a wait.
+/// The event that ended a wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Woken {
     /// Bytes can be read (or the port is gone, which reading shows).
@@ -217,7 +217,7 @@ impl Line {
     /// device server, and `go_on`, called at least once a second, returns whether the port is still needed.
     ///
     /// # Errors
-    /// The errors of [`Line::open`].
+    /// If the port cannot be opened; see [`Line::open`].
     pub fn open_by(
         names: &mut Names,
         port: &str,
@@ -363,7 +363,7 @@ impl Drop for Exclusive {
     /// opening it again fails as busy.
     fn drop(&mut self) {
         if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
-            // An adapter that was unplugged.
+            // The adapter may have been unplugged.
             tracing::debug!(target: "drivegate::line", "the exclusive mode of the port was not released: {error}");
         }
     }
@@ -514,7 +514,7 @@ impl Line {
     }
 }
 
-/// The format that the port reports.
+/// The character format that the port reports.
 fn read_back(fd: &Exclusive) -> Option<String> {
     let modes = tcgetattr(fd).ok()?;
     let data = if modes.control_modes.contains(ControlModes::CS8) {

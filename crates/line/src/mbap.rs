@@ -64,7 +64,7 @@ impl AsFd for Mbap {
     }
 }
 
-/// The ids of a connection. Pure.
+/// The transaction ids of a connection. Pure.
 #[derive(Debug, Default)]
 struct Session {
     last: u16,

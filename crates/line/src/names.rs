@@ -14,7 +14,7 @@ use super::clock;
 use super::dial_in::Place;
 use super::other_server::OtherServer;
 
-/// Longest wait for an answer.
+/// Longest wait for the result of a lookup.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// Interval at which `go_on` of waiting callers is called.
 const STEP: Duration = Duration::from_millis(100);
@@ -31,7 +31,7 @@ pub struct Names {
     /// The last error of the system instead of an address: repeated until there is another result, so that the reason
     /// why a bus is down changes only when the cause does.
     failure: Option<String>,
-    /// The last lookup found nothing.
+    /// Whether the last lookup found nothing.
     doubtful: bool,
     /// The kind of server, once recognised.
     pub(super) other: OtherServer,

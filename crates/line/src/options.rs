@@ -20,7 +20,7 @@ pub enum Level {
     /// The level that the driver sets when the port is opened: Linux asserts RTS and DTR.
     #[default]
     Driver,
-    /// Asserted.
+    /// The signal is asserted.
     On,
     /// The signal is not asserted.
     Off,
@@ -32,7 +32,7 @@ pub enum Spin {
     /// Spin on a machine with more than one processor.
     #[default]
     Auto,
-    /// Always.
+    /// Spin in every case.
     On,
     /// Never: waits end when the kernel wakes the thread, some ten to a hundred microseconds late.
     Off,
@@ -67,7 +67,7 @@ pub struct LineOptions {
     /// Level of RTS; not possible if the kernel switches RTS for RS-485.
     pub rts: Level,
     pub dtr: Level,
-    /// How precisely waits end.
+    /// How precisely waits must end.
     pub spin: Spin,
     /// Whether nothing is ever sent: a port without RTS is then accepted, as RTS need not be lowered.
     pub receives_only: bool,

@@ -28,7 +28,7 @@ impl Receiver {
     /// Opens the port exclusively; the texts are warnings.
     ///
     /// # Errors
-    /// The errors of [`Line::open`].
+    /// If the port cannot be opened; see [`Line::open`].
     pub fn open(port: &str, format: &LineFormat) -> Result<(Receiver, Vec<String>), OpenError> {
         Receiver::open_by(&mut Names::default(), port, format, &|| true)
     }
@@ -36,7 +36,7 @@ impl Receiver {
     /// Opens a receiver like [`Line::open_by`].
     ///
     /// # Errors
-    /// The errors of [`Line::open`].
+    /// If the port cannot be opened; see [`Line::open`].
     pub fn open_by(
         names: &mut Names,
         port: &str,
@@ -57,7 +57,7 @@ impl Receiver {
     /// Waits for bytes, for `wake`, or for the time.
     ///
     /// # Errors
-    /// If the system refuses to wait.
+    /// If the system reports an error while waiting.
     pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>) -> Result<Woken, Lost> {
         self.0.wait(until, wake, false)
     }

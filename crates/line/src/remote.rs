@@ -18,7 +18,7 @@ const NEGOTIATION: Duration = Duration::from_secs(3);
 /// Interval at which `go_on` of waiting callers is called.
 const STEP: Duration = Duration::from_millis(100);
 
-/// A raw connection.
+/// A raw TCP connection to a device server.
 #[derive(Debug)]
 pub(super) struct Raw {
     stream: TcpStream,

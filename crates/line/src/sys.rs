@@ -24,7 +24,7 @@ pub(super) const RTS_ON_SEND: u32 = 1 << 1;
 pub(super) const RTS_AFTER_SEND: u32 = 1 << 2;
 pub(super) const RX_DURING_TX: u32 = 1 << 4;
 pub(super) const TERMINATE_BUS: u32 = 1 << 5;
-/// `TIOCM_DTR` and `TIOCM_RTS`.
+/// Bits of the control lines: `TIOCM_DTR` and `TIOCM_RTS`.
 const LINE_DTR: i32 = 0x002;
 const LINE_RTS: i32 = 0x004;
 const ASYNC_LOW_LATENCY: i32 = 1 << 13;
@@ -34,14 +34,14 @@ const ASYNC_LOW_LATENCY: i32 = 1 << 13;
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SerialRs485 {
     pub(super) flags: u32,
-    /// Milliseconds.
+    /// Delay before sending, in milliseconds.
     pub(super) delay_rts_before_send: u32,
-    /// Milliseconds.
+    /// Delay after sending, in milliseconds.
     pub(super) delay_rts_after_send: u32,
     pub(super) padding: [u32; 5],
 }
 
-/// `struct serial_struct`.
+/// The kernel's `struct serial_struct`.
 #[repr(C)]
 #[derive(Clone, Copy)]
 struct SerialStruct {

@@ -33,7 +33,7 @@ pub(crate) struct Settings {
     pub(crate) dtr: Level,
 }
 
-/// How far the negotiation is.
+/// The progress of the negotiation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum State {
     /// The server has not yet answered whether it supports the option.
@@ -46,7 +46,7 @@ pub(crate) enum State {
     Refused(&'static str),
 }
 
-/// A connection.
+/// The negotiation of a connection.
 #[derive(Debug)]
 pub(crate) struct Session {
     settings: Settings,

@@ -24,7 +24,7 @@ const OPTIONS: [(Verb, u8); 5] = [
     (Verb::Do, SUPPRESS_GO_AHEAD),
 ];
 
-/// A connection of a program.
+/// The server side of a program's connection.
 #[derive(Debug)]
 pub struct ServedPort {
     format: LineFormat,
@@ -62,7 +62,7 @@ impl ServedPort {
     fn option(&mut self, verb: Verb, option: u8, replies: &mut Vec<u8>) {
         let own = |verb| OPTIONS.contains(&(verb, option));
         match verb {
-            // Replies to the initial negotiation.
+            // These are replies to the initial negotiation.
             Verb::Will if own(Verb::Do) => {}
             Verb::Do if own(Verb::Will) => {}
             Verb::Do if option == COM_PORT => {

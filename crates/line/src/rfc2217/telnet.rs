@@ -41,7 +41,7 @@ impl Verb {
 /// Anything that the other end sends apart from data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Command {
-    /// About an option.
+    /// A verb about an option.
     Option(Verb, u8),
     /// A subnegotiation: option and content, both in one; longer ones than [`MOST_SUB`] are left out.
     Sub(Vec<u8>),
