@@ -91,7 +91,7 @@ mod tests {
         assert_eq!(text(b"a = 1\n# \xC3\x9Cbergabe 20 \xB0C\n"), at(0xB0, 2, 15));
         assert_eq!(text(b"\xB0\x00"), at(0xB0, 1, 1));
         assert_eq!(text(b"a = 1\n\x00\xB0"), at(0, 2, 1));
-        // The last letter is cut off.
+        // The last character is cut off.
         assert_eq!(text(b"a\r\n\r\nb\xC3"), at(0xC3, 3, 2));
         for utf16 in [b"\xFF\xFEa\0".as_slice(), b"\xFE\xFF\0a"] {
             assert_eq!(text(utf16), Err(NotText::Utf16));

@@ -7,7 +7,7 @@ pub(super) fn named(source: &str, line: Option<usize>) -> Option<Finding> {
     other_format(source).or_else(|| in_line(source.lines().nth(line?.checked_sub(1)?)?))
 }
 
-/// A whole file in another format.
+/// The file format if the whole file is not TOML.
 fn other_format(source: &str) -> Option<Finding> {
     let mut lines = source.lines().map(str::trim);
     let first = lines.find(|line| !line.is_empty() && !line.starts_with('#'))?;

@@ -27,14 +27,14 @@ pub use value::{FromNode, ValueError, parse_duration, parse_size};
 /// A fault with its remedy.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
-    /// The fault.
+    /// The fault, as text.
     pub what: String,
     /// The remedy for the fault; empty if there is nothing to add.
     pub remedy: String,
 }
 
 impl Finding {
-    /// A finding with both parts.
+    /// A finding with fault and remedy.
     pub fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
         Finding {
             what: what.into(),
@@ -83,7 +83,7 @@ impl Problem {
 }
 
 impl fmt::Display for Problem {
-    /// `what; file:line, key; what to do`.
+    /// Formats as `what; file:line, key; what to do`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut place = self.file.clone();
         if let Some(line) = self.line {
@@ -181,7 +181,7 @@ impl Document {
         }
     }
 
-    /// The whole tree.
+    /// The root table of the document.
     pub fn root(&self) -> &Node {
         &self.root
     }

@@ -8,7 +8,7 @@ pub type Entry = (String, Option<usize>, Node);
 /// A value with its place in the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
-    /// The value.
+    /// The value itself.
     pub value: Raw,
     pub(super) line: Option<usize>,
     pub(super) env: Option<String>,
@@ -63,15 +63,15 @@ impl Node {
 /// A TOML value.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Raw {
-    /// A string.
+    /// A string value.
     Text(String),
     /// A 64-bit integer.
     Integer(i64),
-    /// A float.
+    /// A float value.
     Float(f64),
-    /// A boolean.
+    /// A boolean value.
     Bool(bool),
-    /// An array.
+    /// An array of values.
     Array(Vec<Node>),
     /// A table: key, line of the key, value.
     Table(Vec<Entry>),
@@ -82,7 +82,7 @@ pub enum Raw {
 }
 
 impl Raw {
-    /// The type, for messages: `an integer`.
+    /// The type as text for messages: `an integer`.
     pub fn kind(&self) -> &'static str {
         match self {
             Raw::Text(_) | Raw::Env(_) => "a string",
@@ -209,7 +209,7 @@ pub(super) enum OverrideError {
 }
 
 impl OverrideError {
-    /// The remedy.
+    /// The remedy for the error.
     pub(super) fn remedy(&self) -> &'static str {
         match self {
             OverrideError::NoSection(_) => "add the section to the file first",
@@ -222,7 +222,7 @@ impl OverrideError {
 /// Sets the value at `path` below `root` to the `text` of the variable `name`; its table must exist.
 ///
 /// # Errors
-/// The path leads nowhere.
+/// If the path leads to no table.
 pub(super) fn set(root: &mut Node, path: &[String], name: &str, text: String) -> Result<(), OverrideError> {
     let value = Node {
         value: Raw::Env(text),

@@ -51,7 +51,7 @@ pub trait FromNode: Sized {
     /// The expected type, for messages: `a string`.
     const WANTED: &'static str;
 
-    /// Reads the value.
+    /// Converts the node to a value.
     ///
     /// # Errors
     /// The value has another type, another form, or is out of range.
@@ -184,15 +184,15 @@ impl<T: FromNode> FromNode for Vec<T> {
     }
 }
 
-/// The expected list, for messages.
+/// The expected kind of list, for messages.
 fn each<T: FromNode>() -> String {
     format!("{}, each {}", Vec::<T>::WANTED, T::WANTED)
 }
 
-/// [`duration::parse`], as a value.
+/// Parses a value with [`duration::parse`].
 ///
 /// # Errors
-/// The text is not a duration.
+/// If the text is not a duration.
 pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
     duration::parse(text).ok_or_else(|| ValueError::Duration(text.to_string()))
 }
@@ -200,7 +200,7 @@ pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
 /// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
 ///
 /// # Errors
-/// The text is not a size.
+/// If the text is not a size.
 pub fn parse_size(text: &str) -> Result<u64, ValueError> {
     let bad = || ValueError::Size(text.to_string());
     let trimmed = text.trim();

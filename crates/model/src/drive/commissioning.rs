@@ -3,12 +3,12 @@
 
 use super::profile::Profile;
 
-/// A step of the commissioning.
+/// A step of commissioning a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Step {
-    /// Slot, connector, terminals, shield.
+    /// Connection: slot, connector, terminals, shield.
     Connect,
-    /// Termination and bias.
+    /// Termination and bias of the line.
     Terminate,
     /// Settings for protocol, address, baud rate, parity and timeout, and their factory values.
     Settings,
@@ -16,7 +16,7 @@ pub enum Step {
     ControlPlace,
     /// Setting for the drive's own timeout, and the messages that restart it.
     Timeout,
-    /// Lamps and panel.
+    /// Meaning of lamps and panel.
     Lamps,
     /// How to test the drive.
     Test,
@@ -34,7 +34,7 @@ impl Step {
         Step::Test,
     ];
 
-    /// The key in a profile.
+    /// The key of the step in a profile.
     pub const fn name(self) -> &'static str {
         match self {
             Step::Connect => "connect",
@@ -47,7 +47,7 @@ impl Step {
         }
     }
 
-    /// The heading as text.
+    /// The heading of the step.
     pub const fn title(self) -> &'static str {
         match self {
             Step::Connect => "connect",
@@ -74,7 +74,7 @@ pub struct Commissioning {
 }
 
 impl Commissioning {
-    /// The lines of a step.
+    /// The text lines of a step.
     pub fn lines(&self, step: Step) -> &[String] {
         match step {
             Step::Connect => &self.connect,
@@ -98,7 +98,7 @@ impl Commissioning {
 pub struct Shared<'p> {
     /// Names of the profiles, in the order given.
     pub profiles: Vec<&'p str>,
-    /// The line.
+    /// The text line.
     pub line: &'p str,
 }
 

@@ -8,14 +8,14 @@ use std::time::Duration;
 use super::profile::Raw;
 use crate::codec::Table;
 
-/// `[control]` of a profile.
+/// The section `[control]` of a profile.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Control {
-    /// The control word, or a coil.
+    /// Place of the control word, or of a coil.
     pub at: ControlItem,
-    /// How the control word reads back.
+    /// What reading the control word returns.
     pub own_word: OwnWord,
-    /// Bits that every word carries.
+    /// Bits with a fixed value in every word.
     pub always: Always,
     /// How the motor is started.
     pub run: Run,
@@ -38,7 +38,7 @@ pub struct Control {
 /// A register or coil that takes commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ControlItem {
-    /// Table.
+    /// Modbus table of the place.
     pub table: Table,
     /// PDU address.
     pub address: u16,
@@ -54,7 +54,7 @@ impl ControlItem {
     }
 }
 
-/// How the control word reads back.
+/// What reading the control word returns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OwnWord {
     /// The register reads as the word written last.
@@ -67,7 +67,7 @@ pub enum OwnWord {
     Kept,
 }
 
-/// Bits that every word carries.
+/// Bits with a fixed value in every word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Always {
     /// Bits that are always 1.
@@ -93,7 +93,7 @@ impl Always {
 pub struct Setting {
     /// Register of the word; `None` for the control word.
     pub place: Option<ControlItem>,
-    /// The bits.
+    /// The bits of the word that are meant.
     pub mask: u16,
     /// Values of the bits.
     pub value: u16,
@@ -140,7 +140,7 @@ pub enum Run {
     One(Setting),
     /// A setting for each direction; never both.
     Pair {
-        /// Forward.
+        /// The word that runs the motor forward.
         forward: Setting,
         /// The setting that runs the motor in reverse.
         reverse: Setting,
@@ -154,20 +154,20 @@ pub enum Run {
 pub struct Step {
     /// The word to write; the direction bits are added to it as commanded.
     pub write: Setting,
-    /// The condition that ends the step.
+    /// The condition under which the step is done.
     pub until: Until,
-    /// Time after which the command fails.
+    /// Time limit after which the command fails.
     pub timeout: Duration,
 }
 
-/// The condition that ends a step.
+/// The condition under which a step is done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Until {
     /// The step is done when its word was acknowledged.
     Written,
     /// The step is done when this time has passed after the write.
     Time(Duration),
-    /// A state.
+    /// The step is done when this state is read.
     State(Mask),
 }
 
@@ -189,7 +189,7 @@ impl Mask {
     }
 }
 
-/// A fault reset: a pulse.
+/// A fault reset, which is a pulse.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Reset {
     /// The bits to set, and to invert afterwards.

@@ -26,7 +26,7 @@ pub enum Derived {
     /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`. A minimum above zero is that of either
     /// direction: a negative percentage is the same magnitude in reverse.
     Band {
-        /// Point in percent.
+        /// Index of the point in percent.
         of: PointIndex,
         /// Value at 0 %.
         minimum: Bound,
@@ -44,47 +44,47 @@ pub enum Derived {
     },
     /// True while the absolute value of the point is at most `within`.
     Zero {
-        /// Point.
+        /// Index of the source point.
         of: PointIndex,
         /// Greatest distance from zero, in the unit of the point.
         within: f64,
     },
     /// True while the two points differ by at most `within`.
     Equal {
-        /// Point.
+        /// Index of the source point.
         of: PointIndex,
-        /// The point to compare with.
+        /// Index of the point to compare with.
         to: PointIndex,
         /// Greatest difference, in the unit of the points.
         within: f64,
     },
     /// True if all of the points are true.
     All {
-        /// Points.
+        /// Indices of the source points.
         of: Vec<PointIndex>,
     },
     /// True if a register is in one of these states.
     State {
-        /// Alternatives.
+        /// The alternatives, of which any makes the point true.
         any: Vec<Mask>,
     },
     /// The sum of the points, each multiplied by its weight. All must come from one reading: otherwise a counter
     /// that rolls over into the next register would seem to decrease.
     Sum {
-        /// Points.
+        /// Indices of the source points.
         of: Vec<PointIndex>,
-        /// Weights, as many as points.
+        /// Weight of each point.
         weights: Vec<f64>,
     },
     /// Number of the lowest set bit, counted from 1; 0 if none is set.
     LowestBit {
-        /// Point with a mask.
+        /// The masked point.
         of: PointIndex,
     },
 }
 
 impl Derived {
-    /// The name in profiles.
+    /// The name of the derivation in profiles.
     #[cfg(test)]
     pub fn name(&self) -> &'static str {
         match self {

@@ -19,7 +19,7 @@ macro_rules! index {
                 $name(place)
             }
 
-            /// Place of the element, from 0.
+            /// Index of the element as a number, from 0.
             pub const fn place(self) -> usize {
                 self.0
             }
@@ -81,7 +81,7 @@ pub struct IndexVec<I, T> {
 }
 
 impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
-    /// The element of that index.
+    /// The element with this index.
     pub fn get(&self, index: I) -> Option<&T> {
         self.elements.get(index.into())
     }
@@ -110,7 +110,7 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
         (0..self.elements.len()).map(I::from)
     }
 
-    /// Adds an element behind the others.
+    /// Appends an element.
     pub fn push(&mut self, element: T) {
         self.elements.push(element);
     }

@@ -11,15 +11,15 @@ use super::profile::Order;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum Value {
-    /// A state.
+    /// A state, true or false.
     Bool(bool),
-    /// A code or a bit mask.
+    /// A code or a bit mask, as an integer.
     Integer(i64),
     /// A number in the point's unit; always finite.
     Number(f64),
     /// A whole number that is too large for `Integer`.
     Unsigned(u64),
-    /// A text.
+    /// A text value.
     Text(Text),
 }
 
@@ -127,7 +127,7 @@ pub enum Quality {
 }
 
 impl Quality {
-    /// The worse of two.
+    /// The worse of two qualities.
     pub fn worse(self, other: Quality) -> Quality {
         let rank = |quality| match quality {
             Quality::Good => 0,
@@ -182,11 +182,11 @@ impl Sample {
 pub enum State {
     /// The drive does not answer, has never answered, or its values are too old.
     Offline,
-    /// Answers, is not ready to run.
+    /// The drive answers but is not ready to run.
     NotReady,
-    /// Ready to run.
+    /// The drive is ready to run.
     Ready,
-    /// Runs.
+    /// The drive runs its motor.
     Running,
     /// The drive has a fault.
     Fault,
@@ -234,7 +234,7 @@ pub enum Kind {
     Number,
     /// A code, or a whole number of 64 bits.
     Integer,
-    /// A text.
+    /// The values are texts.
     Text,
 }
 
@@ -260,7 +260,7 @@ pub(crate) fn tidy_product(value: f64) -> f64 {
 
 macro_rules! model_points {
     ($($variant:ident $name:literal $unit:literal $kind:ident $doc:literal,)*) => {
-        /// A point of the common model.
+        /// A point of the common drive model.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
         pub enum ModelPoint {
             $(#[doc = $doc] $variant,)*
@@ -270,7 +270,7 @@ macro_rules! model_points {
             /// All points of the model in their public order.
             pub const ALL: &'static [ModelPoint] = &[$(ModelPoint::$variant,)*];
 
-            /// The public name.
+            /// The public name of the point.
             pub fn name(self) -> &'static str {
                 match self { $(ModelPoint::$variant => $name,)* }
             }

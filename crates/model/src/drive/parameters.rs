@@ -10,7 +10,7 @@ use crate::codec::{Protocol, Table};
 
 pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 
-/// The parameters of a family.
+/// All parameters of a family.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParameterList {
     /// Parameters that are known by name, by ascending address.
@@ -145,7 +145,7 @@ fn with_unit(number: &str, unit: &str) -> String {
 /// The value of a parameter in the form that the drive gives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RawValue {
-    /// The value of a register.
+    /// The value of one register.
     Word(u16),
     /// The bits of an analog output of N2.
     Float(u32),

@@ -8,23 +8,23 @@ use super::model::ModelPoint;
 use super::profile::{PollClass, Profile, Source};
 use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 
-/// A request of the plan.
+/// A read request of a drive's plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PlannedRead {
-    /// Poll class.
+    /// Poll class of the request.
     pub class: PollClass,
-    /// Table.
+    /// Modbus table of the request.
     pub table: Table,
     /// First PDU address.
     pub start: u16,
-    /// Items.
+    /// Number of registers or bits.
     pub count: u16,
     /// Bit i is set if item i is the second register of a value: no request begins there.
     pub wide: u128,
 }
 
 impl PlannedRead {
-    /// The request.
+    /// The request to send.
     pub fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {
             table: self.table,
@@ -269,12 +269,12 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
 /// Time a transaction takes on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WireTime {
-    /// Characters of the request.
+    /// Wire time of the request.
     pub request: Duration,
     /// Silence by which the drive detects the end of the request (Modbus RTU: 3.5 characters); its turnaround
     /// begins after that.
     pub recognition: Duration,
-    /// Characters of the regular reply.
+    /// Wire time of the regular reply.
     pub reply: Duration,
 }
 

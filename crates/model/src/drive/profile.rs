@@ -115,11 +115,11 @@ pub struct FaultText {
 /// Addresses of one table that may be read or written together.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AddressRange {
-    /// Table.
+    /// Modbus table of the range.
     pub table: Table,
     /// First and last PDU address.
     pub addresses: RangeInclusive<u16>,
-    /// Items per read request.
+    /// Maximum items per read request.
     pub read: u16,
     /// Items per read request that no manual states: such a read is tried, and used once a reply has proved it; 0
     /// means none.
@@ -185,25 +185,25 @@ impl WriteFunctions {
 /// A read whose outcome differs between families; identification never writes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Probe {
-    /// Table.
+    /// Modbus table of the probe.
     pub table: Table,
     /// First PDU address.
     pub start: u16,
-    /// Items.
+    /// Number of registers or bits.
     pub count: u16,
 }
 
 /// How a family responds to a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Expected {
-    /// The read.
+    /// The read that identifies the family.
     pub probe: Probe,
     /// Whether the read is answered with values; otherwise it is refused.
     pub values: bool,
 }
 
 impl Probe {
-    /// The request.
+    /// The request to send.
     pub fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {
             table: self.table,
@@ -216,7 +216,7 @@ impl Probe {
 /// How often a point is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum PollClass {
-    /// Process data, every `cycle`.
+    /// Process data, read every `cycle`.
     Fast,
     /// Polled every `slow_cycle`.
     Slow,
@@ -226,12 +226,12 @@ pub enum PollClass {
     Fault,
     /// Read when the drive comes online and when a comparison needs it; see [`Point::monitor`].
     Monitor,
-    /// Never read without a request.
+    /// Never polled, only read on request.
     Never,
 }
 
 impl PollClass {
-    /// The name in profiles and output.
+    /// The name of the class in profiles and output.
     pub fn name(self) -> &'static str {
         match self {
             PollClass::Fast => "fast",
@@ -294,7 +294,7 @@ pub struct Blocks {
     pub cause: String,
     /// The state in which the point blocks the motor: true or not zero, or false.
     pub when: bool,
-    /// The remedy.
+    /// The remedy for the block.
     pub remedy: String,
 }
 
@@ -389,7 +389,7 @@ impl Profile {
         self.model.get(point.index()).copied().flatten()
     }
 
-    /// The point of the common model.
+    /// The point with this meaning in the common model.
     pub fn model_point(&self, point: ModelPoint) -> Option<&Point> {
         self.model_index(point).and_then(|i| self.points.get(i))
     }
@@ -423,7 +423,7 @@ impl Profile {
         self.points.position(|p| p.name == name)
     }
 
-    /// The range that holds `address`.
+    /// The range that contains `address`.
     pub fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
         self.ranges
             .iter()
@@ -591,7 +591,7 @@ impl Profiles {
         self.0.values().flat_map(|profile| &profile.warnings)
     }
 
-    /// The profile of that name.
+    /// The profile with this name.
     pub fn get(&self, name: &str) -> Option<&Arc<Profile>> {
         self.0.get(name)
     }

@@ -11,7 +11,7 @@ use crate::codec::Table;
 /// The raw writes that a drive's configuration allows in addition to its writable points.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum RawWrites {
-    /// No other raw writes.
+    /// No raw writes except to writable points.
     #[default]
     Points,
     /// Only these PDU addresses, for registers and coils alike.

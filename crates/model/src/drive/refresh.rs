@@ -18,7 +18,7 @@ pub const REFRESH: std::ops::RangeInclusive<Duration> = Duration::from_millis(10
 pub struct Repeats {
     /// Whether the control word is repeated.
     pub word: bool,
-    /// A reference.
+    /// Whether a reference is repeated.
     pub reference: bool,
 }
 

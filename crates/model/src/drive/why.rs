@@ -27,11 +27,11 @@ const INTERLOCKED: &str = "interlocked";
 pub struct Cause {
     /// The reason in one word, for programs.
     pub cause: String,
-    /// The evidence.
+    /// The evidence for the cause.
     pub evidence: String,
     /// Age of the evidence, ms; absent if the evidence is not a reading.
     pub age_ms: Option<u64>,
-    /// The remedy.
+    /// The remedy for the cause.
     pub remedy: String,
     /// The client that gave the order, if the cause is the last order.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -104,13 +104,13 @@ pub enum Contact {
 pub struct RunOrder {
     /// Effect of the order on the motor.
     pub run: RunWish,
-    /// The result.
+    /// The result of the last order.
     pub fate: Fate,
     /// Kind of the giver of the order.
     pub by: Giver,
     /// Source and client, as text.
     pub who: String,
-    /// The outcome as text.
+    /// The outcome of the order as text.
     pub text: String,
     /// The outcome as a result code.
     pub result: String,
@@ -142,22 +142,22 @@ pub enum Fate {
     Unsure,
 }
 
-/// Kind of giver of a command.
+/// Who gave the last order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Giver {
-    /// A client.
+    /// A client gave the order.
     Client,
-    /// Supervision, because a lease expired.
+    /// Supervision gave the order, because a lease expired.
     Supervision,
     /// The gateway gave the order when it was stopped.
     Shutdown,
-    /// An interlock that does not hold.
+    /// An interlock that no longer holds gave the order.
     Interlock,
     /// The gateway gave the order when local control took over the drive while its run command was on.
     LocalControl,
 }
 
-/// The situation, except the points.
+/// Everything except the points that explains a standstill.
 pub struct Situation<'s> {
     /// The present time.
     pub now: Instant,
@@ -257,7 +257,7 @@ impl Examination<'_> {
         known.map(|(value, _)| value.as_f64() != 0.0).reduce(|a, b| a || b)
     }
 
-    /// The drive cannot be reached.
+    /// The cause if the drive cannot be reached.
     fn unreachable(&self) -> Option<Cause> {
         let read_at = self.situation.read_at;
         let (cause, evidence, remedy) = match &self.situation.contact {
@@ -399,7 +399,7 @@ impl Examination<'_> {
         held.map(|why| self.cause("held", why, None, remedy))
     }
 
-    /// Causes in the commands.
+    /// Causes in the commands: no run command, or zero reference.
     fn command(&self, found: &[Cause]) -> Vec<Cause> {
         let order = (self.situation.order)();
         let reads = self.bit(ModelPoint::Run);

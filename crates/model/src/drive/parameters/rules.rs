@@ -40,14 +40,14 @@ pub struct Limit {
 /// Parameters that the drive takes in one mode only.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Lock {
-    /// The addresses that the lock concerns.
+    /// The addresses that the lock protects.
     pub of: Addresses,
     /// Point (index in the profile) that is true only while the drive refuses parameters. While it is false, the
     /// drive may still refuse them.
     pub point: PointIndex,
     /// Exception code of the refusal; N2 codes with 0x80 added. `None` if no manual states it.
     pub exception: Option<u8>,
-    /// The remedy.
+    /// The remedy for the lock.
     pub remedy: String,
 }
 

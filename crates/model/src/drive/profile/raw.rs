@@ -21,11 +21,11 @@ const MOST_POWER: i32 = 20;
 /// Address and format of a raw value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Raw {
-    /// Table.
+    /// Modbus table of the value.
     pub table: Table,
     /// First PDU address.
     pub address: u16,
-    /// Form.
+    /// Form in which the value is encoded.
     pub form: Form,
     /// Order of the bytes over all registers of the value.
     pub order: Order,
@@ -48,7 +48,7 @@ pub struct Raw {
 /// The count that makes a point true, or false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Equals {
-    /// The count.
+    /// The count that means true.
     pub count: i64,
     /// Whether the value means false, any other true.
     pub invert: bool,
@@ -84,7 +84,7 @@ pub enum Unwritable {
     ReadOnly,
 }
 
-/// The content of the registers.
+/// The value of registers before scaling.
 enum Count {
     Whole(i128),
     Real(f64),
@@ -325,7 +325,7 @@ fn low_mask(bits: u8) -> u16 {
     ((1u32 << bits.min(16)) - 1) as u16
 }
 
-/// The most compact whole value.
+/// The number in its most compact type.
 fn whole_value(whole: i128) -> Option<Value> {
     let signed = i64::try_from(whole).map(Value::Integer);
     signed.or_else(|_| u64::try_from(whole).map(Value::Unsigned)).ok()

@@ -5,7 +5,7 @@
 
 use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 
-/// Keys of a derived point.
+/// Keys that belong to a derived point.
 const DERIVATION: [&str; 7] = ["derive", "of", "to", "within", "minimum", "maximum", "weights"];
 /// Keys of a point that is read from registers.
 const PLACE: [&str; 14] = [
@@ -52,7 +52,7 @@ pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
     let mut merged = base.with_source(&format!("profile {name}"));
     let own = document.root().clone();
     if let Raw::Table(entries) = &mut merged.value {
-        // The name is the file's own.
+        // The name is never taken from the base.
         entries.retain(|(key, ..)| key != "name");
     }
     if let (Raw::Table(into), Raw::Table(from)) = (&mut merged.value, own.value) {
@@ -146,7 +146,7 @@ fn remove(points: &mut Vec<Node>, line: Option<usize>, names: Raw, mistakes: &mu
     }
 }
 
-/// The texts of a list.
+/// The texts in a list.
 fn texts(list: &Raw) -> impl Iterator<Item = &str> {
     let nodes = match list {
         Raw::Array(nodes) => nodes.as_slice(),

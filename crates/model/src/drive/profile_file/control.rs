@@ -1,4 +1,4 @@
-//! `[control]`: how a family is commanded.
+//! Reads `[control]`: how a family is commanded.
 
 use crate::drive::{PerPoint, PointIndex};
 use std::time::Duration;
@@ -162,7 +162,7 @@ pub(super) fn read_setting(form: &Reader<'_>, around: &Around<'_>) -> Option<Set
             None
         }
         (None, None) => {
-            // Errors of these keys were reported.
+            // Errors in these keys were reported already.
             if !form.has("bit") && !form.has("mask") {
                 form.problem("bit", "the form names no bits", "write `bit`, or `mask` and `value`");
             }

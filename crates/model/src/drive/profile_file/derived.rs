@@ -1,4 +1,4 @@
-//! `derive`: points derived from other points.
+//! Reads `derive`: points derived from other points.
 
 use super::super::derive::{Bound, Derived};
 use super::super::model::Kind;
@@ -61,7 +61,7 @@ pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Sour
     Some(Source::Derived(derived))
 }
 
-/// `of` and `weights` of a sum.
+/// Reads `of` and `weights` of a sum.
 fn read_sum(reader: &Reader<'_>, names: &[String]) -> Option<Derived> {
     let weights: Option<Vec<f64>> = reader.optional("weights");
     let all: Vec<String> = reader.required("of")?;

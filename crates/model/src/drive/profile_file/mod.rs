@@ -426,7 +426,7 @@ fn read_base(reader: &Reader<'_>, known: &Profiles) -> Option<String> {
         let names: Vec<&str> = known.names().collect();
         let remedy = near.unwrap_or_else(|| format!("known profiles: {}", names.join(", ")));
         reader.problem("base", format!("there is no valid profile `{base}`"), remedy);
-        // The base may explain any key.
+        // An unknown key may be explained by the faulty base.
         reader.tolerate();
     }
     Some(base)

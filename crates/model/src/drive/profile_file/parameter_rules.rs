@@ -38,7 +38,7 @@ fn is_inherited(table: &Reader<'_>, key: &str) -> bool {
     table.place_of(key).env.is_some()
 }
 
-/// A table whose keys name parameters.
+/// A table whose keys are parameter names.
 struct Rules<'a, 'd> {
     table: &'a Reader<'d>,
     list: &'a ParameterList,

@@ -1,4 +1,4 @@
-//! `[parameters]`: which parameters a family has.
+//! Reads `[parameters]`: the parameters of a family.
 //!
 //! `list`: rows `id, address, name, unit, scale` and perhaps `, least, greatest`; `spans`: `"id 100 1998"` or `"group 100 9898"`;
 //! `identification`: names of points. The other keys are read in `parameter_rules`.

@@ -231,7 +231,7 @@ fn form_of(reader: &Reader<'_>, kind: &str) -> Option<Form> {
     None
 }
 
-/// `order`, or `words` for two registers.
+/// Reads `order`, or `words` for two registers.
 fn read_order(reader: &Reader<'_>, form: Form) -> Order {
     let order = reader.parsed("order", |text| {
         let known = Order::ALL.into_iter().find(|order| order.name() == text);

@@ -1,4 +1,4 @@
-//! `[[point]]`: one named value.
+//! Reads `[[point]]`: one named value.
 
 use crate::drive::{PerPoint, PointIndex};
 use std::collections::BTreeMap;

@@ -11,7 +11,7 @@ use crate::drive::model::Kind;
 mod stops;
 mod values;
 
-/// The beginning of a valid profile.
+/// The start of a valid profile file.
 const HEAD: &str = r#"
 name = "meter"
 protocols = ["modbus-rtu"]

@@ -39,7 +39,7 @@ fn stands(family: &str) -> Says {
         ("remote", true),
         ("run", true),
         ("reverse", false),
-        // Further bits of a healthy drive.
+        // Other bits of a healthy drive.
         ("hand_auto", true),
         ("hoa_on", true),
         ("reference_from_bus", true),

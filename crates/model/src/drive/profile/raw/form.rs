@@ -1,18 +1,18 @@
 //! Types of raw values and the order of their bytes.
 
-/// Form of a raw value.
+/// How a value is encoded in registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
     /// A bit of a register (0 = least significant), or the bit itself in a bit table.
     Bit {
-        /// Number of the bit.
+        /// Number of the bit in its register.
         bit: u8,
         /// Whether the bit is inverted, so that 0 means true.
         invert: bool,
     },
     /// Neighbouring bits of a register as a number.
     Bits {
-        /// Number of the least significant one.
+        /// Number of the least significant bit.
         first: u8,
         /// Number of bits, 1..=16.
         count: u8,
@@ -44,7 +44,7 @@ pub enum Form {
     Bcd32,
     /// Text, two characters a register, that ends at a NUL.
     Text {
-        /// Registers.
+        /// Number of registers of the text.
         registers: u8,
     },
 }
@@ -58,9 +58,9 @@ pub enum Order {
     Abcd,
     /// The low word is first.
     Cdab,
-    /// Low byte first in each register.
+    /// The low byte is first in each register.
     Badc,
-    /// Low word first, low byte first.
+    /// The low word and the low byte are first.
     Dcba,
 }
 
@@ -68,7 +68,7 @@ impl Order {
     /// All byte orders.
     pub const ALL: [Order; 4] = [Order::Abcd, Order::Cdab, Order::Badc, Order::Dcba];
 
-    /// The name in profiles and output.
+    /// The name of the order in profiles and output.
     pub fn name(self) -> &'static str {
         match self {
             Order::Abcd => "ABCD",
@@ -191,7 +191,7 @@ impl Form {
         count as u64 & all
     }
 
-    /// Least and greatest count.
+    /// Least and greatest count that the form can hold.
     pub(super) fn span(self) -> (f64, f64) {
         match self {
             Form::Bit { .. } => (0.0, 1.0),

@@ -5,7 +5,7 @@ use super::{EXACT, Equals, Form, Raw, low_mask, to_digits};
 /// Bits of a register or of an item of a bit table, with their values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Part {
-    /// The bits.
+    /// The bits that are meant.
     pub mask: u16,
     /// Values of the bits.
     pub value: u16,

@@ -5,7 +5,7 @@ use crate::codec::Table;
 use crate::drive::ModelPoint;
 use crate::drive::control::ControlItem;
 
-/// A profile with that `[control]`.
+/// The text of a profile with this `[control]`.
 fn source(control: &str) -> String {
     format!(
         "{HEAD}[[point]]\nname = \"status_word\"\nat = \"holding 3\"\nclass = \"fast\"\nhidden = true\n\
