@@ -26,7 +26,7 @@ pub(super) struct CertificateSummary {
     pub(super) not_before: u64,
     /// End of the certificate's validity, seconds since 1970.
     pub(super) not_after: u64,
-    /// Role of a Modbus client.
+    /// Role of a Modbus client, from the certificate.
     pub(super) role: Result<Option<String>, RoleError>,
 }
 
@@ -44,7 +44,7 @@ pub(super) enum RoleError {
     TooLong(usize),
 }
 
-/// Reads a certificate.
+/// Reads the summary of a certificate.
 ///
 /// # Errors
 /// The bytes are not one DER-encoded certificate.

@@ -15,7 +15,7 @@ use super::certificate::{common_name, printable, subject_name};
 /// Keys of RSA, in bits: what signatures are verified with, and what the gateway can sign with.
 const RSA_VERIFY: std::ops::RangeInclusive<usize> = 2048..=8192;
 const RSA_SIGN: std::ops::RangeInclusive<usize> = 2048..=4096;
-/// Supported keys, for messages.
+/// Supported kinds of keys, for messages.
 pub(super) const SUPPORTED_KEYS: &str = "P-256, P-384, Ed25519 or RSA with 2048 to 4096 bits";
 const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
 const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
@@ -53,7 +53,7 @@ pub(super) struct Kind {
     pub(super) self_issued: bool,
     /// Whether the certificate is of a version before 3, which has no extensions.
     pub(super) is_old: bool,
-    /// May issue certificates.
+    /// Whether the certificate may issue others.
     pub(super) is_ca: bool,
     pub(super) key: KeyKind,
     /// Names of hosts and addresses (subjectAltName).
@@ -64,7 +64,7 @@ pub(super) struct Kind {
     pub(super) serves: bool,
 }
 
-/// The kind of a public key.
+/// The kind and strength of a public key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct KeyKind {
     /// Name of the key type, such as `P-521`, `RSA with 1024 bits`.

@@ -63,7 +63,7 @@ struct Open {
     used: u64,
 }
 
-/// Whether a new connection is admitted.
+/// Whether and how a new connection is admitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Decision {
     Admit,
@@ -136,7 +136,7 @@ where
 pub(super) struct Rights(Arc<AtomicBool>);
 
 impl Rights {
-    /// The rights of the client now.
+    /// The present authority of the client.
     pub(super) fn authority(&self) -> Authority {
         match self.0.load(Ordering::Relaxed) {
             true => Authority::Write,
@@ -159,10 +159,10 @@ impl From<Authority> for Rights {
 /// Why the gateway closes a connection that works.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum CloseReason {
-    /// See [`decide`].
+    /// A newer connection took the place; see [`decide`].
     #[error("closed in favour of another client, because the maximum number of connections is reached")]
     Displaced,
-    /// The configuration was reloaded.
+    /// A reload does not allow the client any more.
     #[error("closed: the new configuration does not allow it")]
     NotAllowed,
     /// The client's certificate, or the rights of its role, ended.

@@ -32,11 +32,11 @@ pub struct ServerIdentity {
 pub enum TlsFile {
     /// The certificate of the server, followed by intermediate certificates.
     Certificate,
-    /// Private key of the certificate.
+    /// The private key of the certificate.
     Key,
     /// The CA certificates that client certificates are verified against.
     ClientCa,
-    /// The client certificates that were revoked.
+    /// The list of revoked client certificates.
     ClientCrl,
 }
 
@@ -176,7 +176,7 @@ impl ServerIdentity {
     /// The configuration for rustls; with a verifier, clients must present certificates.
     ///
     /// # Errors
-    /// Certificate and key cannot be used.
+    /// If certificate and key cannot be used.
     pub(super) fn server_config(
         &self,
         clients: Option<Arc<dyn ClientCertVerifier>>,

@@ -69,7 +69,7 @@ pub use tls_words::{GATEWAY, Peer, explain};
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// An address cannot be listened on.
+    /// The server cannot listen on an address.
     #[error("cannot listen for {protocol} on {address}: {cause}; {} in `listen` of {section}", remedy(.cause))]
     Listen {
         /// `Modbus TCP` or `HTTP`.

@@ -10,7 +10,7 @@ use super::log_throttle::LogThrottle;
 use super::{ConnectionRefusal, NorthState, ServerKind};
 use crate::order::Authority;
 
-/// The refusals of one server.
+/// Counts the refused connections of one server.
 #[derive(Debug)]
 pub(super) struct Refusals {
     server: ServerKind,

@@ -32,9 +32,9 @@ pub(crate) const HEARTBEAT: u16 = 0x8103;
 /// Register by which a client takes, renews, releases or breaks the hold of the drive.
 pub(crate) const HOLD: u16 = 0x8104;
 
-/// "Not available" of a signed register.
+/// Value of a signed register for "not available".
 const NO_I16: u16 = 0x8000;
-/// "Not available" of an unsigned register.
+/// Value of an unsigned register for "not available".
 const NO_U16: u16 = 0xFFFF;
 /// Maximum age that the age register can show, ms.
 const MAX_AGE_MS: u128 = 65_534;

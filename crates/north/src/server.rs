@@ -14,7 +14,7 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 /// A server that the daemon runs.
 #[allow(async_fn_in_trait, reason = "the daemon awaits it in its own task")]
 pub trait Server: Sized + std::fmt::Debug {
-    /// Name in messages.
+    /// Name of the server in messages.
     const NAME: &'static str;
     /// Time limit for the server to stop.
     const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
@@ -43,7 +43,7 @@ pub trait Server: Sized + std::fmt::Debug {
 /// A server that applies new options while it runs, in two steps.
 #[allow(async_fn_in_trait, reason = "the daemon awaits it in its own task")]
 pub trait Reconfigure: Server {
-    /// A prepared change.
+    /// A prepared change of the options.
     type Change;
 
     /// Does all that can fail; changes nothing for any client.

@@ -20,13 +20,13 @@ use crate::stop_all::StopAll;
 pub struct NorthState {
     /// Time that starts and reloads wait for the disk.
     pub patience: Patience,
-    /// The recordings.
+    /// The recordings on disk and in progress.
     pub recordings: Arc<Recordings>,
-    /// Readings of parameters, and restores.
+    /// Readings and restores of parameters.
     pub parameters: Arc<Vault>,
     /// Commands that stop all drives.
     pub stop_all: Arc<StopAll>,
-    /// Drills.
+    /// The drills of the gateway.
     pub drills: Arc<Drills>,
     /// Trends, counters and events of the past.
     pub history: Arc<History>,
@@ -44,7 +44,7 @@ pub struct NorthState {
     pub listeners: Arc<ListenerStates>,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
-    /// Recent commands.
+    /// Recent commands, to recognise repetitions.
     pub(super) commands: RememberedCommands,
     /// Whether the slots that BACnet clients had before the start were loaded or made void: after that, none is restored.
     pub(super) kept_slots_read: AtomicBool,

@@ -46,9 +46,9 @@ pub enum ServerKind {
     /// Modbus TCP, with and without TLS.
     ModbusTcp,
     Http,
-    /// The tool slots.
+    /// The servers of the tool slots.
     Slot,
-    /// BACnet/IP.
+    /// The BACnet/IP server.
     Bacnet,
 }
 
@@ -147,12 +147,12 @@ pub struct ModbusTcpStats {
 }
 
 impl ModbusTcpStats {
-    /// A client connected.
+    /// Counts a client that connected.
     pub fn connected(&self) {
         self.connections.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// A client disconnected.
+    /// Counts a client that disconnected.
     pub(crate) fn disconnected(&self) {
         self.connections.fetch_sub(1, Ordering::Relaxed);
     }
@@ -321,9 +321,9 @@ pub struct MqttStats {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MqttKind {
     Event,
-    /// Results of commands.
+    /// Results of commands are lost.
     Result,
-    /// Values of an outage.
+    /// Values of an outage are lost.
     History,
 }
 

@@ -15,9 +15,9 @@ use crate::plant::SharedPlant;
 
 /// Differences of one TCP server from the others.
 pub(crate) trait TcpService<Options>: Debug + Sized {
-    /// Name in messages.
+    /// Name of the server in messages.
     const NAME: &'static str;
-    /// The server, in metrics.
+    /// The server's kind in metrics.
     const KIND: ServerKind;
     /// Handles the connections to a listener.
     type Handler: ConnectionHandler + Debug;
@@ -42,7 +42,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     /// Does everything that can fail, except binding; changes nothing for any client.
     ///
     /// # Errors
-    /// The certificates cannot be used.
+    /// If the certificates cannot be used.
     fn prepare(&self, options: &Options) -> Result<Self::Prepared, ServerError>;
 
     /// Applies prepared options: gives each listener its handler.

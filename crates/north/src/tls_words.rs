@@ -9,7 +9,7 @@ use super::certificate_kind::{SUPPORTED_KEYS, algorithm};
 use super::identity::date;
 use super::server_trust::UnknownIssuer;
 
-/// The peer of a connection.
+/// The peer of a TLS connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
     /// A server that the gateway or one of its commands connects to.

@@ -107,7 +107,7 @@ impl Desk {
         self.plant.load_full()
     }
 
-    /// Whether a reload brought another plant.
+    /// Whether a reload has replaced the plant.
     pub(super) fn is_outdated(&self) -> bool {
         !Arc::ptr_eq(&self.plant.load(), &self.view.plant)
     }
@@ -118,7 +118,7 @@ impl Desk {
         self.server.set_devices(self.view.devices());
     }
 
-    /// A datagram arrived.
+    /// Processes a received datagram.
     pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
         self.view.set_time(now);
         self.server.receive(from, datagram, &self.view, now);
@@ -159,7 +159,7 @@ impl Desk {
         None
     }
 
-    /// The drive answered, or did not.
+    /// Notes the result of a write to a drive.
     pub(super) fn ended(&mut self, ended: &Ended, now: Instant) {
         let plant = self.plant.load();
         if let (Some(slot), Some(drive)) = (ended.slot, plant.drive_at(&ended.machine)) {
@@ -184,7 +184,7 @@ impl Desk {
         self.server.poll(&self.view, now);
     }
 
-    /// Announces drives that are back.
+    /// Announces drives that are online again.
     fn announce(&mut self, now: Instant) {
         let answers: HashSet<u32> = self
             .view

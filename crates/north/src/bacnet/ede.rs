@@ -9,7 +9,7 @@ use drivegate_bacnet::{Access, Kind, Object};
 use super::objects::Shown;
 use super::units;
 
-/// The three files.
+/// The three files of an EDE export.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Ede {
     pub objects: String,

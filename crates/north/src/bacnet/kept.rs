@@ -102,10 +102,10 @@ pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
     }
 }
 
-/// Writes the file.
+/// Writes the file of saved slots.
 ///
 /// # Errors
-/// The file cannot be written.
+/// If the file cannot be written.
 fn save(path: &Path, slots: &[KeptSlot]) -> Result<(), String> {
     let text = serde_json::to_vec_pretty(slots).map_err(|error| error.to_string())?;
     files::replace(path, &text).map_err(|error| error.to_string())
@@ -152,7 +152,7 @@ pub(super) struct KeptFile {
 }
 
 impl KeptFile {
-    /// The file was read.
+    /// Notes that the file was read.
     pub(super) fn read(&mut self, path: PathBuf, slots: Vec<KeptSlot>) {
         self.written = Some((path, slots));
     }

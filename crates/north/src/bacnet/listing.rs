@@ -6,7 +6,7 @@ use super::objects::{self, Flat, Shown};
 use super::{Options, units};
 use crate::process_image::{BusSpec, DriveSpec};
 
-/// An object in the list.
+/// An object in the printed list.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Line {
     /// Instance of the device that has this object.
@@ -23,7 +23,7 @@ pub struct Line {
     pub access: &'static str,
 }
 
-/// The columns of a line.
+/// The column names of the list.
 pub const COLUMNS: [&str; 7] = ["device", "device_name", "object", "name", "type", "unit", "access"];
 
 impl Line {

@@ -51,7 +51,7 @@ pub enum WhenOffline {
     Fault,
 }
 
-/// `[bacnet]`.
+/// The options of `[bacnet]`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// Address of the server.
@@ -80,11 +80,11 @@ pub struct Options {
     pub dcc_password: Option<Secret>,
     /// The buses whose drives are served; `None` for all buses.
     pub buses: Option<Vec<String>>,
-    /// Directory for kept state.
+    /// Directory for saved state.
     pub state_dir: PathBuf,
 }
 
-/// Text that is not shown.
+/// A text that is never displayed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
@@ -185,7 +185,7 @@ impl server::Server for Server {
     /// Binds the address and serves until `cancel`.
     ///
     /// # Errors
-    /// The address cannot be bound.
+    /// If the address cannot be bound.
     async fn start(
         options: Options,
         plant: SharedPlant,

@@ -13,7 +13,7 @@ use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
 use crate::order::Commanded;
 use crate::process_image::{Access, BusSpec, DriveSpec};
 
-/// Analog inputs from 1 on.
+/// Points shown as analog inputs from 1 on.
 const ANALOG: [ModelPoint; 12] = [
     ModelPoint::ActualSpeed,
     ModelPoint::OutputFrequency,
@@ -28,7 +28,7 @@ const ANALOG: [ModelPoint; 12] = [
     ModelPoint::OperatingHours,
     ModelPoint::FaultCode,
 ];
-/// Counters: every change is reported.
+/// Counters, of which every change is reported.
 const COUNTERS: [ModelPoint; 3] = [ModelPoint::Energy, ModelPoint::OperatingHours, ModelPoint::FaultCode];
 /// The first number of the points that only the profile has.
 const OWN: u32 = 100;
@@ -38,13 +38,13 @@ const OTHER: &str = "other";
 /// The meaning of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Meaning {
-    /// A point of the profile.
+    /// The object is a point of the profile.
     Point(PointIndex),
     /// A point of the profile that is an enumeration.
     Enumeration(PointIndex),
-    /// The state of the drive.
+    /// The object is the state of the drive.
     State,
-    /// The text of the active fault.
+    /// The object is the text of the active fault.
     FaultText,
     /// A command with a priority array, and its point.
     Slot(Commanded, PointIndex),
@@ -201,7 +201,7 @@ fn model(spec: &DriveSpec, all: &mut Objects) {
             );
         }
     }
-    // Binary inputs from 1 on.
+    // Status bits are binary inputs from 1 on.
     for (number, point) in (1..).zip(ModelPoint::STATUS_WORD) {
         if let Some(index) = index(point) {
             let texts = (point.name(), describe(spec, index));

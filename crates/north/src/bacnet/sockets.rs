@@ -23,7 +23,7 @@ impl Sockets {
     /// Binds all sockets of the server.
     ///
     /// # Errors
-    /// The address cannot be used.
+    /// If the address cannot be used.
     pub(super) async fn bind(listen: SocketAddrV4) -> io::Result<Sockets> {
         let unicast = UdpSocket::bind(SocketAddr::V4(listen)).await?;
         unicast.set_broadcast(true)?;

@@ -154,7 +154,7 @@ impl Task {
         }
     }
 
-    /// Processes received datagrams.
+    /// Reads and processes received datagrams.
     fn take(&mut self, buffer: &mut [u8], broadcast: Option<usize>) {
         let now = Instant::now();
         let [unicast, of_network, of_all] = &self.readers;
@@ -191,7 +191,7 @@ impl Task {
         }
     }
 
-    /// Hands writes to the drives.
+    /// Passes writes to the drives.
     fn take_up_jobs(&mut self) {
         while let Some((token, waiting)) = self.desk.next_order(Instant::now()) {
             self.writes.push(Box::pin(ending(token, waiting)));

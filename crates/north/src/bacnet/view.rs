@@ -23,7 +23,7 @@ use crate::permit::{self, Priorities};
 use crate::plant::{BusHandle, DriveHandle, Plant};
 use crate::process_image::{Reading, Unavailable};
 
-/// The run command of every drive.
+/// Object of the run command of each drive.
 const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
 
 #[derive(Debug)]
@@ -104,7 +104,7 @@ impl View {
         DateTime::from_unix_ms(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
     }
 
-    /// The device that shows a drive.
+    /// Instance of the device that represents a drive.
     pub(super) fn shown_by(&self, drive: u32) -> u32 {
         match self.flat {
             Some(_) => self.options.device,

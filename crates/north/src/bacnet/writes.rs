@@ -25,7 +25,7 @@ const LOWEST: u8 = 16;
 #[derive(Debug)]
 pub(super) enum Begun {
     Answered(Result<(), Error>),
-    /// The write waits for the drive.
+    /// The write waits for its drive.
     Waits(Box<Waiting>),
 }
 
@@ -237,7 +237,7 @@ fn possible(handle: &DriveHandle, index: PointIndex, value: Value, now: Instant)
     }
 }
 
-/// The BACnet result of an outcome.
+/// The BACnet result for an outcome.
 pub(super) fn error(outcome: &Outcome) -> Result<(), Error> {
     Err(match outcome {
         Outcome::Acknowledged(_) => return Ok(()),

@@ -25,7 +25,7 @@ pub(crate) struct Taken<'t> {
     pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
     /// Whether the broker marks the command as a repetition.
     pub(crate) dup: bool,
-    /// Packet id, which identifies that repetition.
+    /// MQTT packet id, which identifies a repetition.
     pub(crate) packet: u16,
     /// Remaining life of the command's message, s.
     pub(crate) expiry: Option<u32>,
@@ -35,7 +35,7 @@ pub(crate) struct Taken<'t> {
 #[derive(Debug)]
 pub(crate) struct Memory<R> {
     hasher: RandomState,
-    /// Oldest first.
+    /// Recent commands, oldest first.
     recent: VecDeque<Recent<R>>,
     /// Commands by a fingerprint of topic, `id` and payload. Trees are used because entries are added and removed
     /// all day: a hash table would double when removals have used up its free places, and keep the size that a
@@ -119,7 +119,7 @@ pub(crate) struct Fingerprint {
     answer_to: u64,
 }
 
-/// Whether and what a message repeats.
+/// Whether and how a message repeats a command.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Repetition<R> {
     /// A command whose result is the same now.
@@ -241,9 +241,9 @@ impl<R: Clone> Memory<R> {
         self.abandoned = self.taken;
     }
 
-    /// Keeps the result of a command.
+    /// Stores the result of a command.
     pub(crate) fn finished(&mut self, number: u64, result: &R) {
-        // Numbers ascend without gaps.
+        // The numbers are consecutive.
         let first = self.recent.front().map_or(0, |recent| recent.number);
         let place = number.checked_sub(first).and_then(|place| usize::try_from(place).ok());
         if let Some(recent) = place.and_then(|place| self.recent.get_mut(place)) {

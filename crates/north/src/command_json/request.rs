@@ -79,7 +79,7 @@ pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
     Id::of(id?)
 }
 
-/// The content of a command.
+/// The parsed content of a command.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Asked {
     pub(crate) points: Points,
@@ -163,7 +163,7 @@ pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal>
 /// Refuses a payload that is too long.
 ///
 /// # Errors
-/// The payload is longer than [`MAX_PAYLOAD`].
+/// If the payload is longer than [`MAX_PAYLOAD`].
 pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
     match size > MAX_PAYLOAD {
         true => Err(Refusal::BadValue(format!(

@@ -22,7 +22,7 @@ impl LimitedPlaces {
         }
     }
 
-    /// A millisecond later.
+    /// Opens a connection a millisecond later.
     fn connect(
         &mut self,
         address: IpAddr,

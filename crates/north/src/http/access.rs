@@ -14,7 +14,7 @@ use super::tokens::{Scope, Tokens};
 #[derive(Debug, PartialEq)]
 pub(super) struct Access {
     pub(super) hosts: Hosts,
-    /// `None`: no token is needed.
+    /// The tokens; `None` if no token is needed.
     pub(super) tokens: Option<Tokens>,
 }
 

@@ -331,7 +331,7 @@ pub(super) struct Diagnosis<'d> {
     verdicts: &'d [Verdict],
     /// Valid replies from addresses that were not polled, in the last minute.
     wrong_address: u32,
-    /// Counted in the last minute.
+    /// Counters of the drives in the last minute.
     drives: &'d [Counted],
 }
 

@@ -69,7 +69,7 @@ impl AppState {
         Cookies::of(&self.plant.load().gateway, reached.tls)
     }
 
-    /// The drive of that name.
+    /// The drive with this name.
     ///
     /// # Errors
     /// The reply if no drive has this name.

@@ -4,12 +4,12 @@ use std::str::FromStr;
 
 /// A token or a user. Its `Display` form is its line in the file.
 pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
-    /// `token` or `user`.
+    /// Kind of credential: `token` or `user`.
     const KIND: &'static str;
     /// Most entries of a file, more than any plant needs.
     const MOST_ENTRIES: usize;
 
-    /// Unique in the file.
+    /// Name of the credential, unique in the file.
     fn name(&self) -> &str;
 }
 
@@ -22,10 +22,10 @@ pub enum CredentialError {
     /// A name of other characters, or a long one.
     #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
     Name(String),
-    /// A name that another line has.
+    /// The name is also used by another line.
     #[error("there are two {0}s named `{1}`")]
     Repeated(&'static str, String),
-    /// An unknown scope.
+    /// The scope does not exist.
     #[error("`{0}` is not a scope; use read, metrics or control")]
     Scope(String),
     /// The hash is not of the kind in the text.

@@ -55,7 +55,7 @@ fn search(query: Option<&str>, now: SystemTime) -> Result<Search, QueryError> {
     })
 }
 
-/// The events that match, newest first.
+/// Handler: the events that match, newest first.
 pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Replied {
     let search = search(query.as_deref(), SystemTime::now())?;
     let _turn = app.turn().await;

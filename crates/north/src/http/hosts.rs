@@ -58,7 +58,7 @@ impl Host {
     }
 }
 
-/// The hosts that are answered under.
+/// Host names under which the server answers.
 #[derive(Debug, PartialEq)]
 pub(super) struct Hosts(Vec<Host>);
 

@@ -32,7 +32,7 @@ impl Drop for InUse {
     }
 }
 
-/// The body of a reply.
+/// The body of a reply, which keeps the connection in use.
 #[derive(Debug)]
 pub(super) struct InUseBody<B> {
     body: B,

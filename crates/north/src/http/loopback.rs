@@ -31,7 +31,7 @@ impl fmt::Debug for Loopback {
 }
 
 impl Loopback {
-    /// A server of that plant.
+    /// A server for this plant.
     ///
     /// # Errors
     /// The system does not provide what a timer needs.

@@ -87,7 +87,7 @@ pub fn is_host(text: &str) -> bool {
     Host::configured(text).is_some()
 }
 
-/// The running server.
+/// The running HTTP server.
 pub type Http = TcpServer<HttpService, Options>;
 
 /// The service for the clients of the listener.
@@ -97,7 +97,7 @@ pub struct HttpService {
     plant: SharedPlant,
     stats: Arc<NorthState>,
     operating: Arc<Operating>,
-    /// Cancelled when the server ends.
+    /// Token that is cancelled when the server ends.
     stopping: CancellationToken,
 }
 
@@ -298,7 +298,7 @@ impl HttpConnections {
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
-            // The head has just been read.
+            // The head of the request has just been read.
             request.extensions_mut().insert(reader.last());
             request.extensions_mut().insert(reader.clone());
             let command =

@@ -44,7 +44,7 @@ pub(super) struct Api {
 
 type Schemas = BTreeMap<String, RefOr<Schema>>;
 
-/// The description of a route.
+/// The OpenAPI description of a route.
 pub(super) struct Doc {
     summary: &'static str,
     query: &'static [(&'static str, &'static str)],
@@ -251,7 +251,7 @@ impl Api {
             .paths(api.paths)
             .components(Some(components))
             .build();
-        // Strings and figures: this cannot fail.
+        // The document has only strings and numbers, so this cannot fail.
         text.get_or_init(|| serde_json::to_string(&described).unwrap_or_default());
         api.router
     }

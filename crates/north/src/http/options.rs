@@ -11,7 +11,7 @@ use crate::connection_limit::Limits;
 /// Configuration of the HTTP server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Address to listen on.
+    /// Address on which the server listens.
     pub listen: SocketAddr,
     /// Host names and addresses by which the gateway is reached, in addition to its own and those of the loopback.
     pub hosts: Vec<String>,

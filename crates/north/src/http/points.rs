@@ -66,7 +66,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
     points
 }
 
-/// The value that a name requests.
+/// The value that a name in the query stands for.
 #[derive(Debug, Clone, Copy)]
 enum Wanted {
     /// A point, by its index in the profile.

@@ -1,4 +1,4 @@
-//! Parameters of a request: `?name=value&…`. Pure.
+//! Parses the query of a request: `?name=value&…`. Pure.
 
 use std::collections::HashSet;
 use std::time::{Duration, SystemTime};

@@ -13,13 +13,13 @@ use super::replies::{Replied, not_found, refused};
 use crate::history::recording::ENDING;
 use crate::history::{Recording, export, pcapng};
 
-/// The forms of a recording.
+/// The output formats of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Form {
     Json,
     Csv,
     Pcap,
-    /// The gateway's own format.
+    /// The gateway's own file format.
     Dgrec,
 }
 
@@ -44,7 +44,7 @@ impl Form {
     }
 }
 
-/// The form in the query.
+/// The output format requested in the query.
 fn form(query: Option<&str>) -> Result<Form, QueryError> {
     let [format] = query::parameters(query, &["format"])?;
     match format.as_deref() {
@@ -60,7 +60,7 @@ fn form(query: Option<&str>) -> Result<Form, QueryError> {
     }
 }
 
-/// The recordings, oldest first.
+/// Handler: the recordings, oldest first.
 pub(super) async fn list(State(app): State<Arc<AppState>>) -> Response {
     let _turn = app.turn().await;
     let entries = app.north.recordings.list();

@@ -1,4 +1,4 @@
-//! Replies that refuse.
+//! Replies to refused requests.
 
 use axum::Json;
 use axum::http::StatusCode;
@@ -54,7 +54,7 @@ pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
     not_found(format!("there is no bus `{name}`"), known.collect())
 }
 
-/// The bus of that name.
+/// The bus with this name.
 ///
 /// # Errors
 /// The reply if no bus has this name.

@@ -286,7 +286,7 @@ async fn guard(
     let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
     let (method, path) = (request.method(), request.uri().path());
     let is_local = reached.local.is_some();
-    // The socket has no logins.
+    // The local socket needs no login.
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
     // A command from an address of a user is also served on the reserved connections.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));

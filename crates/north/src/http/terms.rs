@@ -30,10 +30,10 @@ impl std::fmt::Debug for Tls {
 }
 
 impl Terms {
-    /// The terms of the configuration.
+    /// The terms that follow from the configuration.
     ///
     /// # Errors
-    /// The certificates cannot be used.
+    /// If the certificates cannot be used.
     pub(super) fn new(options: &Options) -> Result<Terms, ServerError> {
         let tls = options.identity.as_ref().map(|identity| {
             let mut config = identity.server_config(None)?;

@@ -26,7 +26,7 @@ const NOT_A_HASH: CredentialError = CredentialError::Hash("`sha256:` and 64 hexa
 pub enum Scope {
     /// The status page and the JSON interface.
     Read,
-    /// `/metrics`.
+    /// Access to `/metrics`.
     Metrics,
     /// Grants nothing at present: only users can give commands, because they have names.
     Control,
@@ -57,7 +57,7 @@ impl FromStr for Scope {
 /// A line of the file. Displayed as that line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Token {
-    /// Unique in the file.
+    /// Name of the token, unique in the file.
     pub name: String,
     /// Scopes of the token, at least one.
     pub scopes: Vec<Scope>,
@@ -125,7 +125,7 @@ impl Credential for Token {
     }
 }
 
-/// The tokens of a file.
+/// All tokens of a file.
 pub type Tokens = Credentials<Token>;
 
 impl Tokens {

@@ -17,10 +17,10 @@ use crate::drive::ModelPoint;
 use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Reach, Step};
 use crate::history::{Clock, DriveHistory};
 
-/// Shown without `from`.
+/// Time span shown without `from`.
 const SHOWN: Duration = Duration::from_secs(600);
 
-/// The request of a client.
+/// The trend requested by a client.
 #[derive(Debug, PartialEq)]
 struct Wanted {
     /// Names of the points; empty if the request only asks which points exist.

@@ -17,7 +17,7 @@ const MEMORY: u32 = 12 * 1024;
 const PASSES: u32 = 3;
 /// Maximum cost of a hash in the file: memory in KiB, passes and lanes. A higher cost would let a file stall the gateway.
 const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
-/// Bytes of a salt.
+/// Length of a salt in bytes.
 const SALT: usize = 16;
 /// Beginning of the hash of a new user.
 const COST: &str = "$argon2id$v=19$m=12288,t=3,p=1$";
@@ -34,7 +34,7 @@ const NOT_A_HASH: CredentialError = CredentialError::Hash("one of Argon2id with 
 /// A line of the file. Displayed as that line.
 #[derive(Clone, PartialEq, Eq)]
 pub struct User {
-    /// Unique in the file.
+    /// Name of the user, unique in the file.
     pub name: String,
     /// The password hash in PHC string format, with salt and parameters.
     hash: String,
@@ -160,7 +160,7 @@ impl Credential for User {
     }
 }
 
-/// The users of a file.
+/// All users of a file.
 pub type Users = Credentials<User>;
 
 impl Users {

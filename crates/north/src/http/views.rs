@@ -164,7 +164,7 @@ fn params_as_file(query: Option<&str>) -> Result<bool, QueryError> {
     }
 }
 
-/// The last reading on disk.
+/// The last parameter reading on disk.
 async fn stored_params(app: &AppState, name: &str) -> Replied<Option<ParameterFile>> {
     let name = name.to_string();
     let latest = from_store(app, move |store| store.latest(&name)).await?;

@@ -122,9 +122,9 @@ impl<H: ConnectionHandler> AcceptLoop<H> {
     }
 }
 
-/// A socket that accepts connections.
+/// A socket that can accept connections.
 pub(super) trait Accept: Send {
-    /// The next connection; cancel safe.
+    /// Accepts the next connection; cancel safe.
     fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
 
     /// Whether a client waits to be accepted.

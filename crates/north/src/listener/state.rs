@@ -32,7 +32,7 @@ pub(crate) struct ListenerState {
 }
 
 impl ListenerStates {
-    /// Adds a listener.
+    /// Adds a listener to the states.
     pub(crate) fn add(self: &Arc<Self>, server: ServerKind, address: SocketAddr) -> ListenerState {
         let mut all = self.lock();
         all.added += 1;

@@ -34,7 +34,7 @@ use crate::{NorthState, ServerError};
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
 
-/// Most clients at one time.
+/// Most simultaneous clients.
 const MAX_CLIENTS: usize = 32;
 /// The address under which all local clients are counted, so that they share one limit.
 const THIS_MACHINE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
@@ -43,7 +43,7 @@ const FIRST_BYTE: Duration = Duration::from_secs(10);
 /// Wait after an accept error, such as no free descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// How the server is configured.
+/// Options of the local socket.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// The path of the socket.
@@ -60,7 +60,7 @@ struct Door {
     right: Arc<AtomicBool>,
 }
 
-/// The running server.
+/// The running local socket server.
 #[derive(Debug)]
 pub struct Local {
     path: PathBuf,

@@ -15,7 +15,7 @@ const SYSTEM_DIRECTORY: &str = "/run/drivegate";
 const MAX_GATEWAYS: usize = 16;
 /// Owner and group may read and write, which both take to connect.
 const MODE: u32 = 0o660;
-/// Clients that wait to be accepted.
+/// Most clients that wait to be accepted.
 const BACKLOG: u32 = 16;
 /// Tries to lock the directory, while another gateway starts, and the time between them.
 const LOCK_TRIES: u32 = 50;
@@ -29,7 +29,7 @@ pub enum SocketPath {
     Default,
     /// Use this path.
     At(PathBuf),
-    /// Nowhere.
+    /// The local socket is off.
     Off,
 }
 
@@ -38,12 +38,12 @@ pub enum SocketPath {
 pub struct RuntimeDirectories {
     /// `RUNTIME_DIRECTORY`: that of a service, by systemd.
     service: Option<PathBuf>,
-    /// `XDG_RUNTIME_DIR`: that of a user's session.
+    /// `XDG_RUNTIME_DIR` of a user's session.
     session: Option<PathBuf>,
 }
 
 impl RuntimeDirectories {
-    /// The directories of this process.
+    /// The runtime directories of this process.
     pub fn of_this_process() -> RuntimeDirectories {
         let variable = |name| {
             std::env::var_os(name)
@@ -100,7 +100,7 @@ fn numbered(directory: PathBuf) -> Vec<PathBuf> {
 pub(super) struct Bound {
     pub(super) listener: UnixListener,
     pub(super) path: PathBuf,
-    /// Device and inode of the file.
+    /// Device and inode of the socket file.
     id: (u64, u64),
 }
 

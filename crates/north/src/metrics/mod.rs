@@ -20,7 +20,7 @@ use self::series::{Families, Kind, SeriesValue};
 use super::NorthState;
 use crate::plant::Plant;
 
-/// Text formats of an exposition.
+/// Text formats of the metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Prometheus text format 0.0.4: the family of a counter is named like its series.

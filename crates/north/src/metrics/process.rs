@@ -10,12 +10,12 @@ pub(super) struct ProcessStats {
     pub(super) max_fds: Option<f64>,
     pub(super) virtual_bytes: Option<f64>,
     pub(super) resident_bytes: Option<f64>,
-    /// Unix time.
+    /// Start of the process as Unix time.
     pub(super) start_seconds: Option<f64>,
     pub(super) threads: Option<f64>,
 }
 
-/// The statistics now.
+/// The present statistics of the process.
 pub(super) fn read() -> ProcessStats {
     let ticks = rustix::param::clock_ticks_per_second() as f64;
     let page = rustix::param::page_size() as f64;

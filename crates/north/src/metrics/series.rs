@@ -27,7 +27,7 @@ impl Labels {
         }
     }
 
-    /// The labels with one more.
+    /// The labels with one more label.
     pub(super) fn with(&self, name: &'static str, value: impl Into<Cow<'static, str>>) -> Labels {
         Labels {
             of: self.of.clone(),
@@ -35,7 +35,7 @@ impl Labels {
         }
     }
 
-    /// The labels with two more.
+    /// The labels with two more labels.
     pub(super) fn with_both(&self, first: Label, second: Label) -> Labels {
         Labels {
             of: self.of.clone(),
@@ -56,7 +56,7 @@ impl EncodeLabelSet for Labels {
     }
 }
 
-/// Kind of a family.
+/// Kind of a metric family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Gauge,
@@ -93,7 +93,7 @@ impl From<HistogramSnapshot> for SeriesValue {
     }
 }
 
-/// 1 or 0.
+/// Converts true to 1 and false to 0.
 impl From<bool> for SeriesValue {
     fn from(it_is: bool) -> SeriesValue {
         SeriesValue::Value(f64::from(u8::from(it_is)))

@@ -49,7 +49,7 @@ pub(super) struct Policy {
 }
 
 impl Policy {
-    /// Admits no client.
+    /// A policy that admits no client.
     pub(super) fn nobody() -> (Policy, View) {
         let write = WriteAccess::ByAddress(Vec::new());
         (
@@ -76,7 +76,7 @@ impl Policy {
     }
 }
 
-/// Admits clients to one listener.
+/// Admits the clients of one listener.
 #[derive(Debug)]
 pub(crate) struct Admission {
     /// Number of the listener, unique in the server.
@@ -84,7 +84,7 @@ pub(crate) struct Admission {
     policy: ArcSwap<Policy>,
     view: Arc<PlantView>,
     state: Arc<ServerState>,
-    /// Ends all connections of the listener.
+    /// Token that ends all connections of the listener.
     cancel: CancellationToken,
 }
 
@@ -172,7 +172,7 @@ impl Admission {
             .run_until_cancelled(authenticator.authenticate(stream, peer))
             .await
         {
-            // Displaced, or the listener is closed.
+            // The connection was displaced, or its listener closed.
             None => {}
             Some(Ok((stream, client))) => {
                 let admitted = self.admit_authenticated(peer, &client);

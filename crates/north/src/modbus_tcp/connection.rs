@@ -278,7 +278,7 @@ enum Reading {
 
 /// An event of a connection.
 enum Event {
-    /// The bus has answered.
+    /// The bus has answered a request.
     Answer(AnsweredRequest),
     /// Number of bytes from the client, 0 at the end of the stream.
     Input(usize),

@@ -16,7 +16,7 @@ use crate::certificate;
 use crate::identity::{FileProblem, date, provider, seconds};
 use crate::pem;
 
-/// The lists of a file.
+/// The revocation lists of a file.
 pub(super) type Crls = Vec<CertificateRevocationListDer<'static>>;
 
 /// Reads the lists of a file, in PEM or DER, for the CAs `client_ca`; returns warnings with them.

@@ -14,7 +14,7 @@ use crate::order::Arrival;
 
 /// Initial input buffer: two frames, so that a thousand idle clients use little memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
-/// Maximum input buffer.
+/// Maximum size of the input buffer.
 const INPUT_MOST: usize = 32 * MAX_FRAME;
 /// Maximum output collected before it is written, bytes.
 const OUTPUT: usize = 32 * 1024;
@@ -37,7 +37,7 @@ pub(super) struct Dialogue {
     input: Vec<u8>,
     /// Bytes in `input` that are not processed yet.
     filled: usize,
-    /// Whether any frame arrived.
+    /// Whether any frame has arrived yet.
     begun: bool,
     /// How and when the bytes of the input arrived.
     arrivals: Arrivals,

@@ -80,7 +80,7 @@ impl PartialRead {
     }
 }
 
-/// State of a forwarded request.
+/// Progress of a forwarded request.
 #[derive(Debug)]
 pub(super) enum Progress {
     /// A command of the request is in the queue.
@@ -96,7 +96,7 @@ pub(super) enum Progress {
 #[derive(Debug)]
 pub(super) enum PendingRequest {
     Forwarded(Option<Box<ForwardedRequest>>, Placed),
-    /// A stop of all drives.
+    /// A stop of all drives waits for its result.
     StopAll(Option<(Header, RequestPdu)>, oneshot::Receiver<bool>),
 }
 

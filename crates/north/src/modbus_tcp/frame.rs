@@ -10,7 +10,7 @@ pub(crate) const MAX_FRAME: usize = HEADER + MAX_PDU;
 /// Offset of the length field, which counts unit id and PDU.
 const LENGTH: usize = 4;
 
-/// Transaction and unit of a frame.
+/// Transaction id and unit id of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Header {
     /// Transaction id; repeated in the reply.

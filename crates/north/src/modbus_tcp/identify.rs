@@ -18,7 +18,7 @@ const LAST_REGULAR: u8 = 0x7F;
 /// VendorName of every unit.
 const VENDOR: &str = "drivegate";
 
-/// The identification of a unit.
+/// The identification data of a unit.
 #[derive(Debug)]
 pub(super) struct Identity<'t> {
     /// ProductCode: name of the profile, or `gateway`.
@@ -95,7 +95,7 @@ mod tests {
         name: "pump-1",
     };
 
-    /// Ids and texts in a reply.
+    /// Ids and texts of the objects in a reply.
     fn objects(code: u8, object: u8) -> Result<Vec<(u8, String)>, Exception> {
         let Reply::DeviceIdentification(body) = NX.reply(code, object)? else {
             panic!("not an identification");

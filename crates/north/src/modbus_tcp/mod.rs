@@ -124,7 +124,7 @@ impl Options {
 pub struct Listener {
     /// Section of the configuration, for messages: `[modbus_tcp]`.
     pub section: String,
-    /// Addresses to listen on.
+    /// Addresses on which the server listens.
     pub listen: Vec<SocketAddr>,
     /// Networks whose clients may connect.
     pub allow: Vec<IpNet>,
@@ -144,7 +144,7 @@ pub enum Uncached {
     Refuse,
 }
 
-/// The running server.
+/// The running Modbus TCP server.
 pub type Server = TcpServer<ModbusTcp, Options>;
 
 /// The service for the clients of the listeners.

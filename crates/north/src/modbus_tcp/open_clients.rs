@@ -172,7 +172,7 @@ impl CertificateGuard {
         }
     }
 
-    /// Whether the client may not stay.
+    /// Whether the client must be disconnected.
     fn is_refused(&self, now: SystemTime) -> bool {
         let state = self.clients.lock();
         let Some(client) = state.open.get(&self.id) else {

@@ -39,7 +39,7 @@ pub(super) enum At {
     Model(u16),
     /// A register of the drive itself.
     Drive,
-    /// Nowhere.
+    /// The address has no register.
     Nowhere,
 }
 
@@ -200,7 +200,7 @@ pub(super) struct Routes {
     pub(super) stop_all: Arc<StopAll>,
     shown: Arc<Shown>,
     drives: Vec<DriveHandle>,
-    /// Index in `drives`.
+    /// Index in `drives` for each unit id.
     units: Vec<Option<u16>>,
     /// Whether a bus is visible, in the order of the plant.
     visible: Vec<bool>,

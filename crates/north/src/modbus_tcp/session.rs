@@ -349,7 +349,7 @@ impl ClientSession {
                 };
                 Decision::Drive(Box::new((forwarded, work)))
             }
-            // A heartbeat alone, or the hold.
+            // The write is only a heartbeat, or the hold.
             Decision::Reply(request, _) => match refused {
                 Some(code) => code.into(),
                 None => {

@@ -30,7 +30,7 @@ const HANDSHAKE: Duration = Duration::from_secs(10);
 /// The TLS listener.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tls {
-    /// Addresses to listen on.
+    /// Addresses on which the TLS listener listens.
     pub listen: Vec<SocketAddr>,
     /// Networks whose clients may connect.
     pub allow: Vec<IpNet>,
@@ -50,7 +50,7 @@ impl Tls {
     }
 }
 
-/// The rights of a client.
+/// The rights that a role grants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// The role may read.
@@ -149,7 +149,7 @@ impl Requirements {
     /// The requirements of the configuration.
     ///
     /// # Errors
-    /// The certificates cannot be used.
+    /// If the certificates cannot be used.
     pub(super) fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
         let verifier = tls.identity.verifier()?;
         Ok(Requirements {

@@ -9,7 +9,7 @@ use super::session::Will;
 /// The broker's capabilities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct BrokerLimits {
-    /// Number of unacknowledged messages.
+    /// Maximum number of unacknowledged messages.
     pub(super) window: usize,
     /// Maximum packet size, bytes.
     pub(super) max_packet: usize,
@@ -19,7 +19,7 @@ pub(super) struct BrokerLimits {
     pub(super) retains: bool,
     /// Whether the broker takes filters with `+` and `#`.
     pub(super) wildcards: bool,
-    /// Number of topic aliases.
+    /// Maximum number of topic aliases.
     pub(super) aliases: u16,
     /// Keep-alive interval that the broker set in place of ours, s.
     pub(super) keep_alive: Option<u16>,
@@ -82,7 +82,7 @@ pub(super) struct WillForm {
 }
 
 impl WillForm {
-    /// The form that is tried first.
+    /// The form of the will that is tried first.
     pub(super) fn first(retain: bool) -> WillForm {
         WillForm {
             not_retained: !retain,

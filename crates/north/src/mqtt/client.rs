@@ -183,7 +183,7 @@ impl PlainClient {
         self.commands.has_room() && self.outbox.has_room_for_results()
     }
 
-    /// A message left the outbox.
+    /// Notes that a message left the outbox.
     fn settled(&mut self, settled: Option<Settled>) {
         let Some(Settled { topic, kind }) = settled else { return };
         match kind {
@@ -388,7 +388,7 @@ impl session::Client for PlainClient {
         if !events.same_channel(&self.events) {
             self.events = events;
         }
-        // The publisher starts again.
+        // The publisher starts again with this plant.
         self.keep_recorded();
         let discovery = discovery_topics(self.announcer.as_mut(), &plant);
         self.publisher.adopt(&plant, discovery);

@@ -33,7 +33,7 @@ const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
-/// Processes commands and publishes their results.
+/// Processes MQTT commands and publishes their results.
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
@@ -86,11 +86,11 @@ struct PendingStop {
     report: oneshot::Receiver<StopReport>,
 }
 
-/// A finished command.
+/// A command whose result is known.
 #[derive(Debug)]
 pub(super) enum Finished {
     Command(PendingCommand, Answer, Shown),
-    /// A stop of all drives.
+    /// The result of a stop of all drives.
     StopAll(Reply, StopReport),
 }
 
@@ -409,7 +409,7 @@ struct QueueLimit {
     bytes: usize,
 }
 
-/// Commands in order.
+/// Commands in progress, in order.
 #[derive(Debug, Default)]
 struct PendingCommands {
     commands: VecDeque<PendingCommand>,

@@ -62,7 +62,7 @@ const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
 
-/// Events of a connection.
+/// Events of a connection to the broker.
 #[derive(Debug)]
 pub(super) enum Step {
     /// The broker accepted the connection: the client subscribes.
@@ -240,7 +240,7 @@ impl Connection {
         }
     }
 
-    /// The next event. Cancel safe.
+    /// The next event of the connection. Cancel safe.
     pub(super) async fn next(&mut self) -> Step {
         // The sender is dropped without a last event only if the task panicked.
         let silent = || Step::Lost("the MQTT client failed".to_string());

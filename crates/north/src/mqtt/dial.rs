@@ -37,7 +37,7 @@ impl Pace {
     }
 }
 
-/// The attempts of one client.
+/// The connection attempts of one client.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Dial(Arc<Mutex<Pace>>);
 
@@ -75,7 +75,7 @@ impl Dial {
         Err(failed)
     }
 
-    /// Waits until another attempt may follow.
+    /// Waits until another attempt is allowed.
     async fn turn(&self) {
         loop {
             let next = self

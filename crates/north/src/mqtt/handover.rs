@@ -17,11 +17,11 @@ pub struct Handover(Mutex<Left>);
 pub(super) struct Left {
     /// The retained topics of the client that runs.
     pub(super) retained: Vec<String>,
-    /// The events that were not read.
+    /// The events that were not published yet.
     pub(super) unread: Option<Receiver<Arc<Event>>>,
     /// State of the client with the topics of drivegate.
     pub(super) client: ClientLeft<OrdersLeft>,
-    /// State of the edge node.
+    /// State of the Sparkplug edge node.
     pub(super) node: ClientLeft<NodeOrdersLeft>,
 }
 
@@ -30,7 +30,7 @@ pub(super) struct Left {
 pub(super) struct ClientLeft<Orders> {
     /// The commands whose results are still owed.
     pub(super) orders: Option<Orders>,
-    /// The broker in use.
+    /// The broker that was in use.
     pub(super) broker: Option<Broker>,
 }
 

@@ -13,7 +13,7 @@ const ENTRIES: usize = 50;
 const BYTES: usize = 32 << 10;
 const COMPLETE: Duration = Duration::from_secs(10);
 
-/// Collects the values of one drive.
+/// Collects the changed values of one drive.
 #[derive(Debug)]
 pub(super) struct Recorder {
     topic: Arc<str>,
@@ -88,7 +88,7 @@ impl Recorder {
         None
     }
 
-    /// The arrays that are complete.
+    /// The completed arrays.
     pub(super) fn ripe(&mut self, now: Instant) -> Vec<Update> {
         let old = |begun| now.saturating_duration_since(begun) >= COMPLETE;
         let complete = self.entries >= ENTRIES || self.array.len() >= BYTES || self.begun.is_some_and(old);

@@ -22,7 +22,7 @@ const UNDER_WAY: usize = 8;
 /// Minimum time between two announcements of everything because Home Assistant was started.
 const BIRTHS: Duration = Duration::from_secs(10);
 
-/// The sources of the entities.
+/// What the entities get their values from.
 #[derive(Debug, Clone)]
 pub(super) struct Sources {
     pub(super) topics: Topics,

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 /// Keep-alive interval that the gateway requests, s.
 pub(super) const KEEP_ALIVE_S: u16 = 10;
-/// Keep-alive interval.
+/// Keep-alive interval of the connection.
 const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
 /// Time without a packet from the broker after which the connection is considered lost.
 const LOST: Duration = KEEP_ALIVE.saturating_mul(3);
@@ -42,17 +42,17 @@ impl Silence {
         }
     }
 
-    /// The broker sent a packet.
+    /// Notes that the broker sent a packet.
     pub(super) fn packet_received(&mut self, now: Instant) {
         (self.heard, self.pinged) = (now, None);
     }
 
-    /// The library sent a ping.
+    /// Notes that the library sent a ping.
     pub(super) fn pinged(&mut self, now: Instant) {
         self.pinged.get_or_insert(now);
     }
 
-    /// A test subscription was sent.
+    /// Notes that a test subscription was sent.
     pub(super) fn test_sent(&mut self) {
         self.asked = true;
     }

@@ -20,11 +20,11 @@ use super::{Broker, Options, Password, Secret, tls};
 /// The reasons of a broker that does not accept a password (any more): 0x86 and 0x87.
 const CREDENTIALS: [&str; 2] = ["BadUserNamePassword", "NotAuthorized"];
 
-/// The next action of the link.
+/// The next action that the link needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Due {
     Nothing,
-    /// The next attempt to connect.
+    /// The next attempt to connect is due.
     Connect,
     /// The connection must be given up, for this reason.
     GiveUp(&'static str),
@@ -97,7 +97,7 @@ impl BrokerLink {
         }
     }
 
-    /// The broker that is tried now.
+    /// The broker that is tried at present.
     pub(super) fn broker(&self) -> Broker {
         let broker = self.options.brokers.get(self.rotation.current());
         broker.cloned().unwrap_or_default()
@@ -180,7 +180,7 @@ impl BrokerLink {
         Some(limits)
     }
 
-    /// The action due now.
+    /// The action that is due now.
     pub(super) fn due(&mut self, now: Instant) -> Due {
         match &mut self.state {
             State::Down { retry_at } if now >= *retry_at => Due::Connect,

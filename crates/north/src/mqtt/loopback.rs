@@ -43,7 +43,7 @@ pub struct Loopback {
     held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
-    /// The connection to the broker.
+    /// The connection over which messages arrive.
     connection: Connection,
 }
 

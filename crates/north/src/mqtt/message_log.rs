@@ -37,7 +37,7 @@ struct Segment {
     number: u64,
     path: PathBuf,
     file: File,
-    /// End of the last record.
+    /// Position after the last record.
     end: u64,
     /// Up to here the records were loaded.
     read: u64,
@@ -48,11 +48,11 @@ struct Segment {
 /// The messages on disk, and after them the messages in memory.
 #[derive(Debug)]
 pub(super) struct MessageLog {
-    /// `None`: everything stays in memory.
+    /// The directory; `None` keeps everything in memory.
     place: Option<MessageLogDir>,
     segments: VecDeque<Segment>,
     next_segment: u64,
-    /// Loaded from disk, not taken yet.
+    /// Messages loaded from disk and not taken yet.
     loaded: VecDeque<(u64, Message)>,
     unwritten: VecDeque<(u64, Message)>,
     unwritten_bytes: usize,
@@ -80,14 +80,14 @@ struct MessageLogDir {
     /// First part of the names of the journal's files.
     name: &'static str,
     max_bytes: u64,
-    /// Creates the file of a segment.
+    /// Function that creates the file of a segment.
     create: fn(&Path) -> io::Result<File>,
     /// Locked while the journal is open, since two gateways would damage each other's files.
     lock: File,
 }
 
 impl MessageLog {
-    /// A journal without a disk.
+    /// A journal that is not written to disk.
     pub(super) fn in_memory() -> MessageLog {
         MessageLog {
             place: None,

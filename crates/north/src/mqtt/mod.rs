@@ -107,7 +107,7 @@ pub struct Options {
     /// Whether all brokers are reached with TLS (`mqtts://`).
     pub tls: bool,
     pub client_id: String,
-    /// User name, with password.
+    /// User name with its password.
     pub username: Option<String>,
     pub password: Option<Password>,
     /// Host and port of an HTTP proxy, by whose CONNECT all brokers are reached.
@@ -159,14 +159,14 @@ pub struct Telemetry {
     pub state: bool,
     /// Each point as a bare value.
     pub points: bool,
-    /// Values of an outage, afterwards.
+    /// Which values of an outage are published afterwards.
     pub history: History,
 }
 
-/// Quality of service of published messages.
+/// MQTT quality of service of published messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Qos {
-    /// 0: sent once, not acknowledged.
+    /// QoS 0: sent once, not acknowledged.
     AtMostOnce,
     /// QoS 1: a message is sent until the broker acknowledges it.
     AtLeastOnce,
@@ -175,19 +175,19 @@ pub enum Qos {
 /// Which values of an outage are published afterwards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum History {
-    /// No history.
+    /// No values of an outage are published.
     #[default]
     Off,
     /// Only values that changed.
     Changes,
-    /// The values of every sample.
+    /// The values of every sample are published.
     All,
 }
 
-/// Disk buffer.
+/// Buffer for messages on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Buffer {
-    /// Directory.
+    /// Directory of the buffer.
     pub dir: PathBuf,
     /// Maximum size on disk, bytes.
     pub max_bytes: u64,

@@ -63,13 +63,13 @@ impl Message {
 /// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
-    /// The latest telemetry of this topic.
+    /// The latest value of this telemetry topic.
     Latest(Arc<str>),
     /// Entry of a queue, with this serial number.
     Queued(MqttKind, u64),
 }
 
-/// An entry that left the outbox.
+/// A message that has left the outbox.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Settled {
     /// Topic of the message.
@@ -112,7 +112,7 @@ struct Entry {
     attempts: u8,
 }
 
-/// Messages in order.
+/// Messages of a kind in order.
 #[derive(Debug, Default)]
 struct Queue {
     entries: VecDeque<Entry>,
@@ -132,14 +132,14 @@ pub(super) struct Outbox {
     /// Topics with a waiting payload, oldest change first.
     order: VecDeque<Arc<str>>,
     results: Queue,
-    /// Waiting results by topic.
+    /// Number of waiting results by topic.
     results_of: HashMap<Arc<str>, usize>,
     events: Queue,
     history: Queue,
     serial: u64,
     /// Published messages whose packet id is not known yet.
     published: VecDeque<Key>,
-    /// Published, by packet id.
+    /// Published messages by packet id.
     unacknowledged: HashMap<u16, Key>,
     /// Whether the first topic of `order` is published before everything else.
     has_leader: bool,
@@ -194,7 +194,7 @@ impl Outbox {
         self.has_leader = true;
     }
 
-    /// Adds a result.
+    /// Adds a result of a command.
     pub(super) fn push_result(&mut self, message: Message) {
         *self.results_of.entry(message.topic.clone()).or_default() += 1;
         self.push(MqttKind::Result, message, None);
@@ -449,7 +449,7 @@ impl Outbox {
         Some(topic)
     }
 
-    /// Postponed messages may be published again.
+    /// Lets postponed messages be published again.
     pub(super) fn retry(&mut self) {
         self.latest.values_mut().for_each(|slot| slot.put_back = false);
         for queue in [&mut self.results, &mut self.events, &mut self.history] {

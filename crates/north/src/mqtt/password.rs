@@ -22,9 +22,9 @@ impl fmt::Debug for Secret {
 /// Source of the password.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Password {
-    /// The configuration.
+    /// The password from the configuration.
     Fixed(Secret),
-    /// The only line of this file.
+    /// The only line of this file is the password.
     File(PathBuf),
 }
 
@@ -37,13 +37,13 @@ pub enum SecretFault {
     /// The file has no text.
     #[error("it is empty")]
     Empty,
-    /// A password is one line.
+    /// The file has more than one line.
     #[error("it is not a password: it has several lines")]
     Lines,
 }
 
 impl Secret {
-    /// The only line of a file.
+    /// Reads the only line of a file.
     ///
     /// # Errors
     /// The file cannot be read, is empty, or has several lines.
@@ -62,7 +62,7 @@ impl Secret {
 }
 
 impl Password {
-    /// The password now.
+    /// The present password.
     ///
     /// # Errors
     /// If the password file contains no usable secret; contains the reason with the path of the file.

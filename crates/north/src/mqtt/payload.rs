@@ -70,14 +70,14 @@ impl StateContent {
 /// The state object of a drive.
 pub(super) struct StateObject<'s> {
     pub(super) shown: &'s StateContent,
-    /// Names in the order of `shown.points`.
+    /// Names of the points in `shown.points`.
     pub(super) names: &'s [String],
     /// The points' indices in the profile.
     pub(super) indices: &'s [PointIndex],
     pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
     pub(super) age: Option<Duration>,
-    /// Time of day.
+    /// Time of day of the values.
     pub(super) wall: SystemTime,
     /// Whether the state is from the past, as part of the history.
     pub(super) historical: bool,
@@ -283,7 +283,7 @@ pub(super) fn rfc3339(time: SystemTime) -> String {
     humantime::format_rfc3339_millis(time).to_string()
 }
 
-/// Milliseconds with three decimals.
+/// Time in milliseconds with three decimals.
 pub(super) fn milliseconds(time: Duration) -> f64 {
     rounded(time.as_secs_f64() * 1000.0, 1000.0)
 }

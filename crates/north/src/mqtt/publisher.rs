@@ -36,14 +36,14 @@ pub(super) struct Publisher {
     topics: Topics,
     pace: PublishInterval,
     telemetry: Telemetry,
-    /// Woken when a drive was updated.
+    /// Wakes the publisher when a drive was updated.
     fresh: Arc<Notify>,
     drives: Vec<DriveTopics>,
     /// Index of the drive that is looked at next among the drives that are due.
     cursor: usize,
     buses: Vec<BusTopic>,
     buses_at: Option<Instant>,
-    /// Additional retained topics.
+    /// Retained topics that other code publishes.
     besides: Vec<Arc<str>>,
     /// Largest packet of the broker, bytes.
     max_packet: usize,
@@ -76,7 +76,7 @@ struct DriveTopics {
     /// The last snapshot that was processed, and when the drive is processed again even without a new one.
     seen: Option<Arc<Snapshot>>,
     look_at: Option<Instant>,
-    /// `None`: only points are published.
+    /// Topic of the state; `None` if only points are published.
     state: Option<Arc<str>>,
     recorder: Recorder,
     /// Index in the profile and name of each published point.
@@ -97,7 +97,7 @@ struct PointTopic {
 
 #[derive(Debug, Clone, Copy)]
 enum PointSource {
-    /// Index in [`StateContent::points`].
+    /// Index of the point in [`StateContent::points`].
     Point(usize),
     State,
     FaultText,

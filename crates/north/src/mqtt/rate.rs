@@ -9,7 +9,7 @@ const SECOND: Duration = Duration::from_secs(1);
 /// The messages of the last second.
 #[derive(Debug, Default)]
 pub(super) struct Rate {
-    /// 0: any number.
+    /// Maximum messages per second; 0 is unlimited.
     limit: usize,
     sent: VecDeque<Instant>,
 }
@@ -22,7 +22,7 @@ impl Rate {
         }
     }
 
-    /// A message was written at `now`.
+    /// Notes a message written at `now`.
     pub(super) fn sent(&mut self, now: Instant) {
         if self.limit > 0 {
             self.forget(now);

@@ -47,7 +47,7 @@ pub(super) fn message(number: u64, message: &Message, bytes: &mut Vec<u8>) {
     );
 }
 
-/// The record of an acknowledgement.
+/// The record of an acknowledgement up to this number.
 pub(super) fn mark(number: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
     encode(ACKNOWLEDGED, number, &[], &mut bytes);

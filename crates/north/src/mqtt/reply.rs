@@ -61,7 +61,7 @@ fn matches(filter: &str, topic: &str) -> bool {
     levels.next().is_none()
 }
 
-/// Destination of a result.
+/// The destination of a result.
 #[derive(Debug)]
 pub(super) struct Reply {
     topic: String,
@@ -84,7 +84,7 @@ impl Reply {
         &self.topic
     }
 
-    /// The message with that result.
+    /// The message with this result.
     pub(super) fn with(&self, payload: Vec<u8>) -> Message {
         Message {
             correlation: self.correlation.clone(),

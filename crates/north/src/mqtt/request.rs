@@ -26,7 +26,7 @@ pub struct Incoming {
     pub response_topic: Option<String>,
     /// Correlation data that is sent back with the result.
     pub correlation: Option<Vec<u8>>,
-    /// Remaining life of the message, s.
+    /// Remaining time until the message expires, s.
     pub expiry: Option<u32>,
     /// The sender, from the user property `who`.
     pub who: Option<String>,

@@ -31,14 +31,14 @@ pub(super) struct Will {
     pub(super) retain: bool,
 }
 
-/// Parts that both clients have.
+/// State that both MQTT clients have.
 pub(super) struct Common {
     pub(super) link: BrokerLink,
     pub(super) plant: SharedPlant,
     /// The plant that the client observes.
     pub(super) observed: Arc<Plant>,
     pub(super) stats: Arc<NorthState>,
-    /// Woken when a drive was updated.
+    /// Wakes the client when a drive was updated.
     pub(super) fresh: Arc<Notify>,
     /// When to check the drives, even if none was updated.
     pub(super) look_at: Instant,
@@ -57,7 +57,7 @@ impl Common {
     }
 }
 
-/// Differences between the clients.
+/// The differences between the two MQTT clients.
 pub(super) trait Client {
     fn common(&mut self) -> &mut Common;
 
@@ -87,13 +87,13 @@ pub(super) trait Client {
     /// Whether the last will would be correct if the broker published it now: subscribers consider the client online.
     fn is_alive(&self) -> bool;
 
-    /// The connection is closed.
+    /// Notes that the connection is closed.
     fn down(&mut self);
 
     /// Follows this plant from now on, which replaces the previous one after a reload.
     fn adopt(&mut self, plant: Arc<Plant>);
 
-    /// Does all else that is due.
+    /// Does everything else that is due.
     fn check(&mut self, now: Instant);
 
     /// Checks the drives that were updated or are due, and sets when to check again.

@@ -60,7 +60,7 @@ pub(super) enum Loaded {
 #[derive(Debug, Default)]
 pub(super) struct Store {
     disk: Option<Disk>,
-    /// Messages given to the disk.
+    /// Number of messages given to the disk thread.
     pushed: Number,
     /// Number up to which no messages wait on disk.
     through: Number,
@@ -269,7 +269,7 @@ struct Thread {
     shared: Arc<Shared>,
     /// The topics to be kept for the next run.
     topics: Vec<String>,
-    /// The last number of earlier runs.
+    /// The last message number of earlier runs.
     base: u64,
     /// Whether the last write failed; logged once.
     failing: bool,

@@ -7,12 +7,12 @@ use std::sync::Arc;
 /// Messages that may wait between the client and the socket, at most.
 const MOST_WAITING: usize = 2048;
 
-/// A packet that was written.
+/// The kind of a packet that was written.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Packet {
     /// A message: topic, bytes of the payload, whether it is retained.
     Publish(Arc<str>, usize, bool),
-    /// A packet with so many filters.
+    /// A packet with this number of filters.
     Subscribe(usize),
     /// The question whether the broker is there.
     Ping,
@@ -76,7 +76,7 @@ impl Trail {
         self.last = Some(Packet::Ping);
     }
 
-    /// The last packet that was written.
+    /// The last packet that the library wrote.
     pub(super) fn last(&self) -> Option<&Packet> {
         self.last.as_ref()
     }

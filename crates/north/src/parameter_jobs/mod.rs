@@ -23,7 +23,7 @@ use crate::process_image::{Access, Machine};
 const EXPIRY: Duration = Duration::from_secs(60);
 /// Time without an answer after which the reading of a drive ends.
 const AWAY: Duration = Duration::from_secs(3600);
-/// Changes that an event names.
+/// Most changes that an event names.
 const NAMED_CHANGES: usize = 5;
 
 /// How a drive is read.
@@ -98,11 +98,11 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     vault.end(&machine, result);
 }
 
-/// Progress of a reading.
+/// Publishes the progress of a reading.
 struct ReadProgress {
     /// Number of addresses requested so far, and of all.
     progress: (usize, usize),
-    /// Time for that, without the pauses.
+    /// Time spent on the reading, without pauses.
     worked: Duration,
     /// What is read next.
     reading: Option<String>,

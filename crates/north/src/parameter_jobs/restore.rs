@@ -26,12 +26,12 @@ const EXPIRY: Duration = Duration::from_secs(30);
 /// The writes of a restore take at most one part in this number of a line's time.
 const SHARE: u32 = 5;
 
-/// Action on an interrupted restore.
+/// The action on an interrupted restore.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Again {
     /// Resumes the interrupted restore.
     Resume,
-    /// The former values are written.
+    /// Writes the former values back.
     Undo,
 }
 
@@ -337,7 +337,7 @@ fn start(
     tokio::spawn(run.carry_on());
 }
 
-/// A restore that is carried out.
+/// A restore that is being carried out.
 struct Run {
     /// The present name of the machine.
     name: String,
@@ -443,7 +443,7 @@ impl Run {
         self.rest(then, pause).await;
     }
 
-    /// Waits before what comes next.
+    /// Waits before the next step.
     async fn rest(&self, then: Then, pause: Duration) {
         let (waits, pause) = match then {
             Then::Go => (None, pause),

@@ -47,7 +47,7 @@ impl Concerning {
 /// The journal that concerns a drive, as the gateway is configured now.
 ///
 /// # Errors
-/// The journals cannot be looked for.
+/// If the journals cannot be searched for.
 pub(super) async fn concerning(
     vault: &Vault,
     plant: &SharedPlant,
@@ -101,7 +101,7 @@ fn found(params: &Path) -> std::io::Result<Vec<Found>> {
 /// The journals below a directory of readings that belong to no configured drive, each with the problem and the remedy.
 ///
 /// # Errors
-/// The directory cannot be read.
+/// If the directory cannot be read.
 pub fn orphans<'a>(
     params: &Path,
     drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,

@@ -21,7 +21,7 @@ struct State {
     floor: Instant,
     /// Whether the reader found nothing, and waits.
     waited: bool,
-    /// Date of the last read.
+    /// Arrival time of the last read bytes.
     last: Dated,
     /// Date of the first read since nothing was left.
     first: Dated,
@@ -156,7 +156,7 @@ mod tests {
             self.reader.nothing(self.start + MS * ms, || false);
         }
 
-        /// Reads at that time; the date.
+        /// Reads bytes at this time; returns their date.
         fn note_read(&self, ms: u32, all: bool) -> u128 {
             self.reader.note_read(self.start + MS * ms, all, || false);
             self.ms(&self.reader.last())

@@ -28,7 +28,7 @@ thread_local! {
 /// Most pauses that wait to be reported; they are reported ten times a second.
 const MOST_UNTOLD: usize = 8;
 
-/// Watches the threads of a runtime.
+/// Watches whether the threads of a runtime run.
 #[derive(Debug)]
 pub struct Watch {
     base: Instant,
@@ -227,7 +227,7 @@ fn in_nanos(time: Duration) -> u64 {
 /// workers.
 ///
 /// # Errors
-/// The system gives no threads.
+/// If the system cannot create threads.
 pub fn watched_runtime() -> io::Result<Runtime> {
     let watch = Watch::new(false);
     let [start, runs] = [watch.clone(), watch.clone()];
@@ -254,7 +254,7 @@ mod tests {
         (watch, start)
     }
 
-    /// A machine that was never suspended.
+    /// The boot time of a machine that was never suspended.
     fn boot(watch: &Watch, now: Instant) -> Duration {
         Duration::from_secs(5000) + now.duration_since(watch.base)
     }

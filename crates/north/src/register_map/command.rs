@@ -14,7 +14,7 @@ pub(crate) struct CommandWrite {
     pub(crate) points: Vec<(PointIndex, Value)>,
     /// The word written to 0x8100, if any.
     pub(crate) word: Option<u16>,
-    /// The heartbeat was written.
+    /// Whether the heartbeat was written.
     pub(crate) heartbeat: bool,
     /// Why everything except a stop is refused; `points` then holds the points of the stop.
     pub(crate) refused: Option<Refusal>,
@@ -25,7 +25,7 @@ pub(crate) struct CommandWrite {
 pub(crate) struct CommandContext {
     /// The command word last written; `None` if none was written since the server started.
     pub(crate) word: Option<u16>,
-    /// The drive has a fault.
+    /// Whether the drive has a fault.
     pub(crate) fault: bool,
 }
 

@@ -13,9 +13,9 @@ pub const BUS_BLOCK: u16 = 16;
 pub struct BusFigures {
     /// Whether the port is open.
     pub(crate) up: bool,
-    /// Drives configured.
+    /// Number of configured drives.
     pub(crate) drives: usize,
-    /// Drives online.
+    /// Number of drives that are online.
     pub(crate) online: usize,
     /// Line load, 0 to 1; unknown until the port was open for a second.
     pub(crate) load: Option<f64>,

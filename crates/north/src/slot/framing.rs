@@ -17,7 +17,7 @@ use crate::order::Arrival;
 /// programs and the delayed acknowledgements of TCP, shorter than the time after which tools repeat a request.
 const HALF_FRAME: Duration = Duration::from_millis(250);
 
-/// A request of a tool.
+/// A message of a tool.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum ToolFrame {
     /// A valid request.

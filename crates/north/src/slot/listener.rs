@@ -16,7 +16,7 @@ use crate::order::{Authority, Proof};
 use crate::reading::Dated;
 use crate::refusals::Refusals;
 
-/// The tools of an address.
+/// How the tools of an address are served.
 #[derive(Debug, Clone)]
 pub(super) struct Served {
     pub(super) terms: Arc<Terms>,
@@ -42,7 +42,7 @@ pub(crate) struct SlotListener {
     limit: Arc<ConnectionLimit>,
     refusals: Arc<Refusals>,
     cancel: CancellationToken,
-    /// Cancelled when the gateway stops.
+    /// Token that is cancelled when the gateway stops.
     stopping: CancellationToken,
 }
 

@@ -23,7 +23,7 @@ pub struct Loopback {
 }
 
 impl Loopback {
-    /// The tool at `peer`.
+    /// The tool with the address `peer`.
     pub fn new(slot: Slot, plant: SharedPlant, stats: Arc<NorthState>, peer: &str) -> Loopback {
         Loopback::of(
             Arc::new(Terms {

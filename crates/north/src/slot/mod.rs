@@ -127,7 +127,7 @@ fn limits() -> Limits {
     Limits::new(MAX_TOOLS, MAX_TOOLS)
 }
 
-/// The running slots.
+/// The running tool slot servers.
 pub type Server = TcpServer<Slots, Options>;
 
 /// The service for the tools of the listeners and pseudo-terminals.

@@ -33,9 +33,9 @@ pub(super) enum Meaning {
 /// Why a request of a tool is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// A Modbus exception.
+    /// The request is answered with a Modbus exception.
     Exception(Exception),
-    /// An N2 error code.
+    /// The request is answered with an N2 error code.
     Nak(u8),
 }
 
@@ -61,7 +61,7 @@ impl ToolRequest {
         self.address == 0 && protocol != Protocol::N2
     }
 
-    /// The frame of a refusal.
+    /// The frame that refuses the request.
     pub(super) fn refusal(&self, protocol: Protocol, why: Refused) -> Vec<u8> {
         let mut frame = Vec::with_capacity(12);
         match why {

@@ -31,11 +31,11 @@ pub(super) enum Decision {
     Refuse(Refused),
     /// The request is neither sent nor answered.
     Silent,
-    /// The bus answers.
+    /// The request waits for the bus.
     Wait(Work),
 }
 
-/// The work given to the bus.
+/// The work that was given to the bus.
 #[derive(Debug)]
 pub(super) enum Work {
     Exchange(Exchange),
@@ -324,7 +324,7 @@ impl Tool {
     }
 }
 
-/// The basis of a decision.
+/// The facts on which a decision is based.
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,

@@ -72,7 +72,7 @@ impl IntoResponse for CommandReply {
     }
 }
 
-/// The status of a result (`docs/commands.md`).
+/// The HTTP status of a result (`docs/commands.md`).
 fn status(outcome: &Outcome) -> StatusCode {
     match outcome {
         Outcome::Acknowledged(_) => StatusCode::OK,
@@ -266,7 +266,7 @@ impl Operating {
     /// Remembers a command that does more than stop.
     ///
     /// # Errors
-    /// The command must not be executed.
+    /// If the command must not be executed.
     fn remember(
         &self,
         drive: &DriveHandle,

@@ -29,12 +29,12 @@ impl Cookies {
         }
     }
 
-    /// The session's cookie of a request.
+    /// The value of the session cookie in a request.
     pub(super) fn session(&self, headers: &HeaderMap) -> Option<String> {
         find(headers, &self.session)
     }
 
-    /// The browser's mark of a request.
+    /// The value of the browser cookie in a request.
     pub(super) fn known(&self, headers: &HeaderMap) -> Option<String> {
         find(headers, &self.known)
     }
@@ -44,7 +44,7 @@ impl Cookies {
         self.set(&self.session, value, "")
     }
 
-    /// Removes the session's cookie.
+    /// The header that removes the session cookie.
     pub(super) fn clear_session(&self) -> Option<HeaderValue> {
         self.set(&self.session, "", "; Max-Age=0")
     }

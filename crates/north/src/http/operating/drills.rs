@@ -14,12 +14,12 @@ use super::super::replies::{Refused, Replied, not_found, refused};
 use super::asker::{Commander, Ordered};
 use crate::drill::{DrillRefusal, DrillReport, Kind};
 
-/// All known drills, the newest first.
+/// Handler: all known drills, newest first.
 pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {
     Json(app.north.drills.reports())
 }
 
-/// The report of one drill.
+/// Handler: the report of one drill.
 pub(in crate::http) async fn drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,
@@ -52,7 +52,7 @@ pub(in crate::http) async fn arm_drill(
     Ok((StatusCode::CREATED, Json(report)).into_response())
 }
 
-/// Starts an armed drill.
+/// Handler: starts an armed drill.
 pub(in crate::http) async fn start_drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,
@@ -64,7 +64,7 @@ pub(in crate::http) async fn start_drill(
     started.map(Json).map_err(|refusal| why_not(&refusal))
 }
 
-/// Ends one, which stops the motor.
+/// Handler: ends a drill, which stops the motor.
 pub(in crate::http) async fn end_drill(
     State(app): State<Arc<AppState>>,
     Path(id): Path<String>,

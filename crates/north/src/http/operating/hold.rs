@@ -16,7 +16,7 @@ use crate::command_json::HoldReply;
 use crate::order::Authority;
 use crate::permit::Verb;
 
-/// The holder of the drive.
+/// Handler: the holder of the drive.
 pub(in crate::http) async fn hold_of(
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,

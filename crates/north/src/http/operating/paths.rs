@@ -31,7 +31,7 @@ pub(in crate::http) fn may_change(method: &Method, path: &str) -> bool {
     ends_a_drill || (*method == Method::POST && changes)
 }
 
-/// Whether the path is about drills.
+/// Whether the path belongs to drills.
 fn is_drill(path: &str) -> bool {
     path == "/api/v1/drills" || path.starts_with("/api/v1/drills/")
 }

@@ -51,7 +51,7 @@ impl Session {
 #[derive(Debug, Default)]
 pub(super) struct Sessions {
     open: HashMap<[u8; 32], Session>,
-    /// Number of logins so far.
+    /// Number of sessions started so far.
     logins: u64,
 }
 
@@ -96,7 +96,7 @@ impl Sessions {
         }
     }
 
-    /// Ends the session of a cookie.
+    /// Ends the session with this cookie.
     pub(super) fn end(&mut self, cookie: &str) {
         self.open.remove(&hash(cookie));
     }

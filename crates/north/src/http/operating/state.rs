@@ -37,7 +37,7 @@ const CSRF: &str = "x-csrf-token";
 /// The state of commands over HTTP. Reloads and changes of listeners keep it.
 #[derive(Debug)]
 pub(in crate::http) struct Operating {
-    /// `None`: commands are off.
+    /// The users; `None` if commands are off.
     pub(super) users: Arc<ArcSwapOption<Users>>,
     state: Mutex<State>,
     verifier: Verifier,
@@ -65,10 +65,10 @@ pub(super) struct State {
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Operator {
     pub(super) user: Arc<str>,
-    /// See [`crate::order::Origin::with_login`].
+    /// Login name; see [`crate::order::Origin::with_login`].
     pub(super) login: Arc<str>,
     pub(super) address: IpAddr,
-    /// The interface.
+    /// The interface that the user used.
     pub(super) kind: SourceKind,
     pub(super) proof: Proof,
     pub(super) right: Right,
@@ -99,7 +99,7 @@ impl Operator {
 /// Why a request is not accepted as one of a user.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(in crate::http) enum Denied {
-    /// No session and no password.
+    /// The request has neither session nor password.
     #[error("log in first: POST /api/v1/login, or send user and password with each request (HTTP Basic)")]
     NotLoggedIn,
     /// The session has ended, or the cookie never belonged to one.
@@ -114,7 +114,7 @@ pub(in crate::http) enum Denied {
     /// Too many passwords wait to be verified.
     #[error("too many logins at once; try again")]
     Busy,
-    /// A page of someone else.
+    /// The request comes from a page of another site.
     #[error("the request comes from another origin")]
     OtherOrigin,
     /// The user lost the right while the request was coming in.
@@ -466,7 +466,7 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
 /// The header of HTTP Basic for `USER:PASSWORD`.
 pub fn basic_authorization(user_and_password: &str) -> String {
     let mut text = vec![0; Encoding::B64.encoded_len(user_and_password.as_bytes())];
-    // The buffer fits.
+    // The buffer is large enough.
     let text = Encoding::B64
         .encode(user_and_password.as_bytes(), &mut text)
         .unwrap_or_default();

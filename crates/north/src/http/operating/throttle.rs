@@ -45,7 +45,7 @@ struct Failures {
     last: Instant,
 }
 
-/// The attempts of late.
+/// Recent attempts to log in.
 #[derive(Debug, Default)]
 pub(super) struct Throttle {
     sources: HashMap<Source, Failures>,

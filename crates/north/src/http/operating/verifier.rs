@@ -46,7 +46,7 @@ impl Waiting {
 struct Queue {
     waiting: Vec<Waiting>,
     numbered: u64,
-    /// A thread takes from the queue.
+    /// Whether a thread processes the queue.
     served: bool,
     /// The working memory, while no thread runs.
     workspace: Workspace,
@@ -84,7 +84,7 @@ impl Queue {
     }
 }
 
-/// Compares passwords.
+/// Verifies passwords on its thread.
 #[derive(Debug, Default, Clone)]
 pub(super) struct Verifier(Arc<Mutex<Queue>>);
 

@@ -172,7 +172,7 @@ mod tests {
     use crate::event::EventKind;
     use crate::history::TriggerKind;
 
-    /// The document with all its files.
+    /// Size limit of the page with all its files, bytes.
     const MOST_BYTES: usize = 224 * 1024;
 
     #[test]

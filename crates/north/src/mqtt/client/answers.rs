@@ -1,4 +1,4 @@
-//! Messages that the broker refuses.
+//! Handles messages that the broker refuses.
 
 use rumqttc::PubAckReason;
 

@@ -10,7 +10,7 @@ impl PlainClient {
         match event {
             Ok(event) => self.store_event(&event),
             Err(RecvError::Lagged(lost)) => self.missed(lost),
-            // The plant was replaced.
+            // The plant was replaced, with its events.
             Err(RecvError::Closed) => self.events = self.common.plant.load().events.subscribe(),
         }
         self.take_pending_events();

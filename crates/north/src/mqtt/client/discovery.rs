@@ -10,9 +10,9 @@ use crate::mqtt::connection::{commanding, of_others};
 pub(super) enum Subscribed {
     /// The status that others publish in the gateway's name.
     Status,
-    /// The set topics.
+    /// Subscription to the set topics.
     Commands,
-    /// Home Assistant was started.
+    /// Subscription to the start message of Home Assistant.
     Birth,
     /// Retained discovery messages of an earlier run.
     Leftovers,

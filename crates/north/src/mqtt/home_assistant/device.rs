@@ -28,7 +28,7 @@ const MANUFACTURERS: [&str; 18] = [
     "Yaskawa",
 ];
 
-/// A device of Home Assistant.
+/// A device as Home Assistant sees it.
 #[derive(Debug)]
 pub(super) struct Device {
     id: String,
@@ -136,7 +136,7 @@ fn parts(head: &Value, entities: Entities, limit: usize) -> Vec<Vec<u8>> {
     let mut payloads = Vec::new();
     let (mut part, mut size) = (Map::new(), empty);
     for (key, entity) in entities {
-        // Quotes, colon and comma.
+        // Length including quotes, colon and comma.
         let more = key.len() + entity.to_string().len() + 4;
         if size + more > limit && !part.is_empty() {
             payloads.push(render(std::mem::take(&mut part)));

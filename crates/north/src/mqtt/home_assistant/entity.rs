@@ -26,7 +26,7 @@ const COMMANDS: [ModelPoint; 5] = [
 /// Limits of a command in percent where neither configuration nor profile has any.
 const PERCENT: (f64, f64) = (0.0, 100.0);
 
-/// Units of what is counted.
+/// Units of counters.
 const COUNTED: [&str; 7] = ["Wh", "kWh", "MWh", "varh", "kvarh", "kVAh", "m³"];
 /// Abbreviations that are written in capitals in the names of entities.
 const CAPITALS: [&str; 8] = ["ac", "dc", "id", "io", "pi", "pid", "pwm", "rms"];
@@ -75,7 +75,7 @@ pub(super) fn of_drive_availability(sources: &Sources, spec: &DriveSpec) -> Valu
     json!([{ "t": sources.topics.status() }, { "t": topic, "val_tpl": template }])
 }
 
-/// The health of the buses.
+/// Entities for the health of the buses.
 pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entities {
     let bus_entities = |bus: &String| {
         let entity = |platform, leaf: &str, name: &str, template: &str, more: Value| {
@@ -316,13 +316,13 @@ fn sensor_platform(point: &Point) -> Platform {
     }
 }
 
-/// How a value is shown.
+/// How Home Assistant displays a value.
 enum Shown<'p> {
     Plain,
     Bool,
     /// A number between limits; Home Assistant would refuse another one and keep the last.
     Within(f64, f64),
-    /// The texts of an enumeration.
+    /// As the texts of an enumeration.
     Texts(&'p Point),
 }
 
@@ -355,7 +355,7 @@ impl Shown<'_> {
     }
 }
 
-/// Unit and kind of a quantity.
+/// Unit and kind of a measured quantity.
 fn quantity(point: &Point) -> Value {
     let mut quantity = device_class(&point.unit);
     if !point.unit.is_empty() {

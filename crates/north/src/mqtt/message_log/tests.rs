@@ -267,7 +267,7 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
     for n in 101..201 {
         journal.append(event(n), false);
     }
-    // The disk has room again.
+    // The disk has free space again.
     let segment = journal.segments.front_mut().unwrap();
     fs::remove_file(&segment.path).unwrap();
     segment.file = real(&segment.path).unwrap();

@@ -8,7 +8,7 @@ use std::time::Duration;
 use crate::files::Patience;
 use crate::files::names::SPARKPLUG;
 
-/// Longest wait for the file.
+/// Longest wait for writing the file.
 const WRITE: Duration = Duration::from_secs(1);
 
 /// Numbers the connections from 0 to 255 and then from 0 again.

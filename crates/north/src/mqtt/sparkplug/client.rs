@@ -96,7 +96,7 @@ struct NodeClient {
     orders: Orders,
     bd_seq: BdSeq,
     bd_seq_fails: bool,
-    /// A message that found no room.
+    /// A message for which there was no room yet.
     held: Option<Message>,
     buses_at: Instant,
     /// Whether the death of the node is to be declared at this broker, and how long to wait before the next one.
@@ -290,7 +290,7 @@ impl NodeClient {
         }
     }
 
-    /// Whether another message may follow.
+    /// Publishes a message; returns whether another may follow.
     fn send(&mut self, message: Message) -> bool {
         let Some(limits) = self.common.link.limits() else {
             return false;
@@ -370,7 +370,7 @@ impl session::Client for NodeClient {
         match self.topics.parse(&message.topic) {
             Some(Received::State(form)) => self.on_state(&message.topic, form, &message.payload),
             Some(Received::NodeCommand) if !message.retain => self.on_node_command(&message),
-            // A retained command was cleared.
+            // The message clears a retained command.
             Some(Received::DeviceCommand(_)) if message.retain && message.payload.is_empty() => {}
             Some(Received::DeviceCommand(device)) if self.broker.commands => self.on_device_command(device, &message),
             _ => {}
@@ -401,7 +401,7 @@ impl session::Client for NodeClient {
         }
     }
 
-    /// A few drives in one call.
+    /// Checks a few drives in one call.
     fn publish_due(&mut self) {
         let (now, wall) = (Instant::now(), SystemTime::now());
         let drives = &self.drives;
@@ -452,7 +452,7 @@ impl session::Client for NodeClient {
         self.orders.is_idle()
     }
 
-    /// Declares the node dead.
+    /// Publishes the death of the node.
     async fn say_goodbye(&mut self) -> bool {
         self.held = None;
         let Some(limits) = self.common.link.ready() else {

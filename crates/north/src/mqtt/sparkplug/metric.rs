@@ -13,7 +13,7 @@ pub(super) struct Moment {
 }
 
 impl Moment {
-    /// The present.
+    /// The present moment.
     pub(super) fn present() -> Moment {
         Moment {
             now: Instant::now(),
@@ -44,7 +44,7 @@ impl Moment {
     }
 }
 
-/// A value of a metric.
+/// The value of a metric.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Datum {
     Bool(bool),
@@ -76,7 +76,7 @@ impl From<Value> for Datum {
 /// How soon changes of a metric are published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Pace {
-    /// Published after the minimum interval.
+    /// Published at most once per minimum interval.
     Normal,
     /// A value that changes continuously: published once a second, or together with others.
     Figure,

@@ -31,13 +31,13 @@ pub(super) use self::orders::NodeOrdersLeft;
 /// Configuration of the edge node; broker and credentials are those of the MQTT client.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Group id.
+    /// Id of the Sparkplug group.
     pub group: String,
-    /// Edge node id.
+    /// Id of the edge node.
     pub node: String,
     /// Id of the host that must be online before anything is published; empty for no such host.
     pub primary_host: String,
-    /// Metrics have aliases.
+    /// Whether metrics have aliases.
     pub alias: bool,
     /// Values of an outage are published afterwards.
     pub history: bool,

@@ -18,7 +18,7 @@ pub(super) const COMMAND_ERROR: &str = "command_error";
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Source {
     Point(PointIndex),
-    /// The text of an enumeration.
+    /// The text of an enumeration point.
     TextOf(PointIndex),
     State,
     FaultText,

@@ -23,7 +23,7 @@ use crate::plant::{Placed, Plant};
 const AWAITED: usize = 4096;
 /// Name in the audit of a command that could not be read.
 const UNREAD: &str = "a Sparkplug command";
-/// Metrics in a command.
+/// Most metrics in a command.
 const METRICS: usize = 64;
 
 /// The command processing of the Sparkplug node.
@@ -33,7 +33,7 @@ pub(super) struct Orders {
     client: Arc<str>,
     awaited: VecDeque<Awaited>,
     memory: SharedMemory,
-    /// Right of all hosts.
+    /// The right to write of all hosts.
     right: Right,
 }
 
@@ -202,7 +202,7 @@ impl Orders {
     }
 }
 
-/// The request in a message.
+/// The request contained in a message.
 struct Request {
     /// The metrics in the order of the message, with their places in the session.
     metrics: Vec<(Metric, Option<usize>)>,

@@ -27,11 +27,11 @@ pub(super) const FIXED_METRICS: usize = 2;
 /// The metric with which a host requests a birth.
 pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
 
-/// The configuration of the session.
+/// The configured rules of the session.
 #[derive(Debug, Clone)]
 pub(super) struct Rules {
     pub(super) topics: Topics,
-    /// Metrics have aliases.
+    /// Whether metrics have aliases.
     pub(super) alias: bool,
     /// Values of an outage are published afterwards.
     pub(super) history: bool,
@@ -49,7 +49,7 @@ pub(super) struct Packet {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// No connection, or no subscribed connection.
+    /// There is no connection, or it is not subscribed.
     Away,
     /// Connected; the primary host is not online.
     Waiting,
@@ -172,7 +172,7 @@ impl Session {
         }
     }
 
-    /// The broker granted the subscriptions.
+    /// Notes that the broker granted the subscriptions.
     pub(super) fn subscribed(&mut self) {
         if self.phase == Phase::Away {
             self.phase = match self.may_be_born() {
@@ -182,7 +182,7 @@ impl Session {
         }
     }
 
-    /// The connection has ended.
+    /// Notes that the connection has ended.
     pub(super) fn closed(&mut self) {
         self.phase = Phase::Away;
         (self.rebirth, self.born_at, self.node.born) = (false, None, false);
@@ -226,7 +226,7 @@ impl Session {
         self.rebirth = self.is_alive();
     }
 
-    /// The present values of the node.
+    /// Sets the present values of the node.
     pub(super) fn set_node(&mut self, samples: Vec<Sample>) {
         self.node.changed = true;
         self.node.now_is = samples;
@@ -375,7 +375,7 @@ impl Session {
         Ok(self.packet(Kind::DeviceData, Some(name), metrics, moment))
     }
 
-    /// The next message of the history.
+    /// The next message with past values.
     fn past(&mut self, moment: Moment) -> Result<Packet, Option<Instant>> {
         let holds = |device: &&mut Device| device.born && !device.history.is_empty();
         let device = self.devices.iter_mut().find(holds).ok_or(None)?;

@@ -63,7 +63,7 @@ impl Topics {
         }
     }
 
-    /// `device` only for types of devices.
+    /// The topic of a message type; `device` only for devices.
     pub(super) fn of(&self, kind: Kind, device: Option<&str>) -> String {
         let (group, kind, node) = (&self.group, kind.name(), &self.node);
         match device {

@@ -120,7 +120,7 @@ pub(super) enum DataType {
 }
 
 impl DataType {
-    /// The code in metrics and properties.
+    /// The code of the data type in metrics and properties.
     pub(super) fn code(self) -> u32 {
         self as u32
     }

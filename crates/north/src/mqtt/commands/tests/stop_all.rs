@@ -28,7 +28,7 @@ fn is_answered_once_all_stand() {
         let mut bench = SetTopics::new();
         assert_eq!(bench.take(stop(payload)), None);
         assert!(bench.commands.try_finished().is_none() && !bench.commands.is_idle());
-        // A reload meanwhile loses no answer.
+        // A reload in between loses no answer.
         bench.succeed_client();
         bench.stand();
         let ended = bench.commands.try_finished().expect("an answer");

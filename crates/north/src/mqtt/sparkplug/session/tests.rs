@@ -66,7 +66,7 @@ struct Watcher {
     values: BTreeMap<(String, String), (f64, u64)>,
     past: Vec<(String, String, f64, u64)>,
     deaths: Vec<String>,
-    /// Types of the messages in order.
+    /// Types of the received messages in order.
     order: Vec<(Kind, Option<String>)>,
 }
 
@@ -221,7 +221,7 @@ impl SessionWithHost {
             .unwrap()
     }
 
-    /// Sends up to `most` messages that are due; returns how many.
+    /// Number of waiting values of an outage.
     fn send(&mut self, most: usize) -> usize {
         let tick = self.tick();
         for count in 0..most {

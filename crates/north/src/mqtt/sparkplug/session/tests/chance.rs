@@ -1,4 +1,4 @@
-//! Connections, outages and changes by chance.
+//! Random connections, outages and changes.
 
 use super::*;
 
