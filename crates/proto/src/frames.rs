@@ -22,14 +22,14 @@ pub const GLITCH: usize = 2;
 pub enum Cut {
     /// A request of the other master; the PDU is `None` if the codec does not know it.
     Request {
-        /// The address; 0 is the broadcast.
+        /// Address of the drive; 0 is the broadcast.
         address: u8,
-        /// The request.
+        /// The request, if it was decoded.
         pdu: Option<RequestPdu>,
     },
     /// The reply to the request that is open.
     Reply {
-        /// The reply.
+        /// The decoded reply.
         reply: Reply,
         /// Whether the bytes could be a request of the other master as well.
         ambiguous: bool,
@@ -62,7 +62,7 @@ pub struct Frames {
     protocol: Protocol,
     format: LineFormat,
     bytes: Vec<u8>,
-    /// End of each character.
+    /// When the last bit of each character arrived.
     times: Vec<Instant>,
     last: Option<Instant>,
     held_back: Duration,

@@ -50,7 +50,7 @@ pub enum Decoded {
     Reply {
         /// Bytes of the buffer that the frame takes.
         used: usize,
-        /// The reply.
+        /// The reply that was decoded.
         reply: Reply,
     },
     /// A sound frame of someone else (other address, function or length): drop `used` bytes and
@@ -64,7 +64,7 @@ pub enum Decoded {
     Corrupt(&'static str),
 }
 
-/// The protocols a bus can speak.
+/// The protocols that a bus can use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Protocol {
@@ -89,7 +89,7 @@ impl Protocol {
         }
     }
 
-    /// The protocol of that name.
+    /// The protocol with this name.
     pub fn from_name(name: &str) -> Option<Protocol> {
         Protocol::ALL.into_iter().find(|p| p.name() == name)
     }

@@ -17,7 +17,7 @@ pub use request::RequestPdu;
 /// Largest PDU of the protocol, function code included.
 pub const MAX_PDU: usize = 253;
 
-/// The four tables of Modbus.
+/// The four data tables of Modbus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Table {
@@ -57,7 +57,7 @@ impl Table {
         }
     }
 
-    /// The table of that name.
+    /// The table with this name.
     pub fn from_name(name: &str) -> Option<Table> {
         [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding]
             .into_iter()

@@ -36,7 +36,7 @@ pub const LONGEST: usize = 256;
 
 /// Baud rate and character format, always (reference/n2.md 1).
 pub const BAUD: u32 = 9600;
-/// Character format, always.
+/// Character format of every N2 line.
 pub const FORMAT: &str = "8N1";
 /// Time for the first byte of a reply (reference/n2.md 4).
 pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
@@ -48,14 +48,14 @@ pub const RETRIES: u32 = 2;
 pub enum Session {
     /// Identify device type. A restarted drive answers no other command before this one.
     Identify,
-    /// Poll for changes.
+    /// Poll of the drive for changes.
     Poll {
         /// Whether the poll acknowledges the previous report.
         again: bool,
     },
     /// Returns an overridden object to the drive's own control.
     Release {
-        /// Table of the object.
+        /// Modbus table of the object.
         table: Table,
         /// The first PDU address of the object to release.
         address: u16,
@@ -146,15 +146,15 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
 pub enum Form {
     /// A status byte with the state.
     State,
-    /// A float, perhaps behind a byte.
+    /// A float, possibly after a status byte.
     Float,
     /// 16 bits, perhaps behind a byte.
     Integer,
-    /// The device type.
+    /// The device type of the drive.
     Identity,
     /// The answer contains change records, possibly none.
     Changes,
-    /// No data: an acknowledgement.
+    /// An acknowledgement without data.
     Acknowledgement,
     /// Any answer, for a request that is not decoded.
     Any,

@@ -11,7 +11,7 @@ pub enum Parity {
     None,
     /// The characters have even parity.
     Even,
-    /// Odd parity.
+    /// The characters have odd parity.
     Odd,
 }
 
@@ -20,11 +20,11 @@ pub enum Parity {
 pub struct LineFormat {
     /// Bits a second, 300 and more.
     pub baud: u32,
-    /// 7 or 8.
+    /// Number of data bits: 7 or 8.
     pub data_bits: u8,
-    /// Parity.
+    /// Parity of the characters.
     pub parity: Parity,
-    /// 1 or 2.
+    /// Number of stop bits: 1 or 2.
     pub stop_bits: u8,
 }
 
@@ -77,7 +77,7 @@ impl LineFormat {
         })
     }
 
-    /// The character format alone: `8N1`.
+    /// The character format as text: `8N1`.
     pub fn characters(&self) -> String {
         let parity = match self.parity {
             Parity::None => 'N',
@@ -92,13 +92,13 @@ impl LineFormat {
         1 + u32::from(self.data_bits) + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits)
     }
 
-    /// Time of `chars` characters.
+    /// Wire time of `chars` characters.
     pub fn chars(&self, chars: usize) -> Duration {
         let bits = u64::from(self.bits_per_char()) * chars as u64;
         Duration::from_nanos(bits * 1_000_000_000 / u64::from(self.baud.max(1)))
     }
 
-    /// 3.5 characters at any baud.
+    /// Wire time of 3.5 characters at any baud rate.
     pub fn silence_chars(&self) -> Duration {
         self.chars(7) / 2
     }
@@ -129,9 +129,9 @@ pub enum Silence {
     /// 3.5 characters, 1.75 ms above 19200 baud.
     #[default]
     Spec,
-    /// 3.5 characters at any baud.
+    /// Silence of 3.5 characters at any baud rate.
     Chars,
-    /// A fixed time, for slow drives.
+    /// Silence of a fixed time, for slow drives.
     Fixed(Duration),
 }
 

@@ -21,7 +21,7 @@ pub enum Reply {
     Changes(Vec<u8>),
     /// Reply to a request that is not decoded: the PDU, or on N2 the line without its CR.
     Other(Vec<u8>),
-    /// Refused.
+    /// The drive refused the request.
     Exception(Exception),
 }
 

@@ -1,4 +1,4 @@
-//! Requests to and from bytes.
+//! Encodes and decodes requests.
 
 use super::super::n2::Session;
 use super::{Exception, Table, be, counted, pack, put, unpack, words};
@@ -6,7 +6,7 @@ use super::{Exception, Table, be, counted, pack, put, unpack, words};
 /// A request of a master.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum RequestPdu {
-    /// Functions 1 to 4.
+    /// Read by functions 1 to 4.
     Read {
         /// The table that is read.
         table: Table,
@@ -15,18 +15,18 @@ pub enum RequestPdu {
         /// Items, 1..=125 registers or 1..=2000 bits.
         count: u16,
     },
-    /// Function 5.
+    /// Write of one coil by function 5.
     WriteCoil {
         /// PDU address.
         address: u16,
-        /// State to set.
+        /// State of the coil to set.
         on: bool,
     },
-    /// Function 6.
+    /// Write of one register by function 6.
     WriteRegister {
         /// PDU address.
         address: u16,
-        /// Value.
+        /// Value to write.
         value: u16,
     },
     /// Function 15.
@@ -47,9 +47,9 @@ pub enum RequestPdu {
     MaskWrite {
         /// PDU address.
         address: u16,
-        /// Bits to keep.
+        /// Bits of the register to keep.
         and_mask: u16,
-        /// Bits to set where not kept.
+        /// Bits to set where they are not kept.
         or_mask: u16,
     },
     /// Function 23: first writes, then reads.
@@ -63,9 +63,9 @@ pub enum RequestPdu {
         /// 1..=121 values to write.
         values: Vec<u16>,
     },
-    /// Function 8.
+    /// Diagnostics by function 8.
     Diagnostics {
-        /// Subfunction.
+        /// Number of the subfunction.
         subfunction: u16,
         /// Data word of the subfunction.
         data: u16,
@@ -90,7 +90,7 @@ impl RequestPdu {
         RequestPdu::Read { table, start, count }
     }
 
-    /// Function 6: one holding register.
+    /// Write of one holding register by function 6.
     pub const fn write_register(address: u16, value: u16) -> RequestPdu {
         RequestPdu::WriteRegister { address, value }
     }

@@ -16,7 +16,7 @@ pub enum RegionWidth {
 }
 
 impl RegionWidth {
-    /// The number in profiles.
+    /// The number of digits in profiles.
     pub fn digits(self) -> u8 {
         match self {
             RegionWidth::One => 1,
@@ -48,7 +48,7 @@ pub struct N2Options {
 }
 
 impl N2Options {
-    /// The defaults.
+    /// The default N2 options.
     pub const DEFAULT: N2Options = N2Options {
         state_bit: 6,
         unreliable_bit: None,
@@ -79,7 +79,7 @@ pub const INVALID_FLOAT: u32 = 0x7FC0_0000;
 pub struct Assumption {
     /// Key of `[n2]` in a profile that changes the assumption; `None` if it need not be changed.
     pub key: Option<&'static str>,
-    /// The assumption.
+    /// The assumption, as text.
     pub what: &'static str,
     /// The reason for the assumption.
     pub why: &'static str,

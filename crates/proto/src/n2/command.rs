@@ -6,9 +6,9 @@ use crate::ascii::digit;
 
 /// The drive has restarted and waits for Identify.
 pub const RESTARTED: u8 = 0x00;
-/// The command is not known.
+/// Error code: the command is unknown.
 pub const UNKNOWN: u8 = 0x01;
-/// The checksum is wrong.
+/// Error code: the checksum is wrong.
 pub const CHECKSUM: u8 = 0x02;
 /// The message is longer than 256 characters.
 pub const OVERRUN: u8 = 0x03;
@@ -25,29 +25,29 @@ pub const LONGEST_REPORT: usize = 200;
 /// A command of a master.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Command {
-    /// F.
+    /// Command F: identify device type.
     Identify,
-    /// 0/0, the payload is not known.
+    /// Command 0/0, whose payload is unknown.
     SyncTime,
-    /// 0/1.
+    /// Command 0/1: read memory.
     ReadMemory,
     /// 0/4 without, 0/5 with acknowledge of the report before.
     Poll {
         /// Whether the poll acknowledges the previous report.
         again: bool,
     },
-    /// 0/8.
+    /// Command 0/8: warm reset.
     WarmReset,
-    /// 0/9.
+    /// Command 0/9: status.
     Status,
-    /// 1.
+    /// Command 1: read an attribute.
     Read {
         /// The object whose attribute is read.
         object: Object,
         /// The attribute that is read.
         attribute: u8,
     },
-    /// 2.
+    /// Command 2: write an attribute.
     Write {
         /// The object whose attribute is written.
         object: Object,
@@ -56,14 +56,14 @@ pub enum Command {
         /// The bytes of the value, as many as were received.
         data: Vec<u8>,
     },
-    /// 7/2.
+    /// Command 7/2: override.
     Override {
         /// The object that is overridden.
         object: Object,
         /// The value: a float, an integer or a byte.
         data: Vec<u8>,
     },
-    /// 7/3.
+    /// Command 7/3: release.
     Release {
         /// The object that is released.
         object: Object,
@@ -233,21 +233,21 @@ fn bytes(digits: &[u8]) -> Result<Vec<u8>, u8> {
 pub enum Answer {
     /// The command is done; to a poll: nothing new.
     Ack,
-    /// Hexadecimal digits.
+    /// An answer with hexadecimal digits.
     Data(Vec<u8>),
     /// Refused; the two printed digits of the code read as hexadecimal.
     Nak(u8),
 }
 
 impl Answer {
-    /// An answer of whole bytes.
+    /// An answer that encodes whole bytes.
     pub fn bytes(data: &[u8]) -> Answer {
         let mut digits = Vec::with_capacity(2 * data.len());
         data.iter().for_each(|byte| put(*byte, &mut digits));
         Answer::Data(digits)
     }
 
-    /// Appends the frame to `out`.
+    /// Appends the frame of the answer to `out`.
     pub fn encode(&self, out: &mut Vec<u8>) {
         match self {
             Answer::Ack => out.extend(*b"A\r"),
@@ -319,7 +319,7 @@ fn put(byte: u8, out: &mut Vec<u8>) {
     out.extend([digit(byte >> 4), digit(byte & 0x0F)]);
 }
 
-/// The value of a digit.
+/// The value of a hexadecimal digit.
 pub(super) fn hex_value(digit: u8) -> Option<u8> {
     char::from(digit).to_digit(16).map(|value| value as u8)
 }

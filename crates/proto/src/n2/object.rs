@@ -38,12 +38,12 @@ impl Region {
         Region::Bd,
     ];
 
-    /// The region of that number.
+    /// The region with this number.
     pub fn from_number(number: u8) -> Option<Region> {
         Region::ALL.into_iter().find(|region| *region as u8 == number)
     }
 
-    /// The short name of the manuals.
+    /// The abbreviation used in the manuals.
     pub fn name(self) -> &'static str {
         match self {
             Region::Ai => "AI",
@@ -69,7 +69,7 @@ impl Region {
         matches!(self, Region::Adf | Region::Adi | Region::Bd)
     }
 
-    /// Bytes of an override's value.
+    /// Number of bytes of an override's value.
     pub fn override_bytes(self) -> usize {
         match self {
             Region::Ai | Region::Ao | Region::Adf => 4,
@@ -79,7 +79,7 @@ impl Region {
     }
 }
 
-/// An object of a drive.
+/// An N2 object of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Object {
     /// Region of the object.
@@ -126,7 +126,7 @@ impl Object {
 }
 
 impl fmt::Display for Object {
-    /// `AI 2`.
+    /// Formats an object like `AI 2`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} {}", self.region.name(), self.number)
     }
