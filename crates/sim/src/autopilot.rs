@@ -49,7 +49,7 @@ impl Autopilot {
         self.at
     }
 
-    /// Does what is due at `now`.
+    /// Does what the autopilot has due at `now`.
     pub(crate) fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
         match self.next {
             Next::Start => {

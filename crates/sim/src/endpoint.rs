@@ -46,9 +46,9 @@ pub enum EndpointOptions {
     },
     /// The line dials in at a gateway, as a modem does.
     Dial {
-        /// The gateway.
+        /// Address of the gateway to dial.
         server: SocketAddr,
-        /// Text sent first after connecting.
+        /// Text to send first after connecting.
         text: String,
     },
 }

@@ -14,11 +14,11 @@ use std::time::Duration;
 /// In what a foreign reply differs from the true one. The data always differs; the check code is valid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Foreign {
-    /// The reply comes from another drive.
+    /// The reply carries the address of another drive.
     Address,
-    /// The reply is to another function.
+    /// The reply carries another function.
     Function,
-    /// A reply of another length.
+    /// The reply has another length.
     Length,
     /// Only the data of the reply differs from the true one.
     Data,
@@ -49,7 +49,7 @@ pub enum Fault {
     DeafEcho,
     /// Noise runs into the beginning of the reply.
     NoiseBefore,
-    /// Noise follows the reply.
+    /// Noise bytes follow the reply.
     NoiseAfter,
     /// The reply is delivered character by character.
     Split,

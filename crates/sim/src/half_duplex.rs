@@ -40,12 +40,12 @@ pub enum Wire {
     Instant,
 }
 
-/// Rules that the line follows.
+/// Rules for the timing of a simulated line.
 #[derive(Debug, Clone)]
 pub struct LineRules {
     /// Protocol of the drives.
     pub protocol: Protocol,
-    /// Baud and character format.
+    /// Baud rate and character format.
     pub format: LineFormat,
     /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and
     /// the reply. A drive whose manual states another time uses that one.
@@ -113,7 +113,7 @@ struct Outgoing {
     kind: Kind,
 }
 
-/// When the line needs attention again.
+/// When the line must be serviced next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wake {
     /// Time of the wake-up.
@@ -127,7 +127,7 @@ pub struct Wake {
 pub struct Act {
     /// When the last character of the request had arrived.
     pub at: SimTime,
-    /// The drive.
+    /// Address of the drive.
     pub address: u8,
     /// Frame of the drive's reply, without the effects of faults.
     pub reply: Vec<u8>,
@@ -159,7 +159,7 @@ pub struct HalfDuplex {
 }
 
 impl HalfDuplex {
-    /// A silent line.
+    /// A line without traffic so far.
     pub fn new(rules: LineRules, slaves: Slaves, faults: FaultPlan, transcript: Transcript) -> HalfDuplex {
         HalfDuplex {
             rules,
@@ -189,7 +189,7 @@ impl HalfDuplex {
         &self.rules
     }
 
-    /// The drives.
+    /// The drives on the line.
     pub fn slaves(&mut self) -> &mut Slaves {
         &mut self.slaves
     }

@@ -31,7 +31,7 @@ impl<D: Model> InTime<D> {
         self.drive.answer(request, self.now)
     }
 
-    /// Registers of a table.
+    /// Reads registers of a table.
     pub(crate) fn registers(&mut self, table: Table, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         match self.ask(&RequestPdu::read(table, start, count)) {
             Some(Reply::Registers(values)) => Ok(values),
@@ -40,7 +40,7 @@ impl<D: Model> InTime<D> {
         }
     }
 
-    /// The drive is written to.
+    /// Writes to the drive.
     pub(crate) fn written(&mut self, request: &RequestPdu) -> Result<(), Exception> {
         match self.ask(request) {
             Some(Reply::Written) => Ok(()),

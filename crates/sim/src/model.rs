@@ -22,7 +22,7 @@ pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Command {
     pub run: bool,
-    /// Counterclockwise.
+    /// Whether the direction is counterclockwise.
     pub reverse: bool,
     /// Speed reference, 0.01 % of what the drive calls 100 %, -10000..=10000.
     pub reference: i16,
@@ -33,7 +33,7 @@ pub struct Command {
 pub struct DriveState {
     /// Whether the drive would run on a run command.
     pub ready: bool,
-    /// The inverter feeds the motor.
+    /// Whether the inverter feeds the motor.
     pub running: bool,
     /// The motor turns counterclockwise, or is about to.
     pub reverse: bool,
@@ -50,7 +50,7 @@ pub struct DriveState {
 pub(crate) struct Body {
     pub(super) motor: Motor,
     pub(super) latch: Latch,
-    /// A run command is obeyed.
+    /// Whether a run command is obeyed.
     pub(super) running: bool,
     powered: bool,
     steps: Steps,
@@ -138,7 +138,7 @@ pub(crate) trait Model: fmt::Debug {
         Some(exception)
     }
 
-    /// A request to all drives.
+    /// Processes a request to all drives.
     fn broadcast(&mut self, request: &RequestPdu, now: SimTime);
 
     /// Notes a valid message on the bus to this drive or to all drives.
@@ -237,12 +237,12 @@ impl Beyond {
 pub enum ReadOnly {
     /// Exception 02.
     Exception,
-    /// Acknowledged and forgotten.
+    /// The write is acknowledged and ignored.
     Ignored,
 }
 
 impl ReadOnly {
-    /// The outcome of such a write.
+    /// The outcome of a write to a read-only register.
     ///
     /// # Errors
     /// Exception 02, unless such accesses are ignored.
@@ -337,7 +337,7 @@ pub(super) fn unsigned(value: f64) -> u16 {
     value.round().clamp(0.0, f64::from(u16::MAX)) as u16
 }
 
-/// `mask` when `on`.
+/// `mask` if `on`, otherwise 0.
 pub(super) fn bit(on: bool, mask: u16) -> u16 {
     if on { mask } else { 0 }
 }

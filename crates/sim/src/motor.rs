@@ -34,7 +34,7 @@ pub struct Load {
     pub inertia: f64,
     /// Supply, V; the DC link has 1.35 times as much.
     pub mains: f64,
-    /// Air around the heatsink, degrees Celsius.
+    /// Temperature of the air at the heatsink, °C.
     pub ambient: f64,
 }
 
@@ -79,14 +79,14 @@ pub(crate) struct Motor {
     pub fed: bool,
     /// Torque, % of nominal.
     pub torque: f64,
-    /// Heatsink, degrees Celsius.
+    /// Temperature of the heatsink, °C.
     pub heatsink: f64,
     /// Calculated heat of the motor, %.
     pub heat: f64,
 }
 
 impl Motor {
-    /// A motor at rest, cold.
+    /// A cold motor at rest.
     pub(crate) fn new(load: &Load) -> Motor {
         Motor {
             output: 0.0,

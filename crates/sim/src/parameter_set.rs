@@ -8,9 +8,9 @@ use super::random::Random;
 pub(crate) struct Parameter {
     /// ID or address of the parameter.
     pub key: u16,
-    /// Least value.
+    /// Least valid value.
     pub min: u16,
-    /// Greatest value.
+    /// Greatest valid value.
     pub max: u16,
     /// Present value of the parameter.
     pub value: u16,
@@ -19,7 +19,7 @@ pub(crate) struct Parameter {
 /// Why a parameter was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refused {
-    /// No parameter has this key.
+    /// There is no parameter with this key.
     Unknown,
     /// The value is outside the parameter's range, or beyond a parameter that limits it.
     Value,
@@ -28,7 +28,7 @@ pub enum Refused {
 /// How often a parameter was written over the bus.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Writes {
-    /// Writes that the drive took.
+    /// Number of writes that the drive accepted.
     pub taken: u32,
     /// Number of writes during which the inverter fed the motor.
     pub while_fed: u32,
@@ -145,7 +145,7 @@ impl ParameterSet {
     /// Gives all parameters except `spared` random values that writes could have set.
     pub(crate) fn fill(&mut self, random: &mut Random, spared: &[u16]) {
         for p in self.all.iter_mut().filter(|p| !spared.contains(&p.key)) {
-            // Inside the range of a register.
+            // The value stays inside the parameter's range.
             p.value = random.within(u64::from(p.min)..=u64::from(p.max)) as u16;
         }
         for &(upper, lower) in &self.limits.clone() {

@@ -249,7 +249,7 @@ fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
             .values()
             .all(|writes| writes.taken <= 1 && writes.kept <= 1 && writes.while_fed == 0)
     );
-    // The addresses of objects are others.
+    // N2 objects have other addresses.
     for write in plan.writes.iter().filter(|_| !is_n2) {
         let expected = Writes {
             taken: 1,

@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 pub struct Random(u64);
 
 impl Random {
-    /// A generator with that seed.
+    /// A random generator with this seed.
     pub fn new(seed: u64) -> Random {
         // Zero is the one state that xorshift never leaves; mixing also separates neighbouring seeds.
         let mixed = seed
@@ -24,7 +24,7 @@ impl Random {
         self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
     }
 
-    /// A number in 0.0..1.0.
+    /// A random number in 0.0..1.0.
     pub fn unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 / (1u64 << 53) as f64
     }

@@ -180,7 +180,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Advances to `now`.
+    /// Advances the drive to `now`.
     pub fn advance(&mut self, now: SimTime) {
         let drive = self.model.get_mut();
         if let Some(autopilot) = &mut self.autopilot {

@@ -24,7 +24,7 @@ pub enum FrameMeaning {
     Nobody(u8),
     /// A broadcast, which the drives carried out.
     Broadcast,
-    /// A request to this drive.
+    /// A request to one drive.
     Request(Asked),
     /// The check code is wrong, and the drive whose address was received answers that by this exception.
     Damaged(Asked, Exception),
@@ -53,7 +53,7 @@ pub struct Slaves {
     drives: BTreeMap<u8, SimulatedDrive>,
     /// N2 boards of the drives, on an N2 line.
     boards: BTreeMap<u8, Board>,
-    /// The drive that [`Slaves::advance_next`] served last.
+    /// The drive that [`Slaves::advance_next`] last served.
     served: u8,
 }
 
@@ -69,7 +69,7 @@ impl Slaves {
         slaves
     }
 
-    /// Makes all N2 boards so.
+    /// Sets these options for all N2 boards.
     pub(crate) fn set_boards(&mut self, options: BoardOptions) {
         for board in self.boards.values_mut() {
             board.options = options;
@@ -410,7 +410,7 @@ mod tests {
         let mut out = Vec::new();
         refuse(&asked, exception, &mut out);
         assert_eq!(ascii::open_frame(&out), Some((1, vec![0x83, 0x00])));
-        // Sound frames are answered as ever.
+        // Valid frames are answered as usual.
         assert_eq!(ask(&mut line, ascii, 1, &[0x03, 0, 0x40, 0, 1]), [3, 2, 0, 10]);
         for (protocol, address) in [(ascii, 2), (ascii, 3), (ascii, 4), (ascii, 0), (RTU, 1)] {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);

@@ -8,11 +8,11 @@ use std::time::Duration;
 /// Counters of a line since its start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Statistics {
-    /// Sound requests to drives that answer.
+    /// Valid requests to drives that answer.
     pub requests: u64,
     /// Reply frames sent, exceptions among them; frames that a fault added do not count.
     pub replies: u64,
-    /// Sound broadcasts.
+    /// Valid broadcasts.
     pub broadcasts: u64,
     /// Valid requests to addresses without a drive that answers.
     pub unanswered: u64,
@@ -24,7 +24,7 @@ pub struct Statistics {
     pub collisions: u64,
     /// Requests that collided with a frame from fault injection (late, doubled, noise), which is not the master's fault.
     pub provoked_overlaps: u64,
-    /// Faults injected.
+    /// Number of injected faults.
     pub faults: u64,
     /// Bytes from the master.
     pub bytes_in: u64,
@@ -59,7 +59,7 @@ pub struct Lateness {
     recent: VecDeque<Duration>,
 }
 
-/// Samples kept for the quantiles.
+/// Number of samples kept for the quantiles.
 const LATENESS_KEPT: usize = 16_384;
 
 impl Lateness {
@@ -85,7 +85,7 @@ impl Lateness {
 /// The sender of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
-    /// The master.
+    /// From the master to the drives.
     ToDrives,
     /// A drive, or a fault in place of a drive.
     FromDrives,

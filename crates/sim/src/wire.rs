@@ -68,7 +68,7 @@ const REOPEN: Duration = Duration::from_secs(1);
 /// Longest wait for the thread of the line to carry out an action.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Whether the port should exist.
+/// Whether the simulated port should exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Wanted {
     Present,
@@ -297,7 +297,7 @@ impl SimulatedBus {
     /// The adapter is plugged in again: a new pseudo-terminal stands under the same link.
     ///
     /// # Errors
-    /// The port cannot be opened again.
+    /// If the port cannot be opened again.
     pub fn restore(&self) -> io::Result<()> {
         {
             let mut port = self.shared.port();
@@ -334,7 +334,7 @@ fn ranges(addresses: &[u8]) -> String {
     runs.iter().map(text).collect::<Vec<String>>().join(", ")
 }
 
-/// The thread of a line.
+/// The thread that runs a line.
 struct Runner<F> {
     shared: Arc<Shared>,
     open: F,

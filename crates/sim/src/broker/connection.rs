@@ -24,7 +24,7 @@ const OUTPUT_BYTES: usize = 64 * 1024;
 enum End {
     /// The client's DISCONNECT.
     Left { with_will: bool },
-    /// Client or network are gone.
+    /// The client or the network has gone.
     Lost,
     /// The broker ends the connection.
     Closed(Fault),

@@ -62,7 +62,7 @@ mod property {
     pub(crate) const OF_WILL: &[u8] = &[1, 2, 3, 8, 9, 24, USER];
     /// Properties that subscribers get as the publisher sent them.
     pub(crate) const FORWARDED: &[u8] = &[1, 3, 8, 9, USER];
-    /// Reason string.
+    /// Properties of acknowledgements: reason string.
     pub(crate) const OF_ACK: &[u8] = &[31, USER];
     pub(crate) const OF_DISCONNECT: &[u8] = &[17, 31, USER];
 }
@@ -70,9 +70,9 @@ mod property {
 /// Version of MQTT, which a client chooses by the level byte of its CONNECT.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Version {
-    /// Level 4.
+    /// MQTT 3.1.1, protocol level 4.
     V311,
-    /// Level 5.
+    /// MQTT 5.0, protocol level 5.
     V5,
 }
 
@@ -140,9 +140,9 @@ impl Message {
 #[derive(Debug)]
 pub(super) struct Connect {
     pub(super) version: Version,
-    /// Empty: the broker assigns one.
+    /// Client id; empty if the broker must assign one.
     pub(super) client_id: String,
-    /// Zero: no supervision.
+    /// Keep-alive time; zero means no supervision.
     pub(super) keep_alive: Duration,
     /// Most unacknowledged QoS 1 messages that the client accepts.
     pub(super) receive_maximum: usize,

@@ -14,9 +14,9 @@ use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source, Valu
 
 /// Rank of a state that was given.
 const GIVEN: u8 = 0;
-/// kW of the simulated motor.
+/// Power of the simulated motor, kW.
 const NOMINAL_POWER: f64 = 3.0;
-/// Nm of the simulated motor.
+/// Torque of the simulated motor, Nm.
 const NOMINAL_TORQUE: f64 = 19.9;
 
 impl ProfileDrive {
@@ -67,7 +67,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Commands hold 0 until somebody writes.
+    /// Whether a command register stays 0 until it is written.
     fn is_kept_back(&self, point: &Point, raw: &Raw) -> bool {
         let is_place = |control: &crate::drive::control::Control| {
             let places = super::effect::places(control);
@@ -128,7 +128,7 @@ impl ProfileDrive {
         }
     }
 
-    /// Brings all registers up to date.
+    /// Updates all registers for this time.
     pub(super) fn show(&mut self, now: SimTime) {
         let profile = self.profile();
         let mut figures: BTreeMap<Key, u16> = BTreeMap::new();
@@ -223,7 +223,7 @@ impl ProfileDrive {
         self.body.shows_running() && self.run.is_some() && near
     }
 
-    /// Whether only a master changes it.
+    /// Whether only a master changes the value.
     fn is_written(&self, point: &Point, raw: &Raw) -> bool {
         let own = self.control.as_ref().is_some_and(|control| {
             let at = raw.covers(control.at.table, control.at.address);
@@ -404,7 +404,7 @@ fn usual(point: &Point, raw: &Raw) -> Option<Given> {
         "ms" => 500.0,
         "rpm" => 0.0,
         _ if name.contains("fault") || name.contains("alarm") || name.contains("error") => 0.0,
-        // Status words, and powers of ten.
+        // Hidden points are status words or powers of ten.
         _ if point.hidden => 0.0,
         _ if name.contains("scale") || name.contains("exponent") => 0.0,
         _ => 1.0,

@@ -57,7 +57,7 @@ pub enum Given {
 }
 
 impl ProfileOptions {
-    /// A drive of that profile.
+    /// Options of a drive with this profile.
     pub fn new(profile: &Arc<Profile>) -> ProfileOptions {
         ProfileOptions {
             profile: Arc::clone(profile),
@@ -102,7 +102,7 @@ pub struct ProfileDrive {
     ratings: Ratings,
     load: Load,
     body: Body,
-    /// The control word that counted last.
+    /// The control word that was last in force.
     word: u16,
     /// Number of words of the start sequence that the drive has received, and when its status shows that.
     position: usize,
@@ -112,7 +112,7 @@ pub struct ProfileDrive {
     reverse: bool,
     coasts: bool,
     remote: bool,
-    /// kWh.
+    /// Consumed energy, kWh.
     energy: f64,
     hours: f64,
 }

@@ -18,11 +18,11 @@ pub(super) enum MotorEffect {
     Stops,
     /// The drive lets the motor coast; its start sequence starts again.
     Coasts,
-    /// An external fault.
+    /// The word causes an external fault.
     Trips,
 }
 
-/// All effects of a word.
+/// All effects of a control word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct WordEffect {
     pub(super) does: MotorEffect,
@@ -35,21 +35,21 @@ pub(super) struct WordEffect {
 /// State of the drive that determines the effect of a word.
 #[derive(Clone, Copy)]
 pub(super) struct Known<'d> {
-    /// The word that counted last.
+    /// The word that was in force before.
     pub(super) before: u16,
     /// How many words of the start sequence the drive has received.
     pub(super) position: usize,
     pub(super) faulted: bool,
-    /// Whether reverse was commanded last.
+    /// Whether reverse was last commanded.
     pub(super) reverse: bool,
-    /// Reads the registers at other addresses.
+    /// Function that reads registers at other addresses.
     pub(super) at: &'d dyn Fn(Table, u16) -> u16,
 }
 
 /// A family with hand-written words.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Family {
-    /// Name in profiles.
+    /// Name of the profile.
     pub(super) name: &'static str,
     /// Effect of the control word.
     pub(super) word: fn(&Known<'_>, u16) -> WordEffect,
@@ -177,7 +177,7 @@ fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if !is(word, 0x0008) => MotorEffect::Coasts,
         _ if !is(word, 0x0054) => MotorEffect::Stops,
-        // Frozen, or a jog.
+        // The word freezes the drive, or is a jog.
         _ if !is(word, 0x0020) || any(word, 0x0100) => MotorEffect::Nothing,
         _ => runs(is(word, 0x8000)),
     };
@@ -309,7 +309,7 @@ fn ls(known: &Known<'_>, word: u16) -> WordEffect {
     effect(does, rises(known, word, 0x0008), word)
 }
 
-/// Bit 2 is an external fault.
+/// TECO: bit 2 of the word is an external fault.
 fn teco(known: &Known<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if is(word, 0x0004) => MotorEffect::Trips,

@@ -48,7 +48,7 @@ impl Registers {
         self.0.get_mut(&key).map(|held| *held = value).ok_or(Exception::ADDRESS)
     }
 
-    /// Sets some bits of one.
+    /// Sets some bits of a register.
     pub(super) fn place(&mut self, key: Key, part: Part) {
         if let Some(held) = self.0.get_mut(&key) {
             *held = *held & !part.mask | part.value & part.mask;

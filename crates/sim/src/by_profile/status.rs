@@ -11,7 +11,7 @@ pub(super) struct Shows {
     pub(super) running: bool,
     /// A run command holds; else a running motor comes down.
     pub(super) commanded: bool,
-    /// The direction that was ordered last.
+    /// The direction that was last ordered.
     pub(super) ordered_reverse: bool,
     /// The direction in which the motor turns, or is about to turn.
     pub(super) turns_reverse: bool,
@@ -19,7 +19,7 @@ pub(super) struct Shows {
     pub(super) standing: bool,
     pub(super) fault: u16,
     pub(super) remote: bool,
-    /// The control word that counts.
+    /// The control word in force.
     pub(super) word: u16,
 }
 

@@ -23,7 +23,7 @@ const MOST_TRIES: usize = 4000;
 /// Most ways to keep a state off that the search follows.
 const MOST_WAYS: usize = 24;
 
-/// Bits whose values are decided.
+/// Bits whose values are fixed already.
 type Fixed = BTreeMap<Key, Part>;
 
 /// Bits that satisfy the wishes; an earlier wish takes precedence over later ones that contradict it. Bits with a

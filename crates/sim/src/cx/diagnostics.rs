@@ -2,7 +2,7 @@
 
 use crate::codec::{Exception, Reply};
 
-/// Subfunctions.
+/// Numbers of the subfunctions.
 mod subfunction {
     pub(super) const ECHO: u16 = 0x0000;
     pub(super) const REINITIALISE: u16 = 0x0001;
@@ -20,17 +20,17 @@ mod subfunction {
 pub struct Counters {
     /// Valid frames on the line, for any address.
     pub bus_messages: u16,
-    /// Frames with a wrong checksum.
+    /// Counter of frames with a wrong checksum.
     pub bus_errors: u16,
-    /// Exceptions that this slave sent.
+    /// Counter of exceptions that this slave sent.
     pub exceptions: u16,
-    /// Frames for this slave, broadcasts included.
+    /// Counter of frames for this slave, including broadcasts.
     pub slave_messages: u16,
     /// Frames for this slave that the slave did not answer, including broadcasts.
     pub no_responses: u16,
 }
 
-/// The communication part of the board.
+/// The diagnostics of the communication board.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Diagnostics {
     pub(super) counters: Counters,

@@ -35,11 +35,11 @@ struct Coils {
 /// Lifetime counters of the drive; they survive a power cycle.
 #[derive(Debug, Clone, Copy)]
 struct Totals {
-    /// Operating days.
+    /// Counter of operating days.
     days: f64,
     /// Operating hours since the counter was reset.
     trip_hours: f64,
-    /// Energy, MWh.
+    /// Energy counter, MWh.
     energy: f64,
     /// Energy since the counter was reset, MWh.
     trip_energy: f64,
@@ -153,7 +153,7 @@ impl CxDrive {
         self.coils.reset = on;
     }
 
-    /// The command that holds now.
+    /// The command in force: run and reference.
     fn held(&self) -> (bool, f64) {
         if !self.fieldbus {
             return (self.local.run, self.frequency(self.local));

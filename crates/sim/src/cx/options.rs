@@ -1,4 +1,4 @@
-//! Options of a simulated CX.
+//! Options of a simulated Vacon CX.
 
 use super::super::model::Beyond;
 use super::super::motor::Load;
@@ -8,10 +8,10 @@ use std::str::FromStr;
 /// Items per message; the manual states no limits and shows one item everywhere (reference/drives.md 9.7).
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Coils or discrete inputs.
+    /// Most coils or discrete inputs per message.
     pub bits: u16,
     pub registers: u16,
-    /// The answer to more.
+    /// The reaction to more items.
     pub beyond: Beyond,
 }
 
@@ -31,14 +31,14 @@ impl Default for Limits {
 pub struct AddressOffset {
     pub coil: u16,
     pub discrete_input: u16,
-    /// Input registers.
+    /// Offset of the input registers.
     pub input: u16,
-    /// Holding registers.
+    /// Offset of the holding registers.
     pub holding: u16,
 }
 
 impl AddressOffset {
-    /// The offset of that table.
+    /// The address offset of this table.
     pub fn of(&self, table: Table) -> u16 {
         match table {
             Table::Coil => self.coil,
@@ -81,16 +81,16 @@ impl FromStr for AddressOffset {
 pub enum OutOfRange {
     /// Exception 03.
     Exception,
-    /// The nearest allowed value is taken.
+    /// The nearest allowed number is used.
     Clamp,
 }
 
 /// Options of a simulated CX.
 #[derive(Debug, Clone)]
 pub struct CxOptions {
-    /// Load and mains.
+    /// Load of the motor and mains.
     pub load: Load,
-    /// Items per message.
+    /// Maximum items per message.
     pub limits: Limits,
     /// Offsets added to the addresses.
     pub offset: AddressOffset,

@@ -102,7 +102,7 @@ impl Parameters {
     /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
     ///
     /// # Errors
-    /// The errors of [`Parameters::set`].
+    /// If the value is refused; see [`Parameters::set`].
     pub(super) fn write(&mut self, address: u16, value: u16, fed: bool) -> Result<(), Refused> {
         self.set.write(address, value, fed)?;
         self.set.record_kept(address);
@@ -114,12 +114,12 @@ impl Parameters {
         self.set.writes().clone()
     }
 
-    /// Random values for all.
+    /// Gives all parameters random values.
     pub(super) fn fill(&mut self, random: &mut Random) {
         self.set.fill(random, &[]);
     }
 
-    /// Minimum frequency, Hz.
+    /// The minimum frequency parameter, Hz.
     pub(super) fn minimum(&self) -> f64 {
         f64::from(self.set.number(MINIMUM_FREQUENCY)) * self.frequency_step
     }

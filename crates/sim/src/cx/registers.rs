@@ -6,7 +6,7 @@ use super::parameters::Refused;
 use super::{AT_REFERENCE_BAND, CxDrive, CxOptions, OutOfRange};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
-/// Functions that the board knows.
+/// Function codes that the board supports.
 pub(super) const FUNCTIONS: [u8; 7] = [1, 2, 3, 4, 5, 6, 8];
 
 /// Item of the active fault among the input registers; the monitoring variables n1 to n99 lie below.

@@ -15,7 +15,7 @@ const HEADER: usize = 6;
 /// Longest wait for a connection, and the pause between two tries.
 const CONNECT: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(1));
 
-/// A line behind a network.
+/// A simulated line that is reached over a network.
 #[derive(Debug)]
 pub(crate) struct Network {
     way: Way,

@@ -96,12 +96,12 @@ pub enum Kind {
     Echo,
 }
 
-/// Characters without a gap.
+/// Characters that are sent without a gap.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Burst {
     /// Time between the characters before the burst and its first character.
     pub gap: Duration,
-    /// The characters.
+    /// The bytes of the characters.
     pub bytes: Vec<u8>,
     /// How the burst relates to the expected reply.
     pub kind: Kind,
@@ -151,7 +151,7 @@ fn garble(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
         // The digit is changed, so that the LRC is wrong.
         0 => *digit = if *digit == b'0' { b'1' } else { b'0' },
         1 => *digit |= 0x80,
-        // An odd number of digits.
+        // Removing one digit makes their number odd.
         _ => drop(reply.remove(at)),
     }
     reply

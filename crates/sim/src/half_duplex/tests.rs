@@ -1,4 +1,4 @@
-//! The wire in virtual time.
+//! Tests of the wire in virtual time.
 
 use super::super::simulated_drive::{DriveOptions, ModelOptions};
 use super::super::teco::TecoOptions;

@@ -11,7 +11,7 @@ pub enum Backing {
     Signed(Table, u16, f64),
     /// An unsigned register; the value of one count.
     Unsigned(Table, u16, f64),
-    /// A bit of a register.
+    /// A single bit of a register.
     Bit(Table, u16, u8),
     /// A constant, because the model has no such value.
     Fixed(f32),
@@ -45,11 +45,11 @@ pub struct Map {
     /// Whether an override of AI, BI or ADI changes what the bus reads until a release; otherwise override and
     /// release do nothing.
     pub overrides_inputs: bool,
-    /// AI have alarm and warning limits.
+    /// Whether AI objects have alarm and warning limits.
     pub has_limits: bool,
-    /// The warm reset is known.
+    /// Whether the board knows the warm reset.
     pub warm_reset: bool,
-    /// Overrides beyond the parameter's limits.
+    /// The reaction to overrides beyond a parameter's limits.
     pub beyond: Beyond,
     /// Overrides are released after about 10 minutes without a poll.
     pub stands_alone: bool,
@@ -182,7 +182,7 @@ pub(crate) const HVX: Map = Map {
     ..NX
 };
 
-/// A family without N2.
+/// The empty map of a family without N2.
 pub(crate) const NONE: Map = Map { entries: &[], ..NX };
 
 /// TECO 7300PA with its PA-C card, from the column "Modbus" of the tables.

@@ -27,7 +27,7 @@ pub(crate) const ALONE: Duration = Duration::from_secs(600);
 pub struct BoardOptions {
     /// A byte, the object's status, stands before the value of a read.
     pub leading_byte: bool,
-    /// Refusals have a checksum.
+    /// Whether refusals have a checksum.
     pub nak_checksum: bool,
     /// Bit of a status byte that is the state of BI and BO.
     pub state_bit: u8,
@@ -52,7 +52,7 @@ impl Default for BoardOptions {
 /// The drive behind a board, which may give no reply.
 pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 
-/// The board of one drive.
+/// The N2 board of one drive.
 #[derive(Debug, Clone)]
 pub struct Board {
     /// Options of the board; may change at any time.
@@ -75,7 +75,7 @@ pub struct Board {
 }
 
 impl Board {
-    /// A board that was switched on.
+    /// A board that was just switched on.
     pub fn new(map: &'static Map, now: SimTime) -> Board {
         Board {
             options: BoardOptions::default(),

@@ -36,9 +36,9 @@ const PROCESS_DATA: usize = 11;
 /// Control word, ID 2001 (reference/drives.md 3.4).
 pub mod control_word {
     pub const RUN: u16 = 1 << 0;
-    /// Counterclockwise.
+    /// Control word bit: counterclockwise.
     pub const REVERSE: u16 = 1 << 1;
-    /// Fault reset by rising edge.
+    /// Control word bit: fault reset by rising edge.
     pub const RESET: u16 = 1 << 2;
     /// HVX: enable bypass.
     pub const BYPASS: u16 = 1 << 3;
@@ -55,22 +55,22 @@ pub mod control_word {
 /// Status word, ID 2101 (reference/drives.md 3.6).
 pub mod status_word {
     pub const READY: u16 = 1 << 0;
-    /// Running.
+    /// Status word bit: running.
     pub const RUN: u16 = 1 << 1;
-    /// Counterclockwise.
+    /// Status word bit: counterclockwise.
     pub const REVERSE: u16 = 1 << 2;
     pub const FAULT: u16 = 1 << 3;
     pub const WARNING: u16 = 1 << 4;
-    /// Reference reached.
+    /// Status word bit: reference reached.
     pub const AT_REFERENCE: u16 = 1 << 5;
-    /// Motor at zero speed.
+    /// Status word bit: motor at zero speed.
     pub const ZERO_SPEED: u16 = 1 << 6;
     pub const FLUX_READY: u16 = 1 << 7;
     /// Torque control's speed limit is **not** active.
     pub const NO_SPEED_LIMIT: u16 = 1 << 8;
     /// The encoder detects counterclockwise rotation.
     pub const ENCODER_REVERSE: u16 = 1 << 9;
-    /// Undervoltage fast stop is **not** active.
+    /// Status bit: undervoltage fast stop is **not** active.
     pub const NO_UNDERVOLTAGE_STOP: u16 = 1 << 10;
     /// HVX: bypass activated.
     pub const BYPASS: u16 = 1 << 6;
@@ -86,7 +86,7 @@ pub const FIELDBUS_FAULT: u16 = 53;
 /// Control place from which a drive takes its commands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ControlPlace {
-    /// I/O terminals.
+    /// Control by the I/O terminals.
     Terminals,
     Panel,
     Fieldbus,
@@ -304,7 +304,7 @@ impl NxDrive {
         }
     }
 
-    /// The command that holds now.
+    /// The command in force.
     fn held(&self) -> Command {
         match self.settings.place {
             ControlPlace::Fieldbus => Command {
@@ -387,7 +387,7 @@ impl Model for NxDrive {
         }
     }
 
-    /// Restarts the supervision.
+    /// Restarts the supervision time.
     fn message_received(&mut self, now: SimTime) {
         self.heard = Some(now);
         self.lost_master = false;

@@ -7,7 +7,7 @@ use std::time::Duration;
 /// Content of the read-only registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Values {
-    /// Values of the simulated motor.
+    /// Registers have values of the simulated motor.
     Physical,
     /// `tag` in the high byte, the low byte of the register's PDU address in the low byte: proves in a test that a
     /// value came from this register of this drive.
@@ -46,13 +46,13 @@ pub struct SpeedReference {
 /// Options of a simulated drive of the family.
 #[derive(Debug, Clone)]
 pub struct NxOptions {
-    /// Load and mains.
+    /// Load of the motor and mains.
     pub load: Load,
     /// Registers per message and what happens beyond.
     pub limits: Limits,
     /// Registers without a meaning inside the process data ranges.
     pub hole: Hole,
-    /// Writes to read-only registers.
+    /// Reaction to writes to read-only registers.
     pub read_only: ReadOnly,
     /// Silence on the bus that counts as loss of the master; zero switches the supervision off. Parameter 5 of the board.
     pub timeout: Duration,

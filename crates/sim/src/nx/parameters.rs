@@ -48,7 +48,7 @@ pub struct Parameters(ParameterSet);
 
 impl Default for Parameters {
     fn default() -> Self {
-        // (ID, minimum, maximum, default)
+        // Fields: ID, minimum, maximum, default.
         let plain = [
             (MINIMUM_FREQUENCY, 0, 32_000, 0),
             (MAXIMUM_FREQUENCY, 100, 32_000, 5000),
@@ -100,7 +100,7 @@ impl Parameters {
     /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
     ///
     /// # Errors
-    /// The errors of [`Parameters::set`].
+    /// If the value is refused; see [`Parameters::set`].
     pub(super) fn write(&mut self, id: u16, value: u16, fed: bool) -> Result<(), Refused> {
         self.0.write(id, value, fed)?;
         self.0.record_kept(id);

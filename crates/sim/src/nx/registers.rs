@@ -11,9 +11,9 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 pub struct Limits {
     /// Reading actual values, the fault code and parameters.
     pub read: u16,
-    /// Writing parameters.
+    /// Most parameters per write.
     pub write: u16,
-    /// Reading and writing process data.
+    /// Most process data items per message.
     pub process: u16,
     /// The answer to a count beyond the limit; the manuals do not say which.
     pub beyond: Beyond,

@@ -44,7 +44,7 @@ pub enum StatusBits {
     Hvx,
 }
 
-/// Signals by bit.
+/// Signals of a status word by bit.
 type Layout = &'static [(u8, Signal)];
 
 const COMMON: Layout = &[

@@ -27,7 +27,7 @@ pub(crate) mod operation {
     pub(crate) const RUN: u16 = 1 << 0;
     pub(crate) const REVERSE: u16 = 1 << 1;
     pub(crate) const EXTERNAL_FAULT: u16 = 1 << 2;
-    /// Fault reset.
+    /// Control bit: fault reset.
     pub(crate) const RESET: u16 = 1 << 3;
     /// Multifunction reference 1; 2 to 4 follow.
     pub(crate) const MULTIFUNCTION_1: u16 = 1 << 4;
@@ -35,24 +35,24 @@ pub(crate) mod operation {
 
 /// Bits of the fault contents, register 0021H (reference/drives.md 5.4).
 pub(crate) mod fault {
-    /// Overcurrent or ground fault.
+    /// Fault bit: overcurrent or ground fault.
     pub(crate) const OVERCURRENT: u16 = 1 << 0;
     pub(crate) const OVERVOLTAGE: u16 = 1 << 1;
     pub(crate) const INVERTER_OVERLOAD: u16 = 1 << 2;
-    /// Inverter overheat.
+    /// Fault bit: inverter overheat.
     pub(crate) const OVERHEAT: u16 = 1 << 3;
-    /// External fault.
+    /// Fault bit: external fault.
     pub(crate) const EXTERNAL: u16 = 1 << 7;
     pub(crate) const CONTROL_CIRCUIT: u16 = 1 << 8;
     pub(crate) const MOTOR_OVERLOAD: u16 = 1 << 9;
-    /// Undervoltage or power loss.
+    /// Fault bit: undervoltage or power loss.
     pub(crate) const POWER: u16 = 1 << 12;
     /// All bits that have a meaning.
     pub(crate) const ALL: u16 =
         OVERCURRENT | OVERVOLTAGE | INVERTER_OVERLOAD | OVERHEAT | EXTERNAL | CONTROL_CIRCUIT | MOTOR_OVERLOAD | POWER;
 }
 
-/// Drive terminals, bit 0 terminal 1.
+/// Bits of the drive's terminals; bit 0 is terminal 1.
 mod terminal {
     pub(super) const FORWARD: u16 = 1 << 0;
     pub(super) const REVERSE: u16 = 1 << 1;
@@ -61,7 +61,7 @@ mod terminal {
     pub(super) const MULTIFUNCTION_1: u16 = 1 << 4;
 }
 
-/// Control registers with a meaning.
+/// The control registers that have a meaning.
 #[derive(Debug, Clone, Copy, Default)]
 struct Control {
     /// 0001H.
@@ -83,7 +83,7 @@ pub(crate) struct TecoDrive {
     body: Body,
     mode: Mode,
     control: Control,
-    /// Terminals 1 to 8.
+    /// States of terminals 1 to 8.
     terminals: u16,
     /// State of frequency detections 1 and 2, which have a hysteresis.
     detected: [bool; 2],

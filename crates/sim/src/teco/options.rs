@@ -69,15 +69,15 @@ pub enum DetectionLevels {
 /// Options of a simulated TECO 7300PA.
 #[derive(Debug, Clone)]
 pub struct TecoOptions {
-    /// Load and mains.
+    /// Load of the motor and mains.
     pub load: Load,
-    /// The operator's mode after power-on.
+    /// Mode of the operator panel after power-on.
     pub mode: Mode,
     /// How Sn-08 and Sn-24 store their digits.
     pub digits: Digits,
     /// The levels of frequency detection.
     pub detection_levels: DetectionLevels,
-    /// Writes to monitor registers.
+    /// Reaction to writes to monitor registers.
     pub read_only: ReadOnly,
     /// Registers of parameters that cannot be written over the bus (error 21H). The manual mentions them without a list.
     pub locked: Vec<u16>,

@@ -78,7 +78,7 @@ pub(super) const CN_32: u16 = 0x021F;
 pub(super) const CN_33: u16 = 0x0220;
 /// Frequency command 1; the commands 2 to 8 follow.
 pub(super) const AN_01: u16 = 0x0400;
-/// Jog frequency.
+/// Register of the jog frequency.
 pub(super) const AN_09: u16 = 0x0408;
 const BN_01: u16 = 0x0500;
 const BN_02: u16 = 0x0501;
@@ -178,7 +178,7 @@ pub(super) fn place(register: u16) -> Option<RegisterKind> {
         })
 }
 
-/// The images of the parameters.
+/// The parameters in RAM and EEPROM.
 #[derive(Debug, Clone)]
 pub(super) struct Parameters {
     ram: ParameterSet,
@@ -197,7 +197,7 @@ impl Parameters {
             .flat_map(|group| group.first..=group.last)
             .filter(|register| place(*register).is_some_and(|place| !place.reserved))
             .map(|register| (register, 0, u16::MAX, 0));
-        // The first of equal registers counts.
+        // Of equal registers, the first one is used.
         let all = coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others);
         let mut ram = ParameterSet::new(all).limited(LIMITS);
         for &(register, value) in set {
@@ -214,7 +214,7 @@ impl Parameters {
         self.ram.number(register)
     }
 
-    /// A parameter of that many tenths.
+    /// A parameter stored in tenths, as a number.
     pub(super) fn tenths(&self, register: u16) -> f64 {
         f64::from(self.number(register)) / 10.0
     }

@@ -5,9 +5,9 @@ use super::parameters::{self, RegisterKind};
 use super::{Mode, TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 
-/// Functions that the card knows.
+/// Function codes that the card supports.
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
-/// Registers per message.
+/// Most registers per message.
 const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
 pub(super) const CHECK_ERROR: Exception = Exception(0x00);
@@ -113,7 +113,7 @@ impl TecoDrive {
         }
     }
 
-    /// Reserved registers read as 0.
+    /// A control register; reserved ones read as 0.
     fn control_register(&self, address: u16) -> u16 {
         match address {
             0x0001 => self.control.operation,

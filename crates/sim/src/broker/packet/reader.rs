@@ -157,7 +157,7 @@ impl<'a> Reader<'a> {
             property::USER => return self.text().and_then(|_| self.text()).map(drop),
             property::RESPONSE_TOPIC if topic::is_name(&self.text()?) => return Ok(()),
             property::RESPONSE_TOPIC => return Err(protocol("response topic with a wildcard")),
-            // Content type, authentication method, reason string.
+            // These are content type, authentication method, reason string.
             _ => return self.text().map(drop),
         };
         found.numbers.push((id, number));

@@ -1,4 +1,4 @@
-//! Packets to clients.
+//! Encodes packets to clients.
 
 use std::time::Instant;
 
