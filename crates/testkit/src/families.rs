@@ -63,7 +63,7 @@ pub fn rows<const CELLS: usize>(table: &'static str) -> Vec<[&'static str; CELLS
     table.lines().map(|row| cells(row).try_into().unwrap()).collect()
 }
 
-/// How a family is commanded.
+/// How to command a family.
 pub struct Family {
     /// Name of the family's profile.
     pub profile: &'static str,

@@ -13,7 +13,7 @@ use drivegate_proto::{LineFormat, Protocol, Table};
 /// Time for which a sample is good, and cadence of slow points.
 pub const STALE_AFTER: Duration = Duration::from_secs(1);
 
-/// The built-in profile of that name.
+/// The built-in profile with this name.
 pub fn profile(name: &str) -> Arc<Profile> {
     Profiles::built_in().get(name).unwrap().clone()
 }
@@ -82,7 +82,7 @@ pub fn nx_plant(drives: &[&str]) -> Plant {
     Plant::new("hall", STALE_AFTER, vec![nx_bus(drives)])
 }
 
-/// The drive answers.
+/// Marks the drive as answering.
 pub fn online(image: &DriveImage) {
     image.update(|snapshot| snapshot.link = Link::Online(SystemTime::now()));
 }
