@@ -1,6 +1,6 @@
 //! Lists of addresses on the command line.
 
-/// Addresses of drives, ascending, without duplicates.
+/// Addresses of drives in ascending order, without duplicates.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Addresses(pub(super) Vec<u8>);
 

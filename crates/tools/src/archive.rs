@@ -53,7 +53,7 @@ pub(super) struct Member {
     pub(super) name: String,
     /// Size of the file.
     pub(super) bytes: u64,
-    /// Permissions.
+    /// Permission bits of the file.
     pub(super) mode: u32,
     /// SHA-256 of the content, in hexadecimal.
     pub(super) sha256: String,
@@ -68,7 +68,7 @@ pub(super) struct LeftOut {
     pub(super) why: String,
 }
 
-/// The directories of members.
+/// The directory to which a member belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Root {
     /// Files below the directory of the configuration.
@@ -97,7 +97,7 @@ impl Root {
 /// The directory and path to which the member `name` belongs.
 ///
 /// # Errors
-/// The name leads elsewhere.
+/// If the name leads to another directory.
 pub(super) fn place(name: &str) -> Result<(Root, PathBuf), String> {
     let bad = || Err(format!("the member {name:?} has no name that a backup uses"));
     let (root, rest) = match name.split_once('/') {

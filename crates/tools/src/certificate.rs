@@ -14,7 +14,7 @@ use super::{printable, report};
 use crate::north::http::is_host;
 
 const DAY: Duration = Duration::from_secs(86_400);
-/// Names of the files.
+/// Name of the certificate file.
 const CERTIFICATE: &str = "http.crt";
 const KEY: &str = "http.key";
 
@@ -58,7 +58,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(report::print(&new(hosts, out, *days, SystemTime::now())?))
 }
 
-/// Writes both files, or none.
+/// Writes certificate and key, or neither.
 fn new(hosts: &[String], out: &Path, days: u16, now: SystemTime) -> Result<String, String> {
     let made = Made::new(hosts, days, now)?;
     let (key, certificate) = (out.join(KEY), out.join(CERTIFICATE));
@@ -135,7 +135,7 @@ fn day(time: SystemTime) -> String {
         .collect()
 }
 
-/// Year, month and day.
+/// The date as year, month and day.
 fn date(time: SystemTime) -> Result<(i32, u8, u8), String> {
     let text = day(time);
     let mut parts = text.split('-');

@@ -25,12 +25,12 @@ pub(crate) use self::gateway::Gateway;
 pub(crate) use self::url::Url;
 use crate::north::http::messages::{ErrorReply, Expected};
 
-/// Time for a connection.
+/// Time limit for connecting.
 const CONNECT: Duration = Duration::from_secs(10);
 /// How often a request that only reads is sent in all where the connection is cut off: a gateway that just ends does that, and
 /// has gone a moment later.
 const TRIES: u32 = 5;
-/// Pause before the next attempt.
+/// Pause between two attempts to reach the gateway.
 const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why a gateway sent no reply; the messages contain problem, place and remedy.
@@ -59,7 +59,7 @@ pub(crate) enum ClientError {
     /// The reply is not that of a gateway.
     #[error("{1}; {0}; check that this is the address of drivegate's [http] section")]
     Strange(String, String),
-    /// The stream ended early.
+    /// The event stream ended early.
     #[error(
         "the gateway ended the stream{1}; {0}; it was stopped, or a reload removed the bus: start it and try again"
     )]
@@ -78,7 +78,7 @@ impl From<ClientError> for String {
 /// Why no gateway was found at the local sockets.
 #[derive(Debug, Default)]
 pub(crate) struct NotFound {
-    /// Sockets that cannot be opened.
+    /// Sockets that could not be opened.
     pub(crate) closed: Vec<String>,
     /// Names of other gateways that were found.
     pub(crate) others: Vec<String>,
@@ -114,7 +114,7 @@ pub(crate) struct Client {
     doors: Vec<Door>,
     /// The expected gateway; `None` accepts any.
     expected: Option<Expected>,
-    /// The configuration, for messages.
+    /// Path of the configuration, for messages.
     file: Option<PathBuf>,
 }
 
@@ -202,7 +202,7 @@ impl Client {
         self.open(asked).await?.whole(asked).await
     }
 
-    /// [`Client::ask`], outside of a runtime.
+    /// Calls [`Client::ask`] outside of a runtime.
     ///
     /// # Errors
     /// The errors of [`Client::ask`], as a message.

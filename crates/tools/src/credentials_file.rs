@@ -33,7 +33,7 @@ pub(super) struct CredentialsFile<C: Filed> {
 }
 
 impl<C: Filed> CredentialsFile<C> {
-    /// The file at that path.
+    /// The credentials file at this path.
     pub(super) fn open(path: &Path) -> CredentialsFile<C> {
         CredentialsFile {
             path: path.to_path_buf(),
@@ -78,7 +78,7 @@ impl<C: Filed> CredentialsFile<C> {
         Ok(is_known)
     }
 
-    /// Removes that of a name.
+    /// Removes the entry with this name.
     ///
     /// # Errors
     /// If the name does not exist, or the file is invalid.
@@ -187,7 +187,7 @@ fn parsed<C: Credential>(path: &Path, text: &str) -> Result<Credentials<C>, Stri
     Credentials::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
 }
 
-/// A text with another line.
+/// The text with another line added.
 fn with_line(text: &str, line: &str) -> String {
     let end = if text.is_empty() || text.ends_with('\n') {
         ""

@@ -111,7 +111,7 @@ const LINES: [DemoLine; 5] = [
 /// The drive with a start guard.
 const GUARDED: &str = "pump-2";
 
-/// Preferred ports.
+/// Preferred port of MQTT.
 const MQTT: u16 = 1883;
 const MODBUS_TCP: u16 = 1502;
 const HTTP: u16 = 9488;
@@ -212,7 +212,7 @@ struct Sides {
 }
 
 impl Sides {
-    /// Name, address and preferred port.
+    /// Name, address and preferred port of each server.
     fn each(&self) -> [(&'static str, SocketAddr, u16); 4] {
         [
             ("MQTT broker", self.mqtt, MQTT),

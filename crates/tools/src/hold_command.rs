@@ -79,7 +79,7 @@ async fn hold(args: &Args) -> Result<(Hold, Json), String> {
     }
 }
 
-/// Holder, rank and seconds left.
+/// One line of text: holder, rank and seconds left.
 fn line(hold: &Hold) -> String {
     let Hold {
         hold,

@@ -98,7 +98,7 @@ pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
 /// The variable that names the configuration where `--config` is missing.
 const CONFIG_VARIABLE: &str = "DRIVEGATE_CONFIG";
 
-/// The configuration that [`CONFIG_VARIABLE`] names.
+/// The configuration named by [`CONFIG_VARIABLE`].
 fn config_of_environment() -> Option<&'static Path> {
     static NAMED: LazyLock<Option<PathBuf>> = LazyLock::new(|| {
         let named = std::env::var_os(CONFIG_VARIABLE).filter(|named| !named.is_empty());
@@ -107,7 +107,7 @@ fn config_of_environment() -> Option<&'static Path> {
     NAMED.as_deref()
 }
 
-/// The configuration where `--config` is missing.
+/// The configuration to use without `--config`.
 fn default_config() -> &'static Path {
     config_of_environment().unwrap_or(Path::new(DEFAULT_CONFIG))
 }
@@ -240,7 +240,7 @@ fn cannot_start(why: std::io::Error) -> String {
     format!("cannot start: {why}; free memory, threads or file descriptors")
 }
 
-/// The settings of a valid configuration.
+/// Loads the settings of a valid configuration.
 fn settings(path: &Path) -> Result<Settings, Failure> {
     let loaded = Settings::load(path, environment());
     loaded.settings.ok_or(Failure::Invalid(loaded.errors))

@@ -26,7 +26,7 @@ const DWELL: Duration = Duration::from_secs(3);
 const ROUNDS: u32 = 2;
 /// Longest single wait for bytes.
 const LOOK: Duration = Duration::from_millis(20);
-/// Bauds that are tried by default.
+/// Baud rates that are tried by default.
 const BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Formats that are tried by default; Modbus ASCII with 7 data bits is seen through 8N1.
 const FORMATS: [&str; 3] = ["8N1", "8E1", "8O1"];

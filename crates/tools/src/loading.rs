@@ -32,11 +32,11 @@ pub(super) enum NotLoaded {
     Thread(#[from] io::Error),
 }
 
-/// A configuration that is being read.
+/// A configuration that is being loaded.
 #[derive(Debug)]
 pub(super) struct Loading {
     loaded: oneshot::Receiver<Loaded>,
-    /// `None`: no time limit.
+    /// Time limit of loading; `None` without one.
     deadline: Option<Instant>,
 }
 
@@ -95,7 +95,7 @@ impl Drop for Reader {
 #[derive(Debug, Default)]
 pub(super) struct Loads {
     loading: Option<Loading>,
-    /// Whether another load was requested meanwhile.
+    /// Whether another load was requested in the meantime.
     again: bool,
     readers: Arc<AtomicUsize>,
 }
@@ -104,7 +104,7 @@ impl Loads {
     /// Begins to read the configuration in `path`, after the present load if one is in progress.
     ///
     /// # Errors
-    /// The configuration cannot be read now.
+    /// If a configuration cannot be read now.
     pub(super) fn begin(&mut self, path: &Path) -> Result<(), NotLoaded> {
         if self.loading.is_some() {
             self.again = true;

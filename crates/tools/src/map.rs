@@ -54,7 +54,7 @@ enum Format {
     Json,
 }
 
-/// Prints the map.
+/// Prints the register map.
 pub(super) fn run(args: &Args) -> Outcome {
     let settings = super::settings(&args.config)?;
     if args.bacnet {

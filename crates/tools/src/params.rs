@@ -264,7 +264,7 @@ fn seconds_in_words(seconds: f64) -> String {
     }
 }
 
-/// A file of parameters.
+/// Reads a parameter file.
 fn read_written(path: &Path) -> Result<ParameterFile, Failure> {
     Ok(read_file(path).map_err(|why| format!("{why}; name a file that `params read` wrote"))?)
 }

@@ -288,7 +288,7 @@ fn show(profile: &Profile) -> String {
     text
 }
 
-/// The lines of each step.
+/// The commissioning lines of each step, as text.
 fn commissioning(profile: &Profile) -> String {
     let mut text = String::new();
     for step in Step::ALL {

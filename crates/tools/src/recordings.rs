@@ -125,13 +125,13 @@ fn list(args: &Args, json: bool) -> Outcome {
     Ok(report::print(&report::lines(&table)))
 }
 
-/// The recordings of a gateway.
+/// The recordings listed by a gateway.
 fn listed_by(client: &Client) -> Result<Vec<Entry>, Failure> {
     let asked = Asked::get("/api/v1/recordings");
     Ok(client.ask_now(&asked)?.accepted(&asked)?)
 }
 
-/// A recording of a gateway.
+/// A recording fetched from a gateway.
 fn fetched(client: &Client, id: &str) -> Result<Recording, Failure> {
     let path = format!("/api/v1/recordings/{}?format={}", encoded(id), recording::ENDING);
     let asked = Asked::get(path).if_refused("choose one from `drivegate recordings list`");

@@ -35,7 +35,7 @@ pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     }
 }
 
-/// A duration of the command line.
+/// Parses a duration of the command line.
 pub(super) fn duration(text: &str) -> Result<Duration, Finding> {
     Ok(parse_duration(text)?)
 }
@@ -45,7 +45,7 @@ pub(super) fn error(message: &str) {
     line("error", message);
 }
 
-/// Reports a failure.
+/// Prints a failure and returns its exit code.
 pub(super) fn failed(message: &str) -> ExitCode {
     error(message);
     ExitCode::from(EXIT_FAILED)
@@ -83,7 +83,7 @@ pub(super) fn problems(loaded: &Loaded) {
 }
 
 fn line(kind: &str, message: &str) {
-    // Syslog: error, warning, notice.
+    // Priorities of syslog: error, warning, notice.
     let priority = match kind {
         _ if !log::reads_stderr() => "",
         "error" => "<3>",
@@ -115,7 +115,7 @@ pub(super) fn table<T: AsRef<str>>(header: impl IntoIterator<Item = T>) -> TextT
 pub(super) struct TextTable(Table);
 
 impl TextTable {
-    /// Adds a row.
+    /// Adds a row to the table.
     pub(super) fn add_row<T: AsRef<str>>(&mut self, cells: impl IntoIterator<Item = T>) {
         self.0
             .add_row(cells.into_iter().map(|cell| printable::line(cell.as_ref())));

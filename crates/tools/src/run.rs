@@ -144,7 +144,7 @@ impl Signals {
         })
     }
 
-    /// The next signal; cancel safe.
+    /// Waits for the next signal; cancel safe.
     async fn next(&mut self) -> SignalKind {
         tokio::select! {
             _ = self.terminate.recv() => SignalKind::terminate(),

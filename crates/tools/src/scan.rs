@@ -88,7 +88,7 @@ pub(super) fn stop_on_signal(stop: Arc<AtomicBool>) {
     });
 }
 
-/// The configuration of what was found.
+/// The configuration for the drives that were found.
 pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) -> String {
     let directory = |dir: &PathBuf| std::path::absolute(dir).unwrap_or_else(|_| dir.clone());
     let snippet = Snippet {

@@ -301,7 +301,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 impl Args {
-    /// The line of the command line.
+    /// The line given on the command line.
     fn line(&self) -> Result<SimulatedBusOptions, String> {
         let mut profiles = Profiles::built_in();
         let problems: Vec<Problem> = self.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();

@@ -81,7 +81,7 @@ async fn trace(args: &Args) -> Result<(), String> {
         let shown = match next {
             Ok(event) if event.name == "lagged" => view.lagged(&event.data),
             Ok(event) if event.name.is_empty() => view.frame(&event.data),
-            // Events of later versions.
+            // Events of later versions are ignored.
             Ok(_) => Ok(More::Yes),
             Err(error) => break Err(error.to_string()),
         };
@@ -247,7 +247,7 @@ impl View {
         self.flush()?;
         if let Some((path, capture)) = &self.capture {
             let text = format!("{} frames written to {}", capture.packets(), path.display());
-            // Failing to print this is harmless.
+            // If this cannot be printed, nothing is lost.
             let _ = writeln!(io::stderr().lock(), "{text}");
         }
         Ok(())

@@ -82,7 +82,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     attempt(args, &Stop::on_signals()?)
 }
 
-/// The end before anything was found.
+/// The failure for an end before anything was found.
 fn stopped() -> Failure {
     report::note("stopped; nothing was written");
     Failure::Reported(EXIT_FAILED)

@@ -11,7 +11,7 @@ use super::client::{Client, Gateway};
 use super::failure::Outcome;
 use super::{printable, report};
 
-/// Refresh interval.
+/// Interval at which the display is refreshed.
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Shows the drives and lines of a running gateway, live.
@@ -67,7 +67,7 @@ async fn watch(args: &Args) -> Outcome {
             }
             continue;
         }
-        // Survive a restart of the gateway.
+        // The display continues through a restart of the gateway.
         let text = match page(&client).await {
             Ok(text) => text,
             Err(why) => format!("{why}\n\nretrying\n"),

@@ -71,7 +71,7 @@ fn text(drive: &str, why: &Why) -> String {
     text
 }
 
-/// A time as text.
+/// A duration as text.
 fn seconds(age: Duration) -> String {
     match age.as_secs() {
         0..120 => format!("{:.1} s", age.as_secs_f64()),

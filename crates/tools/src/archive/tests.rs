@@ -40,7 +40,7 @@ fn archive(manifest: &Manifest, members: &[(&str, &[u8], EntryType)]) -> Vec<u8>
         .unwrap();
     for (name, content, kind) in members {
         let mut header = header("x", content.len() as u64, 0o640).unwrap();
-        // Past the checks of the library.
+        // The name is set directly, past the checks of the library.
         header.as_old_mut().name[..name.len()].copy_from_slice(name.as_bytes());
         header.set_entry_type(*kind);
         header.set_cksum();
@@ -85,7 +85,7 @@ fn what_is_written_is_read() {
     for cut in [100, 512, 1500, bytes.len() - 1024 - 512] {
         assert!(taken(&bytes[..cut]).is_err(), "cut at {cut}");
     }
-    // A file that changes meanwhile.
+    // The file changes while it is read.
     let other = || {
         std::iter::once(Ok(Content {
             member: manifest.members[0].clone(),

@@ -80,7 +80,7 @@ impl Door {
     /// Value of the `Authorization` header.
     ///
     /// # Errors
-    /// The token file cannot be read.
+    /// If the token file cannot be read.
     pub(super) fn authorization(&self) -> Result<Option<String>, ClientError> {
         match self {
             Door::Network(network) => network.token_file.as_deref().map(authorization).transpose(),
@@ -88,7 +88,7 @@ impl Door {
         }
     }
 
-    /// Connects.
+    /// Connects to the gateway.
     ///
     /// # Errors
     /// No gateway listens, or the TLS handshake fails.

@@ -1,4 +1,4 @@
-//! A stream of server-sent events.
+//! A client's stream of server-sent events.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -11,10 +11,10 @@ use super::{Asked, Client, ClientError};
 
 /// A stream that is silent for this long is dead: the gateway sends a comment every 10 s.
 const SILENCE: Duration = Duration::from_secs(35);
-/// Longest line of a stream.
+/// Longest line of an event stream.
 const MOST_BYTES: usize = 1 << 20;
 
-/// An event of a stream.
+/// An event of the stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct StreamEvent {
     /// Name of the event; empty for an ordinary one.
@@ -51,7 +51,7 @@ impl EventStream {
         })
     }
 
-    /// The next event. Cancel safe.
+    /// Waits for the next event. Cancel safe.
     ///
     /// # Errors
     /// If the event stream has ended.

@@ -26,11 +26,11 @@ const SHOWN_WITHIN: Duration = Duration::from_secs(10);
 /// reload for its files.
 const DONE_WITHIN: Duration = Duration::from_secs(40);
 
-/// A request.
+/// A request to a gateway.
 #[derive(Debug, Clone)]
 pub(crate) struct Asked {
     method: Method,
-    /// Begins with a slash.
+    /// Path of the request, beginning with a slash.
     path: String,
     body: String,
     pub(super) within: Duration,
@@ -113,7 +113,7 @@ impl Opened {
     /// Sends a request over a connection, and waits for the head of its reply.
     ///
     /// # Errors
-    /// The error that the connection reports.
+    /// If the connection reports an error.
     pub(super) async fn send(
         stream: Box<dyn Stream>,
         door: &Door,
@@ -155,7 +155,7 @@ impl Opened {
         })
     }
 
-    /// The next piece of the body.
+    /// The next piece of the reply's body.
     pub(super) async fn chunk(&mut self) -> Option<hyper::Result<Bytes>> {
         loop {
             let frame = self
@@ -164,7 +164,7 @@ impl Opened {
                 .await?;
             match frame.map(hyper::body::Frame::into_data) {
                 Ok(Ok(bytes)) => return Some(Ok(bytes)),
-                // Trailers.
+                // HTTP trailers are ignored.
                 Ok(Err(_)) => {}
                 Err(error) => return Some(Err(error)),
             }
@@ -174,7 +174,7 @@ impl Opened {
     /// Reads the body of the reply and returns the whole reply.
     ///
     /// # Errors
-    /// The reply does not arrive complete.
+    /// If the reply does not arrive completely.
     pub(super) async fn whole(mut self, asked: &Asked) -> Result<Reply, ClientError> {
         let place = self.place.clone();
         let whole = async {
@@ -210,7 +210,7 @@ impl Asked {
     }
 }
 
-/// A reply.
+/// A complete reply.
 #[derive(Debug)]
 pub(crate) struct Reply {
     pub(crate) status: StatusCode,
@@ -261,7 +261,7 @@ impl Reply {
         }
     }
 
-    /// The error in a reply.
+    /// The error that a reply reports.
     pub(crate) fn refusal(&self, asked: &Asked) -> ClientError {
         let Some(ErrorReply { error, known }) = self.parsed() else {
             return match self.status {

@@ -1,4 +1,4 @@
-//! Choosing the gateway.
+//! Options for choosing the gateway.
 
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -31,7 +31,7 @@ pub(crate) struct Gateway {
 }
 
 impl Gateway {
-    /// The configuration file.
+    /// Path of the configuration file.
     pub(crate) fn config(&self) -> &Path {
         self.named_config().unwrap_or_else(|| crate::default_config())
     }

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use super::super::credentials_file::CredentialsFile;
 use crate::north::http::{Scope, Token, User};
 
-/// Characters of the password.
+/// Number of characters of the password.
 const LENGTH: usize = 12;
 
 /// The user who may command the drives of the demo from its page.
 #[derive(Debug)]
 pub(super) struct Login {
-    /// The password.
+    /// The password of the login.
     pub(super) password: String,
     /// The users file with a hash of the password.
     pub(super) file: PathBuf,

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 /// Beginning of a file that a demo wrote, which another demo may replace.
 const MARK: &str = "# Written by `drivegate demo --write-config`";
 
-/// The directory.
+/// The directory of a written demo.
 #[derive(Debug)]
 pub(super) struct Written {
     dir: PathBuf,
@@ -38,7 +38,7 @@ impl Written {
         }
     }
 
-    /// The configuration.
+    /// Path of the configuration.
     pub(super) fn config(&self) -> PathBuf {
         self.dir.join("drivegate.toml")
     }
@@ -64,7 +64,7 @@ impl Written {
     /// Writes the configuration.
     ///
     /// # Errors
-    /// The file cannot be written.
+    /// If the file cannot be written.
     pub(super) fn write(&self, text: &str) -> Result<(), String> {
         let config = self.config();
         std::fs::write(

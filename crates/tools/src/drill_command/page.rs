@@ -9,7 +9,7 @@ const STYLE: &str = "body{font:11pt sans-serif;max-width:48em;margin:2em auto}ta
     th,td{border:1px solid #999;padding:.3em .5em;text-align:left;vertical-align:top}.result{font-size:1.5em}\
     .sign td{height:3em}@media print{body{margin:0}}";
 
-/// The report as a page.
+/// The report of a drill as a page.
 pub(super) fn of(drill: &DrillReport) -> String {
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>Drill {id}</title><style>{STYLE}</style></head><body>\n\

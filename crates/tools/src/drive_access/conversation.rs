@@ -46,7 +46,7 @@ impl Conversation {
         }
     }
 
-    /// A further request.
+    /// Sends a further request.
     ///
     /// # Errors
     /// If there is no reply; contains the reason as a message.

@@ -32,7 +32,7 @@ const RESTFUL: Duration = Duration::from_secs(1);
 pub(crate) enum Needs<'n> {
     /// All points that are polled.
     All,
-    /// The named points.
+    /// The points with these names.
     Points(&'n [String]),
     /// The points into which commands of the named points are translated: all polled points, if a command is derived.
     Commands(&'n [String]),
@@ -162,7 +162,7 @@ impl Direct {
         .await;
     }
 
-    /// A client of this bus.
+    /// A client for this bus.
     pub(super) fn client(&self) -> Client {
         let user = std::env::var("SUDO_USER").or_else(|_| std::env::var("USER"));
         let user = user.unwrap_or_else(|_| "unknown".to_string());
@@ -170,7 +170,7 @@ impl Direct {
         Client::through(Door::InProcess(Arc::new(door)))
     }
 
-    /// Closes the port.
+    /// Closes the port and ends the bus.
     pub(super) async fn stop(self) {
         self.daemon.stop().await;
     }

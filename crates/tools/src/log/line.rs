@@ -21,14 +21,14 @@ const KINDS: usize = 1024;
 /// Start of the targets of our own log lines.
 const OWN: &str = "drivegate";
 
-/// The form of a log line.
+/// The format of a log line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Form {
     /// An entry of the journal, with fields.
     Entry,
     /// A line that begins with the priority, which the journal reads.
     Priority,
-    /// A line as text.
+    /// Lines are plain text.
     Text,
     /// A JSON object.
     Json,
@@ -119,7 +119,7 @@ impl LogLine {
     }
 }
 
-/// Priority in the journal.
+/// Priority of the level in the journal.
 fn priority(level: Level) -> u8 {
     match level {
         Level::ERROR => 3,

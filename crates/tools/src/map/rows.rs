@@ -12,7 +12,7 @@ use crate::process_image::Access;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Row {
     pub(super) view: &'static str,
-    /// `holding`, `input`, `holding, input`, `coil`, `discrete-input`.
+    /// Name of the table: `holding`, `input`, `holding, input`, `coil`, `discrete-input`.
     pub(super) table: &'static str,
     pub(super) address: u16,
     /// The address as many SCADA systems write it: table digit and number from 1.
@@ -219,7 +219,7 @@ fn command_source(profile: &Profile) -> String {
     }
 }
 
-/// How a register is read.
+/// How often a register is read, as text.
 fn polled(plan: &Plan, point: &Point, raw: &Raw) -> String {
     if plan.reads.iter().any(|r| r.covers(raw.table, raw.address)) {
         format!("polled {}", point.class.name())

@@ -65,7 +65,7 @@ pub(super) fn restore(gateway: &Gateway, args: &RestoreArgs) -> Outcome {
             return carry(gateway, drive, act, &args.how);
         }
     }
-    // clap has made sure of both.
+    // clap ensures that both are present.
     let (Some(file), Some(drive)) = (&args.file, &args.drive) else {
         return Err(Failure::Reported(EXIT_USAGE));
     };
@@ -167,7 +167,7 @@ fn carry(gateway: &Gateway, drive: &str, act: Option<RestoreAct>, how: &How) -> 
     }
 }
 
-/// The plan, as text.
+/// The plan of a restore as text.
 fn plan_text(prepared: &Restore) -> String {
     let plan = prepared.plan.clone().unwrap_or_default();
     let risks = prepared

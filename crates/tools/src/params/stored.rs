@@ -11,7 +11,7 @@ use crate::drive::parameters::RawValue;
 use crate::north::http::messages::StoredReading;
 use crate::parameters::{ParameterFile, Store};
 
-/// The store of the configuration.
+/// The parameter store of the configuration.
 fn store(config: &Path) -> Result<Store, Failure> {
     Ok(Store::new(settings(config)?.params.dir))
 }
@@ -51,7 +51,7 @@ pub(super) fn list(gateway: &Gateway, drive: Option<&str>, json: bool) -> Outcom
     Ok(report::print(&report::lines(&table)))
 }
 
-/// The readings that a gateway has.
+/// The readings listed by a gateway.
 fn listed_by(client: &Client, drive: Option<&str>) -> Result<Vec<StoredReading>, Failure> {
     let query = drive.map(|drive| format!("?drive={}", encoded(drive)));
     let asked = Asked::get(format!("/api/v1/params{}", query.unwrap_or_default()));

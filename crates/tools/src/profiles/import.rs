@@ -9,7 +9,7 @@ use crate::document::{Finding, Problem, nearest};
 use crate::drive::Profile;
 use crate::parameters::cells;
 
-/// Columns of a list.
+/// Column names of a point list.
 const COLUMNS: [&str; 17] = [
     "name",
     "address",
@@ -32,7 +32,7 @@ const COLUMNS: [&str; 17] = [
 const MAX: &str = "max";
 /// Items of a read request, where the list gives no number.
 const READ: u16 = 16;
-/// Most rows of a list.
+/// Most rows of a point list.
 const MOST_ROWS: usize = 10_000;
 
 /// The profile that the list `text` of the file `path` makes.
@@ -113,7 +113,7 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<String>)> {
     lines.map(move |(place, line)| (place + 1, cells(line, |c| c == separator).0))
 }
 
-/// A point of the profile.
+/// A point read from the list.
 struct Row {
     table: Table,
     address: u16,

@@ -23,7 +23,7 @@ pub(super) struct Staging {
 
 #[derive(Debug)]
 struct Destination {
-    /// The destination.
+    /// Path of the destination.
     to: PathBuf,
     /// Directory in which the archive is unpacked: inside the destination, or inside the existing part of its path.
     aside: PathBuf,
@@ -65,7 +65,7 @@ impl Staging {
     /// A staging area for these destinations, which are created if necessary.
     ///
     /// # Errors
-    /// The directories cannot be written to.
+    /// If the directories cannot be written to.
     pub(super) fn new(config: &Path, state: &Path) -> Result<Staging, String> {
         Ok(Staging {
             config: Destination::new(config)?,
@@ -107,7 +107,7 @@ impl Staging {
     /// Makes a directory for the configuration. `path` has normal components only.
     ///
     /// # Errors
-    /// The directory cannot be created.
+    /// If the directory cannot be created.
     pub(super) fn make_directory(&mut self, path: &Path) -> Result<(), String> {
         let to = self.config.aside.join(path);
         let failed = |error: io::Error| format!("cannot create {}: {error}", to.display());
@@ -119,7 +119,7 @@ impl Staging {
     /// Makes a file that already exists at `path` available to the unpacked configuration, for the check.
     ///
     /// # Errors
-    /// The link cannot be made.
+    /// If the link cannot be created.
     pub(super) fn borrow(&self, below: &Path, path: &Path) -> Result<(), String> {
         let link = self.of(Root::Config).join(below);
         let normal = below.components().all(|part| matches!(part, Component::Normal(_)));

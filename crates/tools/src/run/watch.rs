@@ -64,14 +64,14 @@ impl Watch<'_> {
         }
     }
 
-    /// A reload begins.
+    /// Notifies systemd that a reload begins.
     pub(super) fn reloading(&mut self) {
         let mut states = vec![NotifyState::Reloading];
         states.extend(NotifyState::monotonic_usec_now());
         notify(&states);
     }
 
-    /// A reload has ended.
+    /// Notifies systemd that a reload has ended.
     pub(super) fn reloaded(&mut self, outcome: &ReloadOutcome) {
         let now = SystemTime::now();
         let why = summary(&outcome.errors);
@@ -98,7 +98,7 @@ fn summary(errors: &[String]) -> Option<String> {
     })
 }
 
-/// The gateway in one line.
+/// The status of the gateway in one line.
 fn status(plant: &Plant, refused: Option<&(SystemTime, String)>) -> String {
     let up = plant.buses.iter().filter(|bus| bus.image.health().up).count();
     let images = || plant.buses.iter().flat_map(|bus| &bus.image.drives);

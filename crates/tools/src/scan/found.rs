@@ -60,7 +60,7 @@ impl Found {
         self.profiles.iter().filter_map(text).find(|text| !text.is_empty())
     }
 
-    /// `2 reads got no reply`.
+    /// Remark such as `2 reads got no reply`.
     pub(super) fn silence(&self) -> String {
         match self.unanswered {
             1 => "1 read got no reply".to_string(),

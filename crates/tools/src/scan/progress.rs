@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::printable;
 
-/// Characters of the bar.
+/// Width of the progress bar in characters.
 const BAR: usize = 24;
 /// Shortest interval between updates of a terminal.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -48,7 +48,7 @@ impl Progress {
         self.patience = patience;
     }
 
-    /// Shows what is tried now.
+    /// Shows what is being tried.
     pub(super) fn show(&mut self, what: &str) {
         let now = Instant::now();
         self.begun = now;
@@ -71,7 +71,7 @@ impl Progress {
         }
     }
 
-    /// Prints a line that stays.
+    /// Prints a line above the progress bar.
     pub(super) fn print_line(&mut self, text: &str) {
         let clear = if self.live { "\r\x1b[K" } else { "" };
         // If stderr is closed, this error cannot be reported anywhere.
@@ -79,7 +79,7 @@ impl Progress {
         self.shown = None;
     }
 
-    /// Clears the bar; `early`: before all addresses were asked.
+    /// Clears the progress bar.
     pub(super) fn end(&mut self, early: bool) {
         if self.live {
             let _ = write!(std::io::stderr().lock(), "\r\x1b[K");

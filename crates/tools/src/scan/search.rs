@@ -23,7 +23,7 @@ use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
 use crate::port_users;
 
-/// Bytes received apart from replies.
+/// Bytes received during the search, apart from replies.
 #[derive(Debug, Default)]
 pub(crate) struct StrayBytes {
     /// Settings and addresses that were answered with invalid frames.
@@ -42,7 +42,7 @@ pub(crate) struct StrayBytes {
     pub(crate) stray_before: usize,
     /// Replies of a gateway that no drive is at the address.
     pub(crate) no_way: usize,
-    /// Requests.
+    /// Number of requests sent.
     pub(crate) requests: usize,
 }
 
@@ -51,7 +51,7 @@ pub(crate) struct StrayBytes {
 pub(crate) enum Extent {
     /// The search ends with the first setting that works, because a line has only one.
     OneSetting,
-    /// Yes.
+    /// All settings were tried.
     Exhaustive,
 }
 
@@ -190,7 +190,7 @@ impl<'a> Search<'a> {
         Ok(())
     }
 
-    /// Whether a drive answers.
+    /// Tries whether a drive answers.
     fn tries(&mut self, prober: &mut Prober<'_>, hello: &Request, setting: Setting) -> Result<bool, String> {
         for _ in 0..self.options.tries {
             match self.ask(prober, hello)?.ended {

@@ -41,7 +41,7 @@ pub(crate) fn absolute(port: &str) -> String {
 }
 
 impl Snippet<'_> {
-    /// The text.
+    /// The text of the snippet.
     pub(crate) fn text(&self) -> String {
         let draft = self.with_cadence("");
         if self.mode == Mode::Listen {

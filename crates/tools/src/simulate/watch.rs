@@ -1,4 +1,4 @@
-//! Output while lines are simulated.
+//! Output while lines are being simulated.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};

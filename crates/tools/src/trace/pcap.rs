@@ -11,16 +11,16 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use crate::process_image::Direction;
 
-/// LINKTYPE_RTAC_SERIAL.
+/// Link type LINKTYPE_RTAC_SERIAL of pcap files.
 const LINK_TYPE: u32 = 250;
 /// Largest packet that the file may hold.
 const SNAP_LENGTH: u32 = 65_535;
-/// Event types of the serial header.
+/// Event types in the serial packet header.
 const SENT: u8 = 1;
 const RECEIVED: u8 = 2;
 const LOST: u8 = 5;
 
-/// A capture file that grows.
+/// A capture file that is being written.
 #[derive(Debug)]
 pub(super) struct Capture<W: Write> {
     out: BufWriter<W>,
@@ -52,7 +52,7 @@ impl<W: Write> Capture<W> {
         Ok(Capture { out, packets: 0 })
     }
 
-    /// Adds a frame.
+    /// Adds a frame to the capture.
     ///
     /// # Errors
     /// If the frame cannot be written to the file.
@@ -100,7 +100,7 @@ impl<W: Write> Capture<W> {
         self.out.flush()
     }
 
-    /// Frames in the file.
+    /// Number of frames in the file.
     pub(super) fn packets(&self) -> u64 {
         self.packets
     }
