@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 const COMMIT: &str = "DRIVEGATE_COMMIT";
-/// Changes with each commit and checkout.
+/// Git log that changes with each commit and checkout.
 const HEAD_LOG: &str = ".git/logs/HEAD";
 
 fn main() {

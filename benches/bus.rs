@@ -29,7 +29,7 @@ use common::{median, option, rate, starts};
 
 const DRIVES: std::ops::RangeInclusive<u8> = 1..=10;
 const BAUDS: [u32; 5] = [9_600, 19_200, 38_400, 57_600, 115_200];
-/// Time for a reply.
+/// Time limit for a reply.
 const TIMEOUT: Duration = Duration::from_millis(100);
 /// Last part of a pause in which a master spins on the clock, since the kernel wakes it about ten microseconds late.
 const SPIN: Duration = Duration::from_micros(60);
@@ -76,7 +76,7 @@ impl Master {
 /// Result of one run of one master.
 #[derive(Debug, Clone, Copy)]
 struct Run {
-    /// Replies a second.
+    /// Replies per second.
     rate: f64,
     requests: u64,
     /// Requests that began before 3.5 characters of silence, or during a reply.

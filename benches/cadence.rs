@@ -16,7 +16,7 @@ use drivegate::sim::statistics::{Direction, Recorded, Statistics};
 use common::gateway::{Bus, Gateway, NORTH, line, settings};
 use common::{median, option, quantile, silences};
 
-/// Cadence aimed at.
+/// Cadence that the gateway should reach, s.
 const CYCLE: f64 = 0.010;
 /// A read of the process data of drive 1.
 const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];

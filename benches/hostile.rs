@@ -28,7 +28,7 @@ use common::{option, quantile, starts};
 const OPERATOR: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 const SCADA: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 3);
 const ATTACKER: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 9);
-/// Time for an answer.
+/// Time limit for an answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 const DRIVES: u8 = 10;
 

@@ -20,7 +20,7 @@ use common::{median, option};
 use modbus_tcp::client::{Load, load};
 use modbus_tcp::servers::{self, Process};
 
-/// Connections and requests in a batch.
+/// Loads to measure: connections, and requests in a batch.
 const LOADS: [(usize, usize); 3] = [(1, 1), (16, 1), (16, 8)];
 
 fn main() -> ExitCode {

@@ -186,7 +186,7 @@ fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<(f64, f64), B
 
 type Arrived = (String, Vec<u8>, SystemTime);
 
-/// A mosquitto of our own.
+/// A mosquitto process started by the bench.
 struct Broker {
     port: u16,
     child: Child,

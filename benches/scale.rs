@@ -26,17 +26,17 @@ fn main() -> ExitCode {
     common::exit(measure())
 }
 
-/// Result of one run.
+/// Result of one measurement.
 #[derive(Debug, Clone, Copy)]
 struct Run {
-    /// Exchanges a second and bus.
+    /// Transactions per second on each bus.
     rate: f64,
     /// Rate of the slowest bus.
     slowest: f64,
     /// Processor time of daemon and simulator an exchange, us.
     daemon: f64,
     simulator: f64,
-    /// Processors that both kept busy.
+    /// Number of processors that daemon and simulator kept busy.
     busy: f64,
     /// Resident memory of the daemon, MiB.
     memory: f64,

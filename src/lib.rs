@@ -15,7 +15,7 @@
 //! [`history`], [`parameters`], [`diagnosis`], [`event`], [`files`], [`plant`], [`spec`], [`start_guard`], [`stop_all`], [`version`]
 //! (`-core`), [`mod@line`], [`bus`], [`north`], [`sim`], [`config`] and [`daemon`] (`-gateway`), [`cli`] (`-tools`).
 //!
-//! Deliberately absent:
+//! Deliberately absent from drivegate:
 //!
 //! - A safety function: leases and stops are conveniences; emergency stop and safe torque off are wired.
 //! - Writes without a command: none at start, at reconnect or at reload. The gateway itself writes only the action of a lease

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 /// Options of the measurement with the bare master.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BareOptions {
-    /// Format of the line.
+    /// Baud rate and character format of the line.
     pub(crate) format: LineFormat,
     /// Silence between the end of a reply and the next request.
     pub(crate) silence: Duration,

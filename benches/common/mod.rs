@@ -30,7 +30,7 @@ pub fn exit(outcome: Result<(), Box<dyn Error>>) -> ExitCode {
     }
 }
 
-/// A file of this folder.
+/// Path of a file in this folder.
 pub fn file(name: &str) -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(name)
 }
@@ -81,7 +81,7 @@ pub fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> 
 /// Resident memory of a process, MiB.
 ///
 /// # Errors
-/// The process does not exist.
+/// If the process does not exist.
 pub fn resident_memory(process: u32) -> Result<f64, Box<dyn Error>> {
     let status = std::fs::read_to_string(format!("/proc/{process}/status"))?;
     let line = status
@@ -167,10 +167,10 @@ impl Readers {
         Readers { end, thread }
     }
 
-    /// Ends the readers.
+    /// Ends the reading clients.
     ///
     /// # Errors
-    /// The servers never answered.
+    /// If the servers never answered.
     pub fn stop(self) -> Result<(), String> {
         self.end.store(true, Ordering::Relaxed);
         match self.thread.join() {

@@ -14,7 +14,7 @@ use crate::common::quantile;
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 1, 3, 0x08, 0x34, 0, 11];
 const ANSWER: usize = 31;
 
-/// Result of the client.
+/// Result of a measurement with a client.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Load {
     /// Requests answered in a second.
@@ -22,7 +22,7 @@ pub(crate) struct Load {
     /// Time from sending a batch to its last answer, µs.
     pub(crate) p50: f64,
     pub(crate) p99: f64,
-    /// Requests answered.
+    /// Number of requests answered.
     pub(crate) answered: u64,
 }
 

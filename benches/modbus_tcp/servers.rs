@@ -24,7 +24,7 @@ use tokio_util::sync::CancellationToken;
 use crate::common::gateway::{Bus, Gateway, line, settings};
 use crate::common::{compile, file, median, processor_time, quantile};
 
-/// A server under test.
+/// The process of a server under test.
 pub(crate) struct Process {
     pub(crate) name: &'static str,
     pub(crate) address: SocketAddr,
@@ -218,7 +218,7 @@ async fn tokio_modbus() -> Result<(), Box<dyn Error>> {
     }
 }
 
-/// The request of a round.
+/// The request that is sent in each round.
 const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
 
 /// The whole daemon on a simulated line. A line of input starts a measurement of its rounds, the next one ends it

@@ -1,6 +1,6 @@
 //! An audit file in any state in which a crash or a person may have left it.
 //!
-//! Input: the file.
+//! Input: the audit file.
 
 use std::time::SystemTime;
 

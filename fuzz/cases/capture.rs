@@ -1,6 +1,6 @@
 //! A capture of a line, as `drivegate replay` gets it.
 //!
-//! Input: the file.
+//! Input: the capture file.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

@@ -1,4 +1,4 @@
-//! A configuration file.
+//! A configuration file with any content.
 //!
 //! Input: the file; what is not UTF-8 is replaced.
 

@@ -1,6 +1,6 @@
 //! A file of the MQTT buffer in any state in which a crash or a bad disk may leave it.
 //!
-//! Input: the file.
+//! Input: the journal file.
 
 use drivegate::north::mqtt::whole_records;
 

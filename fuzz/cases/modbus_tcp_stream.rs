@@ -73,7 +73,7 @@ static OPTIONS: LazyLock<Options> = LazyLock::new(|| {
     loaded.settings.and_then(|s| s.modbus_tcp).expect("a server")
 });
 
-/// The bus answers the oldest command.
+/// Lets the bus answer the oldest command.
 fn answer(command: Command, how: u8) {
     let outcome = match how & 7 {
         0 => Outcome::TimedOut,
@@ -131,7 +131,7 @@ pub(crate) fn run(data: &[u8]) {
         let (bytes, rest) = rest.split_at(usize::from(*length).min(rest.len()));
         data = rest;
         let piece = match kind >> 6 {
-            // Raw bytes.
+            // Sends raw bytes.
             0 => bytes.to_vec(),
             1 => {
                 for how in bytes {

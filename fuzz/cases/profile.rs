@@ -1,4 +1,4 @@
-//! A profile of a user.
+//! A user profile with any content.
 //!
 //! Input: the file; what is not UTF-8 is replaced.
 

@@ -56,7 +56,7 @@ fn a_client_that_is_killed_leaves_a_lease_that_runs_out() {
 
 #[test]
 fn a_stop_under_a_full_queue_comes_first() {
-    // Slow enough that the flood waits.
+    // A line so slow that the flood waits.
     let Plant { site, .. } = &plant("2400", "");
     write_registers(site.modbus, 1, 33_024, &[1]);
     site.until_state("pump-1", "running");

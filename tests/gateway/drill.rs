@@ -75,7 +75,7 @@ fn a_drill_proves_stops_and_is_kept() {
         assert!(line.contains(wanted), "{wanted}: {said}");
     };
     check("pump-1 (order, client, gateway), pump-2 (order, gateway)");
-    // The wrong name starts nothing.
+    // A wrong drive name starts nothing.
     let wrong = feed(program(), &["drill", "--config", &config, "pump-1"], "pump-2\n");
     let said = String::from_utf8(wrong.stderr).unwrap();
     assert!(

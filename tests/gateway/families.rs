@@ -161,7 +161,7 @@ fn answer(port: u16, frame: &[u8], head: usize) -> Answer {
     }
 }
 
-/// The frame of a request.
+/// The RTU frame of a request.
 fn rtu(address: u8, pdu: &[u8]) -> Vec<u8> {
     let mut frame = [&[address], pdu].concat();
     let shift = |crc: u16| if crc & 1 == 1 { crc >> 1 ^ 0xA001 } else { crc >> 1 };
@@ -226,7 +226,7 @@ fn obeys(case: &Case) {
         rig.order(&case.reset);
         rig.printed("\nreset", 0);
         until("the end of the fault", || (rig.state() != "fault").then_some(()));
-        // No reset starts the motor.
+        // Time in which a reset must not start the motor.
         std::thread::sleep(Duration::from_millis(300));
         assert_eq!(rig.drive.output().matches("motor forward").count(), 2, "{name}");
         assert_ne!(rig.state(), "running", "{name}");

@@ -202,7 +202,7 @@ fn polled(protocol: Protocol, master: impl FnOnce(&Site, &str) -> Vec<Block>) {
     );
     let audit = shared.site.audit();
     assert_eq!(audit[0]["source"], "other_master", "{audit:?}");
-    // Clients try to write.
+    // Clients try to write meanwhile.
     let write = [
         "-m",
         "tcp",

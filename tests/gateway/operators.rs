@@ -4,7 +4,7 @@ use crate::support::process::{Running, api, get, mbpoll_read, mbpoll_write, read
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive};
 use crate::support::tools::{feed, tool};
 
-/// Simulated drives, a broker, a gateway.
+/// A site with simulated drives, a broker and a gateway.
 struct Plant {
     site: Site,
     gateway: Running,

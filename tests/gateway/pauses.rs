@@ -160,7 +160,7 @@ impl Plant {
     }
 }
 
-/// Opens a connection of a client.
+/// Function that opens a connection of a client.
 type Opens = fn(&Plant) -> Client;
 
 trait Stream: Read + Write {}

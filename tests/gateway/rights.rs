@@ -96,7 +96,7 @@ fn modbus(site: &Site) -> Begun {
     }
 }
 
-/// Answer to a request.
+/// The expected answer to a request.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Gets {
     /// The answer has this status.

@@ -121,7 +121,7 @@ fn from_every_side() {
     assert!(code == 1 && text.contains("known: line1"), "{code} {text}");
     assert_eq!(plant.site.point("pump-1", "running"), true);
 
-    // A login is required.
+    // A login is required for this request.
     let url = format!("http://127.0.0.1:{}/api/v1/stop", plant.site.http);
     let nobody = run(
         &tool("curl"),

@@ -137,7 +137,7 @@ enum Way {
     Coils(u8, u16, Vec<bool>, u8),
     /// A message to a topic below the gateway's, and the code of the rest.
     Mqtt(&'static str, &'static str, &'static str),
-    /// Names and values of metrics.
+    /// Names and values of Sparkplug metrics.
     Sparkplug(&'static [(&'static str, f64)]),
     /// The body, and the status of the reply.
     Http(&'static str, u16),
@@ -199,10 +199,10 @@ fn ways() -> Vec<(&'static str, Way)> {
     ways.push(("coil", Coils(2, 3, states(2, 4), 2)));
     ways.push(("coil", Coils(2, 0, states(5, 0), 2)));
     ways.push(("coil", Coils(2, 5, states(0, 200), 2)));
-    // Registers that stop all drives.
+    // Registers by which all drives are stopped.
     ways.push(("pump", Registers(255, 0x0100, vec![1, 7], 2)));
     ways.push(("pump", Registers(255, 0x00FE, vec![7, 0, 1, 0], 2)));
-    // Objects.
+    // Writes of BACnet objects.
     let (unknown, bad) = ("not_writable", "bad_value");
     ways.push((
         "pump",
@@ -245,7 +245,7 @@ fn ways() -> Vec<(&'static str, Way)> {
         ("analog-value,1", 900.0),
     ];
     ways.push(("pump", Bacnet(many, [1, 31])));
-    // Tools.
+    // Writes through tool slots.
     ways.push(("pump", Slot(0, registers(1990, &around(10, 0, 5)), 2)));
     ways.push(("pump", Slot(0, registers(2000, &[0, 0, 20_000]), 3)));
     ways.push(("coil", Slot(1, coils(3, &states(2, 4)), 2)));

@@ -57,7 +57,7 @@ impl Plant {
     }
 }
 
-/// A line of the output.
+/// A line of the trace's output.
 #[derive(Debug)]
 struct Shown {
     micros: u64,
@@ -270,7 +270,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     let mut plant = Plant::start();
     let url = plant.url();
 
-    // Ctrl-C.
+    // The trace is ended by Ctrl-C.
     let mut trace = Running::drivegate(&["trace", "--url", &url]);
     trace.until_printed("read holding");
     trace.signal("INT");
@@ -291,7 +291,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     assert!(child.wait().unwrap().success());
     assert_eq!(reported, "");
 
-    // The bus does not exist.
+    // A bus that does not exist is an error.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--bus", "hall 1"]);
     assert_eq!(output.status.code(), Some(1));
     let reported = String::from_utf8(output.stderr).unwrap();
@@ -314,7 +314,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     assert_eq!(trace.ended().code(), Some(1));
     trace.until_printed("error: the gateway ended the stream");
 
-    // No gateway is there any more.
+    // The gateway no longer runs.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url]);
     assert_eq!(output.status.code(), Some(1));
     let reported = String::from_utf8(output.stderr).unwrap();

@@ -104,7 +104,7 @@ struct TwoDrives {
 }
 
 impl TwoDrives {
-    /// Drives at 3 and 7.
+    /// Starts drives at addresses 3 and 7.
     fn start() -> TwoDrives {
         let folder = tempfile::tempdir().unwrap();
         let line = line_of(&folder.path().join("line"), &[3, 7]);

@@ -151,7 +151,7 @@ impl Rig {
         self.bus.handle().image.health().up
     }
 
-    /// Sets points as one command.
+    /// Sets several points as one command.
     pub(crate) async fn set(&self, address: u8, points: &[(&str, f64)]) -> Outcome {
         let handle = self.handle(address);
         let index = |name| handle.image.spec.profile.point_index(name).unwrap();

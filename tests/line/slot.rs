@@ -11,7 +11,7 @@ use crate::support::process::{free_port, get, until};
 use crate::support::site::{HTTP, LINE1, Site, controlled, drive};
 use crate::support::tools::{python, root, run, run_well, tool};
 
-/// Requests of each peer.
+/// Number of requests that each peer sends.
 const REQUESTS: &str = "60";
 
 struct SlotSite {
@@ -211,7 +211,7 @@ fn a_reload_changes_slots_and_leaves_the_bus_alone() {
     rig.site.change("access = \"read\"", "access = \"write\"");
     gateway.signal("HUP");
     gateway.until_printed("configuration reloaded");
-    // Connected tools must connect again.
+    // Connected tools must connect again after the reload.
     let mut rest = [0; 16];
     until("the connection of the old slot ends", || {
         matches!(stream.read(&mut rest), Ok(0)).then_some(())

@@ -104,7 +104,7 @@ struct Reader {
 }
 
 impl Reader {
-    /// The next message.
+    /// The next message that was received.
     fn line(&self) -> String {
         let line = || self.lines.recv_timeout(DEADLINE).expect("the client prints a line");
         std::iter::repeat_with(line)

@@ -21,7 +21,7 @@ fn reported(loaded: &Loaded) -> String {
     all.replace(&format!("{ROOT}/"), "")
 }
 
-/// Files of `directory` with that extension.
+/// Files of `directory` with this extension.
 fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = fs::read_dir(Path::new(ROOT).join(directory))
         .unwrap()

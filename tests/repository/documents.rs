@@ -17,7 +17,7 @@ pub(super) fn read(path: &Path) -> String {
     fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The documents for people.
+/// All documents for people.
 fn documents() -> Vec<PathBuf> {
     let mut found = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"]
         .map(|name| root().join(name))
@@ -41,7 +41,7 @@ pub(super) fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
     found
 }
 
-/// The fenced blocks of that language.
+/// The fenced blocks of this language.
 fn blocks(text: &str, language: &str) -> Vec<String> {
     let opening = format!("\n```{language}\n");
     let inside = text.split(&opening).skip(1);

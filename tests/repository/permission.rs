@@ -9,7 +9,7 @@ use crate::support::tools::root;
 /// Refusals which mean that an order may not move a motor now (`docs/decisions/commands.md`).
 const OF_THE_GATE: [&str; 4] = ["HeldByOther", "NeedsTake", "Guarded", "Interlocked"];
 
-/// The lines that are no tests.
+/// The lines of code outside of tests.
 fn code(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let lines = text.lines().enumerate();
     lines.take_while(|(_, line)| !line.starts_with("#[cfg(test)]"))

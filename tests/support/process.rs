@@ -63,7 +63,7 @@ impl Running {
         })
     }
 
-    /// Process id.
+    /// Id of the process.
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
     }
@@ -94,7 +94,7 @@ impl Running {
         });
     }
 
-    /// Waits until the program ends.
+    /// Waits until the process ends.
     pub(crate) fn ended(&mut self) -> ExitStatus {
         until("the end of the process", || self.child.try_wait().unwrap())
     }
@@ -134,7 +134,7 @@ pub(crate) fn drivegate(arguments: &[&str]) -> Command {
 pub(crate) struct Notifications(UnixDatagram, PathBuf);
 
 impl Notifications {
-    /// The socket is this file.
+    /// Notifications over the socket at this path.
     pub(crate) fn at(file: PathBuf) -> Notifications {
         let socket = UnixDatagram::bind(&file).unwrap();
         socket.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -169,7 +169,7 @@ fn keep(stream: impl Read + Send + 'static, output: &Arc<Mutex<String>>) {
     });
 }
 
-/// Waits until `ask` has an answer.
+/// Waits until `ask` returns an answer.
 pub(crate) fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + PATIENCE;
     loop {

@@ -33,7 +33,7 @@ pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
     format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{keys}\n")
 }
 
-/// A drive that takes commands.
+/// Configuration of a drive that may be commanded.
 pub(crate) fn controlled(name: &str, address: u8, keys: &str) -> String {
     drive(name, address, &format!("access = \"control\"\n{keys}"))
 }
@@ -155,7 +155,7 @@ impl Site {
         gateway
     }
 
-    /// Starts Mosquitto.
+    /// Starts a Mosquitto broker.
     pub(crate) fn broker(&self) -> Running {
         let text = format!("listener {} 127.0.0.1\nallow_anonymous true\n", self.mqtt);
         self.write("mosquitto.conf", &text);

@@ -25,7 +25,7 @@ use super::scenario::Line;
 
 /// Seeds of every test run.
 const SEEDS: u64 = 60;
-/// Orders of each seed.
+/// Number of orders of each seed.
 const ORDERS: usize = 60;
 
 const NETWORK: u16 = 1001;
@@ -266,7 +266,7 @@ impl BacnetWorld {
         !profile.is_stop(place.table, place.address, word)
     }
 
-    /// The reference that the drive has.
+    /// The reference in the drive.
     fn speed(&mut self) -> f64 {
         let profile = self.rig.bus.profile.clone();
         let (_, point) = reference_point(&profile);
@@ -274,7 +274,7 @@ impl BacnetWorld {
         f64::from(self.register(raw.table, raw.address)) * raw.scale
     }
 
-    /// An order by another interface.
+    /// Gives an order over another interface.
     fn order_elsewhere(&mut self, points: &[(&str, f64)]) -> Placed {
         let order = self.rig.points(DRIVE, points);
         self.rig.place_as("cloud", DRIVE, order)
@@ -302,7 +302,7 @@ struct Rules {
 
 type Array = [Option<(f64, usize)>; 16];
 
-/// The priority in effect.
+/// The governing priority, its value and client.
 fn governs(array: &Array) -> Option<(usize, f64, usize)> {
     let occupied = array
         .iter()

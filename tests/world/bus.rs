@@ -51,9 +51,9 @@ pub struct Asked {
 pub enum Seen {
     Sent(Asked),
     Acted(Asked),
-    /// The previous exchange has ended.
+    /// The previous transaction has ended.
     Over(Asked),
-    /// Bytes came to the gateway.
+    /// Bytes arrived at the gateway.
     Heard(Vec<u8>),
 }
 
@@ -278,7 +278,7 @@ impl WorldBus {
         )
     }
 
-    /// The time of the line.
+    /// The time on the simulated line.
     pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
@@ -291,7 +291,7 @@ impl WorldBus {
         wake.unwrap_or(self.began + Duration::from_secs(1_000_000))
     }
 
-    /// A client gave an order.
+    /// Notes that a client gave an order.
     pub fn command_came(&mut self, now: Instant) {
         if self.open && self.commands {
             self.core.command_came();

@@ -65,7 +65,7 @@ impl Broker {
         }
     }
 
-    /// The connection breaks.
+    /// Breaks the connection.
     pub fn lose(&mut self, now: Instant, until: Instant) {
         self.delivered.retain(|(at, ..)| now - *at < Broker::UNACKNOWLEDGED.1);
         self.away_until = Some(until);

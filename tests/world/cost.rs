@@ -149,7 +149,7 @@ fn a_flood_leaves_half_of_the_line_to_polls_and_its_turn_to_another_client() {
     let (mut others, mut sent_to_other) = (Vec::new(), 0);
     let (mut polls, mut commands) = (Duration::ZERO, Duration::ZERO);
     for number in 0..4_000 {
-        // The flood is under way.
+        // By then the flood is in progress.
         if number == 1_000 {
             for percent in 1..=20 {
                 let order = Order::Write(RequestPdu::WriteRegister {

@@ -23,7 +23,7 @@ const RUNS_FROM: Duration = Duration::from_secs(20);
 /// Reported causes, each with the address of its drive (0: none).
 type Told = BTreeSet<(Cause, u8)>;
 
-/// The usual lines.
+/// The lines of the usual tests.
 fn lines() -> [Line; 3] {
     [
         line("vacon-nx", Protocol::ModbusRtu, 38_400, 6),
@@ -38,7 +38,7 @@ struct Case {
     faults: fn(u8, u64) -> FaultPlan,
     parts: fn(&mut Parts),
     told: fn(u8) -> Vec<(Cause, u8)>,
-    /// A drive runs from [`RUNS_FROM`] on.
+    /// Whether a drive runs from [`RUNS_FROM`] on.
     runs: bool,
 }
 

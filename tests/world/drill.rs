@@ -30,7 +30,7 @@ const OPTIONS: DrillOptions = DrillOptions {
     every: Duration::from_secs(3600),
 };
 
-/// Families whose standstill is seen.
+/// Families whose standstill can be read.
 const FAMILIES: [(&str, Protocol); 8] = [
     ("vacon-nx", Protocol::ModbusRtu),
     ("eaton-svx", Protocol::ModbusRtu),
@@ -277,7 +277,7 @@ fn what_does_not_stop_is_named() {
         });
         ends(&mut play, &report, DrillState::Aborted, text);
     }
-    // The motor never starts to turn.
+    // The motor never begins to turn.
     let mut play = of();
     let report = play.drill(&[Kind::Order], |rig, _| {
         rig.with_drive(1, |drive, _| drive.set_alive(false))
@@ -290,7 +290,7 @@ fn what_does_not_stop_is_named() {
     play.healed();
 }
 
-/// Trouble during a drill.
+/// The trouble during a drill.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Trouble {
     /// Another master keeps the drive running.
@@ -379,7 +379,7 @@ impl Trouble {
         }
     }
 
-    /// Expected result of the drill.
+    /// The result that the drill must have.
     fn expected(self) -> (DrillState, &'static str) {
         match self {
             Trouble::IgnoresStops => (DrillState::Failed, "the motor still turns"),

@@ -11,10 +11,10 @@ use super::orders::{Unique, sets};
 /// Acts of a drive that are remembered.
 const KEPT: usize = 400;
 
-/// A drive of a world.
+/// The true state of a drive in a world.
 #[derive(Debug)]
 pub struct Truth {
-    /// The run command in the drive.
+    /// The run command as it is in the drive.
     pub run: bool,
     /// Time until which a run command may be sent; `None` after a stop.
     pub may_run: Option<Instant>,
@@ -43,7 +43,7 @@ pub struct Truth {
     pub turned_at: Option<Instant>,
     /// Time since which the drive is online in the image.
     pub online_since: Option<Instant>,
-    /// Supervision last acted.
+    /// When supervision last acted.
     pub supervised: Option<Instant>,
     /// Time until which a disturbance of the drive excuses deviations.
     pub troubled_until: Option<Instant>,

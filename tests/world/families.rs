@@ -28,7 +28,7 @@ const FAMILIES: [(&str, u16, i64, &str); 14] = [
     ("teco-7300pa-n2", 0x0002, 2, "overvoltage"),
 ];
 
-/// Points that every family has.
+/// Points that every family must have.
 const EVERYWHERE: [ModelPoint; 12] = [
     ModelPoint::Ready,
     ModelPoint::Running,

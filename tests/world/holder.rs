@@ -355,7 +355,7 @@ fn a_reference_does_not_let_a_run_go_on_behind_a_stop() {
     play.rig.run(SECOND);
     let mut stopped = play.place(1, 0, &[("run", 0.0)]);
     assert!(play.rig.answered(&mut stopped).is_ok());
-    // Past the reservation.
+    // After the reservation has ended.
     for _ in 0..100 {
         let mut reference = play.place(0, 0, &[("speed_reference", 10.0)]);
         play.rig.run(Duration::from_millis(50));
@@ -398,7 +398,7 @@ fn a_repeated_stop_of_a_cyclic_client_is_not_on_the_wire() {
     let stops = stops.iter().filter(|frame| frame.bytes.get(1..4) == Some(&stop[..]));
     assert_eq!(stops.count(), 0);
     assert!(play.rig.with_drive(1, |drive, _| drive.state().running));
-    // A new stop is one.
+    // A stop after a new run counts as a new one.
     let _run = play.place(0, 0, &[("run", 1.0)]);
     let mut new = play.place(0, 0, &[("run", 0.0)]);
     assert!(play.rig.answered(&mut new).is_ok());

@@ -111,7 +111,7 @@ fn an_n2_reply_belongs_to_the_request_before_it() {
     assert_eq!(all(&[(read, 5), (state, 300), (b"A4064\r", 5)]), [(1, 1, vec![1])]);
 }
 
-/// Numbers from a seed.
+/// Random numbers from a seed.
 struct Dice(u64);
 
 impl Dice {

@@ -29,7 +29,7 @@ fn ready(drives: u8) -> Rig {
     rig
 }
 
-/// Frames of the master as text.
+/// The frames of the master as text.
 fn requests(rig: &Rig) -> Vec<String> {
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim_end().to_string();
     rig.requests().iter().map(|frame| text(&frame.bytes)).collect()

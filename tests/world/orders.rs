@@ -7,7 +7,7 @@ use drivegate_world::drive::{ModelPoint, Point, PointIndex, Profile, Value};
 use drivegate_world::order::{Order, written};
 use drivegate_world::sim::random::Random;
 
-/// Kind of an order.
+/// The kind of an order in a world.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wish {
     Reference,
@@ -52,7 +52,7 @@ impl Wish {
             || (self == Wish::Parameter && older == self)
     }
 
-    /// A random order.
+    /// A random kind of order.
     pub fn of(dice: &mut Random) -> Wish {
         match dice.within(0..=99) {
             0..=29 => Wish::Reference,

@@ -17,7 +17,7 @@ use super::scenario::Line;
 const DRIVE: u8 = 1;
 
 impl Rig {
-    /// A background transaction.
+    /// Makes a background transaction.
     fn in_background(&mut self, pdu: RequestPdu) -> Outcome {
         if !self.is_online(0) {
             return Outcome::Offline;

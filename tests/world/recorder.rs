@@ -34,7 +34,7 @@ fn clock(rig: &Rig) -> Clock {
     }
 }
 
-/// The recordings that are made meanwhile.
+/// Runs the rig; returns the recordings made meanwhile.
 fn run(rig: &mut Rig, recorder: Option<&mut Recorder>, time: Duration) -> Vec<Recording> {
     let Some(recorder) = recorder else {
         rig.run(time);

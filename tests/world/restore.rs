@@ -45,7 +45,7 @@ const FAULTS: [&str; 5] = [
     "drop=0.1,corrupt=0.1",
 ];
 
-/// The gateway was killed.
+/// The restore was cut off because the gateway was killed.
 struct Cut;
 
 struct RestoreWorld {
@@ -56,9 +56,9 @@ struct RestoreWorld {
     plan: Plan,
     /// Time at which the gateway is killed.
     cut_at: Option<Instant>,
-    /// Time of the next event.
+    /// When the next event happens.
     next: Instant,
-    /// Whether anything happens.
+    /// Whether events disturb the restore.
     troubled: bool,
     /// The motor was last started by somebody at the drive.
     started: Option<Instant>,

@@ -142,7 +142,7 @@ impl Rig {
         self.place_as("test", address, order)
     }
 
-    /// Places an order for this client.
+    /// Gives an order of this client.
     pub fn place_as(&mut self, client: &str, address: u8, order: Order) -> Placed {
         let origin = Origin::new(SourceKind::Mqtt, client);
         let placed = self
@@ -223,7 +223,7 @@ impl Rig {
         self.sample(address, point).good()
     }
 
-    /// The good value of any point.
+    /// The good value of the point with this name.
     pub fn value(&self, address: u8, name: &str) -> Option<Value> {
         let drive = self.drive(address);
         let index = drive.image.spec.profile.point_index(name).unwrap();
@@ -315,7 +315,7 @@ impl Rig {
     }
 }
 
-/// A write of one register.
+/// An order that writes one register.
 pub fn write(address: u16, value: u16) -> Order {
     Order::Write(RequestPdu::WriteRegister { address, value })
 }

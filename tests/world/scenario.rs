@@ -7,7 +7,7 @@ use drivegate_world::drive::RawWrites;
 use drivegate_world::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate_world::sim::random::Random;
 
-/// The description of a world.
+/// The description of a random world.
 #[derive(Debug, Clone)]
 pub struct Scenario {
     pub seed: u64,
@@ -44,7 +44,7 @@ pub struct Line {
     /// How often the gateway writes its orders again.
     pub refresh: Option<Duration>,
     pub on_shutdown: OnShutdown,
-    /// Addresses without a drive that answers.
+    /// Configured addresses without an answering drive.
     pub dead: Vec<u8>,
     /// Whether the names and units of the drives are in the opposite order.
     pub swapped: bool,
@@ -54,7 +54,7 @@ pub struct Line {
     pub spec: fn(&mut DriveSpec),
 }
 
-/// Habits of a client.
+/// The habits of a client in a world.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Habit {
     /// Over MQTT: single points and whole objects, often two at once.

@@ -109,7 +109,7 @@ fn a_changed_selection_is_told_once_and_the_value_is_that_of_the_monitoring_regi
     back_with(&mut rig, OUT_4, DC_LINK);
     rig.until_state(1, State::Running);
     assert_eq!(differing(&mut rig, &mut events), [""; 0]);
-    // The selection is set back.
+    // The selection is restored.
     rig.at_the_drive(1, OUT_4, TORQUE);
     rig.until("process data is believed again", PATIENCE, |rig| {
         rig.drive(1).image.snapshot().monitored.is_empty()

@@ -47,7 +47,7 @@ const HEALED: Duration = Duration::from_secs(20);
 
 /// A connection of a client, as the operating system keeps it.
 struct Connection {
-    /// Number of the connection.
+    /// Number that identifies the connection.
     number: usize,
     offline: Loopback,
     /// Whether the gateway has accepted the connection.
@@ -83,14 +83,14 @@ struct World {
     next_tick: Instant,
     bus_ran: Instant,
     connections: Vec<Connection>,
-    /// Number of connections so far.
+    /// Number of connections opened so far.
     clients: usize,
-    /// The last transaction.
+    /// Number of the last transaction.
     number: u16,
     placed: Vec<Placed>,
     standing: Standing,
     next_stall: Instant,
-    /// Length of the last one.
+    /// Length of the last stall.
     stalled_for: Duration,
     next_incident: Instant,
     reloads: bool,
@@ -252,7 +252,7 @@ impl World {
         Duration::from_millis(self.dice.within(range))
     }
 
-    /// The next thing that happens.
+    /// Runs the next event.
     fn step(&mut self) {
         self.now = self.now.max(self.next());
         let now = self.now;
@@ -384,7 +384,7 @@ impl World {
         self.promised.told(asked.acted, asked.at);
     }
 
-    /// No motor starts by itself.
+    /// Checks that no motor starts by itself.
     fn check_motors(&mut self) {
         let (now, sim) = (self.now, self.bus.sim(self.now));
         for machine in 1..=self.bus.line.drives {
@@ -439,7 +439,7 @@ impl World {
         }
     }
 
-    /// Reads what a client has sent.
+    /// Reads bytes that a client has sent.
     fn read(&mut self, index: usize) {
         let now = self.now;
         let connection = &mut self.connections[index];

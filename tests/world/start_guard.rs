@@ -59,14 +59,14 @@ struct Disk {
     fails: bool,
 }
 
-/// True actions of the drives.
+/// What the drives really did.
 #[derive(Default)]
 struct Truth {
     running: BTreeMap<u8, bool>,
     stood: BTreeMap<u8, Instant>,
     /// When each drive carried out the last word that starts it.
     acted: BTreeMap<u8, Instant>,
-    /// Starts by orders.
+    /// Starts of each drive by orders.
     starts: BTreeMap<u8, Vec<Instant>>,
 }
 
@@ -465,7 +465,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
         if let Some(first) = &mut first {
             assert!(rig.answered(first).is_ok(), "it joins");
         }
-        // The ramp takes a while.
+        // The ramp takes several seconds.
         rig.run(8 * SECOND);
         assert!(!turns(&mut rig), "{who}");
     }
@@ -541,7 +541,7 @@ fn repeated_stops_of_a_cyclic_client_wait_for_min_run() {
     }
 }
 
-/// A drive with this guard, ready.
+/// A rig with one ready drive that has this guard.
 fn ready(spec: fn(&mut DriveSpec)) -> Rig {
     let mut rig = Rig::of(&Line {
         spec,

@@ -50,7 +50,7 @@ const REPEATED: Duration = Duration::from_secs(8);
 /// Interval of the checks of what must hold at any time.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// Figures of a world.
+/// Figures that a world reports at its end.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Figures {
     pub worlds: u64,
@@ -216,12 +216,12 @@ impl World {
         self.history.note(self.now - self.began, words);
     }
 
-    /// No client gives orders any more.
+    /// Whether no client gives orders any more.
     fn is_calm(&self) -> bool {
         self.stopping || self.healing.is_some()
     }
 
-    /// The next thing that happens anywhere.
+    /// Runs the next event anywhere in the world.
     fn step(&mut self) {
         let wakes: Vec<Instant> = self.buses.iter().map(WorldBus::wake_at).collect();
         let clients = self

@@ -8,7 +8,7 @@ use drivegate::drive::profile::Profiles;
 use super::Rig;
 use super::cases::{Case, cases};
 
-/// Signal, and what the drive prints.
+/// Signal to the drive, and the text that it prints.
 const HAPPENS: [(&str, &str); 3] = [
     ("USR2", "stopped at the panel"),
     ("HUP", "restarted"),
@@ -77,7 +77,7 @@ fn stays_as_it_is(case: &Case) {
             if signal == "USR1" && has("fault_reset") {
                 rig.command("{\"fault_reset\": true}");
             } else if signal == "USR1" {
-                // The family's reset is not known.
+                // The reset of this family is unknown.
                 rig.drive.signal("HUP");
                 rig.printed("restarted", 0);
             }

@@ -57,7 +57,7 @@ impl Rig {
             (Way::Broadcast, _) => {
                 let mut stream = TcpStream::connect(("127.0.0.1", self.raw_slot)).unwrap();
                 stream.write_all(&rtu(0, &pdu)).unwrap();
-                // A broadcast is not answered.
+                // A broadcast gets no answer.
                 std::thread::sleep(Duration::from_millis(500));
                 Answer::Done
             }

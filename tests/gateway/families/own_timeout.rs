@@ -9,7 +9,7 @@ use super::Rig;
 use super::cases::{Case, cases};
 use crate::support::process::{get, until};
 
-/// The drive's own timeout, s.
+/// Option that sets the drive's own timeout.
 const TIMEOUT: &str = "timeout=3";
 
 const REFRESH: &str = "refresh = \"500ms\"\nsupervision = { timeout = \"60s\", action = \"stop\" }\n";

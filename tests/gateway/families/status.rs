@@ -114,7 +114,7 @@ impl Both {
         }
     }
 
-    /// The reply of the independent drive.
+    /// The reply of the independent drive on its line.
     fn by_line(&mut self, pdu: &RequestPdu, length: usize) -> Vec<u8> {
         let mut bytes = Vec::new();
         pdu.encode(&mut bytes);

@@ -48,11 +48,11 @@ fn profidrive(word: u16) -> Does {
 
 fn danfoss(word: u16) -> Does {
     match word {
-        // No data valid; a jog.
+        // Either the data is not valid, or the word is a jog.
         _ if !is(word, 0x0400) || any(word, 0x0100) => Other,
-        // DC brake, coast, quick stop.
+        // The word means DC brake, coast or quick stop.
         _ if !is(word, 0x001C) => Stops,
-        // Frozen.
+        // The word freezes the output.
         _ if !is(word, 0x0020) => Other,
         _ if is(word, 0x0040) => Runs,
         _ => Stops,
@@ -115,7 +115,7 @@ fn invertek(word: u16) -> Does {
 
 fn weg(word: u16) -> Does {
     match word {
-        // The panel commands; a jog.
+        // Either the panel commands, or the word is a jog.
         _ if !is(word, 0x0010) || any(word, 0x0008) => Other,
         _ if !is(word, 0x0003) || any(word, 0x0040) => Stops,
         _ => Runs,
@@ -205,7 +205,7 @@ fn every_word_is_taken_for_what_it_does() {
         }
         assert!(stops > 0 && runs > 0, "{name}: {stops} stops, {runs} run commands");
     }
-    // Coils.
+    // Hitachi is commanded by coils.
     let hitachi = profiles.get("hitachi-wj200").unwrap();
     let coil = |address| ControlItem {
         table: Table::Coil,

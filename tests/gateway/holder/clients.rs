@@ -186,7 +186,7 @@ impl Plant {
         self.set(client, "speed_reference", &json!(10.0 + client as usize as f64))
     }
 
-    /// Everybody sees the same: state, holder.
+    /// All clients see this state and this holder.
     fn all_see(&self, state: &str, holder: &Json) {
         let plc: u16 = self.pymodbus(0x8013, &[]).parse().unwrap();
         let rank = ALL

@@ -9,7 +9,7 @@ use tokio::time::timeout;
 
 pub(crate) use crate::support::process::PATIENCE;
 
-/// A whole reply.
+/// A complete HTTP reply.
 #[derive(Debug)]
 pub(crate) struct Reply {
     pub(crate) status: u16,
@@ -97,7 +97,7 @@ pub(crate) struct EventStream {
     pub(crate) head: String,
 }
 
-/// A server-sent event.
+/// A message of the event stream.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Message {
     pub(crate) event: String,

@@ -22,7 +22,7 @@ const PASSWORD: &str = "correct horse";
 const PUMP: &str = "/api/v1/drives/pump-1/commands";
 const HEARTBEAT: &str = "/api/v1/drives/pump-1/heartbeat";
 const STOP: &str = "{\"run\": false}";
-/// `alice:correct horse`
+/// Basic authentication of `alice:correct horse`.
 const BASIC: &str = "Authorization: Basic YWxpY2U6Y29ycmVjdCBob3JzZQ==\r\n";
 
 /// A server with commands: `pump-1` may be commanded and has a lease, `fan-2` is monitored. A bus acknowledges.

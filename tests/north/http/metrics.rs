@@ -300,10 +300,10 @@ async fn what_is_not_good_has_no_sample() {
         "drivegate_drive_up",
         "drivegate_drive_state",
         "drivegate_drive_transactions_total",
-        // Counts stay, as counters do.
+        // Counters are kept while the drive is offline.
         "drivegate_drive_starts_total",
         "drivegate_drive_running_seconds_total",
-        // Offline is a cause.
+        // Being offline is a cause.
         "drivegate_drive_blocked",
     ];
     let never: BTreeSet<String> = known.map(String::from).into();

@@ -14,7 +14,7 @@ use drivegate::event::EventKind;
 
 use self::lively::Lively;
 
-/// A text that must stay one.
+/// A text that must be shown as text.
 const NASTY: &str = "<img src=x onerror=window.hacked=1>";
 
 /// Runs a script of `tests/north/http/page`, which controls the browser; returns its output.

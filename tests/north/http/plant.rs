@@ -188,7 +188,7 @@ pub(crate) fn count_a_write(plant: &Plant) {
     ticket.answer(order::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
 }
 
-/// Figures of all north sides.
+/// Figures of all servers.
 pub(crate) fn stats() -> Arc<NorthState> {
     let stats = NorthState::default();
     stats.slots.count("line1", SlotOutcome::Answered);
@@ -202,7 +202,7 @@ pub(crate) fn stats() -> Arc<NorthState> {
     Arc::new(stats)
 }
 
-/// A served plant.
+/// A server with its plant.
 pub(crate) struct Server {
     pub(crate) shared: SharedPlant,
     pub(crate) stats: Arc<NorthState>,

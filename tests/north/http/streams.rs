@@ -1,4 +1,4 @@
-//! Server-sent events.
+//! Tests of server-sent events.
 
 use std::time::{Duration, UNIX_EPOCH};
 

@@ -28,7 +28,7 @@ pub(crate) use crate::support::process::PATIENCE;
 /// Longer than any test takes.
 const HOUR: Duration = Duration::from_secs(3600);
 
-/// A family with all four tables.
+/// A family that uses all four tables.
 const METER: &str = r#"
 name = "meter"
 title = "Meter"
@@ -242,7 +242,7 @@ pub(crate) fn plant() -> Plant {
     plant_where(|_| {})
 }
 
-/// The plant with changed drives.
+/// The plant with its drives changed by `change`.
 pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
     let bus = |name: &str, mut drives: Vec<DriveSpec>| {
         drives.iter_mut().for_each(&change);

@@ -24,7 +24,7 @@ use super::rig::{Client, PATIENCE, Rig, frame, listener, options, registers, unt
 use crate::support::process::{Running, free_port};
 use crate::support::tools;
 
-/// Runs the script.
+/// Runs the certificate script.
 pub(super) fn make(dir: &Path, arguments: &[&str], days: &str) {
     let script = tools::root().join("docs/modbus-tls-ca.sh");
     let output = Command::new(script)

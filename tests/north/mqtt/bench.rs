@@ -70,7 +70,7 @@ fn keep_log() {
         .try_init();
 }
 
-/// A Mosquitto of our own.
+/// A Mosquitto process started by the test.
 pub(crate) struct Broker {
     pub(crate) port: u16,
     pub(crate) dir: TempDir,
@@ -89,7 +89,7 @@ impl Broker {
         broker
     }
 
-    /// Configured, not started.
+    /// A broker that is configured but not started.
     pub(crate) fn prepared(dir: TempDir, settings: &str) -> Broker {
         let port = free_port();
         let settings = settings.replace("{dir}", &dir.path().display().to_string());
@@ -121,7 +121,7 @@ impl Broker {
         child.wait().unwrap();
     }
 
-    /// Sends a signal.
+    /// Sends a signal to the broker.
     pub(crate) fn signal(&self, name: &str) {
         let id = self.child.as_ref().unwrap().id().to_string();
         let sent = Command::new("kill").args(["-s", name, &id]).status().unwrap();
@@ -341,7 +341,7 @@ impl CutLine {
     }
 }
 
-/// Threads of the gateway.
+/// Number of threads of the gateway's runtime.
 const THREADS: usize = 2;
 
 pub(crate) fn runtime() -> Runtime {
@@ -434,7 +434,7 @@ impl Gateway {
         self.orders.lock().unwrap().clone()
     }
 
-    /// Stops in order.
+    /// Stops the gateway in an orderly way.
     pub(crate) fn stop(self) {
         self.cancel.cancel();
         let stopped = async { tokio::time::timeout(DEADLINE, self.mqtt.stopped()).await };
@@ -462,7 +462,7 @@ impl Gateway {
     }
 }
 
-/// Acknowledges all commands.
+/// Answers for the bus: acknowledges all commands.
 async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
     loop {
         let now = Instant::now();

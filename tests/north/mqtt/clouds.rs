@@ -55,7 +55,7 @@ fn serve_connect(mut client: TcpStream, asked: &Mutex<Vec<String>>) {
     let head = String::from_utf8_lossy(&head).into_owned();
     let target = head.split_whitespace().nth(1).unwrap_or_default().to_string();
     asked.lock().unwrap().push(target.clone());
-    // The name means something here only.
+    // The name can only be resolved by the proxy.
     let Ok(mut server) = TcpStream::connect(target.replace("broker.plant.invalid", "127.0.0.1")) else {
         return;
     };

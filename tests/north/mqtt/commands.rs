@@ -1,4 +1,4 @@
-//! The set topics.
+//! Commands on the set topics.
 
 use std::time::Duration;
 
@@ -245,7 +245,7 @@ fn retained_messages_are_never_commands() {
     watcher.wait("the second event", |m| {
         m.topic == EVENT && m.payload.contains("retained")
     });
-    // Retained, when the gateway comes again.
+    // The command is retained when the gateway connects again.
     watcher.clear();
     gateway.stop();
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));

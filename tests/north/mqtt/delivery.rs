@@ -87,7 +87,7 @@ fn a_killed_broker_gets_everything_again() {
     watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
     watcher.wait("the bus", |m| m.topic == "drivegate/hall/bus/line1");
     assert_eq!(watcher.all()[0].topic, "drivegate/hall/status", "the birth comes first");
-    // Subscribed again.
+    // The gateway has subscribed again.
     broker.publish("drivegate/hall/drive/p1/set/run", "1", &[]);
     watcher.wait("the result", |m| m.topic == "drivegate/hall/drive/p1/result");
     assert_eq!(gateway.ordered().len(), 1);

@@ -13,7 +13,7 @@ use super::bench::*;
 const EVENT: &str = "drivegate/hall/drive/p1/event";
 const STATE: &str = "drivegate/hall/drive/p1/state";
 
-/// Behaviour of the broker.
+/// The behaviour of the hostile broker.
 #[derive(Clone, Default)]
 struct Manners {
     /// Properties of the broker's CONNACK.
@@ -26,7 +26,7 @@ struct Manners {
     backwards: bool,
     /// The first connection ends with this DISCONNECT after the first event.
     farewell: Option<Vec<u8>>,
-    /// Whether the broker leaves subscriptions unanswered.
+    /// Whether the broker does not answer subscriptions.
     deaf: bool,
     /// Whether the broker stops answering at the first ping.
     mute: bool,
@@ -46,7 +46,7 @@ fn with(properties: Vec<u8>) -> Manners {
 
 #[derive(Default)]
 struct Seen {
-    /// Topic, QoS, retain flag and payload.
+    /// Received messages: topic, QoS, retain flag and payload.
     messages: Vec<(String, u8, bool, Vec<u8>)>,
     connections: usize,
     most_in_flight: usize,
@@ -69,7 +69,7 @@ impl Hostile {
         let port = listener.local_addr().unwrap().port();
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let shared = seen.clone();
-        // The thread ends with the process.
+        // The thread lives as long as the process.
         std::thread::spawn(move || {
             for stream in listener.incoming().map_while(Result::ok) {
                 let first = {
@@ -397,7 +397,7 @@ fn refused_messages_concern_their_topic() {
 
 #[test]
 fn what_is_refused_for_now_comes_later() {
-    // Quota exceeded, packet id in use.
+    // Reason codes: quota exceeded, packet id in use.
     for code in [0x97, 0x91] {
         let broker = Hostile::start(Manners {
             refused: Some((EVENT, code, 3)),

@@ -116,7 +116,7 @@ fn wait_seen(what: &str, watcher: &Watcher, wanted: impl Fn(&Seen) -> bool) -> S
     })
 }
 
-/// A host sends a command.
+/// Sends a command as a host.
 fn command(broker: &Broker, topic: &str, metrics: Json, more: &[&str]) {
     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
     let payload = json!({ "timestamp": now.as_millis() as u64, "metrics": metrics });

@@ -6,7 +6,7 @@ use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
 use drivegate::drive::{Bound, Derived, ModelPoint, Point, PointIndex, PollClass, Source, Value};
 
-/// The families, Modbus first.
+/// The Modbus families.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
 /// Profiles for one application, each based on another profile.
 const APPLICATIONS: [&str; 6] = [

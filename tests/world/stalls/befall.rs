@@ -1,4 +1,4 @@
-//! Incidents of threads, drives and names.
+//! Random incidents of threads, drives and names.
 
 use super::*;
 
@@ -19,7 +19,7 @@ impl World {
         }
     }
 
-    /// Incidents of threads, drives and names.
+    /// Lets random incidents happen to threads, drives and names.
     pub(super) fn incidents(&mut self) {
         let now = self.now;
         if self.calm {

@@ -1,4 +1,4 @@
-//! The actions of the clients.
+//! The actions of the clients in a world with stalls.
 
 use super::*;
 
@@ -18,7 +18,7 @@ impl World {
         });
     }
 
-    /// The next action of a client.
+    /// Runs the next action of a client.
     pub(super) fn act(&mut self, index: usize) {
         let now = self.now;
         if let Some((_, bytes, id)) = self.connections[index].rest.take_if(|(at, ..)| *at <= now) {

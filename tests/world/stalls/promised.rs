@@ -32,11 +32,11 @@ pub struct Order {
     pub connection: usize,
     pub machine: u8,
     pub does: Does,
-    /// When the first byte was sent.
+    /// When the first byte of the order was sent.
     pub sent: Instant,
-    /// When the last byte was sent.
+    /// When the last byte of the order was sent.
     pub complete: Instant,
-    /// When the last byte was read.
+    /// When the last byte of the order was read.
     pub read: Option<Instant>,
     /// When the client closed the connection, if before that.
     pub closed: Option<Instant>,

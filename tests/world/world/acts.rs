@@ -1,4 +1,4 @@
-//! The actions of the clients.
+//! The actions of the clients in a world.
 
 use super::*;
 use drivegate_world::drive::PointIndex;

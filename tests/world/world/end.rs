@@ -1,4 +1,4 @@
-//! The end of the gateway.
+//! The end of the gateway in a world.
 
 use drivegate_world::queue::NotStopped;
 

@@ -15,7 +15,7 @@ const MUTE: Duration = Duration::from_secs(4);
 const COMMANDED: Duration = Duration::from_secs(11);
 /// Longest pause between two stops of a flood to a drive that does not answer.
 const FLOODED: Duration = Duration::from_secs(2);
-/// Granularity of what is measured.
+/// Granularity of the measurements.
 const STEP: Duration = Duration::from_millis(10);
 
 /// The oldest values of each read of a drive in a time of observation.
@@ -66,7 +66,7 @@ impl World {
         late + MUTE + 3 * round + self.exchange(bus)
     }
 
-    /// The longest exchange on a line.
+    /// Duration of the longest transaction on a line.
     pub(super) fn exchange(&self, bus: &WorldBus) -> Duration {
         let report = if bus.line.protocol == Protocol::N2 { 2 } else { 1 };
         report * bus.line.response_timeout + bus.handle.image.spec.format.chars(160)

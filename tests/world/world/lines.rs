@@ -31,7 +31,7 @@ impl World {
         }
     }
 
-    /// A request is on the wire.
+    /// Checks a request that is on the wire.
     pub(super) fn sent(&mut self, bus: usize, asked: &Asked) {
         let (drive, pdu, now) = (asked.drive, &asked.pdu, self.now);
         assert!(
@@ -270,7 +270,7 @@ impl World {
         }
     }
 
-    /// A drive acted upon a request.
+    /// Notes a request that a drive carried out.
     pub(super) fn acted(&mut self, bus: usize, asked: &Asked) {
         let profile = self.buses[bus].profile.clone();
         let refused = matches!(asked.reply, Some(Reply::Exception(_)));

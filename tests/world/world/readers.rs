@@ -15,7 +15,7 @@ use super::*;
 const EVERY: (usize, usize) = (8, 8);
 
 impl World {
-    /// Reads one drive after the other.
+    /// Reads one drive after the other over HTTP.
     pub(super) fn read_by_http(&mut self) {
         self.readings += 1;
         if !self.readings.is_multiple_of(EVERY.0) {

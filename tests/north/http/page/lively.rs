@@ -31,11 +31,11 @@ const TRIP: Duration = Duration::from_secs(75);
 pub(super) enum Play {
     /// Runs with changing references, with that phase.
     Runs(u64),
-    /// Runs, then trips with an overcurrent.
+    /// The drive runs, then trips with an overcurrent.
     Trips,
     /// The drive is ready, and its panel is the control place.
     Local,
-    /// Answered until a minute ago.
+    /// The drive answered until a minute ago.
     Gone,
 }
 
@@ -198,7 +198,7 @@ impl Lively {
     }
 }
 
-/// Events and commands of its past.
+/// Adds events and commands to the past.
 fn tell(plant: &Plant) {
     let ago = |seconds: u64| std::time::SystemTime::now() - Duration::from_secs(seconds);
     let events = [
@@ -260,7 +260,7 @@ fn answer(cast: &Cast, now: Instant) {
     }
 }
 
-/// The past; who kept it.
+/// Creates the past; returns what must be kept.
 fn live_through(plant: &Plant, stats: &NorthState, cast: &Cast, options: &RecorderOptions) -> Recorder {
     let end = Clock::read();
     let begin = Clock {
