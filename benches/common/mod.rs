@@ -66,7 +66,7 @@ pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
 /// Waits at most two minutes until `there` holds.
 ///
 /// # Errors
-/// The condition is not met in time.
+/// If the condition is not met in time.
 pub fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
     let patience = Instant::now() + Duration::from_secs(120);
     while !there() {

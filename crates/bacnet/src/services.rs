@@ -274,7 +274,7 @@ pub fn subscribe_cov(data: &[u8]) -> Read<Subscribe> {
 /// Parses a SubscribeCOVProperty request.
 ///
 /// # Errors
-/// The encoding is not valid, or the increment is negative or not finite.
+/// If the encoding is not valid, or the increment is negative or not finite.
 pub fn subscribe_cov_property(data: &[u8]) -> Read<Subscribe> {
     let mut reader = Reader::new(data);
     let (process, object) = (reader.context_u32(0)?, reader.context_object(1)?);

@@ -236,7 +236,7 @@ impl CommandRun {
     /// The client's stop in the form in which it was ordered: the bus that replaces this one sends it completely.
     ///
     /// # Errors
-    /// The command is not a stop of a client.
+    /// If the command is not a stop of a client.
     pub fn into_stop(mut self) -> Result<Command, Box<CommandRun>> {
         if self.urgency != Urgency::Stop || !self.is_of_client() {
             return Err(Box::new(self));

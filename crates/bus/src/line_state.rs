@@ -279,8 +279,8 @@ impl LineState {
     /// Ends the transaction if its time limit has passed.
     ///
     /// # Errors
-    /// Ends the transaction if its time limit has passed; otherwise returns the time until which more bytes are
-    /// awaited, or `None` if there is no transaction.
+    /// If the time limit has not passed: the time until which more bytes are awaited. `None` if there is no
+    /// transaction.
     pub fn on_time(&mut self, now: Instant) -> Result<Exchanged, Option<Instant>> {
         let Some(underway) = self.underway.as_mut() else {
             return Err(None);

@@ -363,7 +363,7 @@ impl Master {
     /// The next transaction to send.
     ///
     /// # Errors
-    /// The time until which nothing does, always after `now`.
+    /// If nothing is to be done yet: the time of the next thing to do, always after `now`.
     pub fn next(&mut self, now: Instant, news: &mut Vec<News>) -> Result<Turn, Instant> {
         self.put_back_background(now);
         self.check(now, news);

@@ -124,7 +124,7 @@ impl Daemon {
     /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
     ///
     /// # Errors
-    /// A server cannot start, or the system does not provide a thread.
+    /// If a server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
         Daemon::start_with(settings, None).await
     }
@@ -233,8 +233,8 @@ impl Daemon {
     /// Applies a new configuration and returns what changed. Unchanged parts keep running without a lost cycle.
     ///
     /// # Errors
-    /// A bus or a server cannot start: everything runs as before. Or a changed recorder cannot: everything else runs as
-    /// before, without a recorder.
+    /// If a bus or a server cannot start: everything runs as before. If a changed recorder cannot start: everything
+    /// else runs as before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
         // All steps that can fail come before any running part is stopped or changed.

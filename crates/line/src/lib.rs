@@ -208,7 +208,8 @@ pub struct Line {
 impl Line {
     /// Opens the port exclusively; the texts are warnings.
     ///
-    /// # Errors When the port cannot be opened or does not support the settings.
+    /// # Errors
+    /// When the port cannot be opened or does not support the settings.
     pub fn open(port: &str, format: &LineFormat, options: &LineOptions) -> Result<(Line, Vec<String>), OpenError> {
         Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }

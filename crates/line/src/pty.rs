@@ -28,8 +28,8 @@ impl Pty {
     /// Opens a new pseudo-terminal in raw mode; `link` becomes a symbolic link to it.
     ///
     /// # Errors
-    /// No pseudo-terminal is available, or the link cannot be made. Anything but a symbolic link to a pseudo-terminal at its
-    /// path is left alone and is an error.
+    /// If no pseudo-terminal is available, or the link cannot be made. Whatever exists at the path of the link and is
+    /// not a symbolic link to a pseudo-terminal is left unchanged and is an error.
     pub fn open(link: Option<&Path>) -> io::Result<Pty> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;

@@ -49,7 +49,8 @@ impl Receiver {
 
     /// Reads the available bytes without waiting; returns 0 if there are none.
     ///
-    /// # Errors When the port is lost.
+    /// # Errors
+    /// When the port is lost.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         self.0.receive(buffer)
     }

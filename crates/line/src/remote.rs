@@ -33,7 +33,7 @@ impl Raw {
     /// Opens the connection; `other` is what earlier connections have shown about the server.
     ///
     /// # Errors
-    /// The server speaks Modbus TCP.
+    /// If the server speaks Modbus TCP.
     pub(super) fn open(stream: TcpStream, port: &str, other: &OtherServer) -> Result<Raw, OpenError> {
         if other.is_found() && !other.is_gone(&stream) {
             return Err(OpenError::Remote {

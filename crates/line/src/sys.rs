@@ -68,7 +68,7 @@ struct SerialStruct {
 /// Sets how the driver switches the direction; `config` becomes the driver's actual settings.
 ///
 /// # Errors
-/// ENOTTY where the driver cannot.
+/// `ENOTTY` if the driver does not support RS-485 settings.
 pub(super) fn set_rs485(port: impl AsFd, config: &mut SerialRs485) -> std::io::Result<()> {
     // SAFETY: the request reads and writes one `struct serial_rs485`, whose layout is that of `linux/serial.h`.
     unsafe { ioctl(port, Updater::<TIOCSRS485, SerialRs485>::new(config)) }?;
@@ -78,7 +78,7 @@ pub(super) fn set_rs485(port: impl AsFd, config: &mut SerialRs485) -> std::io::R
 /// Sets RTS and DTR where a level is chosen.
 ///
 /// # Errors
-/// ENOTTY or EINVAL where the driver cannot.
+/// `ENOTTY` or `EINVAL` if the driver cannot set the lines.
 pub(super) fn set_levels(port: impl AsFd, rts: Level, dtr: Level) -> std::io::Result<()> {
     let lines = |wanted| {
         let of = |level, line| if level == wanted { line } else { 0 };
@@ -99,7 +99,7 @@ pub(super) fn set_levels(port: impl AsFd, rts: Level, dtr: Level) -> std::io::Re
 /// Asks the driver to pass bytes on at once (FTDI delays them by 16 ms by default).
 ///
 /// # Errors
-/// ENOTTY where the driver cannot, EPERM where the user may not.
+/// `ENOTTY` if the driver has no such setting, `EPERM` if the user may not change it.
 pub(super) fn low_latency(port: impl AsFd) -> io::Result<()> {
     // SAFETY: the requests write and read one `struct serial_struct`, whose layout is that of `linux/serial.h`.
     unsafe {

@@ -47,7 +47,7 @@ pub(super) enum RoleError {
 /// Reads the summary of a certificate.
 ///
 /// # Errors
-/// The bytes are not one DER-encoded certificate.
+/// If the bytes are not one DER-encoded certificate.
 pub(super) fn read(der: &[u8]) -> der::Result<CertificateSummary> {
     let certificate = Certificate::from_der(der)?;
     let certificate = certificate.tbs_certificate();

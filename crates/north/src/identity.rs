@@ -266,7 +266,8 @@ pub(super) fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientCo
 
 /// TLS towards a gateway, verified by the certificates of a file or by the CAs of the system.
 ///
-/// # Errors Their fault, and the remedy.
+/// # Errors
+/// If the certificates of the authority are not usable: contains the fault and the remedy.
 pub fn client_tls(ca: Option<&Path>) -> Result<Arc<ClientConfig>, String> {
     let builder = client_builder(ca).map_err(|error| error.to_string())?;
     Ok(Arc::new(builder.with_no_client_auth()))
@@ -277,7 +278,7 @@ pub fn client_tls(ca: Option<&Path>) -> Result<Arc<ClientConfig>, String> {
 /// with error and remedy.
 ///
 /// # Errors
-/// The file cannot be read, or contains no certificate.
+/// If the file cannot be read, or contains no certificate.
 pub fn certificate_warnings(file: &Path, host: &str, now: SystemTime) -> Result<Vec<String>, String> {
     let certificates = pem::certificates(file).map_err(|error| error.to_string())?;
     let problems = certificates.iter().flat_map(|der| {

@@ -152,7 +152,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// would replace one that works.
     ///
     /// # Errors
-    /// The first address that cannot be bound; everything is open as before.
+    /// If an address cannot be bound: contains the first such address. All listeners stay as before.
     pub(super) async fn prepare(&mut self, wanted: Vec<ListenerSpec>) -> Result<NewSockets, ServerError> {
         let mut kept = vec![false; self.open.len()];
         let mut missing = Vec::new();

@@ -277,7 +277,7 @@ impl<'r> DriveView<'r> {
     /// and an age but no values.
     ///
     /// # Errors
-    /// 02 if the span is not within one block.
+    /// Exception 02 if the span is not within one block.
     pub(crate) fn registers(&self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         let (start, end) = (u32::from(start), u32::from(start) + u32::from(count));
         let inside = |block: &&&[Entry]| {

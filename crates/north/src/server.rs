@@ -24,7 +24,7 @@ pub trait Server: Sized + std::fmt::Debug {
     /// Starts the server, which runs until `cancel`.
     ///
     /// # Errors
-    /// The server cannot run with these options: an address, a certificate or a thread is not available.
+    /// If the server cannot run with these options: an address, a certificate or a thread is not available.
     async fn start(
         options: Self::Options,
         plant: SharedPlant,

@@ -27,7 +27,7 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
     /// A service without listeners; `tasks` end with `cancel`.
     ///
     /// # Errors
-    /// A certificate cannot be used, or a thread cannot be started.
+    /// If a certificate cannot be used, or a thread cannot be started.
     fn new(
         options: &Options,
         plant: SharedPlant,

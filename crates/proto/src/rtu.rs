@@ -148,7 +148,7 @@ pub type ReceivedPdu = Result<RequestPdu, (u8, super::Exception)>;
 /// Decodes the request in a whole frame, as a slave does.
 ///
 /// # Errors
-/// `None` when the CRC is wrong (a slave stays silent); the exception with the function when the
+/// `None` if the CRC is wrong: a slave does not answer. The exception and the function if the
 /// PDU is refused.
 pub fn decode_request(frame: &[u8]) -> Option<(u8, ReceivedPdu)> {
     let (address, pdu) = open_frame(frame)?;

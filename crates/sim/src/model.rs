@@ -222,7 +222,7 @@ impl Beyond {
     /// Checks that a message may contain this number of items.
     ///
     /// # Errors
-    /// The exception for none and for too many.
+    /// If the count is zero or exceeds the limit: contains the exception.
     pub fn check(self, count: u16, limit: u16) -> Result<(), Exception> {
         match self {
             _ if (1..=limit).contains(&count) => Ok(()),
@@ -245,7 +245,7 @@ impl ReadOnly {
     /// The outcome of a write to a read-only register.
     ///
     /// # Errors
-    /// Exception 02, unless such accesses are ignored.
+    /// Exception 02, unless the drive ignores such accesses.
     pub fn outcome(self) -> Result<(), Exception> {
         match self {
             ReadOnly::Exception => Err(Exception::ADDRESS),

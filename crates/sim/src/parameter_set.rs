@@ -105,7 +105,7 @@ impl ParameterSet {
     /// Sets a parameter as [`ParameterSet::check`] allows, not over the bus.
     ///
     /// # Errors
-    /// The errors of [`ParameterSet::check`]; nothing is set then.
+    /// The errors of [`ParameterSet::check`]: then no value is set.
     pub(crate) fn set(&mut self, key: u16, value: u16) -> Result<(), Refused> {
         self.check(key, value)?;
         let at = self.find(key)?;
@@ -118,7 +118,7 @@ impl ParameterSet {
     /// A write over the bus: as [`ParameterSet::set`], and recorded; `fed` whether the inverter feeds the motor.
     ///
     /// # Errors
-    /// The errors of [`ParameterSet::check`]; nothing is written then.
+    /// The errors of [`ParameterSet::check`]: then no value is written.
     pub(crate) fn write(&mut self, key: u16, value: u16, fed: bool) -> Result<(), Refused> {
         self.set(key, value)?;
         let writes = self.writes.entry(key).or_default();

@@ -144,7 +144,7 @@ impl SimulatedBus {
     /// Opens the port and starts the thread.
     ///
     /// # Errors
-    /// The port cannot be opened, linked or listened on.
+    /// If the port cannot be opened, linked or listened on.
     pub fn start(options: SimulatedBusOptions) -> io::Result<SimulatedBus> {
         let SimulatedBusOptions {
             name,

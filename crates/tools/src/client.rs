@@ -136,7 +136,7 @@ impl Client {
     /// Sends a request and waits for the head of the reply.
     ///
     /// # Errors
-    /// No gateway is found, or it does not answer.
+    /// If no gateway is found, or it does not answer.
     async fn open(&self, asked: &Asked) -> Result<Opened, ClientError> {
         let mut missed = NotFound {
             file: self.file.clone(),
@@ -197,7 +197,7 @@ impl Client {
     /// Sends a request and waits for the reply.
     ///
     /// # Errors
-    /// No gateway is found, or it does not answer.
+    /// If no gateway is found, or it does not answer.
     pub(crate) async fn ask(&self, asked: &Asked) -> Result<Reply, ClientError> {
         self.open(asked).await?.whole(asked).await
     }
@@ -213,7 +213,7 @@ impl Client {
     /// The document at `path`, which begins with a slash.
     ///
     /// # Errors
-    /// No gateway is found, or it refuses.
+    /// If no gateway is found, or it refuses.
     pub(crate) async fn view<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         let asked = Asked::view(path);
         self.ask(&asked).await?.accepted(&asked)

@@ -43,7 +43,8 @@ impl<C: Filed> CredentialsFile<C> {
 
     /// Reads the text of the file.
     ///
-    /// # Errors The fault, as a message.
+    /// # Errors
+    /// If the file cannot be read: contains the message.
     fn read(&self) -> Result<String, String> {
         let (what, shown) = (C::FILE, self.path.display());
         read_to_string(&self.path)
@@ -52,7 +53,8 @@ impl<C: Filed> CredentialsFile<C> {
 
     /// Reads the credentials in the file.
     ///
-    /// # Errors The fault, as a message.
+    /// # Errors
+    /// If the file cannot be read or is invalid: contains the message.
     pub(super) fn list(&self) -> Result<Credentials<C>, String> {
         parsed(&self.path, &self.read()?)
     }
@@ -60,7 +62,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// Adds a credential; one of the same name is replaced if `may_replace`. Returns whether there was one.
     ///
     /// # Errors
-    /// The name exists and may not be replaced, or the file cannot be read or written.
+    /// If the name exists and may not be replaced, or the file cannot be read or written.
     pub(super) fn put(&self, new: &C, may_replace: bool) -> Result<bool, String> {
         let (mut is_known, line) = (false, new.to_string());
         self.change(|text| {
@@ -96,7 +98,7 @@ impl<C: Filed> CredentialsFile<C> {
     /// so that no change is lost.
     ///
     /// # Errors
-    /// The error of `change`, or of the system; the file is unchanged.
+    /// The error of `change` or of the system: then the file is unchanged.
     fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
         // A symbolic link is kept: the file that it points to is changed.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());

@@ -44,7 +44,7 @@ impl Loading {
     /// Begins to read the configuration in `path`.
     ///
     /// # Errors
-    /// The system does not provide a thread.
+    /// If the system does not provide a thread.
     pub(super) fn begin(path: &Path, limit: Option<Duration>) -> io::Result<Loading> {
         Loading::counted(path, limit, Reader::new(&Arc::default()))
     }

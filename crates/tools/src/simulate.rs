@@ -153,7 +153,7 @@ fn parse_protocol(text: &str) -> Result<Protocol, String> {
 /// The simulated drive of a profile.
 ///
 /// # Errors
-/// The profile cannot be simulated: the reason.
+/// If the profile cannot be simulated: contains the reason.
 fn model_of(profile: &Arc<Profile>) -> Result<ModelOptions, String> {
     ModelOptions::of_profile(profile).ok_or_else(|| match &profile.simulator {
         Some(name) if ModelOptions::by_name(name).is_none() && !profile.protocols.contains(&Protocol::N2) => format!(

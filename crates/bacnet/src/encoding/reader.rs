@@ -181,7 +181,7 @@ impl<'a> Reader<'a> {
     /// The unsigned value with this context tag, if it is the next one.
     ///
     /// # Errors
-    /// The encoding is not valid, or the number exceeds 32 bits.
+    /// If the encoding is not valid, or the number exceeds 32 bits.
     pub fn optional_u32(&mut self, number: u8) -> Read<Option<u32>> {
         self.optional(number)?.map(u32_of).transpose()
     }
@@ -278,7 +278,7 @@ fn primitive(number: u8, bytes: &[u8]) -> Read<Data> {
 /// A CharacterString in one of the usual character sets.
 ///
 /// # Errors
-/// The encoding is not valid, or the character set is not supported.
+/// If the encoding is not valid, or the character set is not supported.
 pub fn text_of(bytes: &[u8]) -> Read<String> {
     let wrong = Reject::InvalidParameterDataType;
     let (set, text) = bytes.split_first().ok_or(wrong)?;
@@ -306,7 +306,7 @@ fn u64_of(bytes: &[u8]) -> Read<u64> {
 /// An Unsigned of at most 32 bits.
 ///
 /// # Errors
-/// The number is empty or longer than 32 bits.
+/// If the number is empty or longer than 32 bits.
 pub fn u32_of(bytes: &[u8]) -> Read<u32> {
     u32::try_from(u64_of(bytes)?).map_err(|_| Reject::ParameterOutOfRange)
 }

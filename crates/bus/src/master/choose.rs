@@ -84,7 +84,7 @@ impl Master {
     /// Makes decisions until there is a request for the line, or nothing to do.
     ///
     /// # Errors
-    /// The time until which nothing is to be done, after `now`.
+    /// If nothing is to be done yet: the time of the next thing to do, after `now`.
     pub(super) fn choose(&mut self, now: Instant) -> Result<Turn, Instant> {
         let soon = now + Duration::from_millis(1);
         for _ in 0..MOST_DECISIONS {

@@ -227,7 +227,7 @@ impl SavedDrills {
     /// Parses the file of saved drills.
     ///
     /// # Errors
-    /// The file is damaged or of another version: the reason.
+    /// If the file is damaged or of another version: contains the reason.
     pub fn from_json(bytes: &[u8]) -> Result<SavedDrills, String> {
         let saved: SavedDrills = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
         match saved.drivegate_drills {

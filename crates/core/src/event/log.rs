@@ -86,7 +86,7 @@ pub enum LineError {
 /// Parses an event from its JSON, as [`Event`] is serialized.
 ///
 /// # Errors
-/// The line is not an event, or of a newer version.
+/// If the line is not an event, or of a newer version.
 pub fn from_line(line: &[u8]) -> Result<Event, LineError> {
     #[derive(Deserialize)]
     struct Line {

@@ -33,7 +33,7 @@ pub fn set_aside(path: &Path, aside: &Path) -> String {
 /// The content of a file of at most `longest` bytes; `None` if the file does not exist.
 ///
 /// # Errors
-/// The file cannot be read, or is longer and so not written by the gateway.
+/// If the file cannot be read, or is longer than `longest`: the gateway did not write such a file.
 pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
     let length = match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -49,7 +49,7 @@ pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
 /// directory if necessary.
 ///
 /// # Errors
-/// The file cannot be written; the old content is left.
+/// If the file cannot be written; the old content is left.
 pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let dir = path.parent();
     if let Some(dir) = dir {

@@ -57,7 +57,7 @@ impl Patience {
     /// Runs `read` on a separate thread and waits for its result within the limit.
     ///
     /// # Errors
-    /// The disk does not answer in time, or `read` panicked, which is logged.
+    /// If the disk does not answer in time, or `read` panicked, which is logged.
     pub async fn read<T: Send + 'static>(&self, read: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
         match self.wait(tokio::task::spawn_blocking(read)).await {
             Some(Ok(found)) => Ok(found),

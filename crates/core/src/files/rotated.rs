@@ -63,7 +63,7 @@ impl Rotated {
     /// Opens the file with an exclusive lock and creates its directory; returns the size of the file in bytes.
     ///
     /// # Errors
-    /// The file cannot be opened, or another process has it open.
+    /// If the file cannot be opened, or another process has it open.
     pub fn open(&mut self) -> io::Result<(&mut File, u64)> {
         self.open = None;
         if let Some(dir) = self.path.parent() {
@@ -100,7 +100,7 @@ impl Rotated {
     /// Appends bytes, whole or not at all.
     ///
     /// # Errors
-    /// The bytes cannot be written, or the file is not open. A part that was written is removed, as far as that is
+    /// If the bytes cannot be written, or the file is not open. A part that was written is removed, as far as that is
     /// possible.
     pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
         let open = self.open.as_mut().ok_or_else(|| io::Error::other("it is not open"))?;
@@ -128,7 +128,7 @@ impl Rotated {
     /// Makes the current file the first of the older ones and removes the oldest one; the current file is then closed.
     ///
     /// # Errors
-    /// A file cannot be renamed, or the current one not be brought to disk.
+    /// If a file cannot be renamed, or the current file cannot be synchronised to disk.
     pub(crate) fn rotate(&mut self) -> io::Result<()> {
         self.sync()?;
         self.open = None;

@@ -58,7 +58,7 @@ pub struct LineCapture {
 /// Reads a capture up to its end or its first defect. Packets of interfaces other than serial lines are left out.
 ///
 /// # Errors
-/// The file is not a capture of a serial line, or is broken before its first packet with bytes.
+/// If the file is not a capture of a serial line, or is broken before its first packet with bytes.
 pub fn read(file: &[u8]) -> Result<LineCapture, CaptureError> {
     let mut packets = Vec::new();
     let read = match file.first_chunk::<4>() {

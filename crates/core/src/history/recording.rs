@@ -250,7 +250,7 @@ impl Header {
     /// Reads the header of a file from its beginning, and where the next line begins.
     ///
     /// # Errors
-    /// The bytes do not begin with a header of this version.
+    /// If the bytes do not begin with a header of this version.
     pub fn parse(bytes: &[u8]) -> Result<(Header, usize), RecordingError> {
         let end = bytes.iter().position(|byte| *byte == b'\n');
         let line = bytes.get(..end.unwrap_or(bytes.len())).unwrap_or_default();
@@ -336,7 +336,8 @@ impl Recording {
 
     /// Parses the bytes of a recording file.
     ///
-    /// # Errors They are not an intact recording of this version: the fault and its position.
+    /// # Errors
+    /// If the bytes are not an intact recording of this version: contains the fault and its position.
     pub fn parse(bytes: &[u8]) -> Result<Recording, RecordingError> {
         let (header, mut offset) = Header::parse(bytes)?;
         let mut recording = Recording::new(header);

@@ -98,7 +98,8 @@ pub fn read(path: &Path) -> Result<Recording, ReadError> {
 
 /// The recordings of a directory, oldest first, and the faults of the others.
 ///
-/// # Errors The directory cannot be read; a missing one has no recordings.
+/// # Errors
+/// If the directory cannot be read. A missing directory is not an error: it contains no recordings.
 pub fn list(dir: &Path) -> io::Result<(Vec<Entry>, Vec<ReadError>)> {
     let files = match fs::read_dir(dir) {
         Ok(files) => files,

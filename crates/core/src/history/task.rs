@@ -86,7 +86,7 @@ impl Recordings {
     /// Reads a recording; none where the id is unknown. Blocks while the disk is read.
     ///
     /// # Errors
-    /// The file of the recording cannot be read.
+    /// If the file of the recording cannot be read.
     pub fn read(&self, id: &str) -> Option<Result<Recording, ReadError>> {
         let path = {
             let shared = self.shared();
@@ -104,7 +104,7 @@ impl Recordings {
     /// complete.
     ///
     /// # Errors
-    /// The recorder is off, or no drive has this name.
+    /// If the recorder is off, or no drive has this name.
     pub async fn record(&self, drive: &str, who: &str) -> Result<(String, Duration), NotRecorded> {
         let (reply, begun) = oneshot::channel();
         let after = {

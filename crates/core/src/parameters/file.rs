@@ -194,7 +194,8 @@ impl ParameterFile {
 
     /// Reads a file; `checked` whether its checksum fits.
     ///
-    /// # Errors The fault, with the line.
+    /// # Errors
+    /// If the text is not a parameter file: contains the fault and its line.
     pub fn parse(text: &str) -> Result<ParameterFile, FileError> {
         let mut lines = (1..).zip(text.lines());
         if lines.next().is_none_or(|(_, line)| line.trim_end() != HEAD) {

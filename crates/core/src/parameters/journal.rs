@@ -92,7 +92,7 @@ impl Owner {
     /// Parses the head of a journal, even if the rest cannot be parsed.
     ///
     /// # Errors
-    /// The text is not a journal: the reason.
+    /// If the text is not a journal: contains the reason.
     pub fn parse(text: &str) -> Result<Owner, String> {
         owner(&mut body_of(text)?.lines())
     }
@@ -231,7 +231,7 @@ impl Journal {
     /// Reads a journal of a drive of that family.
     ///
     /// # Errors
-    /// The text is not a journal of this family: the reason.
+    /// If the text is not a journal of this family: contains the reason.
     pub fn parse(text: &str, profile: &Profile) -> Result<Journal, String> {
         let body = body_of(text)?;
         let mut lines = body.lines();

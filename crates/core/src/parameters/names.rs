@@ -16,7 +16,8 @@ impl Names {
     /// Reads a list: comma or semicolon between fields, double quotes around fields that contain one; the first row
     /// may have the names of the columns. `scale` is the value of one count; unit and scale may be empty.
     ///
-    /// # Errors The fault, with its line.
+    /// # Errors
+    /// If the text is not a list of names: contains the fault and its line.
     pub fn parse(text: &str) -> Result<Names, String> {
         let mut names = BTreeMap::new();
         for (number, line) in (1..).zip(text.trim_start_matches('\u{feff}').lines()) {

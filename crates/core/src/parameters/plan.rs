@@ -83,7 +83,8 @@ pub struct Risk(pub String);
 ///
 /// The notes of both files become part of [`ParameterWrite::line`]; [`ParameterFile::named`] renews them.
 ///
-/// # Errors Every reason against it, each with the difference and the remedy.
+/// # Errors
+/// If the restore is not possible: contains every reason, each with the difference and the remedy.
 pub fn plan(
     profile: &Profile,
     wanted: &ParameterFile,

@@ -136,7 +136,8 @@ fn name_after(newest: &str, own: String) -> String {
 
 /// Parses a parameter file from disk.
 ///
-/// # Errors The file and its fault.
+/// # Errors
+/// If the file cannot be read or is invalid: contains the path and the fault.
 pub fn read(path: &Path) -> Result<ParameterFile, String> {
     let shown = path.display();
     let mut text = String::new();

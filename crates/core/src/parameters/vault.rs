@@ -168,7 +168,8 @@ impl Vault {
 
     /// Notes that a reading of this drive begins.
     ///
-    /// # Errors The number of the one already in progress.
+    /// # Errors
+    /// If a backup of the drive is already in progress: contains its number.
     pub fn begin(&self, drive: &Machine) -> Result<u64, u64> {
         let mut state = self.lock();
         if let Some(reading) = state.readings.get(drive).filter(|reading| reading.result.is_none()) {
@@ -237,7 +238,8 @@ impl Vault {
 
     /// Starts a restore of the drive at this stage; returns the number of the restore.
     ///
-    /// # Errors Another one is in progress.
+    /// # Errors
+    /// If another restore of the drive is in progress.
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
         let mut state = self.lock();
         if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {
@@ -260,7 +262,7 @@ impl Vault {
     /// Lets the prepared restore with this number start writing; returns the prepared restore.
     ///
     /// # Errors
-    /// The restore is not the last one, or not prepared.
+    /// If the restore is not the last one, or not prepared.
     pub fn carry_out(&self, drive: &Machine, name: &str, number: u64) -> Result<Arc<Prepared>, String> {
         let mut state = self.lock();
         let restore = state.restores.get_mut(drive).filter(|restore| restore.number == number);

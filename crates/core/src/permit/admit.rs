@@ -22,7 +22,7 @@ const MOST_TEXTS: usize = 12;
 /// `client` is the authority of the client.
 ///
 /// # Errors
-/// The refusal, in the order authority, address, value; nothing is clamped.
+/// If the order is refused. Authority, address and value are checked in this order; no value is clamped.
 pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Admitted, Refusal> {
     let alone = |order: Order, urgency: Urgency| Admitted {
         order,
@@ -99,7 +99,8 @@ fn past_commands(drive: &Reading<'_>, what: &str) -> Refusal {
 
 /// Whether parameters of a drive may be restored.
 ///
-/// # Errors The reason, and the remedy.
+/// # Errors
+/// If the drive does not permit a restore: contains the reason and the remedy.
 pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
     let name = &spec.name;
     if spec.access != Access::Control {

@@ -75,7 +75,7 @@ impl Saved {
     /// Parses the content of a file of starts.
     ///
     /// # Errors
-    /// The file is not a list of starts of this version: the reason.
+    /// If the file is not a list of starts of this version: contains the reason.
     pub fn from_json(bytes: &[u8]) -> Result<Saved, String> {
         let saved: Saved = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
         let most = MOST_STARTS as usize + 1;

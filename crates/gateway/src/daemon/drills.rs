@@ -53,7 +53,7 @@ pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patienc
 /// Reads the drills saved in a file; `None` if the file does not exist.
 ///
 /// # Errors
-/// The file cannot be read, or is not one of drills.
+/// If the file cannot be read, or is not a file of drills.
 pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
     let bytes = files::read(path, LONGEST)?;
     bytes.map(|bytes| SavedDrills::from_json(&bytes)).transpose()

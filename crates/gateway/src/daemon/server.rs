@@ -51,7 +51,7 @@ impl<S: Server> ServerSlot<S> {
     /// Makes the server run as configured: unchanged options keep it running, others restart it.
     ///
     /// # Errors
-    /// The server does not start, and does not run afterwards.
+    /// If the server cannot start: no such server runs afterwards.
     pub(super) async fn apply(
         &mut self,
         configured: Option<&S::Options>,

@@ -54,7 +54,7 @@ pub trait FromNode: Sized {
     /// Converts the node to a value.
     ///
     /// # Errors
-    /// The value has another type, another form, or is out of range.
+    /// If the value has another type, another form, or is out of range.
     fn from_node(node: &Node) -> Result<Self, ValueError>;
 }
 

@@ -94,7 +94,7 @@ impl KeptSlot {
 /// Reads the file with the kept slots; a missing file holds no slots.
 ///
 /// # Errors
-/// The file cannot be read, or is not a list of slots.
+/// If the file cannot be read, or is not a list of slots.
 pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
     match files::read(path, LONGEST)? {
         Some(text) => serde_json::from_slice(&text).map_err(|error| error.to_string()),

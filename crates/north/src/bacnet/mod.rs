@@ -230,7 +230,7 @@ impl Reconfigure for Server {
     /// Prepares other options: binds a new address. Nothing changes for any client.
     ///
     /// # Errors
-    /// The address cannot be bound; everything is as before.
+    /// If the address cannot be bound: the server continues as before.
     async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let sockets = match options.listen == self.options.listen {
             true => None,

@@ -94,7 +94,7 @@ impl Asked {
     /// A command with `points`, where `refused` is the error of the part that is not understood.
     ///
     /// # Errors
-    /// The refusal, unless a stop is among the points, which is carried out in any case.
+    /// If the request is refused: contains the refusal. A request with a stop is never refused.
     pub(crate) fn new(
         points: Points,
         expiry: Duration,

@@ -26,7 +26,7 @@ pub struct StopBody {
 /// Parses which drives are to be stopped, and how long the answer waits for standstill. An empty body stops all drives.
 ///
 /// # Errors
-/// The request does not specify the drives clearly.
+/// If the request does not specify the drives clearly.
 pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
     let unclear = |why: String| {
         let shown = excerpt(payload);

@@ -57,7 +57,7 @@ impl AppState {
     /// Reads files with `read`, away from the tasks of other clients, one reader at a time.
     ///
     /// # Errors
-    /// 503 where the gateway ends.
+    /// Reply 503 if the gateway is shutting down.
     pub(super) async fn read_files<T: Send + 'static>(&self, read: impl FnOnce() -> T + Send + 'static) -> Replied<T> {
         let unavailable = StatusCode::SERVICE_UNAVAILABLE;
         let _permit = self.files.acquire().await.map_err(|_| unavailable)?;
@@ -72,7 +72,7 @@ impl AppState {
     /// The drive with this name.
     ///
     /// # Errors
-    /// The reply if no drive has this name.
+    /// If no drive has this name: contains the reply.
     pub(super) fn drive(&self, name: &str) -> Replied<DriveHandle> {
         let plant = self.plant.load();
         plant.drive(name).ok_or_else(|| no_drive(&plant, name))

@@ -30,7 +30,7 @@ impl<S: Sync> FromRequest<S> for Payload {
 /// yields to others.
 ///
 /// # Errors
-/// The reply to a body that is too long, incomplete or too slow.
+/// If the body is too long, incomplete or too slow: contains the reply.
 pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Replied<Bytes> {
     let in_use = |in_use| {
         if let Some(place) = &reached.place {

@@ -60,7 +60,7 @@ impl<C: Credential> Credentials<C> {
     /// Reads the text of a file; empty lines and lines that begin with `#` are ignored.
     ///
     /// # Errors
-    /// The first bad line, counted from 1, and why.
+    /// If a line is invalid: contains the number of the first such line, counted from 1, and the reason.
     pub fn parse(text: &str) -> Result<Credentials<C>, (usize, CredentialError)> {
         let mut all = Credentials(Vec::new());
         let lines = (1..).zip(text.lines().map(str::trim));

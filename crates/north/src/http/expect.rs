@@ -16,7 +16,7 @@ type Unmet = (StatusCode, String);
 /// Checks that this gateway is the one named by the header [`EXPECT`], if the header is present.
 ///
 /// # Errors
-/// The gateway is another one, or runs with another configuration.
+/// If the client expects another gateway or another configuration.
 pub(super) fn check(headers: &HeaderMap, plant: &Plant, reached: &Reached) -> Result<(), Unmet> {
     let Some(header) = headers.get(EXPECT) else {
         return Ok(());

@@ -34,7 +34,7 @@ impl Loopback {
     /// A server for this plant.
     ///
     /// # Errors
-    /// The system does not provide what a timer needs.
+    /// If the system does not provide what a timer needs.
     pub fn new(plant: SharedPlant) -> io::Result<Loopback> {
         let router = routes::router(
             plant,

@@ -372,7 +372,7 @@ fn set_socket_options(stream: &TcpStream) {
 /// The JSON of `/api/v1/drives/{name}` for a drive at `now`, which is `wall` on the calendar. Pure.
 ///
 /// # Errors
-/// No error is known; a value that JSON cannot express would be one.
+/// If a value cannot be expressed in JSON; no such value is known.
 pub fn drive_json(
     drive: &DriveHandle,
     history: &History,

@@ -77,7 +77,7 @@ pub(super) fn names(query: Option<&str>, parameter: &str) -> Option<HashSet<Stri
 /// A time: RFC 3339 in UTC, seconds since 1970, or an age such as `10min`.
 ///
 /// # Errors
-/// The text is not a time in one of these forms.
+/// If the text is not a time in one of these forms.
 pub(super) fn time(name: &'static str, value: &str, now: SystemTime) -> Result<SystemTime, QueryError> {
     let seconds = || {
         let seconds: f64 = value.parse().ok()?;

@@ -75,7 +75,8 @@ pub(super) struct Reached {
 impl Reached {
     /// How the request with this head arrived.
     ///
-    /// # Errors No server has reported it.
+    /// # Errors
+    /// If no listener stored this data in the request.
     pub(super) fn of(head: &request::Parts) -> Replied<Reached> {
         let reached = head.extensions.get().cloned();
         reached.ok_or(StatusCode::INTERNAL_SERVER_ERROR.into())

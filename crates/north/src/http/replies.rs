@@ -57,7 +57,7 @@ pub(super) fn no_bus(plant: &Plant, name: &str) -> Refused {
 /// The bus with this name.
 ///
 /// # Errors
-/// The reply if no bus has this name.
+/// If no bus has this name: contains the reply.
 pub(super) fn find_bus<'p>(plant: &'p Plant, name: &str) -> Replied<&'p BusHandle> {
     let found = plant.buses.iter().find(|bus| bus.image.spec.name == name);
     found.ok_or_else(|| no_bus(plant, name))

@@ -68,7 +68,7 @@ impl Token {
     /// A new token, and the secret that its bearer sends: 64 hexadecimal digits, stored nowhere.
     ///
     /// # Errors
-    /// The name is not one, or the system has no random numbers.
+    /// If the name is not valid, or the system has no random numbers.
     pub fn generate(name: &str, scopes: Vec<Scope>) -> Result<(Token, String), CredentialError> {
         let mut bytes = [0; BYTES];
         SystemRandom::new()

@@ -44,7 +44,7 @@ impl User {
     /// A user with that password, whose hash has a new salt.
     ///
     /// # Errors
-    /// The name is not one, the password is too short or too long, or the system has no random numbers.
+    /// If the name is not valid, the password is too short or too long, or the system has no random numbers.
     pub fn new(name: &str, password: &str) -> Result<User, CredentialError> {
         let long_enough = password.chars().count() >= MIN_PASSWORD && password.len() <= MAX_PASSWORD;
         if !long_enough || password.chars().any(char::is_control) {

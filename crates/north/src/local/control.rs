@@ -53,7 +53,7 @@ pub fn absolute(config: &Path) -> PathBuf {
 /// Makes the gateway read its configuration again, and waits for the outcome.
 ///
 /// # Errors
-/// The gateway has no configuration file, or is shutting down.
+/// If the gateway has no configuration file, or is shutting down.
 pub(crate) async fn reload(control: Option<&Control>, who: String) -> Result<ReloadOutcome, String> {
     let stops = || "the gateway is shutting down and no longer reads its configuration".to_string();
     let control = control.ok_or("the gateway has no configuration file to reload")?;

@@ -21,7 +21,8 @@ pub(super) type Crls = Vec<CertificateRevocationListDer<'static>>;
 
 /// Reads the lists of a file, in PEM or DER, for the CAs `client_ca`; returns warnings with them.
 ///
-/// # Errors The fault in the file.
+/// # Errors
+/// If the file is not usable: contains the fault.
 pub(super) fn load(
     file: &Path,
     client_ca: &[CertificateDer<'_>],

@@ -303,7 +303,7 @@ impl AnsweredRequest {
 /// transaction (N2); `None` for protocols that read registers, where the request is forwarded unchanged.
 ///
 /// # Errors
-/// The exception if part of the read is stale, was refused by the drive, or is not an object.
+/// If part of the read data is stale, was refused by the drive, or does not exist: contains the exception.
 pub(super) fn read_parts(
     protocol: Protocol,
     reading: &Reading<'_>,

@@ -35,7 +35,7 @@ impl Identity<'_> {
     /// 1.1b3, 6.21).
     ///
     /// # Errors
-    /// 03 for a code other than 1 to 4, 02 for a single object that does not exist.
+    /// Exception 03 for a code other than 1 to 4, exception 02 for a single object that does not exist.
     pub(super) fn reply(&self, code: u8, object: u8) -> Result<Reply, Exception> {
         let objects = [
             (0, VENDOR),

@@ -88,7 +88,7 @@ impl OpenClients {
     /// Registers a client whose `chain` was verified against `verified`, with the role in its certificate.
     ///
     /// # Errors
-    /// The requirements changed since, and do not admit it.
+    /// If the requirements changed in the meantime and no longer admit the client.
     pub(super) fn admit(
         self: &Arc<Self>,
         verified: &Arc<Requirements>,

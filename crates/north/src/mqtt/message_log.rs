@@ -111,7 +111,7 @@ impl MessageLog {
     /// Opens the journal in `dir`, which is created if necessary, and finds the waiting messages.
     ///
     /// # Errors
-    /// The directory cannot be used, or another process uses it (`WouldBlock`).
+    /// If the directory cannot be used, or another process uses it (`WouldBlock`).
     pub(super) fn open(dir: &Path, name: &'static str, max_bytes: u64) -> io::Result<MessageLog> {
         fs::create_dir_all(dir)?;
         let lock = lock(dir, name)?;

@@ -403,7 +403,7 @@ impl Outbox {
     /// The connection assigned this packet id to the oldest published message.
     ///
     /// # Errors
-    /// The state is inconsistent; the connection must be closed.
+    /// If the state is inconsistent; the connection must be closed.
     pub(super) fn numbered(&mut self, packet: u16) -> Result<(), &'static str> {
         let key = self
             .published

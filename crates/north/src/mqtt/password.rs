@@ -46,7 +46,7 @@ impl Secret {
     /// Reads the only line of a file.
     ///
     /// # Errors
-    /// The file cannot be read, is empty, or has several lines.
+    /// If the file cannot be read, is empty, or has several lines.
     pub fn read(path: &Path) -> Result<Secret, SecretFault> {
         let mut text = String::new();
         File::open(path)?.take(LONGEST).read_to_string(&mut text)?;

@@ -21,7 +21,8 @@ pub(super) enum TlsConfigError {
 
 /// Reads the certificates and keys of `options`; `None` without TLS. Blocking, because it reads files.
 ///
-/// # Errors The faulty file, and the remedy.
+/// # Errors
+/// If a file is not usable: contains the file and the remedy.
 pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig>>, TlsConfigError> {
     if !options.tls {
         return Ok(None);

@@ -396,7 +396,8 @@ impl Run {
 
     /// The machine as it is configured now, under any name.
     ///
-    /// # Errors It is not, or that name now belongs to another machine.
+    /// # Errors
+    /// If the plant has no drive with this name, or the name now belongs to another machine.
     fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
         let of = self.restoration.journal().of.place();
         let drive = plant.drive_at(&self.machine).ok_or_else(|| {

@@ -27,7 +27,7 @@ impl Concerning {
     /// The journal, if it belongs to this machine.
     ///
     /// # Errors
-    /// The journal belongs to another machine, or cannot be read.
+    /// If the journal belongs to another machine, or cannot be read.
     pub(super) fn own(self, drive: &DriveHandle) -> Result<(JournalFile, String), String> {
         let spec = &drive.image.spec;
         if let (Claim::Place | Claim::Name, Ok(owner)) = (self.claim, &self.owner) {

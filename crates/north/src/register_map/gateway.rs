@@ -110,7 +110,7 @@ impl BusFigures {
 /// Registers of the gateway itself; `bus` returns the statistics of a bus by its index in the configuration.
 ///
 /// # Errors
-/// 02 if the span goes beyond the last bus.
+/// Exception 02 if the span goes beyond the last bus.
 pub fn gateway(start: u16, count: u16, bus: impl Fn(usize) -> Option<BusFigures>) -> Result<Vec<u16>, Exception> {
     let mut registers = Vec::with_capacity(usize::from(count));
     let end = start.checked_add(count).ok_or(Exception::ADDRESS)?;

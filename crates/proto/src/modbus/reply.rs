@@ -79,7 +79,7 @@ impl Reply {
     /// Decodes the reply in `pdu` if it matches `request`.
     ///
     /// # Errors
-    /// [`Misfit`] when function, byte count or echo do not fit: the frame answers something else.
+    /// [`Misfit`] if function, byte count or echo do not match: the frame is not the reply to this request.
     pub fn decode(request: &RequestPdu, pdu: &[u8]) -> Result<Reply, Misfit> {
         let (&function, body) = pdu.split_first().ok_or(Misfit)?;
         if function == request.function() | 0x80 {

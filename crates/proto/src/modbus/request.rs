@@ -232,7 +232,7 @@ impl RequestPdu {
     /// Decodes the request in `pdu`, as a slave does.
     ///
     /// # Errors
-    /// The exception that the slave answers: 01 for a function that is not known, 03 for a wrong
+    /// If the slave refuses the request: the exception it answers, 01 for an unknown function, 03 for a wrong
     /// length, count or value.
     pub fn decode(pdu: &[u8]) -> Result<RequestPdu, Exception> {
         let (&function, body) = pdu.split_first().ok_or(Exception::FUNCTION)?;

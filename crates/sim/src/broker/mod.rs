@@ -86,7 +86,7 @@ impl Broker {
     /// see [`Broker::local_addr`].
     ///
     /// # Errors
-    /// The address cannot be bound: take another port.
+    /// If the address cannot be bound. The remedy is another port.
     pub async fn start(listen: SocketAddr, cancel: CancellationToken) -> io::Result<Broker> {
         let listener = TcpListener::bind(listen).await?;
         let address = listener.local_addr()?;

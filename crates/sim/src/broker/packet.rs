@@ -185,7 +185,7 @@ pub(super) enum Incoming {
 /// Length of the packet at the start of `bytes`, once all of it has arrived.
 ///
 /// # Errors
-/// A malformed length, or more than [`MAX_PACKET_BYTES`].
+/// If the length is malformed, or exceeds [`MAX_PACKET_BYTES`].
 pub(super) fn packet_length(bytes: &[u8]) -> Result<Option<usize>, Fault> {
     let mut rest = Reader(bytes.get(1..).unwrap_or_default());
     let available = rest.0.len();
@@ -276,7 +276,7 @@ pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault
 /// Reads a packet that follows the CONNECT and came at `now`.
 ///
 /// # Errors
-/// The packet is malformed or not served: close the connection.
+/// If the packet is malformed or not supported: the broker then closes the connection.
 pub(super) fn read(version: Version, packet: &[u8], now: Instant) -> Result<Incoming, Fault> {
     let (first, mut body) = open(packet)?;
     let incoming = match first {

@@ -197,7 +197,7 @@ impl Parameters {
             .flat_map(|group| group.first..=group.last)
             .filter(|register| place(*register).is_some_and(|place| !place.reserved))
             .map(|register| (register, 0, u16::MAX, 0));
-        // Of equal registers, the first one is used.
+        // If several registers are equal, the first one is used.
         let all = coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others);
         let mut ram = ParameterSet::new(all).limited(LIMITS);
         for &(register, value) in set {

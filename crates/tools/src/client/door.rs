@@ -91,7 +91,7 @@ impl Door {
     /// Connects to the gateway.
     ///
     /// # Errors
-    /// No gateway listens, or the TLS handshake fails.
+    /// If no gateway listens, or the TLS handshake fails.
     pub(super) async fn connect(&self) -> Result<Box<dyn Stream>, NotConnected> {
         match self {
             Door::Network(network) => network.connect().await,

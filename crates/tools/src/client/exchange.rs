@@ -223,7 +223,7 @@ impl Reply {
     /// The document of a reply that is not a refusal.
     ///
     /// # Errors
-    /// The gateway refuses, or is not a gateway.
+    /// If the gateway refuses the request, or the server is not a gateway.
     pub(crate) fn accepted<T: DeserializeOwned>(self, asked: &Asked) -> Result<T, ClientError> {
         match self.status.is_success() {
             true => self.document(),
@@ -239,7 +239,7 @@ impl Reply {
     /// The document of a reply of any status.
     ///
     /// # Errors
-    /// The reply is not such a document.
+    /// If the reply is not such a document.
     pub(crate) fn document<T: DeserializeOwned>(self) -> Result<T, ClientError> {
         serde_json::from_slice(&self.text).map_err(|error| self.strange(format!("unexpected reply ({error})")))
     }

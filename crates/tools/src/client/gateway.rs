@@ -53,7 +53,8 @@ impl Gateway {
 
     /// A client of the gateway that runs with the configuration, which may be invalid.
     ///
-    /// # Errors It cannot be reached in any way.
+    /// # Errors
+    /// If the configuration gives no address at which the gateway can be reached.
     pub(crate) fn client(&self) -> Result<Client, String> {
         match self.network() {
             Some(client) => Ok(client),
@@ -63,7 +64,8 @@ impl Gateway {
 
     /// A client that only reads values: from any gateway that is found, unless one is specified.
     ///
-    /// # Errors It cannot be reached in any way.
+    /// # Errors
+    /// If the configuration gives no address at which the gateway can be reached.
     pub(crate) fn viewer(&self) -> Result<Client, String> {
         let mut client = self.client()?;
         if self.named_config().is_none() && self.url.is_none() {
@@ -82,7 +84,8 @@ impl Gateway {
 impl Client {
     /// A client of the gateway that runs with this configuration: through its local socket or, if that is off, by HTTP.
     ///
-    /// # Errors It cannot be reached in any way.
+    /// # Errors
+    /// If the configuration gives no address at which the gateway can be reached.
     pub(crate) fn of_configuration(config: &Path) -> Result<Client, String> {
         let socket = Settings::socket_of(config, environment());
         let mut client = Client::for_socket(&socket, Expected::Configuration(absolute(config)));

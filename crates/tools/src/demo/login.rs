@@ -24,7 +24,7 @@ impl Login {
     /// Writes the user with a new password into the users file of that directory, which is created; other users stay.
     ///
     /// # Errors
-    /// The directory or the file cannot be written, or the system has no random numbers.
+    /// If the directory or the file cannot be written, or the system has no random numbers.
     pub(super) fn new(directory: &Path) -> Result<Login, String> {
         let failed = |why: String| format!("cannot make the login of the demo: {why}");
         std::fs::create_dir_all(directory).map_err(|why| failed(why.to_string()))?;

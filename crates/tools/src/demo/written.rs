@@ -16,7 +16,7 @@ impl Written {
     /// Creates the directory; only files of another demo are replaced in it.
     ///
     /// # Errors
-    /// The directory cannot be made, or has a configuration that is not a demo's.
+    /// If the directory cannot be made, or contains a configuration that is not a demo's.
     pub(super) fn prepare(dir: &Path) -> Result<Written, String> {
         let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
         let written = Written { dir: absolute };

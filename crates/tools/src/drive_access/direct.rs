@@ -50,7 +50,7 @@ impl Direct {
     /// Opens the port and waits until the drive answers, and has answered what the request needs.
     ///
     /// # Errors
-    /// The bus cannot be started: the message with place and remedy.
+    /// If the bus cannot be started: contains the message with place and remedy.
     pub(super) async fn start(target: &Configured, needs: Needs<'_>, not_found: &str) -> Result<Direct, String> {
         let mut spec = target.spec.clone();
         let mut bus = target.bus.clone();

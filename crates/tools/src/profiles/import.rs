@@ -38,7 +38,7 @@ const MOST_ROWS: usize = 10_000;
 /// The profile that the list `text` of the file `path` makes.
 ///
 /// # Errors
-/// The problems of the list, each with its line.
+/// If the list is invalid: contains the problems, each with its line.
 pub(super) fn profile(path: &Path, text: &str) -> Result<String, Vec<Problem>> {
     let file = path.display().to_string();
     let mut problems: Vec<Problem> = Vec::new();

@@ -94,7 +94,7 @@ impl<'a> Search<'a> {
     /// Listens for `time` before anything is sent, to detect another master on the line.
     ///
     /// # Errors
-    /// The port cannot be opened, or was lost.
+    /// If the port cannot be opened, or was lost.
     pub(crate) fn listen(&mut self, setting: Setting, time: Duration) -> Result<(), String> {
         let line = self.open(&setting.format)?;
         let mut prober = self.prober(&line, setting);

@@ -101,7 +101,7 @@ impl Chain {
     /// The line of an entry, with its line end, and the state of the chain after it.
     ///
     /// # Errors
-    /// The entry has no form in JSON, which all have.
+    /// If the entry cannot be written as JSON; every entry can.
     pub fn line(&self, entry: &Entry<'_>) -> serde_json::Result<(Vec<u8>, Chain)> {
         #[derive(Serialize)]
         struct Line<'e> {
@@ -237,7 +237,8 @@ impl Verifier {
 
     /// Processes the next line, given without its line end.
     ///
-    /// # Errors The fault; the next line can still be checked.
+    /// # Errors
+    /// If the line is at fault: contains the fault. The next line can still be checked.
     pub fn line(&mut self, line: &[u8]) -> Result<(), Fault> {
         let Some(head) = Head::read(line) else {
             let (bytes, hash) = self.fragment.get_or_insert_with(|| (0, Context::new(&SHA256)));
@@ -277,7 +278,8 @@ impl Verifier {
 
     /// Checks the end of the file after all lines were read.
     ///
-    /// # Errors The fault at the end.
+    /// # Errors
+    /// If the last line is at fault: contains the fault.
     pub fn finish(&self) -> Result<(), String> {
         if self.fragment.is_some() {
             return Err("the last line is incomplete: truncated by a crash or by someone".to_string());

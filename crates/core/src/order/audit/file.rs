@@ -122,7 +122,7 @@ impl AuditFile {
     /// Starts the thread that writes the audit.
     ///
     /// # Errors
-    /// The system does not provide a thread.
+    /// If the system does not provide a thread.
     pub fn start(options: AuditFileOptions) -> io::Result<AuditFile> {
         AuditFile::behind(Arc::default(), options)
     }
@@ -130,7 +130,8 @@ impl AuditFile {
     /// Starts the thread that replaces this writer and takes over the waiting records and the number of lost ones.
     /// If an earlier thread still writes the same file, the new one waits for its end.
     ///
-    /// # Errors The system does not provide a thread. This one continues.
+    /// # Errors
+    /// If the system does not provide a thread: then this file continues to be written.
     pub fn succeed(&self, options: AuditFileOptions) -> io::Result<AuditFile> {
         AuditFile::behind(self.shared.clone(), options)
     }

@@ -77,7 +77,7 @@ impl JournalFile {
     /// journal of another machine is not touched.
     ///
     /// # Errors
-    /// The journal is not certain to be on disk.
+    /// If the journal is not certain to be on disk.
     pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
         self.is_free(of)?;
         files::replace(&self.path(), text.as_bytes())?;

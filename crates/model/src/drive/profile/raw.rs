@@ -266,7 +266,7 @@ impl Raw {
     /// The registers for `value`; bits are merged into `old`.
     ///
     /// # Errors
-    /// The value does not fit the register's type. Nothing is clamped.
+    /// If the value does not fit the register's type. Nothing is clamped.
     pub fn encode(&self, value: Value, old: u16) -> Result<Vec<u16>, Unwritable> {
         if self.is_only_read() {
             return Err(Unwritable::ReadOnly);

@@ -253,7 +253,8 @@ impl Operating {
 
     /// The user of a request that changes something; also checks that the request comes from the gateway's own page.
     ///
-    /// # Errors No user, or the request does not come from this gateway's own page.
+    /// # Errors
+    /// If no user is signed in, or the request does not come from this gateway's own page.
     pub(in crate::http) async fn commander(
         &self,
         headers: &HeaderMap,
@@ -419,7 +420,7 @@ impl State {
 /// report nothing.
 ///
 /// # Errors
-/// The request comes from a page of another origin.
+/// If the request comes from a page of another origin.
 pub(super) fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
     let text = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or("\0"));
     let host = text(header::HOST).next().unwrap_or_default();

@@ -59,7 +59,7 @@ impl Throttle {
     /// served first.
     ///
     /// # Errors
-    /// Time to wait; the attempt then does not count.
+    /// If the client must wait first: contains the time to wait. Such an attempt is not counted.
     pub(super) fn begin(&mut self, source: Source, user: u64, now: Instant) -> Result<u32, Duration> {
         let failures = current(&self.sources, &source, now);
         let of_user = current(&self.users, &user, now);
