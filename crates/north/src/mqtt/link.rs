@@ -9,10 +9,11 @@ use rumqttc::mqttbytes::v5::Filter;
 
 use super::back_off::Rotation;
 use super::broker_limits::{BrokerLimits, WillForm};
-use super::connection::{CLOSED, Connection, NO_WILDCARDS, SUBSCRIBE_TIMEOUT, Step};
+use super::connection::{Connection, NO_WILDCARDS, SUBSCRIBE_TIMEOUT, Step};
 use super::dial::Dial;
 use super::outage_log::OutageLog;
 use super::outbox::Message;
+use super::reasons::CLOSED;
 use super::session::Will;
 use super::takeover::Takeovers;
 use super::{Broker, Options, Password, Secret, tls};

@@ -39,6 +39,7 @@ mod password;
 mod payload;
 mod publisher;
 mod rate;
+mod reasons;
 mod record;
 mod reply;
 mod request;
