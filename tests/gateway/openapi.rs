@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::parameters::few;
 use crate::support::process::{drivegate, get, until};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site};
 use crate::support::tools::{python, root, tool};
 
 #[test]
@@ -20,7 +20,7 @@ fn every_answer_is_as_the_description_says() {
     let gateway = LINE1.replace("[gateway]\n", &keys);
     let pump = "[[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"few\"\naccess = \"control\"\n";
     let recordings = "[recordings]\nbefore = \"1s\"\nafter = \"1s\"\n";
-    site.configure(&[&gateway, pump, HTTP, MODBUS_TCP, recordings]);
+    site.configure(&[&gateway, pump, HTTP, MODBUS_TCP, MQTT, recordings]);
     let _line = site.line(&[1]);
     let _gateway = site.run_ready();
     let done = |arguments: &[&str]| {
@@ -38,6 +38,11 @@ fn every_answer_is_as_the_description_says() {
     until("the recording", || {
         let (_, listed) = get(site.http, "/api/v1/recordings")?;
         listed.contains(&recording).then_some(())
+    });
+    // No broker runs.
+    until("why there is no connection", || {
+        let (_, links) = get(site.http, "/api/v1/mqtt")?;
+        (links.contains("\"connected\":false") && links.contains("is running")).then_some(())
     });
     let names = json!({"drives": "pump-1", "buses": "line1", "recordings": recording, "assets": "x"});
     let checked = Command::new(tool("node"))

@@ -2,8 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
+
+use crate::mqtt::LinkStatus;
 
 /// How the last reload ended; the start of the gateway counts as a reload.
 #[derive(Debug)]
@@ -314,6 +316,9 @@ pub struct MqttStats {
     pub published: AtomicU64,
     /// Messages waiting for the broker.
     pub buffered: AtomicU64,
+    /// Links of the clients to their brokers.
+    pub plain: Arc<LinkStatus>,
+    pub sparkplug: Arc<LinkStatus>,
     lost: [AtomicU64; MqttKind::ALL.len()],
 }
 

@@ -260,10 +260,17 @@ fn a_broker_that_closes_at_a_ninth_filter_or_a_retained_message_is_served() {
     drop(gateway);
     assert_eq!(*closed.lock().unwrap(), [""; 0]);
     options.retain = true;
-    let _gateway = Gateway::start(options, plant(&["p1"]));
+    let gateway = Gateway::start(options, plant(&["p1"]));
     wait_log(
         port,
         "the broker closed the connection without a reason; the last packet sent before was PUBLISH to ",
     );
     assert!(closed.lock().unwrap()[0].starts_with("retained: "));
+    wait_for("the reason for the status page", || {
+        let link = gateway.stats.mqtt.plain.get()?;
+        assert_eq!(link.broker, format!("127.0.0.1:{port}"));
+        let (_, why) = link.error?;
+        why.contains("the last packet sent before was PUBLISH to ")
+            .then_some(())
+    });
 }

@@ -16,6 +16,7 @@ mod limits;
 mod line;
 mod loopback;
 pub mod messages;
+mod mqtt;
 mod openapi;
 mod operating;
 mod options;

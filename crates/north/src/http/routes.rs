@@ -21,7 +21,7 @@ use super::openapi::{Api, Doc};
 use super::operating::{self, Operating};
 use super::params::Parameters;
 use super::reached::{Client, Coverage, Reached};
-use super::{api, event_log, expect, line, page, points, recordings, replies, streams, trend, views};
+use super::{api, event_log, expect, line, mqtt, page, points, recordings, replies, streams, trend, views};
 use crate::NorthState;
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::drill::DrillReport;
@@ -186,6 +186,11 @@ fn described() -> Api {
             "/api/v1/buses/{name}/diagnosis",
             Doc::object::<api::Diagnosis<'_>>("The diagnosis of the line of a bus"),
             views::diagnosis,
+        )
+        .get(
+            "/api/v1/mqtt",
+            Doc::object::<mqtt::Clients>("The links to the brokers, and what waits for them"),
+            mqtt::clients,
         )
         .get(
             "/api/v1/audit",

@@ -111,7 +111,12 @@ impl PlainClient {
         events: Receiver<Arc<Event>>,
     ) -> PlainClient {
         let ClientLeft { mut orders, broker } = left;
-        let link = BrokerLink::new(options.clone(), options.client_id.clone(), "", broker.as_ref());
+        let link = BrokerLink::new(
+            options.clone(),
+            options.client_id.clone(),
+            ("", stats.mqtt.plain.clone()),
+            broker.as_ref(),
+        );
         let common = Common::new(link, plant, stats);
         let (observed, stats) = (&common.observed, &common.stats);
         let topics = Topics::new(&options.base, &observed.gateway);

@@ -3,7 +3,7 @@
 //! received.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use rumqttc::mqttbytes::v5::Filter;
 
@@ -15,6 +15,7 @@ use super::outage_log::OutageLog;
 use super::outbox::Message;
 use super::reasons::CLOSED;
 use super::session::Will;
+use super::status::LinkStatus;
 use super::takeover::Takeovers;
 use super::{Broker, Options, Password, Secret, tls};
 
@@ -74,14 +75,26 @@ pub(super) struct BrokerLink {
     password: Option<Secret>,
     /// A password from a file that the broker refused, and when it may be tried again.
     refused: Option<(Secret, Instant)>,
+    status: Arc<LinkStatus>,
+}
+
+impl Drop for BrokerLink {
+    fn drop(&mut self) {
+        self.status.end();
+    }
 }
 
 impl BrokerLink {
     /// A link that starts with the broker `kept`, which worked before a reload, if that broker is still configured.
-    pub(super) fn new(options: Options, client_id: String, prefix: &'static str, kept: Option<&Broker>) -> BrokerLink {
+    pub(super) fn new(
+        options: Options,
+        client_id: String,
+        (prefix, status): (&'static str, Arc<LinkStatus>),
+        kept: Option<&Broker>,
+    ) -> BrokerLink {
         let brokers = &options.brokers;
         let first = kept.and_then(|kept| brokers.iter().position(|broker| broker == kept));
-        BrokerLink {
+        let link = BrokerLink {
             rotation: Rotation::new(brokers.len(), first.unwrap_or(0)),
             outages: brokers.iter().map(|_| OutageLog::default()).collect(),
             client_id,
@@ -95,7 +108,10 @@ impl BrokerLink {
             takeovers: Takeovers::default(),
             password: None,
             refused: None,
-        }
+            status,
+        };
+        link.status.begin(link.broker().to_string(), SystemTime::now());
+        link
     }
 
     /// The broker that is tried at present.
@@ -271,6 +287,7 @@ impl BrokerLink {
         if let Some(outages) = self.outages.get_mut(self.rotation.current()) {
             outages.end();
         }
+        self.status.connected(broker.to_string(), SystemTime::now());
     }
 
     /// The connection could not be ended in order.
@@ -288,6 +305,7 @@ impl BrokerLink {
     /// Notes that the connection was lost for this reason; returns it. Dropping it aborts its task and closes the socket.
     pub(super) fn lost(&mut self, why: &str) -> Option<Connection> {
         let (now, prefix, broker) = (Instant::now(), self.prefix, self.broker());
+        self.status.lost(broker.to_string(), why, SystemTime::now());
         let place = self.rotation.current();
         let before = self.turn_to_next(None, now);
         self.read_password_again(why, now);
@@ -333,6 +351,7 @@ impl BrokerLink {
     /// Closes the connection, if any; the next attempt follows after `wait`.
     pub(super) fn close(&mut self, wait: Duration) {
         drop(self.turn_to_next(Some(wait), Instant::now()));
+        self.status.left(self.broker().to_string(), SystemTime::now());
     }
 
     /// Drops the connection; the next attempt, to the next broker, follows after `wait` or as the rotation requires.

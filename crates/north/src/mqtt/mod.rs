@@ -10,13 +10,13 @@
 //! ```
 //!
 //! `payload`, `publisher`, `rounds`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O:
-//! they decide what is published, when, and in which order; `offline` drives `commands` without a broker.
+//! they decide what is published, when, and in which order; `loopback` drives `commands` without a broker.
 //! `broker_limits`, `keep_alive`, `retry` and `takeover` judge the behaviour of the broker, also without I/O;
 //! `back_off` chooses the broker. `client` owns all of these. `sparkplug` is a separate client with a separate
 //! link. `session` is the loop of both clients: it connects, reconnects, follows reloads and disconnects. `link` is
 //! the way to one of the brokers: it owns the `connection`, which wraps rumqttc and keeps no state: every
 //! connection is a new rumqttc client with a clean session, and unacknowledged messages are sent again from the
-//! outbox. `handover` keeps the state that a client leaves for the one after a reload.
+//! outbox. `reasons` has the texts for a lost connection, `status` shows them. `handover` keeps the state that a client leaves for the one after a reload.
 
 mod back_off;
 mod broker_limits;
@@ -48,6 +48,7 @@ mod rights;
 mod rounds;
 mod session;
 pub mod sparkplug;
+mod status;
 mod store;
 mod takeover;
 mod tls;
@@ -71,6 +72,7 @@ pub use self::loopback::{Loopback, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
 pub use self::rights::BrokerRights;
+pub use self::status::{LinkState, LinkStatus};
 
 pub use self::password::{Password, Secret, SecretFault};
 

@@ -281,6 +281,28 @@ async function rowsKeepTheFocus(gateway, page) {
   gateway.recordings = {};
 }
 
+/// Whether the brokers are reached, and the last packet before one closed the connection.
+async function brokersSayWhyTheyAreAway(gateway, page) {
+  const said = () => [...document.querySelectorAll(".brokers .card")].map((card) => card.innerText.replace(/\s+/g, " "));
+  const link = (more) => ({ client: "mqtt", broker: "broker.example:8883", connected: true, since: "2026-03-02T07:40:12.118Z", error: null, ...more });
+  gateway.mqtt = { links: [link(), link({ client: "sparkplug" })], waiting: 0, published: 17, lost: 0 };
+  for (const address of ["#/", "#/lines"]) {
+    await page.open(`${gateway.url}#/events`);
+    await page.open(`${gateway.url}${address}`);
+    await page.until(() => document.querySelectorAll(".brokers .card").length === 2);
+    const [plain, node] = await page.eval(said);
+    assert.match(plain, /^MQTT ● connected Broker broker\.example:8883 connected since 2026-03-02 \S+ 0 messages waiting, 17 sent, 0 lost$/);
+    assert.match(node, /^Sparkplug ● connected Broker broker\.example:8883 connected since \S+ \S+$/);
+  }
+  const text = `the broker closed the connection without a reason; the last packet sent before was PUBLISH to ${NASTY} (12 bytes, retained)`;
+  gateway.mqtt = { links: [link({ connected: false, error: { time: "2026-03-02T07:41:00.000Z", text } })], waiting: 3, published: 17, lost: 1 };
+  await page.until(() => document.querySelector(".brokers .why"));
+  const away = (await page.eval(said))[0];
+  assert.ok(away.includes("✕ not connected") && away.includes(text) && away.includes("3 messages waiting, 17 sent, 1 lost"), away);
+  gateway.mqtt = { links: [], waiting: 0, published: 0, lost: 0 };
+  await page.until(() => !document.querySelector(".brokers .card"));
+}
+
 /// A magnitude and an arrow, whether a family gives its values a sign or says the direction by a bit alone.
 async function everyFamilyHasOneConventionOfSigns(gateway, page) {
   const values = (sign, more) => ({ output_frequency: point(sign * 27.5, { unit: "Hz" }), actual_speed: point(sign * 55, { unit: "%" }), motor_speed: point(sign * 803, { unit: "rpm" }),
@@ -396,7 +418,7 @@ async function main() {
   const browser = new Browser();
   const page = await browser.page();
   for (const step of [rowsFollowTheirDrives, listIsFiltered, listIsSortedAndGrouped, agesAreTheException, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, eventsOfATimeAreSaved, linesTellTheirDiagnosis,
-    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, everyFamilyHasOneConventionOfSigns, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
+    rowsKeepTheFocus, whatIsChosenIsShownAtOnce, brokersSayWhyTheyAreAway, everyFamilyHasOneConventionOfSigns, causesAreToldToAnOperator, pageSpeaksTheLanguageOfTheBrowser]) {
     try {
       await step(gateway, page, browser);
     } catch (error) {

@@ -30,7 +30,7 @@ const isBefore = ({ id, time }, before) => (before.includes("-") ? id < Number(b
 
 class FakeGateway {
   constructor() {
-    Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, asked: [] });
+    Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, mqtt: { links: [], waiting: 0, published: 0, lost: 0 }, asked: [] });
     // Of a gateway that takes commands: who is logged in, what can be commanded, what was, and the answer to it, which may have to wait.
     Object.assign(this, { operating: false, session: null, about: null, commands: [], obey: () => [200, { result: "confirmed", confirmed_ms: 20 }], wait: null });
     this.server = http.createServer((request, response) => this.answer(request, response));
@@ -100,6 +100,7 @@ class FakeGateway {
     if (kind === "events") return this.search(url.searchParams);
     if (kind === "recordings") return name ? this.recordings[name] : Object.values(this.recordings).map((recording) => recording.entry);
     if (kind === "audit") return this.audit;
+    if (kind === "mqtt") return this.mqtt;
     return undefined;
   }
 

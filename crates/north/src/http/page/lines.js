@@ -2,6 +2,7 @@
 
 import { anchor, className, clock, fill, hide, keyed, make, places, section, stateOf, STATES, stateWords, table, text, told, words } from "./common.js";
 import { Refused } from "./gateway.js";
+import { brokerCards } from "./mqtt.js";
 import { PlotGroup } from "./plot.js";
 import { histogram, strip } from "./strips.js";
 import { decimal, plain, t } from "./texts.js";
@@ -100,12 +101,14 @@ export function busCards(level, address, titles) {
 /// All lines.
 export function open(root) {
   const cards = busCards("h2", (bus) => `#/?bus=${encodeURIComponent(bus)}`);
-  root.append(make("h1", "", t("Lines")), cards.element);
+  const brokers = brokerCards("h2");
+  root.append(make("h1", "", t("Lines")), cards.element, brokers.element);
   return {
     title: t("Lines"),
     async refresh(load) {
-      const [buses, drives] = await Promise.all([load("buses"), load("drives?points=")]);
+      const [buses, drives, mqtt] = await Promise.all([load("buses"), load("drives?points="), load("mqtt")]);
       cards.show(buses, drives);
+      brokers.show(mqtt);
     },
   };
 }

@@ -34,8 +34,8 @@ pub(in crate::http) const ASSETS: &[Asset] = assets! {
     "image/svg+xml": "icon.svg";
     "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
     "text/javascript; charset=utf-8":
-        "causes.js", "common.js", "controls.js", "de.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js",
-        "page.js", "plot.js", "questions.js", "recording.js", "session.js", "stop_all.js", "stops.js", "strips.js", "texts.js",
+        "causes.js", "common.js", "controls.js", "de.js", "drive.js", "events.js", "gateway.js", "lines.js", "mqtt.js", "operate.js",
+        "overview.js", "page.js", "plot.js", "questions.js", "recording.js", "session.js", "stop_all.js", "stops.js", "strips.js", "texts.js",
         "trend.js";
 };
 

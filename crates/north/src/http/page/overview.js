@@ -7,6 +7,7 @@ import {
 import { blockedOf } from "./causes.js";
 import { eventList } from "./events.js";
 import { busCards, FEW_FACTS } from "./lines.js";
+import { brokerCards } from "./mqtt.js";
 import { t } from "./texts.js";
 
 // Point, and the widths that have its column: all, not the phone, the desktop only. A column that no drive fills is left out.
@@ -271,7 +272,8 @@ export function open(root, { query }) {
   const heads = headings(filter, changed);
   const parts = frame(root, heads.element);
   const cards = busCards("h3", (bus) => address({ bus }), FEW_FACTS);
-  parts.lines.append(cards.element);
+  const brokers = brokerCards("h3");
+  parts.lines.append(cards.element, brokers.element);
 
   function arrangeRows() {
     const { drives, rows } = state;
@@ -335,8 +337,8 @@ export function open(root, { query }) {
   return {
     title: t("Drives"),
     async refresh(load) {
-      const [drives, buses, latest] = await Promise.all([
-        load(`drives?points=${POINTS.join(",")}`), load("buses"), parts.latest.load(load, { limit: EVENTS_SHOWN }),
+      const [drives, buses, latest, mqtt] = await Promise.all([
+        load(`drives?points=${POINTS.join(",")}`), load("buses"), parts.latest.load(load, { limit: EVENTS_SHOWN }), load("mqtt"),
       ]);
       state.drives = drives;
       keyed(state.rows, drives, driveRow, showDrive);
@@ -345,6 +347,7 @@ export function open(root, { query }) {
       showTiles();
       announce();
       cards.show(buses, drives);
+      brokers.show(mqtt);
       parts.latest.show(latest);
     },
   };

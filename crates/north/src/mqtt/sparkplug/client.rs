@@ -124,7 +124,12 @@ impl NodeClient {
             min_interval: broker.min_interval,
         };
         let client_id = format!("{}-sparkplug", broker.client_id);
-        let link = BrokerLink::new(broker.clone(), client_id, "Sparkplug: ", left.broker.as_ref());
+        let link = BrokerLink::new(
+            broker.clone(),
+            client_id,
+            ("Sparkplug: ", stats.mqtt.sparkplug.clone()),
+            left.broker.as_ref(),
+        );
         let mut client = NodeClient {
             topics,
             broker,
