@@ -146,7 +146,7 @@ fn a_trend_shows_the_motor_coming_up() {
             kept["points"].as_array().unwrap().len(),
             kept["ranges"].as_array().unwrap().len()
         ),
-        (9, 3)
+        (10, 3)
     );
     let (_, csv) = get(site.http, "/api/v1/drives/pump-1/trend?format=csv&point=motor_current").unwrap();
     assert!(

@@ -37,8 +37,8 @@ impl Range {
 /// The ranges, finest first.
 pub const RANGES: [Range; 3] = [Range::new(600, 1), Range::new(3600, 5), Range::new(24 * 3600, 120)];
 
-/// Points with a trend, as far as a profile has them.
-pub const POINTS: [ModelPoint; 9] = [
+/// Points with a trend, as far as a profile has them; see [`points_of`].
+const POINTS: [ModelPoint; 11] = [
     ModelPoint::ActualSpeed,
     ModelPoint::OutputFrequency,
     ModelPoint::MotorSpeed,
@@ -48,6 +48,8 @@ pub const POINTS: [ModelPoint; 9] = [
     ModelPoint::MotorVoltage,
     ModelPoint::DcLinkVoltage,
     ModelPoint::HeatsinkTemperature,
+    ModelPoint::SpeedReference,
+    ModelPoint::FrequencyReference,
 ];
 
 /// Memory of the trend of a point that reaches back as far as [`RANGES`], from its first value on, in bytes.
@@ -56,7 +58,7 @@ pub const POINT_BYTES: usize = {
     (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
 };
 
-/// Memory of all trends of the gateway at most, bytes: about 150 drives of nine points with all of [`RANGES`].
+/// Memory of all trends of the gateway at most, bytes: about 135 drives of ten points with all of [`RANGES`].
 pub const MOST_BYTES: usize = 32 << 20;
 
 /// Memory of the trends of a drive that reach back as far as [`RANGES`], bytes.
@@ -104,9 +106,16 @@ impl Reach {
     }
 }
 
-fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, PointIndex)> {
+/// Points of a profile with a trend. Of the references the one in the unit of the speed that is shown: both say the same.
+pub fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, PointIndex)> {
+    let has_speed = profile.model_index(ModelPoint::ActualSpeed).is_some();
+    let is_kept = move |point: &ModelPoint| match point {
+        ModelPoint::SpeedReference => has_speed,
+        ModelPoint::FrequencyReference => !has_speed,
+        _ => true,
+    };
     let index = |point: ModelPoint| Some((point, profile.model_index(point)?));
-    POINTS.into_iter().filter_map(index)
+    POINTS.into_iter().filter(is_kept).filter_map(index)
 }
 
 /// The values of a step; empty if there were none.

@@ -14,7 +14,7 @@ use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, no_drive, not_found};
 use crate::drive::ModelPoint;
-use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Reach, Step};
+use crate::history::trend::{DriveTrend, Part, RANGES, Range, Reach, Step, points_of};
 use crate::history::{Clock, DriveHistory};
 
 /// Time span shown without `from`.
@@ -85,8 +85,7 @@ pub(super) async fn trend(
     let _turn = app.turn().await;
     let history = app.north.history.drive(&name);
     let profile = &drive.image.spec.profile;
-    let has = |point: &&ModelPoint| profile.model_index(**point).is_some();
-    let known: Vec<ModelPoint> = POINTS.iter().filter(has).copied().collect();
+    let known: Vec<ModelPoint> = points_of(profile).map(|(point, _)| point).collect();
     let mut points = Vec::new();
     for name in &wanted.points {
         let Some(point) = known.iter().find(|point| point.name() == name) else {

@@ -322,6 +322,20 @@ async function everyFamilyHasOneConventionOfSigns(gateway, page) {
   await page.until(() => document.querySelector(".plot .at-aim")?.textContent === "reference now 55.0 %");
   const [line, curve] = await page.eval(() => [document.querySelector(".plot .aim").getBoundingClientRect(), document.querySelector(".plot .curve").getBoundingClientRect()].map(({ y, height }) => y + height / 2));
   assert.ok(Math.abs(line - curve) < 2, "a motor that turns at its reference in reverse is at the line");
+  // The past of the reference is a line of steps, in the direction of the speed, and is said at the cursor.
+  gateway.trends.speed_reference = { unit: "%", samples: [[20, 20, 20], [55, 55, 55]] };
+  await page.open(`${gateway.url}#/lines`);
+  await page.open(`${gateway.url}#/drive/a-signed`);
+  await page.until(() => document.querySelector(".plot path.aim"));
+  const [, first, second] = /^M[\d.]+ ([\d.]+)H[\d.]+V([\d.]+)h0\.1$/.exec(await page.eval(() => document.querySelector(".plot path.aim").getAttribute("d")));
+  assert.ok(Number(first) < Number(second), "20 % in reverse is above 55 % in reverse");
+  assert.equal(await page.eval(() => document.querySelectorAll(".plot").length), 1, "the reference has no plot of its own");
+  await page.until(() => {
+    const cursor = document.querySelector(".cursor");
+    cursor.value = String(Number(cursor.min) + 1000);
+    cursor.dispatchEvent(new Event("input"));
+    return document.querySelector(".plot .sub").textContent === "set 20.0 %";
+  });
   gateway.trends = { output_frequency: { unit: "Hz", samples: [[-27.5, -27.5, -27.5], [-27.5, -27.5, -27.5], [-27.5, -27.5, -27.5]] } };
   await page.open(`${gateway.url}#/lines`);
   await page.open(`${gateway.url}#/drive/a-signed`);

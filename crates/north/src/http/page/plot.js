@@ -95,7 +95,7 @@ const place = (n) => n.toFixed(1);
 /// One plot. `digits`: of its figures; `directed`: a value below zero is read as a magnitude and an arrow.
 class Plot {
   constructor(group, { title, unit, digits, directed = false }) {
-    Object.assign(this, { group, title, unit: unitOf(unit), digits, directed, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
+    Object.assign(this, { group, title, unit: unitOf(unit), digits, directed, samples: [], set: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
     this.svg = draw("svg", { role: "img", "aria-label": title, height: group.height });
     this.reading = make("span", "reading");
     this.spread = make("span", "sub");
@@ -114,16 +114,16 @@ class Plot {
     return from + ((event.clientX - left - LEFT) / this.width) * (to - from);
   }
 
-  /// `reach`: how long a sample is in force, ms; `aim`: what the values are meant to be, said as `aimed`;
-  /// `includes`: values that the axis has in any case.
-  show(samples, { reach = Infinity, marks = [], aim = null, aimed = t("target {time}"), includes = [] } = {}) {
-    Object.assign(this, { samples, reach, marks, aim, aimed, includes, loading: false });
+  /// `reach`: how long a sample is in force, ms; `aim`: what the values are meant to be now, said as `aimed`, and `set`: what they were
+  /// meant to be, as samples; `includes`: values that the axis has in any case.
+  show(samples, { reach = Infinity, marks = [], set = [], aim = null, aimed = t("target {time}"), includes = [] } = {}) {
+    Object.assign(this, { samples, set, reach, marks, aim, aimed, includes, loading: false });
     this.render();
   }
 
   /// Empty until values of another time are there.
   wait() {
-    Object.assign(this, { samples: [], loading: true });
+    Object.assign(this, { samples: [], set: [], loading: true });
     this.render();
   }
 
@@ -148,9 +148,10 @@ class Plot {
     this.width = Math.max(50, (this.svg.clientWidth || 600) - LEFT - RIGHT);
     this.visible = within(this.samples, from, to);
     const known = this.visible.filter(Boolean);
+    const wanted = within(this.set, from, to).filter(Boolean).map(({ value }) => value);
     const low = known.reduce((least, sample) => Math.min(least, sample.low), Infinity);
     const high = known.reduce((most, sample) => Math.max(most, sample.high), -Infinity);
-    this.scale = axis(Math.min(low, ...this.includes), Math.max(high, ...this.includes));
+    this.scale = axis(Math.min(low, ...wanted, ...this.includes), Math.max(high, ...wanted, ...this.includes));
     // Its own view cuts off what lies beyond the range.
     const inner = draw("svg", { x: LEFT, width: this.width, height, viewBox: `${LEFT} 0 ${this.width} ${height}` }, ...this.gaps(), ...this.lines());
     const parts = [...this.grid(), inner, ...this.events()];
@@ -220,13 +221,24 @@ class Plot {
       if (points.length === 1) line += "h0.1";
     }
     const drawn = line ? [draw("path", { class: "band", d: band }), draw("path", { class: "curve", d: line })] : [];
-    if (this.aim !== null) {
-      const y = place(this.y(this.aim));
-      const aim = draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y });
-      const label = draw("text", { class: "at-aim", x: LEFT + 4, y: this.y(this.aim) + 13 }, this.aimed.replace("{time}", `${this.figure(this.directed ? Math.abs(this.aim) : this.aim)} ${this.unit}`));
-      drawn.push(aim, label);
-    }
-    return drawn;
+    return [...drawn, ...this.aims()];
+  }
+
+  /// What the values are meant to be: steps through its past, else a line at what it is now.
+  aims() {
+    const { from, to } = this.group.range;
+    const steps = runs(within(this.set, from, to)).map((run) => {
+      const [first, ...rest] = run.map((sample) => [place(this.x(sample.t)), place(this.y(sample.value))]);
+      return `M${first.join(" ")}${rest.map(([x, y]) => `H${x}V${y}`).join("")}h0.1`;
+    });
+    const drawn = steps.length ? [draw("path", { class: "aim", d: steps.join("") })] : [];
+    if (this.aim === null) return drawn;
+    const y = place(this.y(this.aim));
+    if (!steps.length) drawn.push(draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y }));
+    // Its past stands on the left.
+    const at = steps.length ? { x: LEFT + this.width - 4, "text-anchor": "end" } : { x: LEFT + 4 };
+    const said = `${this.figure(this.directed ? Math.abs(this.aim) : this.aim)} ${this.unit}`;
+    return [...drawn, draw("text", { class: "at-aim", y: this.y(this.aim) + 13, ...at }, this.aimed.replace("{time}", said))];
   }
 
   events() {
@@ -259,8 +271,10 @@ class Plot {
     const isReverse = this.directed && sample?.value < 0;
     const value = sample ? `${this.figure(isReverse ? -sample.value : sample.value)} ${this.unit}${isReverse ? " ←" : ""}` : t("no value");
     const spread = sample && sample.high > sample.low ? `${this.figure(sample.low)} … ${this.figure(sample.high)}` : "";
+    const wanted = sampleAt(this.set, at, this.reach);
+    const aimed = wanted ? t("set {value}", { value: `${this.figure(this.directed ? Math.abs(wanted.value) : wanted.value)} ${this.unit}` }) : "";
     text(this.reading, resting ? this.resting : value);
-    text(this.spread, resting ? "" : spread);
+    text(this.spread, resting ? "" : [spread, aimed].filter(Boolean).join(" · "));
   }
 }
 

@@ -24,16 +24,26 @@ function nowOf(name, points) {
   return `${figure(Math.abs(point.value), point.unit)} ${unitOf(point.unit)} ${arrow}`.trim();
 }
 
-/// The reference of now, in the direction of the speed: a dashed line in its plot. It has no past.
-function referenceOf(name, { speed_reference: reference, actual_speed: speed }) {
-  if (name !== "actual_speed" || reference?.quality !== "good" || typeof reference.value !== "number") return {};
-  const aim = speed?.value < 0 ? -Math.abs(reference.value) : reference.value;
-  return { aim, aimed: t("reference now {time}"), includes: [aim] };
+// The reference in the plot of each speed.
+const REFERENCES = { actual_speed: "speed_reference", output_frequency: "frequency_reference" };
+
+// Families that turn by a bit have a reference without a sign.
+const turned = (value, speed) => (speed < 0 ? -Math.abs(value) : value);
+
+/// The reference, in the direction of the speed: a dashed line through its past, or the one of now where the gateway keeps none.
+function referenceOf({ point, samples }, replies, values) {
+  const name = REFERENCES[point];
+  const past = replies.find((reply) => reply.point === name);
+  const set = past && samplesOf({ ...past, samples: past.samples.map((sample, at) => sample && [sample[0], ...Array(3).fill(turned(sample[3], samples[at]?.[3]))]) });
+  const now = values[name];
+  if (now?.quality !== "good" || typeof now.value !== "number") return { set };
+  const aim = turned(now.value, values[point]?.value);
+  return { set, aim, aimed: t("reference now {time}"), includes: [aim] };
 }
 
 /// The trends of one drive; `marks` are its events.
 export function trends(drive) {
-  const chosen = { span: SPANS[0], points: null, next: 0 };
+  const chosen = { span: SPANS[0], points: null, next: 0, asked: "" };
   const plots = new Map();
   const links = [];
   const group = new PlotGroup({
@@ -66,6 +76,8 @@ export function trends(drive) {
   function create(points) {
     const first = (names) => names.map((name) => points.find(({ point }) => point === name)).find(Boolean);
     chosen.points = SHOWN.map(first).filter(Boolean);
+    const references = chosen.points.map(({ point }) => REFERENCES[point]).filter((name) => points.some(({ point }) => point === name));
+    chosen.asked = [...chosen.points.map(({ point }) => point), ...references].join(",");
     for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit), directed: isDirected(point) }));
     // The same links for every time: new ones would take the focus from those that somebody is on.
     const titles = chosen.points.map(({ point }) => [`point=${point}&`, titleOf(point)]);
@@ -86,7 +98,7 @@ export function trends(drive) {
       const span = chosen.span;
       if (!chosen.points) create((await load(all)).points);
       // In one request, so that all have the same times; one alone comes without a list.
-      const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}&`, span))].flat() : [];
+      const replies = chosen.points.length ? [await load(address(`point=${chosen.asked}&`, span))].flat() : [];
       if (span !== chosen.span) return;
       chosen.next = performance.now() + span[2];
       text(note, replies.length ? "" : t("This family has none of the points with trends."));
@@ -94,7 +106,7 @@ export function trends(drive) {
       if (!replies.length) return;
       const step = replies[0].step_s * 1000;
       group.setRange(Date.parse(replies[0].from), Date.parse(replies[0].to), step);
-      for (const reply of replies) plots.get(reply.point).show(samplesOf(reply), { reach: 1.5 * step, marks, ...referenceOf(reply.point, values) });
+      for (const reply of replies) plots.get(reply.point)?.show(samplesOf(reply), { reach: 1.5 * step, marks, ...referenceOf(reply, replies, values) });
       group.moved();
     },
   };
