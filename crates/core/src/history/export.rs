@@ -7,9 +7,10 @@ use std::time::{Duration, SystemTime};
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value as Json, json};
 
+use super::decoded::Decoder;
 use super::recording::{CommandNote, EventNote, Frame, Header, Recording};
 
-/// The recording as a JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, `frames`.
+/// The recording as a JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, and `frames` with what they say.
 /// The text is written a sample at a time: as a tree, a recording of 1 MB takes 10 MB of memory.
 pub fn json(recording: &Recording) -> String {
     let mut header = match serde_json::to_value(&recording.header) {
@@ -24,7 +25,7 @@ pub fn json(recording: &Recording) -> String {
         samples: Samples(recording),
         events: &recording.events,
         commands: &recording.commands,
-        frames: &recording.frames,
+        frames: Frames(recording),
     };
     // Strings, numbers and null can always be serialized.
     serde_json::to_string(&object).unwrap_or_default()
@@ -40,7 +41,8 @@ pub struct RecordingObject<'r> {
     samples: Samples<'r>,
     events: &'r [EventNote],
     commands: &'r [CommandNote],
-    frames: &'r [Frame],
+    #[schema(value_type = Vec<FrameObject<'r>>)]
+    frames: Frames<'r>,
 }
 
 struct Samples<'r>(&'r Recording);
@@ -58,6 +60,29 @@ impl Serialize for Samples<'_> {
             }
         }))
     }
+}
+
+struct Frames<'r>(&'r Recording);
+
+impl Serialize for Frames<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Frames(recording) = self;
+        let mut decoder = Decoder::new(&recording.header.bus.protocol);
+        serializer.collect_seq(recording.frames.iter().map(|frame| {
+            let decode = decoder.next(frame);
+            FrameObject { frame, decode }
+        }))
+    }
+}
+
+/// A frame and what it says.
+#[derive(Serialize, utoipa::ToSchema)]
+#[schema(as = DecodedFrame)]
+struct FrameObject<'r> {
+    #[serde(flatten)]
+    frame: &'r Frame,
+    /// As `drivegate trace` says it; empty for a timeout.
+    decode: String,
 }
 
 /// The values of one read.

@@ -19,6 +19,7 @@ mod buckets;
 pub mod budget;
 pub mod capture;
 pub mod counters;
+mod decoded;
 pub mod drives;
 pub mod export;
 mod keeper;

@@ -3,9 +3,9 @@
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use super::decoded::Decoder;
 use super::export::moment;
 use super::recording::{Frame, Recording};
-use crate::codec::{Protocol, RequestPdu, describe};
 use crate::process_image::Verdict;
 
 /// Link type LINKTYPE_RTAC_SERIAL of pcap files.
@@ -41,10 +41,10 @@ pub fn pcapng(recording: &Recording) -> Vec<u8> {
     interface.extend([0; 4]);
     block(&mut out, INTERFACE, &interface);
     let start = humantime::parse_rfc3339(&header.time).ok();
-    let protocol = Protocol::from_name(&header.bus.protocol);
+    let mut decoder = Decoder::new(&header.bus.protocol);
     for frame in &recording.frames {
         let at = moment(start, frame.t).unwrap_or(UNIX_EPOCH);
-        let comment = comment(recording, frame, protocol, &frame.bytes);
+        let comment = comment(recording, frame, &decoder.next(frame));
         block(&mut out, PACKET, &packet(at, frame.verdict, &frame.bytes, &comment));
     }
     out
@@ -71,22 +71,11 @@ fn packet(at: SystemTime, verdict: Verdict, bytes: &[u8], comment: &str) -> Vec<
     packet
 }
 
-/// `pump-1: read holding 2100..2110`, `pump-1 answers: …`.
-fn comment(recording: &Recording, frame: &Frame, protocol: Option<Protocol>, bytes: &[u8]) -> String {
+/// `+0.004 s, pump-1, request: read holding 2100..2110`.
+fn comment(recording: &Recording, frame: &Frame, meaning: &str) -> String {
     let drives = &recording.header.bus.drives;
     let drive = frame.drive.and_then(|place| drives.get(place));
     let drive = drive.map_or("between two transactions", String::as_str);
-    let meaning = protocol.filter(|_| !bytes.is_empty()).map(|protocol| {
-        let opened = protocol.open_frame(bytes).filter(|_| frame.verdict == Verdict::Sent);
-        match opened.and_then(|(_, pdu)| RequestPdu::decode(&pdu).ok()) {
-            Some(pdu) => describe::request_on(protocol, &pdu),
-            // The prefix `foreign` is cut off: only the verdict of the frame says whether the reply was requested.
-            None => describe::stray(protocol, bytes)
-                .trim_start_matches("foreign: ")
-                .to_string(),
-        }
-    });
-    let meaning = meaning.unwrap_or_default();
     let verdict = match frame.verdict {
         Verdict::Sent => "request",
         Verdict::Ok => "ok",

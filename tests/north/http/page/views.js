@@ -20,7 +20,7 @@ const views = (recording) => [
   ["#/line/line1", ".strip .minutes rect", ["Load and cycle", "errors", "to 2 ms", "pump-2"]],
   ["#/events", ".events li", ["has fault 1: overcurrent", NASTY, "recording"]],
   ["#/recordings", ".list td a", ["fault 1: overcurrent"]],
-  [`#/recording/${recording}`, ".plots .curve", ["Recording: fault of pump-2", "Current", "has fault 1", "running", "sent", "CSV of the values"]],
+  [`#/recording/${recording}`, ".plots .curve", ["Recording: fault of pump-2", "Current", "has fault 1", "running", "read holding ", " registers: ", "CSV of the values"]],
 ];
 
 async function looks(page, [hash, sign, wanted], base, check) {

@@ -116,6 +116,13 @@ fn exports() {
         (&json["trigger"], &json["values"]["dc_link_voltage"]),
         (&"fault".into(), &655.0.into())
     );
+    let frames = json["frames"].as_array().unwrap();
+    assert_eq!(frames.len(), recording.frames.len());
+    let last = frames.last().unwrap();
+    assert_eq!(
+        (&last["decode"], &last["hex"]),
+        (&"address 1, function 3, 1 register".into(), &"01030200017984".into())
+    );
     // The file is a chain of pcapng blocks, checked by the lengths at both ends of each.
     let capture = pcapng::pcapng(&recording);
     let word = |at: usize| u32::from_le_bytes(capture[at..at + 4].try_into().unwrap());

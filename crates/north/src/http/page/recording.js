@@ -92,6 +92,9 @@ function lanes(group, states) {
 
 // ---- Frames
 
+/// As `drivegate trace` says it: the gateway decodes, and what is as usual needs no verdict.
+const meaningOf = ({ decode, verdict }) => [decode, ["sent", "ok"].includes(verdict) || decode.startsWith(verdict) ? "" : verdict].filter(Boolean).join(", ");
+
 function frameList(recording) {
   const list = table(t("Frames on the line around the cursor"), "t", t("Drive"), t("What"), t("Bytes"));
   let first = null;
@@ -105,7 +108,7 @@ function frameList(recording) {
       if (begin !== first) {
         first = begin;
         list.body.replaceChildren(...recording.frames.slice(begin, begin + FRAMES_SHOWN).map((frame) => {
-          const row = make("tr", "", ...[seconds(frame.t), recording.bus.drives[frame.drive] ?? "", frame.verdict].map((cell) => make("td", "", cell)),
+          const row = make("tr", "", make("td", "", seconds(frame.t)), make("td", "", recording.bus.drives[frame.drive] ?? ""), told("td", "", meaningOf(frame)),
             make("td", "hex", frame.hex.replace(/(..)(?=.)/g, "$1 ")));
           row.dataset.t = frame.t;
           return row;
