@@ -19,18 +19,21 @@ use tokio_util::sync::CancellationToken;
 use super::client::{get, raw, request};
 use super::plant::{self, HOLDING, STALE_AFTER, Server};
 
-const PLACES: [&str; 15] = [
+const PLACES: [&str; 18] = [
     "/",
     "/assets/style.css",
     "/assets/page.js",
     "/assets/icon.svg",
     "/metrics",
+    "/docs/",
+    "/docs/http.md",
     "/healthz",
     "/readyz",
     "/api/v1/drives",
     "/api/v1/drives/pump-1",
     "/api/v1/buses",
     "/api/v1/buses/line1/diagnosis",
+    "/api/v1/mqtt",
     "/api/v1/audit",
     "/api/v1/recordings",
     "/api/v1/events",
@@ -323,6 +326,40 @@ async fn what_is_wrong_with_a_line() {
         unknown.json(),
         json!({"error": "there is no bus `line9`", "known": ["line1", "line2"]})
     );
+}
+
+#[tokio::test]
+async fn the_figures_of_mqtt_are_served_without_a_client() {
+    let server = Server::of(plant::mixed()).await;
+    let reply = get(server.address, "/api/v1/mqtt").await.json();
+    assert_eq!(reply, json!({"links": [], "waiting": 2, "published": 17, "lost": 0}));
+}
+
+/// The foot of the page links the documentation, which comes from the program itself.
+#[tokio::test]
+async fn the_documentation_is_one_link_away() {
+    let server = Server::of(plant::mixed()).await;
+    let page = get(server.address, "/").await.body;
+    assert!(page.contains("<a href=\"docs/\""), "{page}");
+    let list = get(server.address, "/docs/").await;
+    assert_eq!(list.status, 200);
+    let names: Vec<&str> = list
+        .body
+        .split("href=\"")
+        .skip(1)
+        .filter_map(|rest| rest.split('"').next())
+        .collect();
+    assert!(names.len() > 20, "{}", list.body);
+    for name in names {
+        let document = get(server.address, &format!("/docs/{name}")).await;
+        assert_eq!(
+            document.header("content-type"),
+            Some("text/plain; charset=utf-8"),
+            "{name}"
+        );
+        assert!(document.status == 200 && document.body.starts_with("# "), "{name}");
+    }
+    assert_eq!(get(server.address, "/docs/nowhere.md").await.status, 404);
 }
 
 #[tokio::test]

@@ -8,6 +8,7 @@ mod api;
 mod app_state;
 mod body;
 mod credentials;
+mod documents;
 mod event_log;
 mod expect;
 mod hosts;

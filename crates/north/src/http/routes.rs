@@ -21,7 +21,7 @@ use super::openapi::{Api, Doc};
 use super::operating::{self, Operating};
 use super::params::Parameters;
 use super::reached::{Client, Coverage, Reached};
-use super::{api, event_log, expect, line, mqtt, page, points, recordings, replies, streams, trend, views};
+use super::{api, documents, event_log, expect, line, mqtt, page, points, recordings, replies, streams, trend, views};
 use crate::NorthState;
 use crate::command_json::{CommandResult, HoldReply, StopBody};
 use crate::drill::DrillReport;
@@ -61,6 +61,12 @@ fn described() -> Api {
             Doc::text("A file of the status page", "application/octet-stream"),
             views::asset,
         )
+        .get(
+            "/docs/",
+            Doc::text("List of the documentation", "text/html"),
+            documents::list,
+        )
+        .get("/docs/{name}", Doc::text("A document", TEXT), documents::one)
         .get("/metrics", Doc::text("Metrics for Prometheus", TEXT), views::exposition)
         .get(
             "/healthz",

@@ -221,6 +221,7 @@ const texts = {
   "line {line}": "Leitung {line}",
   "loading …": "wird geladen …",
   "metrics": "Metriken",
+  "documentation": "Dokumentation (englisch)",
   "connected": "verbunden",
   "not connected": "nicht verbunden",
   "Broker {broker}": "Broker {broker}",
