@@ -2,10 +2,10 @@
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
-use crate::support::process::{Running, api, drivegate, get, until};
-use crate::support::site::{HTTP, LINE1, Site, controlled, drive};
+use crate::support::process::{Running, api, drivegate, get, mbpoll_write, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, PASSWORD, Site, USERS, controlled, drive};
 use crate::support::tools::{root, run, tool};
 
 const COMMANDS: &str = "commands = true\nusers_file = \"users\"\n";
@@ -127,6 +127,102 @@ fn a_removed_user_stops_nothing_and_the_lease_does() {
     until("the lease runs out", || (state(&site) == "\"ready\"").then_some(()));
     let audit = audit(&site);
     assert!(audit.contains("\"supervision\""), "{audit}");
+}
+
+const AUTHORITY: &str = r#"
+[authority]
+mode = "exclusive"
+lease = "10min"
+[[authority.principal]]
+name = "alice"
+rank = "operator"
+http_user = "alice"
+[[authority.principal]]
+name = "plc"
+rank = "automation"
+modbus_tcp = ["127.0.0.1/32"]
+[[authority.principal]]
+name = "bob"
+rank = "remote"
+http_user = "bob"
+"#;
+
+/// The page of a user, which prints each step that it has done and waits for a line.
+struct Hand {
+    browser: Child,
+    printed: BufReader<ChildStdout>,
+}
+
+impl Hand {
+    fn new(site: &Site, user: &str, what: &str) -> Hand {
+        let script = root().join("tests/north/http/page/takeover.js");
+        let url = format!("http://localhost:{}/", site.http);
+        let mut browser = Command::new(tool("node"))
+            .arg(script)
+            .args([&url, user, PASSWORD, what])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let printed = BufReader::new(browser.stdout.take().unwrap());
+        Hand { browser, printed }
+    }
+
+    fn until(&mut self, step: &str) {
+        let mut line = String::new();
+        self.printed.read_line(&mut line).unwrap();
+        assert_eq!(line.trim_end(), step);
+    }
+
+    fn goes_on(&mut self) {
+        self.browser.stdin.as_mut().unwrap().write_all(b"\n").unwrap();
+    }
+
+    fn ends(mut self) {
+        self.goes_on();
+        assert!(self.browser.wait().unwrap().success());
+    }
+}
+
+/// A higher rank takes a running drive over and releases it on the page, and its motor goes on; a lower one can only stop it.
+#[test]
+fn a_running_drive_is_taken_over_on_the_page() {
+    let pump = controlled("pump-1", 1, "");
+    let site = Site::of(&[LINE1, &pump, MODBUS_TCP, HTTP, USERS, AUTHORITY]);
+    site.add_user("alice");
+    site.add_user("bob");
+    let _line = site.simulate(&["--addresses", "1", "--baud", "38400"]);
+    let _gateway = site.run_ready();
+    site.until_state("pump-1", "ready");
+    write_registers(site.modbus, 1, 0x8100, &[1, 5000]);
+    site.until_point("pump-1", "output_frequency", 25.0);
+    let holder = || api(site.http, "pump-1")["holder"].clone();
+    assert_eq!(holder(), "plc");
+    let mut alice = Hand::new(&site, "alice", "take");
+    alice.until("taken");
+    assert_eq!(holder(), "alice");
+    let refused = mbpoll_write(site.modbus, 1, 0x8100, &[1, 4000]).unwrap_err();
+    assert!(refused.to_lowercase().contains("busy"), "{refused}");
+    assert_eq!(site.point("pump-1", "output_frequency"), 25.0);
+    alice.goes_on();
+    alice.until("released");
+    assert_eq!(holder(), serde_json::Value::Null);
+    alice.ends();
+    write_registers(site.modbus, 1, 0x8100, &[1, 4000]);
+    site.until_point("pump-1", "output_frequency", 20.0);
+    assert_eq!(api(site.http, "pump-1")["starts"], 1, "the motor was not stopped by it");
+    let mut bob = Hand::new(&site, "bob", "stop");
+    bob.until("stopped");
+    bob.ends();
+    let seen = api(site.http, "pump-1");
+    assert_eq!((&seen["hold"], &seen["holder"]), (&"reserved".into(), &"bob".into()));
+    let stops: Vec<_> = site
+        .audit()
+        .into_iter()
+        .filter(|entry| entry["command"] == "run=false")
+        .collect();
+    assert_eq!(stops.len(), 1, "{stops:?}");
+    assert!(stops[0]["client"].as_str().unwrap().starts_with("bob "), "{stops:?}");
 }
 
 /// Messages of `check` about commands that cannot work.
