@@ -7,6 +7,7 @@ mod cases;
 mod confirmed;
 mod other_stops;
 mod own_timeout;
+mod path;
 mod status;
 mod words;
 
