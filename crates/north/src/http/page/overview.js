@@ -82,12 +82,12 @@ export function driveRow({ name }) {
   const row = { bus: make("span"), address: make("span", "address"), badge: make("span", "badge"), warning: make("span", "tag amber", "! ", make("span", "word", t("warning"))), quality: make("span", "tag"),
     notice: make("span", "notice"), fault: told("span", "why"), blocked: make("span", "blocked"), cells: [] };
   row.notice.setAttribute("role", "status");
-  row.second = make("span", "second", row.notice, row.fault, row.blocked);
+  row.second = make("span", "second", row.quality, row.notice, row.fault, row.blocked);
   row.element = make("div", "row");
   row.element.setAttribute("role", "row");
   row.element.append(
     cell("div", name.length > LONG_NAME ? "name long" : "name", anchor(places.drive(name), "", name), make("span", "where", row.bus, row.address)),
-    cell("div", "state", make("span", "first", row.badge, " ", row.warning, " ", row.quality), row.second),
+    cell("div", "state", make("span", "first", row.badge, " ", row.warning), row.second),
   );
   for (const [point, width] of COLUMNS) {
     const entry = { point, ...valueCell("div", `n ${width}`) };
