@@ -12,11 +12,11 @@ const HOPS: u8 = 0xFF;
 pub struct Npdu<'a> {
     /// Destination network and station with the remaining hops; `None` for this network.
     pub to: Option<(u16, Mac, u8)>,
-    /// Network and station that sent the message; `None` if the host itself sent it.
+    /// The network and the station that sent the message; `None` if the host itself sent the message.
     pub from: Option<(u16, Mac)>,
     /// Whether the sender expects an answer.
     pub expects: bool,
-    /// The message itself: to an application, or between routers.
+    /// The content of the message: for an application, or for another router.
     pub payload: Payload<'a>,
 }
 

@@ -159,7 +159,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Reads a value like [`Reader::context`], if that context comes next.
+    /// Reads a value as [`Reader::context`] does, if this context tag is the next one; otherwise returns `None`.
     ///
     /// # Errors
     /// If the encoding is not valid.
@@ -186,7 +186,7 @@ impl<'a> Reader<'a> {
         self.optional(number)?.map(u32_of).transpose()
     }
 
-    /// Reads a BOOLEAN in a context, if that context comes next.
+    /// Reads a BOOLEAN with this context tag, if the tag is the next one; otherwise returns `None`.
     ///
     /// # Errors
     /// If the encoding is not valid.
@@ -219,7 +219,7 @@ impl<'a> Reader<'a> {
         self.context_u32(number).map(PropertyId)
     }
 
-    /// Reads a REAL in a context, if that context comes next.
+    /// Reads a REAL with this context tag, if the tag is the next one; otherwise returns `None`.
     ///
     /// # Errors
     /// If the encoding is not valid.

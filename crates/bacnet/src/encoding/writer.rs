@@ -82,7 +82,7 @@ impl Writer {
         self.app(tag::NULL, &[])
     }
 
-    /// BOOLEAN, whose value stands in the tag.
+    /// Writes a BOOLEAN. The tag itself contains its value.
     pub fn bool(&mut self, value: bool) -> &mut Writer {
         self.bytes.push(tag::BOOLEAN << 4 | u8::from(value));
         self

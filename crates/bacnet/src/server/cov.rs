@@ -1,5 +1,6 @@
-//! Subscriptions to changes of value (clauses 13.1, 13.14, 13.15): which client is notified of what, and when again. The values
-//! come from the server; this module is the bookkeeping, which is bounded.
+//! Subscriptions to changes of value (clauses 13.1, 13.14, 13.15): which client is notified of which object, and
+//! when it is notified again. The server supplies the values. This module only records the subscriptions; their
+//! number is bounded.
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::Ipv4Addr;

@@ -95,7 +95,7 @@ impl Server {
         })
     }
 
-    /// Answers to where a question came from.
+    /// Sends the answer to the sender of the question.
     fn answer_source(&mut self, source: Source, device: u32, apdu: &[u8], now: Instant) {
         match source.way {
             Way::Unicast => self.send(source.address, device, apdu, now),

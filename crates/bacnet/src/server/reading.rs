@@ -12,7 +12,7 @@ use crate::types::{Abort, Address, Error, ObjectId, ObjectType, PropertyId, Reje
 
 /// Longest answer in octets, all segments together.
 const LONGEST: usize = 64 * 1024;
-/// Longest time for which a device sends no notification by itself.
+/// Longest time for which a device sends no notification of its own accord.
 const QUIET: Duration = Duration::from_secs(300);
 
 /// The content of an answer; `None` if nothing is to be answered now.

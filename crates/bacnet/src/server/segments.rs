@@ -9,7 +9,7 @@ use crate::types::Address;
 const WINDOW: u8 = 4;
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;
-/// Answers under way: in all, and to one host.
+/// Limits of the number of answers in progress: for all hosts, and for one host.
 const MOST_ANSWERS: usize = 32;
 const MOST_OF_ONE: usize = 8;
 
@@ -66,7 +66,7 @@ impl Sending {
 }
 
 impl Segments {
-    /// Begins an answer in segments of messages of that size; false where too many are under way.
+    /// Begins an answer in segments of this size. Returns false if too many answers are in progress.
     pub(super) fn begin(
         &mut self,
         (to, device): (Address, u32),
@@ -115,7 +115,7 @@ impl Segments {
         let Some(sending) = self.sending.get_mut(place) else {
             return;
         };
-        // An acknowledgement of the segment before `first` means that none of the window arrived.
+        // An acknowledgement of the segment before `first` means that no segment of the window arrived.
         let base = sending.first;
         let ahead = usize::from(sequence.wrapping_sub((base & 0xFF) as u8).wrapping_add(1));
         if ahead > sending.sent - base {
@@ -142,7 +142,7 @@ impl Segments {
             .retain(|s| (s.to, s.device, s.invoke) != (from, device, invoke));
     }
 
-    /// Sends again what was not acknowledged in time.
+    /// Sends again the segments that were not acknowledged in time.
     pub(super) fn poll(&mut self, now: Instant, out: &mut Vec<Message>) {
         self.sending.retain_mut(|sending| {
             if now < sending.until {

@@ -192,7 +192,7 @@ impl ServerWithClients {
             .receive(ServerWithClients::client(from), bytes, &self.plant, self.now);
     }
 
-    /// A message to a station of the virtual network, or to the gateway itself.
+    /// Sends a message to a station of the virtual network, or to the gateway itself.
     fn tell(&mut self, from: u8, station: Option<u8>, apdu: &[u8]) {
         let to = station.map(|octet| (NETWORK, Mac::new(&[octet]).unwrap()));
         let npdu = npdu::encode(to, None, true, Payload::Application(apdu));

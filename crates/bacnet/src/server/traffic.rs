@@ -125,7 +125,7 @@ impl Traffic {
         }
     }
 
-    /// The state of that address; when the table is full, the one idle for longest is dropped.
+    /// The state of this address. If the table is full, the address that was idle for longest is dropped.
     fn known(&mut self, address: Ipv4Addr, step: u64) -> Option<&mut Known> {
         if !self.known.contains_key(&address) {
             if self.known.len() >= ADDRESSES {
@@ -177,7 +177,7 @@ impl Traffic {
         self.ready.push_back((To::Host(to), bytes));
     }
 
-    /// Broadcasts, at once or later; a broadcast that waits already does not wait twice.
+    /// Sends a broadcast, at once or later. A broadcast that already waits is not added a second time.
     pub(super) fn broadcast(&mut self, bytes: Vec<u8>, now: Instant) {
         let step = self.step(now);
         if self.broadcasts.is_empty() && self.sent.sum(step) < BROADCASTS {

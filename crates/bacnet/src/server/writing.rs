@@ -18,7 +18,8 @@ use crate::types::{Address, Data, Error, ObjectId, ObjectType, PropertyId, WILDC
 
 /// Time for which an answer is remembered.
 const REMEMBERED: Duration = Duration::from_secs(10);
-/// Requests under way or remembered: of one host, and in all. Stops find room beyond that.
+/// Limits of the number of requests in progress or remembered: for one host, and for all hosts. Stops are accepted
+/// beyond these limits.
 const MOST_OF_HOST: usize = 64;
 const MOST_REQUESTS: usize = 1024;
 /// Requests beyond [`MOST_REQUESTS`] for which stops find room.
@@ -66,7 +67,7 @@ struct Exchange {
     /// The write in progress.
     current: Option<(ObjectId, PropertyRef)>,
     failed: Option<(Failure, Option<(ObjectId, PropertyRef)>)>,
-    /// The client has since sent another request with the same invoke id: the answer is not sent.
+    /// The client has sent another request with the same invoke id since then: this answer is not sent.
     mute: bool,
     state: State,
 }
@@ -107,7 +108,7 @@ impl Exchanges {
         self.all.iter_mut().find(is)
     }
 
-    /// Makes room for one more; false where all that are kept are under way.
+    /// Makes room for one more request. Returns false if all remembered requests are in progress.
     fn make_room(&mut self, from: Address, stops: bool) -> bool {
         let is_done = |e: &Exchange| matches!(e.state, State::Done { .. });
         let own = |e: &Exchange| e.from.ip() == from.ip();
@@ -308,7 +309,7 @@ impl Server {
         }
     }
 
-    /// Judges a write by what the object is.
+    /// Decides about a write by the kind of the object.
     fn step(&mut self, device: &Device, item: &WriteItem) -> Result<Step, Failure> {
         if item.priority.is_some_and(|priority| !(1..=16).contains(&priority)) {
             return Err(Error::PARAMETER_OUT_OF_RANGE.into());
@@ -405,7 +406,7 @@ fn has(object: &Object, property: PropertyId) -> bool {
     }
 }
 
-/// The value in the kind of the object; `None` releases a slot.
+/// Converts the value to the type of the object; `None` releases a slot.
 fn written(object: &Object, value: &Data) -> Result<Option<Datum>, Error> {
     Ok(Some(match (&object.kind, value) {
         (_, Data::Null) if object.access == Access::Command => return Ok(None),

@@ -58,7 +58,7 @@ proptest! {
     }
 }
 
-/// Numbers by chance, the same in every run.
+/// Pseudo-random numbers. Each run of the test gets the same numbers.
 struct Dice(u64);
 
 impl Dice {

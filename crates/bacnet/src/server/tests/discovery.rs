@@ -222,7 +222,7 @@ fn a_message_with_one_hop_left_is_not_delivered_further() {
         (NETWORK, 1, &[]),
     ] {
         let mut bytes = who_is(Some((to, Mac::ALL)), None, None);
-        // The hop count stands before the APDU.
+        // The hop count is directly before the APDU.
         let place = bytes.len() - WHO_IS.len() - 1;
         bytes[place] = hops;
         rig.datagram(5, &bvlc::broadcast(&bytes));
