@@ -309,7 +309,7 @@ impl CommandRun {
             .any(|ticket| ticket.origin().kind == SourceKind::Slot)
     }
 
-    /// Whether the command comes only from supervision.
+    /// Whether all parts of the command come from supervision.
     pub fn is_of_supervision(&self) -> bool {
         self.tickets.iter().all(|ticket| ticket.origin().is_lease())
     }
@@ -394,7 +394,7 @@ impl CommandRun {
         self.overtaken = self.overtaken.saturating_add(1);
     }
 
-    /// Whether the end of the pulse goes before the next stop, because enough stops went first.
+    /// Whether the end of the pulse is sent before the next stop, because enough stops were sent before it.
     pub fn is_put_off(&self) -> bool {
         !self.may_write_on() && self.overtaken >= MOST_STOPS
     }
@@ -460,7 +460,8 @@ impl CommandRun {
     }
 }
 
-/// Whether an order sets the direction, or starts the motor; a raw write to one of their places counts.
+/// Whether an order sets the direction or starts the motor. A raw write to one of the places of these commands
+/// counts as well.
 fn turns(profile: &Profile, order: &Order) -> bool {
     match order {
         Order::Points(values) => {

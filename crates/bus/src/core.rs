@@ -28,7 +28,7 @@ pub enum Action {
     Send,
     /// Wait for bytes, or until this time.
     Wait {
-        /// Latest time at which the caller must come back.
+        /// Latest time at which the caller must call again.
         until: Instant,
         /// Whether an arriving command ends the wait.
         commands: bool,

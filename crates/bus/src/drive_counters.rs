@@ -112,7 +112,7 @@ impl DriveCounters {
     }
 }
 
-/// Requests the counter behind those that were read.
+/// Requests the counter that follows those already read.
 fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
     let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");

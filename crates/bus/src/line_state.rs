@@ -134,8 +134,8 @@ impl LineState {
         }
     }
 
-    /// Resets the state, because the port was reopened. What was learned about the line is kept: a line without wire
-    /// time would seem silent for seconds, and replies correct what no longer holds.
+    /// Resets the state because the port was reopened. Properties of the line that were measured are kept: without
+    /// a known wire time, a line would seem silent for seconds. Replies correct any property that has changed.
     pub fn reset(&mut self, now: Instant) {
         let learned = self.learned;
         *self = LineState {
@@ -149,7 +149,7 @@ impl LineState {
         self.learned
     }
 
-    /// Adopts what was learned about the same line, if its settings are the same.
+    /// Adopts the properties that were measured on the same line, if the line has the same settings.
     pub fn take_over(&mut self, learned: Learned) {
         if (learned.protocol, learned.format) == (self.protocol, self.format) {
             self.learned = learned;

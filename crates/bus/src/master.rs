@@ -158,7 +158,7 @@ pub struct Carried {
 }
 
 impl Carried {
-    /// The lease without what is refreshed and repeated.
+    /// The lease without the data for refreshes and repetitions.
     #[must_use]
     pub fn alone(self) -> Carried {
         Carried {

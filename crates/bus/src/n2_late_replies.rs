@@ -96,8 +96,8 @@ impl N2LateReplies {
         self.0.iter_mut().find(|late| late.is_of(address, pdu))
     }
 
-    /// The drive answered a request. Replies of another form to earlier requests will not come any more; another reply to
-    /// the same request may, within `window`.
+    /// The drive answered a request. Replies of another form to earlier requests will not arrive any more. Another
+    /// reply to the same request may arrive within `window`.
     pub fn answered(&mut self, address: u8, pdu: &RequestPdu, window: Duration, now: Instant) {
         let Some(form) = form(pdu) else { return };
         self.0
@@ -107,7 +107,7 @@ impl N2LateReplies {
         }
     }
 
-    /// When the object in the reply that came now was requested.
+    /// The time at which the object in the present reply was requested.
     pub(crate) fn asked_by(&self, address: u8, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let late = self.0.iter().find(|late| late.is_of(address, pdu) && late.until > now);
         late.map(|late| late.asked)

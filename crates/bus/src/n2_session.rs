@@ -82,7 +82,7 @@ impl N2Sessions {
         self.drives.is_empty()
     }
 
-    /// The step needed before the drive is read (`None`) or commanded.
+    /// The step that the drive needs before a read (`None`) or a command.
     pub fn before(&mut self, drive: DriveIndex, command: Option<Urgency>, now: Instant) -> Option<Session> {
         let drive = self.drives.get_mut(drive)?;
         if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
@@ -164,7 +164,7 @@ impl N2Sessions {
         }
     }
 
-    /// The device type by which a drive identifies itself, or is expected to.
+    /// The device type that the drive reported or, if it has not reported one, the expected device type.
     pub fn device(&self, drive: DriveIndex) -> u8 {
         let drive = self.drives.get(drive);
         drive.map_or(0, |drive| drive.device.unwrap_or(drive.options.device_type))

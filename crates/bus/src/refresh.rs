@@ -288,14 +288,14 @@ impl Refresh {
         end.and_then(|end| self.end(end))
     }
 
-    /// When the next round is due; `None` if no round is awaited.
+    /// When the next round is due; `None` if no round is planned.
     pub(super) fn due(&self) -> Option<Instant> {
         let going = self.repeated.going?;
         // A run command is only repeated to a motor that was seen to run by it.
         (going.does == InForce::Stop || going.seen).then_some(going.due)
     }
 
-    /// Whether a run command is what stands.
+    /// Whether the values to be refreshed contain a run command.
     pub(super) fn runs(&self) -> bool {
         self.repeated.going.is_some_and(|going| going.does == InForce::Run)
     }

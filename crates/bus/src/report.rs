@@ -68,7 +68,7 @@ pub(super) struct Wanted {
 /// The known response of a drive to a silent master.
 #[derive(Debug, Clone, Copy, Default)]
 struct Response {
-    /// Whether the response was evaluated since the drive came online.
+    /// Whether the response was checked since the drive came online.
     looked_at: bool,
     /// Whether the missing own response was reported.
     told: bool,
@@ -194,7 +194,7 @@ impl Report {
         });
     }
 
-    /// Whether a thread that reads orders stands still.
+    /// Whether a thread that reads orders is blocked.
     pub(super) fn is_deaf(&self, now: Instant) -> bool {
         self.events.pauses().is_deaf(now)
     }

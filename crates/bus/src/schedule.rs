@@ -25,7 +25,7 @@ use crate::codec::Exception;
 use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
 use crate::order::Urgency;
 
-/// Commands in a row before a due poll goes first.
+/// Number of consecutive commands after which a due poll is sent first.
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
 pub const SLOW_SHARE: f64 = 0.05;
@@ -41,7 +41,7 @@ pub fn slow_share(demand: f64) -> f64 {
     (demand / 6.0).clamp(SLOW_SHARE, MOST_SLOW_SHARE)
 }
 
-/// Credit that slow polls gather while none is due, in requests of the longest kind.
+/// Maximum credit that slow polls collect while no slow poll is due, in requests of the longest kind.
 const MOST_CREDIT: f64 = 1.5;
 
 /// A planned read of a drive.
@@ -116,7 +116,7 @@ pub struct RoundStart {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
     Due,
-    /// A slow poll that goes before fast ones.
+    /// A slow poll that is sent before fast ones.
     OnCredit,
     /// The poll was requested by a command.
     Asked,

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Raw};
 use crate::process_image::Reading;
 
-/// Comparisons that differ, of one and the same selection, until it counts as changed.
+/// Number of consecutive comparisons that differ, all with the same selection, after which the selection counts as changed.
 const DIFFERING: u8 = 3;
 /// Matching comparisons in a row after which process data is trusted again.
 const AGREEING: u8 = 2;

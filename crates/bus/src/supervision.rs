@@ -472,7 +472,7 @@ fn has_failed(outcome: &Outcome) -> bool {
 pub(super) enum OwnResponse {
     /// The response was not read yet, or the profile has no point for it.
     Unknown,
-    /// The drive has no response: the point that shows that.
+    /// The response is switched off in the drive; contains the point that shows this.
     Off(&'static str),
     /// The drive responds, if settings without a register are set too (such as the timeout of an option board).
     On,

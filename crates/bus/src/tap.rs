@@ -240,7 +240,7 @@ mod tests {
         let mut fast = Hearing::new(format, start);
         fast.add(&[0; 10], start);
         assert_eq!(fast.times(&part(0..10), start), (Duration::ZERO, start));
-        // A second frame 3 ms behind the first.
+        // A second frame, 3 ms after the end of the first one.
         let end = start + ms(5) + format.chars(10);
         bytewise.add(&[0; 4], end + ms(3) + format.chars(4));
         assert_eq!(bytewise.times(&part(10..14), end).0, ms(3));

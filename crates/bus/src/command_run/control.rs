@@ -39,7 +39,7 @@ pub(super) enum Word {
     ResetHigh(Setting),
     /// Writes the word after a reset pulse.
     ResetEnd(Setting),
-    /// Bits that are no command of `[control]`.
+    /// Bits that belong to no command of `[control]`.
     Others(Setting),
 }
 
@@ -240,7 +240,7 @@ fn stops(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Act
         None => actions.push(Action::Word(Word::Stop(reverse))),
         Some(place) => actions.push(Action::Send(write(place, control.stop.applied(0), profile))),
     }
-    // Run settings at other places are taken away, too.
+    // Run settings at other places are removed as well.
     let stands = |setting: &Setting| !setting.once && setting.place != control.stop.place;
     let mut done: Vec<ControlItem> = Vec::new();
     for setting in control.runs().iter().filter(|setting| stands(setting)) {

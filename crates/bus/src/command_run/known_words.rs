@@ -65,7 +65,7 @@ impl KnownWords {
         self.functions.form(pdu, profile)
     }
 
-    /// The reply that is applied next came at `now`.
+    /// Advances the known state to `now`, when the next reply that is applied arrived.
     pub(crate) fn come_to(&mut self, now: Instant) {
         self.now = Some(now);
     }

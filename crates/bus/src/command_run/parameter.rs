@@ -108,7 +108,7 @@ impl ParameterRun {
         self.in_doubt = true;
     }
 
-    /// No valid reply came: the value of the drive is read before anything is written again.
+    /// No valid reply arrived: the present value of the drive is read before the next write.
     pub(super) fn begin_again(&mut self) {
         if self.stage != Stage::Release {
             self.look.begin_again();
@@ -163,7 +163,7 @@ impl ParameterRun {
         if !self.look.take_reply(reply) {
             return Then::Go;
         }
-        // A reply without the running state does not prove that the motor stands.
+        // A reply without the running state does not prove that the motor is at standstill.
         if self.look.runs() == Some(false) {
             return self.go(Stage::Write);
         }

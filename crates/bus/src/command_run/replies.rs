@@ -16,7 +16,7 @@ const LOOK_AGAIN: Duration = Duration::from_millis(100);
 const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(500));
 /// Longest such pause before a stop: a gateway that is about to end has little time for it.
 const BUSY_STOP: Duration = Duration::from_millis(100);
-/// Tries in a row of the end of a pulse, which has no other end.
+/// Number of consecutive attempts to end a pulse. Nothing else ends a pulse.
 const MOST_BUSY: u32 = 10;
 
 impl CommandRun {

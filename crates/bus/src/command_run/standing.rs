@@ -13,7 +13,7 @@ pub(crate) enum Motor {
     Runs,
     /// The motor runs, and is commanded elsewhere.
     RunsElsewise,
-    /// The motor stands, or the drive has a fault.
+    /// The motor is at standstill, or the drive has a fault.
     Stands,
     /// No status shows the state of the motor.
     NotShown,

@@ -36,7 +36,7 @@ pub(super) enum Action {
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// A pause, usually two update periods of the drive.
     Wait(Duration),
-    /// A word of the control register by `[control]` of the profile.
+    /// A word for the control register, as `[control]` of the profile defines it.
     Word(Word),
     /// Waits for the state that ends a step of a sequence.
     Await(Box<AwaitedState>),
@@ -120,7 +120,7 @@ pub(super) struct Known {
     pub(super) stopped: bool,
     /// Whether the motor runs, as last reported.
     pub(super) running: bool,
-    /// The drive changes bits of a register by itself.
+    /// Whether the drive itself changes bits of a register.
     pub(super) masks: bool,
     /// State of the motor as the drive reported it right before; `None` if it was not read.
     pub(super) motor: Option<Motor>,

@@ -501,7 +501,7 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
 #[test]
 fn what_cannot_be_sent_is_no_success() {
     let refused = |run: &CommandRun| matches!(run.success(), Outcome::Refused(_));
-    // The derived value goes to another point, which the order does not name.
+    // The derived value is written to another point, which the order does not name.
     let mut bench = ObedientDrive::new(0);
     let (mut derived, _a) = bench.begin(&[("run", 1.0), ("frequency_reference", 20.0)], Urgency::Command);
     assert_eq!(bench.run(&mut derived), [], "not a part of it either");

@@ -57,7 +57,7 @@ fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
             coming.retain(|(at, _)| *at > now);
             continue;
         };
-        // Bytes that came while no request was open are noise.
+        // Bytes that arrived while no request was open are noise.
         coming.retain(|(at, _)| *at > now);
         coming.push_back((now + behind, asked.clone()));
         let sent = now;

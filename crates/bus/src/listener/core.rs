@@ -118,7 +118,7 @@ impl ListenCore {
         self.report.reconnected();
     }
 
-    /// The port is gone or cannot be opened.
+    /// The port has disappeared or cannot be opened.
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.refuse_all(now);
         self.report.bus_down(why, now);
@@ -309,7 +309,7 @@ impl ListenCore {
         }
     }
 
-    /// Stores what was read, whole values only.
+    /// Stores the values that were read. Values of which only a part was read are not stored.
     fn read(&mut self, index: DriveIndex, (table, start): (Table, u16), words: &[u16], at: Instant, now: Instant) {
         let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get(index)) else {
             return;
@@ -339,7 +339,7 @@ impl ListenCore {
             seen.clear();
             self.report.fast_round(cycle);
         }
-        // A master whose reads never repeat has no cycle.
+        // If the reads of the other master never repeat, the master has no cycle.
         if self.round.0.len() < 4096 {
             self.round.0.push(key);
         }

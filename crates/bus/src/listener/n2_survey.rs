@@ -26,12 +26,12 @@ pub struct N2Survey {
     states: Seen,
     /// Device types that were seen.
     devices: Seen,
-    /// Times at which a drive wanted to be identified.
+    /// How often a drive asked to be identified.
     unidentified: u64,
     /// Number of overrides of analog outputs, and of their releases.
     overrides: u64,
     releases: u64,
-    /// Polls, by form and by what was answered.
+    /// Number of polls, by form and by kind of answer.
     polls: Seen,
     reports: Seen,
     last_polls: BTreeMap<u8, Instant>,
@@ -58,7 +58,7 @@ fn count(seen: &mut Seen, what: impl Into<String>) {
 }
 
 impl N2Survey {
-    /// Adds what was received to the survey.
+    /// Adds a received frame to the survey.
     pub fn add(&mut self, heard: &Traffic) {
         match heard {
             Traffic::Exchange(exchange) => self.exchange(exchange),
@@ -66,7 +66,7 @@ impl N2Survey {
         }
     }
 
-    /// Whether the checksum of a line, a request's or an answer's with data, is what is assumed.
+    /// Whether the checksum of a request, or of an answer with data, is formed as assumed.
     fn sum(&mut self, line: &[u8]) {
         // An A may be a digit as well.
         let request = line.iter().rposition(|byte| *byte == b'>');
@@ -139,7 +139,7 @@ impl N2Survey {
         }
     }
 
-    /// Counts the width of a region behind `>aa72` or `>aa73`: a leading 0 shows two digits.
+    /// Counts the width of the region number that follows `>aa72` or `>aa73`. A leading 0 indicates two digits.
     fn width(&mut self, frame: &[u8]) {
         let begin = frame.iter().rposition(|byte| *byte == b'>').unwrap_or(0);
         let two = frame.get(begin + 5) == Some(&b'0');

@@ -105,7 +105,7 @@ pub struct Survey {
 }
 
 impl Survey {
-    /// Adds what was received to the survey.
+    /// Adds a received frame to the survey.
     pub fn add(&mut self, protocol: Protocol, heard: &Traffic) {
         let (began, at) = match heard {
             Traffic::Stray { bytes, at, .. } => {

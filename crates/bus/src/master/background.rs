@@ -242,7 +242,7 @@ impl Master {
         };
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
         let mut pending = self.bus.queue.lock();
-        // A stop that came in while the line went silent.
+        // A stop that was ordered while the line became silent.
         let stopped = command
             .reach()
             .any(|drive| pending.was_stopped(drive) && !command.stops(drive));

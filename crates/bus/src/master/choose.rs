@@ -210,7 +210,7 @@ impl Master {
             let want = |drive: &mut DriveState| drive.next_need(image, &waits.n2_late, now);
             match next_need(bus, index, (drive, image), want, now) {
                 Wanted::Step(slot, step) => {
-                    // The session step that N2 needs first can be blocked by late replies like the step itself.
+                    // Late replies can block the session step that N2 needs first, as they block the step itself.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
                     let blocked = before.and_then(|before| waits.n2_late.blocks(&before, now));
                     let waits = drive.run(slot).is_some_and(|run| run.waits_for_late());

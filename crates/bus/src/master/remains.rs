@@ -25,7 +25,7 @@ pub struct Remains {
     pub owed_actions: usize,
     /// Number of drives that do not answer.
     pub away: usize,
-    /// Reads that wait behind failures: not answered, or requested by a command and not done.
+    /// Number of reads that wait after failures: a read was not answered, or a command requested it and it is not done.
     pub held_reads: usize,
 }
 

@@ -280,7 +280,7 @@ impl Master {
         news.push(News::Offline(index));
     }
 
-    /// The drive answered a read that was sent at `sent`, at the latest at `came`.
+    /// The drive answered a read that was sent at `sent`; the reply arrived at `came` at the latest.
     fn read(
         &mut self,
         index: DriveIndex,

@@ -491,7 +491,7 @@ fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
     let mut rig = Rig::new(2);
     let from = rig.wire.len();
     for round in 0..300 {
-        // The run behind each stop makes the next stop effective again.
+        // A run command follows each stop, so that the next stop has an effect again.
         let _stop = rig.switch(0, "flood", false);
         let _run = rig.switch(0, "flood", true);
         let _reference = rig.order(

@@ -264,7 +264,7 @@ impl<'p> Drive<'p> {
         }
     }
 
-    /// Whether a run command stands that is more than a moment.
+    /// Whether a run command that lasts longer than a pulse is in effect.
     fn is_commanded(&self) -> bool {
         let prepared = self.prepared >= self.steps().len();
         let stands = |run: &Setting| {

@@ -1,4 +1,4 @@
-//! A round of a refresh: a reference that lies apart, the reads, the write. Pure: time is an argument.
+//! A round of a refresh: a reference at a separate address, the reads, the write. Pure: time is an argument.
 
 use std::time::{Duration, Instant};
 
@@ -58,7 +58,7 @@ impl Refresh {
         }
     }
 
-    /// The request of the present step of the round, which begins where none has.
+    /// The request of the present step of the round. Begins a round if none is in progress.
     pub(crate) fn request(&mut self, profile: &Profile) -> Option<RequestPdu> {
         let control = profile.control.as_ref()?;
         if self.round.is_none() {
@@ -246,8 +246,8 @@ impl Refresh {
         }
     }
 
-    /// Handles a step without an accepted reply: the refresh continues with the next period, by what the drive then
-    /// shows.
+    /// Handles a step without an accepted reply: the refresh continues with the next period, based on what the
+    /// drive then shows.
     pub(crate) fn not_answered(&mut self, now: Instant) {
         self.round = None;
         let Some((every, _)) = self.settings else { return };

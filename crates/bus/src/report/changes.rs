@@ -11,7 +11,7 @@ use crate::process_image::Reading;
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
-/// Time from a command to the poll that shows the motor standing.
+/// Maximum time from a stop command to the poll that shows the motor at standstill.
 const STOPS_WITHIN: Duration = Duration::from_secs(300);
 
 /// Points whose changes are events, with the texts for their start and end.

@@ -10,7 +10,7 @@ use crate::event::EventKind;
 use crate::process_image::DriveImage;
 
 impl Report {
-    /// Compares what was just read. The monitoring points to be read: drive, point and time.
+    /// Compares the values that were just read. Returns the monitoring points to read: drive, point and time.
     pub(super) fn compare_selection(
         &mut self,
         (index, drive): (DriveIndex, &DriveImage),

@@ -10,7 +10,7 @@ use crate::order::Pace;
 #[derive(Debug, Default)]
 pub(super) struct BackgroundShare {
     balance: [f64; 2],
-    /// The longest transaction that was wanted, which limits the saved time.
+    /// The longest transaction that was requested. This time limits the credit.
     longest: Duration,
     /// By how much recent transactions took longer than calculated, because drives are slower than their profiles state.
     overrun: Duration,
@@ -42,7 +42,7 @@ impl BackgroundShare {
         self.balance.get(pace as usize).copied().unwrap_or(0.0)
     }
 
-    /// Time until the share of that pace has earned `wanted`.
+    /// Time until the share of this pace has earned `wanted`.
     fn missing(&self, pace: Pace, wanted: f64) -> Duration {
         Duration::from_secs_f64(((wanted - self.balance(pace)) / pace.share()).max(0.0))
     }

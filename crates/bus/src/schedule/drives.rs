@@ -278,8 +278,9 @@ impl DriveSchedule {
         self.unproved.clone_from(&self.trials);
     }
 
-    /// The drive does not answer; the last request took the line for `took`. Sets the time of the next probe: the first probes
-    /// come soon, then the pause doubles, and the probe's cost stays within its share of the line.
+    /// The drive does not answer; the last request occupied the line for `took`. Sets the time of the next probe:
+    /// the first probes follow soon, then the interval doubles, and the probes do not exceed their share of the
+    /// line.
     pub(super) fn is_away(&mut self, now: Instant, took: Duration) {
         let pause = match self.presence {
             Presence::Online => Duration::ZERO,
@@ -454,7 +455,8 @@ impl DriveSchedule {
             return Change::None;
         };
         if !addressed {
-            // Busy or failing: the drive is alive, the values age, the poll comes round again.
+            // The drive is busy or reports a failure: it is online, its values become older, and the poll is
+            // repeated in turn.
             item.due = match item.read.class {
                 PollClass::Fast => item.due.max(now),
                 _ => now + BUSY_PAUSE,
@@ -484,7 +486,7 @@ impl DriveSchedule {
         Change::None
     }
 
-    /// Joins the sound neighbours that splitting tore apart, around the refused addresses.
+    /// Joins the valid reads on both sides of the refused addresses again that were separated by splitting.
     pub(super) fn join(&mut self, origin: PlannedRead, now: Instant) {
         let mut joined: Vec<Item> = Vec::with_capacity(self.items.len());
         for item in self.items.drain(..) {

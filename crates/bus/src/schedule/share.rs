@@ -61,8 +61,8 @@ impl CommandShare {
         self.stops.time = Duration::ZERO;
     }
 
-    /// Whether a command of that rank goes before a poll that is due. A stop waits for one poll at most, and only where
-    /// stops alone took half of the line.
+    /// Whether a command of this rank is sent before a due poll. A stop waits for one poll at most, and only if
+    /// stops alone used half of the line time.
     pub(super) fn admits(&self, urgency: Urgency) -> bool {
         match urgency {
             Urgency::Stop => {

@@ -244,7 +244,7 @@ fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_sh
     let plans: Vec<&Plan> = (0..32).map(|_| &plan).collect();
     let mut schedule = Schedule::new(cadence, &plans, |_, _| COST, now);
     let mut at = now;
-    // Polls by class, and drives of which each read of a fault was made.
+    // Counts polls by class, and the drives of which all fault reads were made.
     let mut pass = |schedule: &mut Schedule, time: Duration| {
         let (until, mut polls, mut asked) = (at + time, BTreeMap::new(), Vec::new());
         while at < until {

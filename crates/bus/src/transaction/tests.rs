@@ -154,8 +154,8 @@ fn garbage_ends_the_exchange_once_no_more_of_it_can_come() {
     assert_eq!(transaction.on_time(deadline), corrupt("check code is wrong"));
 }
 
-/// A byte count with which no frame exists does not hold the line until the deadline, and the reply is still found
-/// behind it.
+/// A byte count that no valid frame has does not occupy the line until the deadline: the valid reply that follows
+/// is still found.
 #[test]
 fn a_reply_of_impossible_length_ends_the_exchange_before_its_deadline() {
     let (request, frame) = request();

@@ -82,7 +82,7 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
         let (asked, outcome) = drive.carries_out(&mut bench, run);
         assert_eq!((asked.len(), asked[0].0, outcome.is_ok()), (1, 16, true), "{points:?}");
     }
-    // The drive restarts, and is still the same machine.
+    // The drive restarts, and is the same machine as before.
     bench.words.forget();
     let run = stop(&bench);
     let (asked, _) = drive.carries_out(&mut bench, run);

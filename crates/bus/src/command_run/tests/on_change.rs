@@ -1,4 +1,4 @@
-//! Writes of what a drive keeps in a memory that wears: overrides of N2.
+//! Writes of values that a drive keeps in memory that wears out: N2 overrides.
 
 use super::*;
 use crate::codec::n2::Session;

@@ -86,7 +86,7 @@ fn a_drive_that_goes_on_turning_fails() {
     );
 }
 
-/// Incident while the motor should come to a standstill.
+/// An incident that occurs before the motor reaches standstill.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meanwhile {
     /// The first replies after a silence are lost; the motor stops before any reply arrives.
@@ -232,7 +232,7 @@ fn a_silent_client_stops_a_motor_by_its_lease_only() {
     assert_eq!(report.state, DrillState::Passed, "{report:#?}");
     let took = report.steps[0].took_ms.unwrap();
     assert!((500..1_000).contains(&took), "its lease is 500 ms: {took} ms");
-    // The motor stands for another reason before that.
+    // The motor reaches standstill before that, for another reason.
     let (_, report) = drill(Kind::Client, |rig, report| {
         if says(report, "the client is silent") {
             rig.drives[0].holding.insert(2000, 0);

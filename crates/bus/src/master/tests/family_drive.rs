@@ -18,7 +18,7 @@ pub(super) struct FamilyDrive {
 }
 
 impl FamilyDrive {
-    /// A drive that stands, without a fault, commanded by the bus.
+    /// A drive without a fault that the bus controls, whose motor is at standstill.
     pub(super) fn new(profile: &Arc<Profile>) -> FamilyDrive {
         let mut drive = FamilyDrive {
             profile: profile.clone(),

@@ -32,7 +32,7 @@ struct Plant {
 }
 
 impl Plant {
-    /// A drive that stands, and whose orders are repeated every second.
+    /// A drive whose motor is at standstill, and whose orders are repeated every second.
     fn new(name: &'static str) -> Plant {
         Plant::with(name, |spec| spec)
     }
@@ -448,7 +448,8 @@ fn what_was_handed_over_goes_on_with_a_lease_and_soon() {
     }
 }
 
-/// The drive is too busy for the stop: the end of a reset, which goes before the next try, carries no run command.
+/// The drive is too busy for the stop. The reset is ended before the stop is tried again; the word that ends the
+/// reset contains no run command.
 #[test]
 fn no_end_of_a_reset_repeats_a_run_command_behind_a_stop() {
     let mut ends = 0;

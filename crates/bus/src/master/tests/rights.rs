@@ -74,7 +74,7 @@ enum Goes {
 #[test]
 fn an_order_without_its_right_goes_no_further_and_an_accepted_stop_does() {
     use Goes::{Before, Begun, Waiting};
-    // The result, the writes after the right has gone, and whether the motor runs.
+    // The result, the writes after the right was withdrawn, and whether the motor runs.
     let table = [
         (Before, START, "not_allowed", 0, false),
         (Before, REFERENCE, "not_allowed", 0, false),

@@ -48,7 +48,7 @@ fn plan_of(reads: &[(u8, u16)]) -> Plan {
             read(class(*n), at, *count)
         })
         .collect();
-    // Fast reads come first, as in the planner's order. Each drive has one.
+    // Fast reads are first in the list, as in the order of the planner. Each drive has one fast read.
     reads.push(read(PollClass::Fast, 0, 11));
     reads.sort();
     Plan {
@@ -60,7 +60,7 @@ fn plan_of(reads: &[(u8, u16)]) -> Plan {
 const DEADLINE: Duration = Duration::from_millis(110);
 const SLOW: Duration = Duration::from_secs(1);
 
-/// Figures of a minute behind a start of fifteen seconds, in which the dead drives are detected.
+/// Figures of one minute, after a start of fifteen seconds in which the drives that do not answer are detected.
 #[derive(Default)]
 struct Seen {
     fast_counts: BTreeMap<(usize, u16), usize>,

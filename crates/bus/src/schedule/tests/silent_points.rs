@@ -94,7 +94,7 @@ fn a_point_that_is_never_answered_is_found_in_its_block_and_takes_no_drive_away(
         .iter()
         .filter(|(_, read)| (read.start, read.count) == (2100, 11));
     assert!(whole.count() > 100, "{:?}", drive.asked.last());
-    // A drive that does not answer at all goes offline, after the usual number of tries.
+    // A drive that answers no request goes offline after the usual number of attempts.
     drive.of = (Table::Holding, 2100);
     drive.rig.dead = vec![0];
     drive.rig.run(Duration::from_secs(2));
@@ -122,7 +122,7 @@ fn a_register_in_the_only_block_of_a_drive_is_found() {
     }
 }
 
-/// A slow block, of which a meter never answers one register.
+/// A meter never answers one register of a slow block.
 #[test]
 fn a_register_in_a_slow_block_is_found() {
     let fast = plan().reads.into_iter().next().expect("process data");

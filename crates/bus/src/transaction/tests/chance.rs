@@ -39,7 +39,7 @@ fn mutated() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// How the transaction ends when the bytes come in pieces of `chunk`, `gap_us` apart.
+/// How the transaction ends if the bytes arrive in pieces of `chunk` bytes, `gap_us` apart.
 fn fed(
     mut transaction: Transaction,
     begun: Instant,
@@ -146,7 +146,7 @@ proptest! {
             }
             step = transaction.on_bytes(now, piece);
         }
-        // Noise and the first bytes of the reply form a sound frame of another address once in some ten thousand cases.
+        // In about one of ten thousand cases, noise and the first bytes of the reply form a valid frame of another address.
         prop_assert!(step == done(0x4711) || transaction.foreign() > strange, "{:?}", step);
     }
 }
