@@ -21,9 +21,10 @@ pub use refusals::RefusalLimit;
 /// Most events by which a listener may lag behind: one event for each drive of 66 full lines, or 16 events for each
 /// of a thousand drives.
 pub const BURST: usize = 16_384;
-/// Events a listener of a small plant may lag behind: 16 of each of 256 drives. Allocated from the start.
+/// Number of events that a listener of a small plant may lag behind: 16 for each of 256 drives. This buffer is
+/// allocated at the start.
 const SMALL_BURST: usize = 4096;
-/// Events of each drive a listener may lag behind.
+/// Number of events for each drive that a listener may lag behind.
 const OF_EACH_DRIVE: usize = 16;
 /// Events of drives and buses kept for late readers.
 const KEPT: usize = 4096;
@@ -337,7 +338,7 @@ pub struct RefusedCommand<'r> {
     pub text: String,
 }
 
-/// The place where events are published and received.
+/// The channel through which events are published and received.
 #[derive(Debug, Clone)]
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,
@@ -427,8 +428,8 @@ impl Events {
         self.publish(Event::new(EventKind::Paused, time, text));
     }
 
-    /// Publishes a refused command: the first of a kind at once, then one event a second per client, covering all of
-    /// them.
+    /// Publishes a refused command. The first one of a kind is published at once; after that, one event a second
+    /// for each client covers all further ones.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
         let kind = match refused.reason {
             "guarded" => EventKind::Guarded,
@@ -506,7 +507,7 @@ impl Events {
 
 impl Store {
     fn keep(&mut self, event: &Event) {
-        // A time before 1970 or after 9999 has no line.
+        // A time before 1970 or after 9999 cannot be written as a line.
         let Ok(line) = serde_json::to_string(event) else { return };
         let (number, line) = (self.earlier + self.number, Arc::from(line));
         let source = Arc::from(event.drive.as_deref().unwrap_or(&event.bus));

@@ -199,7 +199,7 @@ impl DriveHandle {
         joins
     }
 
-    /// Origin of the last accepted stop; none before the first one.
+    /// Origin of the last accepted stop; `None` before the first stop.
     pub(crate) fn last_stop_by(&self) -> Option<Origin> {
         self.bus.queue.lock().gate.last_stop_by(self.index).cloned()
     }

@@ -115,7 +115,7 @@ impl Stalls {
         let stall = Stall {
             began: now.checked_sub(gap).unwrap_or(now),
             ended: now,
-            // The two clocks are not read at the same moment.
+            // The two clocks are not read at exactly the same moment.
             slept: Some(booted.saturating_sub(ran))
                 .filter(|slept| *slept > TICK)
                 .unwrap_or_default(),
@@ -226,7 +226,7 @@ mod tests {
             after - self.start.saturating_duration_since(at).as_millis() as i64
         }
 
-        /// Date, stall and pause of what is read.
+        /// Date, stall and pause of the data that is read.
         fn reads(&self, floor: u32, waited: bool, now: u32) -> (i64, Option<(i64, i64)>, bool) {
             let dated = self.stalls.date(self.at(floor), waited, self.at(now));
             let stall = dated.stall.map(|s| (self.ms(s.began), self.ms(s.ended)));
@@ -243,7 +243,7 @@ mod tests {
             // The machine was suspended for an hour, during which its clock did not advance.
             (&[(100, 0), (150, 3_600_000)], &[(-3_599_900, 150, 3_600_000)]),
             (&[(100, 0), (2100, 3000), (2200, 3000)], &[(-2900, 2100, 3000)]),
-            // The two clocks are not read at the same moment.
+            // The two clocks are not read at exactly the same moment.
             (&[(100, 3), (200, 0), (300, 40), (400, 0)], &[]),
         ] {
             assert_eq!(Thread::new().runs(times), stalls, "{times:?}");

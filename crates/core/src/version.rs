@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-/// The version of the packages, the same for all.
+/// The version of all packages.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 static COMMIT: OnceLock<&'static str> = OnceLock::new();

@@ -131,7 +131,7 @@ impl Contrast {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Running {
     pub(super) runs: bool,
-    /// Transactions and failures in the current slot and in the one before.
+    /// Number of transactions and failures in the present slot and in the previous one.
     slots: [(f32, f32); 2],
     slot_ends: Option<Instant>,
     /// Recent maximum of the age of the running state before it was read again.

@@ -65,7 +65,7 @@ pub struct Exchange<'e> {
     pub began: Instant,
     /// When the transaction ended.
     pub at: Instant,
-    /// When the last bytes arrived; irrelevant if none did.
+    /// When the last bytes arrived; irrelevant if no bytes arrived.
     pub heard_at: Instant,
     /// Time until the reply started; `None` without a reply.
     pub turnaround: Option<Duration>,
@@ -89,13 +89,14 @@ pub struct Figures {
     /// Settings of the line.
     pub line: Line,
     pub drives: PerDrive<Drive>,
-    /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
+    /// Number of valid replies by the millisecond of their arrival, modulo the latency timer. Requests after a
+    /// pause are counted in the same way.
     arrivals: Window<LATENCY>,
     paced: Window<LATENCY>,
     running: Running,
-    /// Close behind a reply, after a pause.
+    /// Requests sent directly after a reply, compared with requests after a pause.
     pub pause: Contrast,
-    /// Sound replies from an address that was not addressed, by step.
+    /// Number of valid replies from an address to which no request was sent, by step.
     wrong: Window<1>,
     idle: Vec<u8>,
     last: Option<(DriveIndex, End)>,
@@ -176,13 +177,13 @@ impl Figures {
         (self.reconnects.sum(0), steps)
     }
 
-    /// Notes that a reply was too early for the configured baud rate and could have come at `baud`.
+    /// Notes that a reply was too early for the configured baud rate and is possible at `baud`.
     pub fn beats(&mut self, baud: u32) {
         self.early.add(BAUDS.partition_point(|usual| *usual < baud), 1);
     }
 
-    /// Replies in the last minute that were too early for the configured baud rate, by the lowest of [`BAUDS`] that
-    /// they fit; the last count is of those that fit none.
+    /// Number of replies in the last minute that were too early for the configured baud rate, by the lowest baud
+    /// rate of [`BAUDS`] at which they are possible. The last count is of replies that are possible at none.
     pub fn early(&self) -> [u32; BAUDS.len() + 1] {
         std::array::from_fn(|place| self.early.sum(place))
     }
@@ -224,7 +225,7 @@ impl Figures {
         self.drives.iter().map(|drive| drive.sum(sign)).sum()
     }
 
-    /// Sound replies from addresses that were not addressed, in the last minute.
+    /// Number of valid replies in the last minute from addresses to which no request was sent.
     pub fn wrong_address(&self) -> u32 {
         self.wrong.sum(0)
     }

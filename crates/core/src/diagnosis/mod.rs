@@ -198,11 +198,11 @@ pub struct Verdict {
 /// The diagnosis of a line at one time.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Diagnosis {
-    /// When the diagnosis was made; none before the first one.
+    /// When the diagnosis was made; `None` before the first diagnosis.
     pub at: Option<SystemTime>,
     /// The present verdicts, most significant first.
     pub verdicts: Vec<Verdict>,
-    /// Sound replies from addresses that were not addressed, in the last minute.
+    /// Number of valid replies in the last minute from addresses to which no request was sent.
     pub wrong_address: u32,
     /// The counters of the last minute, one entry per drive in the order of the file.
     pub drives: Vec<Counted>,
@@ -289,8 +289,9 @@ impl CountedByDrive {
         }
     }
 
-    /// The disturbed direction of the line, as text: from the messages that the drive received damaged between two
-    /// readings, and the number of its replies damaged here. `None` if neither shows anything.
+    /// The direction of the line that is disturbed, as text. Derived from the number of messages that the drive
+    /// received damaged between two readings, and the number of its replies that arrived damaged here. `None` if
+    /// neither number shows a disturbance.
     pub fn direction(&self, name: &str, damaged_here: u32) -> Option<String> {
         let CountedByDrive { messages, damaged, .. } = self;
         match (*damaged, damaged_here) {

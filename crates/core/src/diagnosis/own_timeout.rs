@@ -9,10 +9,10 @@ use crate::drive::{DriveIndex, Profile};
 /// Longest time between the last write to a drive and a fault that is reported as a trip by the drive's own timeout.
 pub const WITHIN: Duration = Duration::from_secs(30);
 
-/// A drive's new fault, and what the gateway had written before.
+/// A new fault of a drive, and the gateway's writes before the fault.
 #[derive(Debug, Clone, Copy)]
 pub struct Trip {
-    /// The fault code; 0 if the drive shows none.
+    /// The fault code; 0 if the drive reports none.
     pub fault: i64,
     /// Time since the last write that the drive acknowledged.
     pub after: Duration,

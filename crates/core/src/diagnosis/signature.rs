@@ -31,7 +31,7 @@ pub enum Shape {
 /// What the bytes of a transaction show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signature {
-    /// The request was echoed before the reply; `None` if unclear.
+    /// The request was echoed before the reply; `None` if this is not certain.
     pub echoed: Option<bool>,
     /// The shape of the received bytes apart from the reply.
     pub shape: Shape,

@@ -6,8 +6,8 @@ use crate::drive::{DriveIndex, PlannedRead, Profile};
 /// Most registers and points that one verdict lists.
 const NAMED: usize = 6;
 
-/// The verdict about the reads of a drive of that profile that get no reply, none of which can be divided further.
-/// `answered`: how many of the drive's other requests were answered in the last minute.
+/// The finding about reads of a drive of this profile that get no reply and cannot be divided further. `answered`
+/// is the number of other requests to the drive that were answered in the last minute.
 pub fn finding(drive: DriveIndex, profile: &Profile, reads: &[PlannedRead], answered: u32) -> Finding {
     let points = points_of(profile, reads);
     let places: Vec<String> = reads.iter().map(place).collect();

@@ -28,7 +28,7 @@ pub const ARMED: Duration = Duration::from_secs(60);
 pub const LOOK: Duration = Duration::from_millis(20);
 /// Most drill reports that are kept.
 const MOST_REPORTS: usize = 200;
-/// Machines and ways whose last proof is kept.
+/// Maximum number of combinations of machine and way to stop whose last proof is kept.
 const MOST_PROOFS: usize = 16_384;
 
 /// `[drill]` of the configuration.
@@ -101,7 +101,7 @@ impl Drills {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Sets the options; none: no drill can be armed.
+    /// Sets the options; with `None`, no drill can be armed.
     pub fn set_options(&self, options: Option<DrillOptions>) {
         self.state().options = options;
     }

@@ -40,7 +40,7 @@ pub enum DrillState {
     Armed,
     /// The drill is running.
     Running,
-    /// The motor stopped in time each way.
+    /// The motor stopped in time in each way that was tried.
     Passed,
     /// The motor did not stop in time.
     Failed,

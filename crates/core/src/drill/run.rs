@@ -1,4 +1,4 @@
-//! A drill that is armed or under way, step by step.
+//! A drill that is armed or in progress, step by step.
 
 mod interruption;
 mod observation;
@@ -42,7 +42,7 @@ const LAST_STOP: Duration = Duration::from_secs(60);
 /// someone else may have started the motor.
 const CUT_OFF: Duration = Duration::from_secs(3600);
 
-/// A drill that is armed or under way.
+/// A drill that is armed or in progress.
 #[derive(Debug)]
 pub(super) struct Run {
     report: DrillReport,
@@ -125,7 +125,8 @@ pub(super) fn ended_without_stop(mut report: DrillReport, why: &str, time: Syste
     }
 }
 
-/// Whether an interrupted drill is recent enough for a stop. A clock that was set back makes none old.
+/// Whether an interrupted drill is so recent that its motor must be stopped. If the clock was set back, every drill
+/// counts as recent.
 pub(super) fn is_recent(report: &DrillReport, time: SystemTime) -> bool {
     let started = report
         .started_at

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// Number of clients that are counted separately.
 const CLIENTS: usize = 64;
-/// Kinds of one client whose first refusal passes at once.
+/// Number of kinds of each client whose first refusal is published at once.
 const KINDS: usize = 16;
 /// Shortest time between two reported refusals of one client, except the first of a kind.
 const INTERVAL: Duration = Duration::from_secs(1);
@@ -28,7 +28,7 @@ struct Client<T> {
     kinds: BTreeSet<(&'static str, String)>,
     passed: Instant,
     refused: Instant,
-    /// The last refusal held back, and the number of refusals that it stands for.
+    /// The last refusal that was delayed, and the number of refusals that it represents.
     waiting: Option<(T, u64)>,
 }
 

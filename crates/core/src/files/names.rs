@@ -1,6 +1,6 @@
 //! The file names in the state directory and in that of the MQTT buffer.
 
-/// File of events; older files have a number behind this name.
+/// File of events; the names of older files end with a number.
 pub const EVENTS: &str = "events.jsonl";
 /// File of run hours and starts.
 pub const COUNTERS: &str = "counters.json";
@@ -16,7 +16,7 @@ pub const MQTT_TOPICS: &str = "mqtt-topics";
 pub const SPARKPLUG: &str = "sparkplug-bdseq";
 /// File of the reservations that stops left.
 pub const RESERVATIONS: &str = "reservations.json";
-/// Drills, and when each way was proven last.
+/// File of the drills, and of the time at which each way to stop was last proven.
 pub const DRILLS: &str = "drills.json";
 /// Directory of the recordings.
 pub const RECORDINGS: &str = "recordings";

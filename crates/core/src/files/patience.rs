@@ -21,7 +21,7 @@ pub struct Patience {
 }
 
 impl Patience {
-    /// The gateway ends. A wait that is under way, and each later one, takes 0.1 s at most.
+    /// The gateway is shutting down. The wait that is in progress, and each later one, takes 0.1 s at most.
     pub fn end(&self) {
         self.ended.cancel();
     }
@@ -109,7 +109,7 @@ mod tests {
         let (_answer, hangs) = oneshot::channel::<()>();
         assert_eq!(patience.wait(hangs).await, None);
         assert_eq!(begun.elapsed(), DISK / 4 + NEXT);
-        // An answer that comes in time is still used.
+        // An answer that arrives in time is still used.
         let answers = async {
             tokio::time::sleep(NEXT / 2).await;
             7

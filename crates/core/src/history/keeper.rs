@@ -28,7 +28,7 @@ const COUNTERS_EVERY: Duration = Duration::from_secs(45);
 pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);
 /// Most events that wait for the disk.
 const WAITING: usize = 4096;
-/// Counters of drives in a file at most; more are none of ours.
+/// Maximum number of drives with counters in a file. A file with more drives was not written by the gateway.
 const MOST_DRIVES: usize = 16_384;
 /// Version of the counter file's format.
 const VERSION: u32 = 1;
@@ -56,7 +56,7 @@ pub fn keep(
     let (found, earlier) = oneshot::channel();
     let keeper = Keeper::start("history", dir, move |end| {
         let earlier = if first { writer.remember() } else { Vec::new() };
-        // The receiver is gone where the disk was too slow.
+        // The receiver no longer exists if the disk was too slow.
         let _ = found.send(earlier);
         writer.run(end);
     })?;
@@ -151,7 +151,8 @@ impl Writer {
         if self.events.is_replaced() {
             self.events.close();
         }
-        // Anyone who has the events has the counters, too: another gateway with the same directory gets neither.
+        // Whoever may write the events may write the counters as well. Another gateway with the same directory gets
+        // neither.
         if !self.events.is_open() {
             self.open()?;
         }

@@ -117,7 +117,7 @@ impl LineHistory {
     pub fn last_hour(&self, clock: Clock) -> LastHour {
         let now = number(clock.now.saturating_duration_since(self.epoch), STEP);
         let figures = |bucket: Bucket| (!bucket.is_empty()).then_some((bucket.min, bucket.max, bucket.last));
-        // Start time of the first step, which may lie before the history began.
+        // Start of the first step. This time may be before the history began.
         let first = (now + 1) as i64 - STEPS as i64;
         let apart = STEP * u32::try_from(first.unsigned_abs()).unwrap_or(u32::MAX);
         let begin = clock.wall_at(self.epoch);

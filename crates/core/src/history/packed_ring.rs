@@ -148,7 +148,7 @@ impl<T: Packed> PackedRing<T> {
         self.bytes.shrink_to(most_bytes);
     }
 
-    /// Removes the oldest entries until none is older at `now` than the window and `size` more bytes fit.
+    /// Removes the oldest entries until no entry is older than the window at `now` and `size` more bytes fit.
     fn make_room(&mut self, size: usize, now: Instant, gone: &mut impl FnMut(Instant, &[u8])) {
         let Some(start) = self.start else { return };
         while let Some((oldest, at)) = self.head(0, start) {
@@ -172,7 +172,7 @@ impl<T: Packed> PackedRing<T> {
         })
     }
 
-    /// Length and time of the entry at this place.
+    /// Length and time of the entry at this position.
     fn head(&self, place: usize, start: Instant) -> Option<(usize, Instant)> {
         let head = self.slice(place, HEAD);
         let (length, time) = head.split_first_chunk()?;

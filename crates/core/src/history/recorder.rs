@@ -1,5 +1,5 @@
-//! The rings of all buses, the recordings in progress, and what feeds the trends. Pure: time is an argument, what the
-//! buses taped is taken from their images.
+//! The rings of all buses and the recordings in progress; also updates the trends. Pure: time is an argument, and
+//! the taped data is taken from the images of the buses.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};

@@ -119,9 +119,9 @@ pub struct Read {
 pub struct Sample {
     /// Time of the read, s from the trigger.
     pub t: f64,
-    /// Place of the read in the header.
+    /// Position of the read in the header.
     pub read: usize,
-    /// Places of the sample's values among those of all samples.
+    /// Positions of the values of the sample among the values of all samples.
     values: Range<usize>,
 }
 
@@ -158,7 +158,7 @@ pub struct CommandNote {
 pub struct Frame {
     /// Time of a request: when the port accepted it. Time of a reply: when its last byte arrived.
     pub t: f64,
-    /// Place of the drive that was addressed.
+    /// Position of the addressed drive in the header.
     pub drive: Option<usize>,
     /// How the transaction of the frame ended.
     #[schema(value_type = String)]

@@ -83,7 +83,7 @@ impl Recordings {
         self.shared().made.clone()
     }
 
-    /// Reads a recording; none where the id is unknown. Blocks while the disk is read.
+    /// Reads a recording; `None` if the id is unknown. Blocks while the disk is read.
     ///
     /// # Errors
     /// If the file of the recording cannot be read.

@@ -118,7 +118,7 @@ pub fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, PointIn
     POINTS.into_iter().filter(is_kept).filter_map(index)
 }
 
-/// The values of a step; empty if there were none.
+/// The values of a step; empty if the step has no values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Bucket {
     pub(super) min: f32,
@@ -323,8 +323,8 @@ impl Kept {
         }
     }
 
-    /// Adds a value that was read `since` the beginning; the previous value was good for `good_for`, which matters only if steps lie
-    /// between the two.
+    /// Adds a value that was read `since` the beginning. The previous value was good for `good_for`; this only
+    /// matters if there are steps between the two values.
     fn add(&mut self, since: Duration, value: f32, good_for: impl Fn() -> Duration) {
         let [finest, ..] = RANGES;
         let before = self

@@ -6,7 +6,8 @@ use std::time::Instant;
 
 use crate::stalls::Stall;
 
-/// A way in: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a broker. Clones are the same one.
+/// A connection through which orders arrive: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a
+/// broker. Clones represent the same connection.
 #[derive(Debug, Clone)]
 pub struct Connection(Arc<Way>);
 

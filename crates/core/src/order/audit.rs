@@ -225,7 +225,7 @@ impl Audit {
         self.file.load_full()
     }
 
-    /// Receives all records from now on; a listener that lags 4,096 behind loses the oldest.
+    /// Receives all records from now on. A listener that lags more than 4,096 records behind loses the oldest ones.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<AuditRecord>> {
         self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
@@ -297,7 +297,7 @@ impl Audit {
         records.number += 1;
         let number = records.number;
         let ring = if sent { &mut records.sent } else { &mut records.unsent };
-        // A time before 1970 or after 9999 has no line.
+        // A time before 1970 or after 9999 cannot be written as a line.
         if let Ok(line) = serde_json::to_string(&*record) {
             ring.push(record.share.clone(), number, line.into());
         }

@@ -72,7 +72,7 @@ impl Effect {
         }
     }
 
-    /// Whether the effect starts a motor that stands.
+    /// Whether the effect starts a motor that is at standstill.
     pub fn starts(self) -> bool {
         !self.stops && self.run == Some(true)
     }

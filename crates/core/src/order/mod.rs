@@ -101,7 +101,7 @@ pub struct Admitted {
 /// Whether `min_run` of the drive may delay a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Haste {
-    /// No delay: the stop of a person, of the gateway itself, or a second one.
+    /// Without delay: the stop of a person or of the gateway itself, or a second stop.
     AtOnce,
     /// A delay is possible if this is the first stop of the client that started the motor.
     Usual,
@@ -114,7 +114,7 @@ pub enum Haste {
 pub struct Stop {
     /// Whether `min_run` may delay the stop.
     pub haste: Haste,
-    /// Clients that wait for the same stop, and until when.
+    /// Clients that wait for the same stop, each with the time until which it waits.
     pub joined: Vec<(Ticket, Instant)>,
     /// Whether another bus accepted the stop before a reload: the consequences for holds and priorities were noted
     /// there.
@@ -159,7 +159,7 @@ pub enum Work {
 /// When a command arrived, and until when it may be sent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Window {
-    /// When the first byte of the command came.
+    /// When the first byte of the command arrived.
     pub arrival: Arrival,
     /// The command is not sent after this time.
     pub expires: Instant,
@@ -170,7 +170,7 @@ pub struct Window {
 /// The part of a command that the rules judge: its identity, its effect on each drive, and when it arrived.
 #[derive(Debug, Clone)]
 pub struct Intent {
-    /// Names the command: no other one of the process has the same number.
+    /// Identifies the command: no other command of the process has this number.
     pub number: u64,
     /// Index of the drive on its bus.
     pub drive: DriveIndex,
@@ -219,7 +219,7 @@ impl Intent {
         }
     }
 
-    /// Time until which a start waits that must wait; `None` if the command does not wait.
+    /// Time until which the start must wait; `None` if the command need not wait.
     pub fn waits_until(&self) -> Option<Instant> {
         self.window.waits.then_some(self.window.expires)
     }

@@ -157,7 +157,7 @@ impl Origin {
     /// The client name for the stop of a drive that was switched to local control with its run command set.
     pub const LOCAL: &str = "local control place";
 
-    /// An origin that is a client by itself.
+    /// An origin that is a separate client.
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
         let client = format!("{} {who}", kind.name()).into();
@@ -240,7 +240,7 @@ impl Origin {
         self.login.as_ref()
     }
 
-    /// Whether the origin is the lease of a drive, not another stop of the gateway itself.
+    /// Whether the origin is the lease of a drive and not another stop of the gateway itself.
     pub fn is_lease(&self) -> bool {
         self.kind == SourceKind::Supervision && self.who == Origin::LEASE
     }

@@ -228,7 +228,7 @@ pub enum Refusal {
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
     #[error("{0}")]
     BadValue(String),
-    /// Someone else has a right to the drive that goes before that of the client.
+    /// Another client has a right to the drive that takes precedence over the right of this client.
     #[error("{0}")]
     HeldByOther(Box<Holder>),
     /// A guard does not let the motor start yet.
@@ -246,7 +246,7 @@ pub enum Refusal {
     /// The drive reports that its motor runs: no parameter is written.
     #[error("{0}")]
     MotorRuns(String),
-    /// The drive has neither the value that a restore found nor the one to be written.
+    /// The value in the drive is neither the one that the restore found nor the one that it is to write.
     #[error("{0}")]
     OtherValue(String),
 }

@@ -31,7 +31,7 @@ impl Pace {
     }
 }
 
-/// The index of no drive: that of a request to an address of the line at which none is configured.
+/// Index that belongs to no drive: used for a request to an address of the line at which no drive is configured.
 pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
 
 /// A request passed on for a tool, which gets the drive's reply, or a broadcast.

@@ -39,7 +39,7 @@ impl Right {
     }
 }
 
-/// A client is the same with any right.
+/// Clients are equal even if their rights differ.
 impl PartialEq for Right {
     fn eq(&self, _: &Right) -> bool {
         true

@@ -110,7 +110,7 @@ impl SlotWrite {
         }
     }
 
-    /// Plans the write with `entry` as the one that governs as a result.
+    /// Plans the write; `entry` is the entry that governs afterwards.
     pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
         self.heir = Some(entry.number);
         self

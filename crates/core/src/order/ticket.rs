@@ -1,4 +1,4 @@
-//! The one place where commands get their result and are counted and audited.
+//! The only module in which commands get their results and are counted and audited.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -166,7 +166,7 @@ impl Ticket {
             self.stats.note(self.origin.kind, &answer);
             self.note_run(&answer.outcome, now);
         }
-        // Even if the client is gone, the command counts as answered.
+        // The command counts as answered even if the client no longer waits.
         let _ = sender.send(answer);
     }
 

@@ -82,7 +82,7 @@ pub struct Owner {
     pub bus: String,
     /// Name of the drive's profile.
     pub family: String,
-    /// The machine; `None` in journals of earlier versions, which only know a name.
+    /// The machine; `None` in journals of earlier versions, which only contain a name.
     pub machine: Option<Machine>,
     /// The machine's identification.
     pub identification: String,
@@ -456,7 +456,8 @@ pub(super) mod tests {
             file.remove(&other).unwrap();
             assert_eq!(file.read().unwrap(), Some(earlier.text(&profile)));
         }
-        // Once resumed, the journal names its machine; another machine of the same name no longer takes it.
+        // When the restore is resumed, its machine is written into the journal; another machine with the same name
+        // then cannot resume the restore.
         let taken_up = Journal {
             of: owner_at(1),
             ..earlier

@@ -88,7 +88,7 @@ impl Reading {
         reading
     }
 
-    /// The addresses of a file of the same family.
+    /// The addresses that a file of the same family contains.
     pub fn addresses_of(profile: &Profile, file: &ParameterFile) -> BTreeSet<u16> {
         let ids = file.values.keys();
         ids.filter_map(|id| profile.parameters.address(id.name())).collect()
@@ -167,7 +167,7 @@ impl Reading {
         })
     }
 
-    /// The next request to send; none when everything was requested.
+    /// The next request to send; `None` if all requests were sent.
     pub fn request(&self) -> Option<RequestPdu> {
         let Some(block) = self.todo.front() else {
             return match &self.counters {

@@ -40,7 +40,8 @@ impl Store {
         &self.dir
     }
 
-    /// Keeps a reading. Of readings in a row with the same values the first and the last are kept, of all a hundred.
+    /// Stores a reading. Of consecutive readings with the same values, the first and the last are kept; at most a
+    /// hundred readings are kept in all.
     ///
     /// # Errors
     /// If the disk reports an error.

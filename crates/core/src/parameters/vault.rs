@@ -68,7 +68,7 @@ pub struct RestoreStatus {
     pub waits: Option<String>,
     /// Plan of the restore, once it is known.
     pub prepared: Arc<Prepared>,
-    /// Whether someone wants the restore to end before the next parameter.
+    /// Whether a user asked to end the restore before the next parameter.
     pub is_unwanted: bool,
 }
 
@@ -209,12 +209,12 @@ impl Vault {
         }
     }
 
-    /// The restore lock of that drive, the same for any configuration.
+    /// The hold of this drive; the hold stays the same when the configuration changes.
     pub fn restore_lock(&self, drive: &Machine) -> Arc<RestoreLock> {
         self.lock().restore_locks.entry(drive.clone()).or_default().clone()
     }
 
-    /// Path of the journal of a restore that begins, by the name of the drive; `None` without a store.
+    /// Path of the journal for a restore that begins, by the name of the drive; `None` without a store.
     pub fn journal(&self, drive: &str) -> Option<JournalFile> {
         let state = self.lock();
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))

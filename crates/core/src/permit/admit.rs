@@ -329,7 +329,7 @@ fn resolve(
                 .map_err(|why| Refusal::BadValue(format!("`{}`: {why}; nothing was written", point.name)))?;
             Ok((index, value))
         }
-        // A derived command is converted into control words when its turn comes.
+        // A derived command is converted into control words when the command is sent.
         Source::Derived(Derived::State { .. }) if point.write => Ok((index, value)),
         Source::Derived(derived) => {
             let name = &point.name;

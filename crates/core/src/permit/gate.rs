@@ -71,7 +71,7 @@ pub struct Gate {
     hold_news: HoldNews,
 }
 
-/// State of a drive that a bus hands to the bus that replaces it.
+/// State of a drive that one bus passes to the bus that replaces it.
 #[derive(Debug)]
 pub(crate) struct Inheritance {
     stops: u64,

@@ -27,7 +27,7 @@ pub enum Verdict {
     Go,
     /// The order is judged again at this time.
     Wait(Instant),
-    /// The state of the drive is read first, in the same command, and it is judged by that.
+    /// The state of the drive is read first, within the same command, and the command is judged by this state.
     LookFirst,
     /// The order ends with this outcome.
     Refuse(Outcome),

@@ -78,7 +78,7 @@ struct Slot {
 }
 
 impl Slot {
-    /// The effective entry: the last requested, or else the one in force.
+    /// The effective entry: the last requested entry, or else the entry that is in force.
     fn counts(&self) -> Option<&Entry> {
         match self.asked.last() {
             Some((_, entry)) => entry.as_ref(),

@@ -22,7 +22,7 @@ use crate::queue::Denied;
 /// Receiver of a request on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Target {
-    /// The configured drive at that place of the bus.
+    /// The drive that is configured at this position of the bus.
     Drive(DriveIndex),
     /// An address at which no drive is configured; 0 is the broadcast, except on N2.
     Address(u8),

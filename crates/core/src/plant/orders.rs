@@ -285,7 +285,7 @@ impl DriveHandle {
         }
     }
 
-    /// Whether a stop goes to the bus.
+    /// Whether a stop may be passed to the bus.
     fn may_go(&self, stop: &Order, reading: &Reading<'_>, authority: Authority) -> bool {
         self.takes_stops() && admit(stop.clone(), reading, authority).is_ok()
     }

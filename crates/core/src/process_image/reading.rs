@@ -280,8 +280,8 @@ impl Reading<'_> {
         Raw::multiplied(value, factors?.into_iter())
     }
 
-    /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the
-    /// profile gives way to the configured one.
+    /// The ends of a band: those of the drive itself, or else the configured frequencies. The configured maximum
+    /// replaces a maximum that the profile states as a fixed number.
     pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
         self.band_of(minimum, maximum, |sample| sample.good())
     }

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use arc_swap::ArcSwapOption;
 
-/// Set while the parameters of a drive are being restored, or were left half restored. A drive keeps the same lock under
-/// every image that a reload gives it.
+/// Set while the parameters of a drive are being restored, or if a restore was not completed. A drive keeps this
+/// hold in every new process image after a reload.
 #[derive(Debug, Default)]
 pub struct RestoreLock(ArcSwapOption<String>);
 

@@ -68,7 +68,7 @@ pub(super) struct Cell {
 }
 
 impl Cell {
-    /// Whether everything but the word is the same.
+    /// Whether everything except the word is the same.
     pub(super) fn is_like(&self, other: &Cell) -> bool {
         let alike = |cell: &Cell| (cell.at, cell.refused, cell.outlived, cell.cadence);
         alike(self) == alike(other)

@@ -8,7 +8,7 @@ use crate::drive::{ModelPoint, Point};
 /// Causes (`blocks` of a point in the profile) for which a motor may turn whatever its drive does.
 const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
 
-/// Output frequency in Hz up to which a motor that does not run stands.
+/// Highest output frequency in Hz at which a motor that does not run counts as being at standstill.
 const STANDS: f64 = 0.5;
 
 /// The state of a motor in readings.
@@ -23,8 +23,8 @@ pub enum Standstill {
 }
 
 impl Reading<'_> {
-    /// Whether the motor stands, by good samples that were read after `since`: at zero speed, or without output frequency, and
-    /// not running.
+    /// Whether the motor is at standstill, by good samples that were read after `since`: zero speed or no output
+    /// frequency, and not running.
     pub fn standstill(&self, since: Option<Instant>) -> Standstill {
         self.standstill_read(since).0
     }
@@ -63,7 +63,7 @@ impl Reading<'_> {
         }
     }
 
-    /// Whether the polls of the drive can show that the motor stands.
+    /// Whether the polls of the drive can show that the motor is at standstill.
     fn tells_standstill(&self) -> bool {
         let reads = |point| self.spec.profile.model_point(point).is_some_and(Point::is_read);
         reads(ModelPoint::ZeroSpeed) || (reads(ModelPoint::Running) && reads(ModelPoint::OutputFrequency))

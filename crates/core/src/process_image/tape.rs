@@ -77,7 +77,7 @@ pub struct TapedFrame {
 /// An entry of the tape.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Taped {
-    /// The drive at that place was read.
+    /// The drive at this position was read.
     Read(DriveIndex, TapedRead),
     /// A frame that was on the line.
     Frame(TapedFrame),

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use tokio::sync::broadcast;
 
-/// Frames in flight for a listener; a listener that is further behind loses the oldest ones.
+/// Number of frames that wait for a listener. A listener that lags further behind loses the oldest ones.
 const IN_FLIGHT: usize = 1024;
 
 /// The direction of a frame on the line.

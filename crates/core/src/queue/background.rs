@@ -19,7 +19,7 @@ pub const BACKGROUND_PER_CLIENT: usize = 8;
 #[derive(Debug, Default)]
 pub struct Background {
     waiting: VecDeque<BackgroundRequest>,
-    /// Set while the bus accepts none: the outcome that each gets.
+    /// Set while the bus accepts no background work: contains the outcome of each request.
     closed: Option<Outcome>,
 }
 

@@ -71,7 +71,7 @@ pub struct Chosen {
     number: u64,
 }
 
-/// An accepted command that was refused later, to be reported as one that was refused at once.
+/// A command that was accepted and refused later; it is reported like a command that was refused at once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Denied {
     /// The drive, or one of the drives of the order.
@@ -276,7 +276,7 @@ impl Pending {
             true => Vec::new(),
             false => self.passed_on(&mut is_ready),
         };
-        // Drives whose later commands wait: behind an older one, or behind a stop.
+        // Drives whose later commands must wait: for an older command, or for a stop.
         let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);
         let mut stopped: Vec<DriveIndex> = Vec::new();
         let mut best = None;

@@ -77,7 +77,7 @@ impl Pending {
         choice
     }
 
-    /// The broadcast that goes before all that waits, stops included.
+    /// The broadcast that is sent before all other waiting commands, including stops.
     pub fn first_of_all(&self, now: Instant) -> Option<Chosen> {
         let goes_first = |c: &&Command| c.as_passed_on().is_some_and(|p| p.first) && c.intent.window.expires > now;
         let rank = Urgency::Stop;

@@ -1,5 +1,5 @@
-//! The command queue of a bus, shared by the servers and the bus: behind a lock, with the descriptor that wakes the
-//! bus.
+//! The command queue of a bus, shared by the servers and the bus: protected by a lock, with the descriptor that
+//! wakes the bus.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};

@@ -10,11 +10,11 @@ pub const MOST_STARTS: u32 = 120;
 pub struct Guard {
     /// Most starts within any hour.
     pub starts_per_hour: Option<u32>,
-    /// Least time that the motor stands before another start.
+    /// Minimum time that the motor must be at standstill before another start.
     pub min_off: Duration,
     /// Time that the motor runs before an ordinary stop.
     pub min_run: Duration,
-    /// Time between two starts of drives of the same group.
+    /// Minimum time between two starts of drives of the same group.
     pub stagger: Duration,
 }
 
@@ -23,7 +23,7 @@ pub struct Guard {
 pub struct Interlock {
     /// The drive with the point.
     pub drive: String,
-    /// Name of the point, which is true or false.
+    /// Name of the point; its values are true and false.
     pub point: String,
     /// Value that the point must have.
     pub is: bool,

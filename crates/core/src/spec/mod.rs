@@ -124,8 +124,8 @@ pub struct Timing {
 }
 
 impl Timing {
-    /// Silence that an exchange with the drive takes at most, on a line with that silence: before the request, and what
-    /// the next request waits longer than after any other drive.
+    /// Longest silence that an exchange with the drive needs on a line with this silence: the silence before the
+    /// request, and the additional time that the next request waits, compared with any other drive.
     pub fn silence_around(&self, of_bus: Duration) -> Duration {
         let own = self.silence.unwrap_or(of_bus);
         own + own.saturating_sub(of_bus)

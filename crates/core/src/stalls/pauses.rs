@@ -9,7 +9,7 @@ use tokio::sync::Notify;
 
 use super::{Stall, UNNOTICED};
 
-/// The pauses of the process. Clones are the same ones.
+/// The pauses of the process. Clones share the same data.
 #[derive(Debug, Clone, Default)]
 pub struct Pauses(Arc<Shared>);
 

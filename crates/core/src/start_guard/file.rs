@@ -9,7 +9,7 @@ use crate::process_image::Machine;
 
 /// Version of the file format.
 const VERSION: u32 = 1;
-/// Motors in a file at most; more are none of ours.
+/// Maximum number of motors in a file. A file with more motors was not written by the gateway.
 const MOST_MOTORS: usize = 16_384;
 /// The year 9999, in which no clock is.
 const LATEST: Duration = Duration::from_secs(253_370_764_800);

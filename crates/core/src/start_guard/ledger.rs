@@ -171,7 +171,7 @@ impl Ledger {
         self.motors.get(machine).map(|entry| &entry.motor)
     }
 
-    /// Changes a motor in a way that is not a start.
+    /// Changes the state of a motor; the change is not a start.
     pub(super) fn with<T>(&mut self, machine: &Machine, act: impl FnOnce(&mut Motor) -> T) -> Option<T> {
         self.motors.get_mut(machine).map(|entry| act(&mut entry.motor))
     }

@@ -365,7 +365,7 @@ impl Motor {
             .is_some_and(|started| own(started) && first(started))
     }
 
-    /// Time until which an ordinary stop waits; `None` if the motor does not run for certain.
+    /// Time until which an ordinary stop waits; `None` if it is not certain that the motor runs.
     pub(super) fn stop_waits(&self, guard: &Guard, now: Instant) -> Option<Instant> {
         let started = self.started.as_ref()?;
         let runs = match self.running {
@@ -383,7 +383,7 @@ impl Motor {
         self.starts = all.into_iter().skip(spare).collect();
     }
 
-    /// Whether the motor has no starts in the last hour.
+    /// Whether the motor had no start in the last hour.
     pub(super) fn is_forgotten(&self, now: Instant) -> bool {
         self.starts().all(|at| at + HOUR <= now)
     }

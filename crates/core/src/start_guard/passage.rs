@@ -1,4 +1,4 @@
-//! A start by an order: the passage of the motor from standing to running, and the meaning of further run commands
+//! A start by an order: the motor goes from standstill to running, and further run commands have a special meaning
 //! meanwhile. Pure: time is an argument.
 
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub enum Unable {
 pub enum ByRun {
     /// The run command changes nothing: the motor runs for certain.
     Runs,
-    /// The repetition of a start that is under way, and counts already.
+    /// The repetition of a start that is in progress and already counted.
     Repeats,
     /// The repetition of a run command that the drive could not follow; it does not count while the drive cannot
     /// follow.

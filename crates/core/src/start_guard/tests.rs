@@ -68,7 +68,7 @@ impl GuardedDrives {
         self.start + Duration::from_secs_f64(seconds)
     }
 
-    /// Reads the drive: the motor runs, or stands.
+    /// Reads the drive: the motor runs, or is at standstill.
     fn read(&self, drive: usize, running: bool, seconds: f64) {
         let (image, at) = (&self.images[drive], self.at(seconds));
         // Words of the image: the status word (running, or at zero speed) and the output frequency.
@@ -116,7 +116,7 @@ impl GuardedDrives {
         )
     }
 
-    /// Starts a drive and sees it run, then stops it and sees it stand a second later.
+    /// Starts a drive and reads that it runs, then stops it and reads its standstill a second later.
     fn start_and_stop(&self, drive: usize, number: u64, seconds: f64) {
         assert_eq!(self.clear(&[drive], number, seconds), Verdict::Go, "at {seconds} s");
         self.guards
@@ -468,7 +468,7 @@ fn counters_belong_to_the_machine_over_a_reload() {
     rig.start_and_stop(0, 1, 1.0);
     let starts =
         |guards: &Arc<BusGuards>, drive| reason(judged(guards, Stage::Accept, &[drive], (0, None), rig.at(10.0)));
-    // Renamed, and at another place of the bus.
+    // The drive was renamed, and has another position on the bus.
     let mut specs: Vec<DriveSpec> = rig.images.iter().map(|image| image.spec.clone()).collect();
     specs[0].name = "other".to_string();
     specs.reverse();

@@ -23,7 +23,7 @@ use crate::order::Origin;
 use crate::plant::{BusHandle, DriveHandle, Exchange, Plant, Question};
 use crate::process_image::{Access, Machine, Standstill};
 
-/// Default time after which a command is answered even if not every drive stands.
+/// Default time after which a command is answered even if not every drive is at standstill.
 pub const WAIT: Duration = Duration::from_secs(10);
 /// Longest time that a command may set for its answer.
 pub const LONGEST_WAIT: Duration = Duration::from_secs(60);

@@ -112,7 +112,7 @@ impl OneStop {
         format!("not acknowledged: {why}")
     }
 
-    /// Whether a read since shows that the motor stands.
+    /// Whether a read since then shows that the motor is at standstill.
     pub(crate) fn motor_stands(&self, plant: &Plant, now: Instant) -> bool {
         self.outcome(plant, now).outcome == Stopped::Standing
     }

@@ -63,8 +63,8 @@ fn an_order_reaches_the_controlled_drives_of_its_scope() {
     assert_eq!(error, NothingToStop::NotControlled);
 }
 
-/// The plant of one drive that runs, and a stop-all under way that its drive has acknowledged; a second order after `then`: how
-/// many stops that places.
+/// A plant of one drive that runs, with a stop-all in progress that the drive has acknowledged; returns how many
+/// stops a second order after `then` places.
 fn second_order(then: impl Fn(&Plant, &StopAll, Instant)) -> (Plant, usize) {
     let (mut plant, all) = (plant(), StopAll::default());
     plant.buses.truncate(1);

@@ -57,7 +57,7 @@ pub struct Drive {
     pub(super) run_paused: [u16; 2],
     pub(super) silent_at: Option<Instant>,
     pub(super) mains: InPhase,
-    /// Requests to a drive that has never replied; `None` once it has.
+    /// Number of requests to a drive that has never replied; `None` if the drive has replied.
     pub(super) in_vain: Option<u16>,
 }
 
@@ -86,7 +86,7 @@ impl Drive {
         f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
     }
 
-    /// A reply came after the time limit, at `at`.
+    /// Notes that a reply arrived after the time limit, at `at`.
     pub(super) fn replied_late(&mut self, at: Instant) {
         self.add(Sign::Late);
         let over = self.silent_at.map(|silent| at.saturating_duration_since(silent));

@@ -46,7 +46,7 @@ impl Rules<'_> {
         };
         let silent = self.figures.sum(Sign::Silent);
         let mut few = turned;
-        // Pauses are rare on a busy line, mostly those behind a request without a reply.
+        // Pauses are rare on a busy line. Most of them follow a request without a reply.
         few.asked[0] = few.asked[0].max(if few.asked[0] >= 15.0 { 100.0 } else { 0.0 });
         let rate = close.0 / close.1.max(1.0);
         let chance = (1.0 - rate).max(0.0).powf(paused.1);
@@ -154,7 +154,7 @@ impl Rules<'_> {
 
     pub(super) fn latency_timer(&mut self) {
         let [(lock, arrivals), (paced_lock, paced)] = self.figures.in_steps();
-        // A cadence of whole steps would look the same.
+        // A request interval of a whole number of steps would give the same picture.
         let by_cadence = paced * 5 >= arrivals && paced_lock > 0.5;
         let enough = arrivals >= 100 && self.steps(&[Sign::Answered]) >= 2 * LASTING;
         if lock < 0.85 || !enough || by_cadence {

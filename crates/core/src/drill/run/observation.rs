@@ -33,7 +33,7 @@ impl Run {
         (now, time): (Instant, SystemTime),
     ) {
         if !matches!(how, Cause::Client { .. }) {
-            // The drill is no silent client here: its heartbeat keeps the lease from writing a stop.
+            // Here the drill does not act as a silent client: its heartbeat prevents the lease from writing a stop.
             self.drive.heartbeat(&self.own, now);
         }
         let by_the_gateway = !matches!(how, Cause::Gateway(_));
@@ -72,7 +72,7 @@ impl Run {
                     }
                 }
             }
-            // The stop that it was to give, or to see to, may have come late by that.
+            // The stop that the drill should have given or observed may be late for this reason.
             Seen::Ended(DrillState::Failed, why) if by_the_gateway && self.paused.is_some() => {
                 let seconds = self.paused.unwrap_or_default().as_secs_f64();
                 let why = format!("the gateway paused for {seconds:.1} s meanwhile; {why}");
@@ -132,7 +132,7 @@ impl Run {
         }
     }
 
-    /// Whether the first reads after the silence show that the motor stands.
+    /// Whether the first reads after the silence show the motor at standstill.
     fn seen_after(&self, cause: Instant, until: Instant, reading: &Reading<'_>, now: Instant) -> Seen {
         if now < until {
             return Seen::Nothing;

@@ -233,7 +233,7 @@ fn an_unwritable_directory_costs_the_recording_only() {
         ),
         "{error}"
     );
-    // A disk without room, as far as the file system goes.
+    // To the file system, the disk seems full.
     assert!(
         store_in(Path::new("/proc/none"))
             .write(&mut recording(), SystemTime::now())
@@ -267,7 +267,7 @@ fn a_process_that_is_killed_leaves_only_whole_recordings() {
             assert!(std::time::Instant::now() < deadline, "it writes nothing");
             std::thread::sleep(Duration::from_millis(1));
         }
-        // The kill comes at another moment of a write each time.
+        // Each time, the process is killed at another moment of a write.
         std::thread::sleep(Duration::from_micros(700 * round));
         child.kill().unwrap();
         assert_eq!(child.wait().unwrap().signal(), Some(9));

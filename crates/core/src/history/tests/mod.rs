@@ -1,4 +1,4 @@
-//! The recorder as a whole, in virtual time: what a bus tapes by hand becomes recordings.
+//! Tests of the whole recorder in virtual time: the test tapes reads of a bus, and they become recordings.
 
 mod files;
 mod trends;
@@ -35,7 +35,7 @@ pub(super) fn options() -> RecorderOptions {
     }
 }
 
-/// A line with Vacon NX drives that a test polls by hand.
+/// A line with Vacon NX drives. The test itself does the polls.
 pub(super) struct Rig {
     pub(super) bus: Arc<BusImage>,
     pub(super) recorder: Recorder,

@@ -24,7 +24,7 @@ impl Rig {
         self.bus.drives[0].update(|snapshot| snapshot.link = link);
     }
 
-    /// Polls for a time; `runs` says for each poll whether the motor runs.
+    /// Polls for some time; `runs` says for each poll whether the motor runs.
     fn run(&mut self, time: Duration, runs: impl Fn(usize) -> bool) {
         self.polls(time, |rig, n| {
             let status = if runs(n) { RUNS } else { 1 };

@@ -14,7 +14,7 @@ fn clock() -> Clock {
     }
 }
 
-/// The trends of a drive that is fed by hand.
+/// The trends of a drive to which the test adds the values.
 struct Rig {
     trend: DriveTrend,
     clock: Clock,
@@ -147,7 +147,7 @@ proptest! {
 #[test]
 fn a_day_at_the_fastest_poll_shows_every_peak() {
     let mut rig = Rig::new();
-    // A short peak each hour; 10 polls a second stand for more.
+    // A short peak in each hour. 10 polls a second are enough to represent more frequent polls.
     for n in 0..24 * 36_000u32 {
         rig.pass(Duration::from_millis(100));
         let peak = n % 36_000 == 18_000;

@@ -195,7 +195,7 @@ pub fn fragment(rest: &[u8]) -> (Option<(u64, Hash)>, bool) {
     (found, ended)
 }
 
-/// A place where the file was changed.
+/// A place at which the file was changed, and the kind of the change.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fault {
     /// Whether the fault concerns the line before.
@@ -204,7 +204,7 @@ pub struct Fault {
     pub why: String,
 }
 
-/// Reads the lines of a chain and finds what was changed.
+/// Reads the lines of a chain and finds changes to them.
 #[derive(Default)]
 pub struct Verifier {
     chain: Option<Chain>,

@@ -35,7 +35,7 @@ fn value_of(file: &ParameterFile, id: &Id) -> Option<RawValue> {
     file.values.get(id).and_then(|entry| entry.value.as_ref().ok().copied())
 }
 
-/// Whether both are the same number of the same kind: 0.0 and -0.0 are.
+/// Whether both values are the same number of the same kind. 0.0 and -0.0 count as the same number.
 fn same(a: RawValue, b: RawValue) -> bool {
     same_kind(a, b) && a.number() == b.number()
 }

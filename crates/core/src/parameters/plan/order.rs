@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use super::ParameterWrite;
 use crate::drive::parameters::{Limit, RawValue};
 
-/// The writes in a safe order; `present` is what the drive holds at an address.
+/// The writes in an order in which no limit is violated; `present` is the value of the drive at an address.
 pub(super) fn safe(
     mut waiting: Vec<ParameterWrite>,
     limits: &[Limit],
@@ -35,7 +35,7 @@ pub(super) fn safe(
             after.insert(write.address, write.to.number());
             concerned.all(|limit| holds(limit, &after) || !holds(limit, &held))
         };
-        // Limits in a circle, which no profile can have, could leave none.
+        // Limits that depend on each other in a circle could leave no possible write; no profile can have such limits.
         let next = waiting.iter().position(is_safe).unwrap_or(0);
         let write = waiting.remove(next);
         held.insert(write.address, write.to.number());
@@ -44,7 +44,7 @@ pub(super) fn safe(
     ordered
 }
 
-/// Whether a limit holds; a limit of which a value is unknown does.
+/// Whether a limit is met. A limit with an unknown value counts as met.
 fn holds(limit: &Limit, values: &BTreeMap<u16, f64>) -> bool {
     match (values.get(&limit.upper), values.get(&limit.lower)) {
         (Some(upper), Some(lower)) => upper >= lower,

@@ -135,7 +135,7 @@ fn forced(profile: &Profile, wanted: &Values, present: &Values) -> Plan {
     plan(profile, &wanted, &present, &FORCED).unwrap().0
 }
 
-/// The states that the drive goes through, the first one included.
+/// The states that the drive passes through, including the first one.
 fn states_of(plan: &Plan, present: &Values) -> Vec<Values> {
     let mut all = vec![present.clone()];
     for write in &plan.writes {

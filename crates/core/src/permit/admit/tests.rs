@@ -532,7 +532,7 @@ fn a_write_on_n2_is_one_whole_object() {
         bits: bits.to_vec(),
     };
     let (address, value) = (Some(Exception::ADDRESS), Some(Exception::VALUE));
-    // AO 1 and 2 are points, AO 8 has no name; the raw range ends behind it, and BO 9 and 10 do not exist.
+    // AO 1 and 2 are points. AO 8 has no name; the raw range ends after AO 8. BO 9 and 10 do not exist.
     for (pdu, wanted) in [
         (registers(0, &float), None),
         (registers(14, &float), None),

@@ -260,7 +260,7 @@ impl Gate {
         self.with_hold(drive, |holding, _, told| holding.set_local(local, told));
     }
 
-    /// Ends what has expired, and returns the changes since the last call.
+    /// Ends holds that have expired, and returns the changes since the last call.
     pub fn take_changes(&mut self, now: Instant) -> Vec<(DriveIndex, HoldChange)> {
         let drives: Vec<DriveIndex> = self.drives.keys().copied().collect();
         for drive in drives {

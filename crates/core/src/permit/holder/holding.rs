@@ -81,7 +81,7 @@ pub struct HoldView {
     pub holder: Option<Arc<str>>,
     /// Name of the holder's rank.
     pub rank: Option<Arc<str>>,
-    /// Seconds left, rounded up; 0 if free, none for local control.
+    /// Seconds left, rounded up; 0 if the drive is free, `None` for local control.
     pub left_s: Option<u64>,
 }
 
@@ -117,7 +117,7 @@ enum State {
 #[derive(Debug, Clone)]
 struct Waiting {
     who: Claim,
-    /// Client whose stop is in the way.
+    /// Client whose stop prevents the command.
     stopper: Claim,
     /// When the client last tried to run.
     tried: Instant,
@@ -136,7 +136,7 @@ struct LastStop {
 pub struct Holding {
     state: State,
     local: bool,
-    /// The last holder, whose silence is the one that counts.
+    /// The last holder. Its silence is the one that is measured.
     last: Option<Claim>,
     /// Clients that must take the drive; at most as many as principals.
     waiting: Vec<Waiting>,

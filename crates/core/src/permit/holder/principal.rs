@@ -22,7 +22,7 @@ pub enum Mode {
 pub struct Principal {
     /// Name of the principal.
     pub name: Arc<str>,
-    /// Place of the rank; 0 is the highest.
+    /// Position of the rank; 0 is the highest.
     pub rank: usize,
     /// Whether the client writes its command word continuously: a word that repeats its last stop is then not a new
     /// stop. Stops over HTTP and the local socket are always new ones.
@@ -66,7 +66,7 @@ impl Principal {
 pub struct Claim {
     /// Name of the principal: two claims of one name are one principal.
     pub name: Arc<str>,
-    /// Place of the rank; 0 is the highest.
+    /// Position of the rank; 0 is the highest.
     pub rank: usize,
     /// See [`Principal::cyclic`]; never set where the interface excludes repetitions.
     pub cyclic: bool,

@@ -292,8 +292,8 @@ fn a_run_that_goes_on_behind_a_stop_needs_a_take() {
     }
     assert_eq!(drive.order("plc", Asks::Run), "needs_take");
     assert_eq!(drive.order("cloud", Asks::Run), "ok", "another client was not refused");
-    // A stop of the client itself, a take, the release by the stopper, or ten leases without a run make a new run
-    // possible.
+    // A new run is possible after a stop of the client itself, a take, the release by the client that stopped, or
+    // ten leases without a run.
     let mut drive = stopped();
     drive.order("plc", Asks::Stop);
     drive.wait(31);
@@ -691,7 +691,7 @@ fn in_bacnet_the_priority_is_the_act() {
     assert_eq!(holding.judge(high.as_ref(), Asks::Run, &drive.rules, drive.now), Ok(()));
     holding.accepted(high.as_ref(), Asks::Run, &drive.rules, drive.now, &mut drive.told);
     assert_eq!(drive.told(), ["plc held", "plc broken by op"]);
-    // A run behind a stop of another client is judged like any run: it does not break the hold.
+    // A run after a stop of another client is judged like any other run: it does not break the hold.
     let mut holding = Holding::default();
     let site = drive.who("site");
     holding.accepted(site.as_ref(), Asks::Stop, &drive.rules, drive.now, &mut drive.told);

@@ -108,7 +108,7 @@ impl Rig {
             asked,
             now: asked + Duration::from_millis(10),
         };
-        // The motor stands, and the drive is not ready.
+        // The motor is at standstill, and the drive is not ready.
         read(&rig.image, 2100, &[0x40, 0, 0, 0], asked);
         let shared = Arc::new(Guards::default());
         if let Some(guards) = BusGuards::of(&shared, &bus, [&rig.image.spec]) {

@@ -172,7 +172,7 @@ fn a_reference_from_elsewhere_withdraws_those_that_do_not_protect() {
     assert!(elsewhere(&mut all, SourceKind::Http, effect(None, true)));
 }
 
-/// The slots of both arrays that an order from elsewhere leaves, at each priority, behind an active that governs.
+/// The slots of both arrays that remain after an order from elsewhere, at each priority, when an active value governs.
 #[test]
 fn what_protects_people_stays_also_behind_an_active_that_governs() {
     for priority in 2..=16 {
@@ -200,7 +200,7 @@ fn what_protects_people_stays_also_behind_an_active_that_governs() {
             assert_eq!(elsewhere(&mut all, kind, effect(Some(true), false)), !stays);
         }
     }
-    // A reference of the gateway itself is not refused, and leaves another client's that protects people.
+    // A reference of the gateway itself is not refused, and keeps the value of another client that protects people.
     for priority in 1..=16 {
         let mut all = Priorities::default();
         write(&mut all, Run, "silent", 8, Some(1.0));

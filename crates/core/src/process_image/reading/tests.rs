@@ -199,7 +199,7 @@ fn a_scale_in_another_register() {
     assert_eq!(seen("motor_current", 0).1, Quality::Good);
 }
 
-/// A meter behind transformers, whose counter takes two registers.
+/// A meter behind transformers; its counter uses two registers.
 #[test]
 fn a_value_of_several_registers_is_as_good_as_all_of_them() {
     let text = "name = \"meter\"\nprotocols = [\"modbus-rtu\"]\n\

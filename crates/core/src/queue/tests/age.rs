@@ -1,4 +1,4 @@
-//! Orders that came while the reading threads did not run: of several clients, read in any sequence.
+//! Orders that arrived while the threads that read were not running: orders of several clients, read in any sequence.
 
 use super::*;
 use crate::order::{Arrival, Connection, Effect, Effects};

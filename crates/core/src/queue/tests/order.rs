@@ -142,7 +142,7 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
         "{order:?}"
     );
     assert_eq!(order.len(), 4);
-    // A broadcast with no order waiting behind it waits for idle time.
+    // A broadcast waits for idle time if no order waits for it.
     let _broadcast = rig.broadcast(STOP);
     assert_eq!(rig.pop(), None);
     assert!(rig.passes_on());

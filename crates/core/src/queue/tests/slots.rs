@@ -14,7 +14,7 @@ fn effect(run: bool) -> Effect {
     }
 }
 
-/// A value of `run` stands at that priority.
+/// Enters a value of `run` at this priority.
 fn stand(pending: &mut Pending, drive: usize, priority: u8, run: bool, now: Instant) {
     let origin = Origin::new(SourceKind::Bacnet, "10.0.0.5:47808");
     let write = SlotWrite::new(
