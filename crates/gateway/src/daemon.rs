@@ -192,7 +192,7 @@ impl Daemon {
         reservations::restore(&daemon.reservations, &daemon.north.patience, &daemon.plant.load_full()).await;
         daemon.apply_mqtt(&settings).await?;
         daemon.discard_kept_slots(&settings).await;
-        // The servers that report readiness come last.
+        // The servers that report readiness start last.
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
         daemon.apply_local(&settings).await;

@@ -185,7 +185,7 @@ fn check_numbers(reader: &Reader<'_>, drives: &[drive::Found], mode: Mode) {
     }
 }
 
-/// Address 248 is reserved, and devices that answer at any address take it for theirs.
+/// Address 248 is reserved; devices that answer at any address treat it as their own.
 fn check_only_one(reader: &Reader<'_>, drives: &[drive::Found], protocol: Protocol, is_modbus_tcp: bool) {
     if protocol == Protocol::N2 || is_modbus_tcp {
         return;

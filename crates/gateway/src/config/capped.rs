@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::key::{Form, Time};
 use crate::document::{Reader, format_duration};
 
-/// A duration of the range; a longer one, up to what was allowed before, counts as the longest of the range.
+/// A duration within a range. A longer duration that earlier versions allowed counts as the longest of the range.
 pub(super) struct Capped {
     pub(super) range: RangeInclusive<Duration>,
     /// Largest value that an earlier version allowed.

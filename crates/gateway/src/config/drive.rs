@@ -31,14 +31,14 @@ pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
     pub(super) unit: Option<(u8, Place)>,
-    /// The unit is the address, because none is written.
+    /// The configuration states no unit, so the unit is the address.
     pub(super) unit_is_address: bool,
     pub(super) access: (Access, Place),
-    /// Places of `limits`, of `supervision` and of a stop `on_shutdown`.
+    /// Places of the keys `limits`, `supervision` and a stop `on_shutdown` in the file.
     pub(super) limits: Place,
     pub(super) lease: Option<Place>,
     pub(super) shutdown_stop: Option<Place>,
-    /// Place of a `refresh` that is written and not off.
+    /// Place of a configured `refresh` that is not off.
     pub(super) refresh: Option<Place>,
     pub(super) guards: Guards,
     pub(super) spec: Option<DriveSpec>,

@@ -32,7 +32,7 @@ pub(super) fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
     Finding::new(what, remedy)
 }
 
-/// Reports what is wrong with the files of an identity at the key of each, by `name`.
+/// Reports the problems in the files of an identity, each at the key that names the file, by `name`.
 pub(super) fn reported<T>(
     reader: &Reader<'_>,
     loaded: Result<(T, Vec<IdentityFault>), Vec<IdentityFault>>,

@@ -49,7 +49,7 @@ pub(super) trait Form<T> {
 }
 
 impl<T> Key<T> {
-    /// The value, or the default if the key is absent; `None` also if the value is invalid, which is reported.
+    /// The value, or the default if the key is absent. `None` also if the value is invalid; the problem is reported.
     pub(super) fn read(&self, reader: &Reader<'_>) -> Option<T> {
         if reader.has(self.name) {
             return self.form.read(reader, self.name);
@@ -82,7 +82,7 @@ impl<T> Key<T> {
         }
     }
 
-    /// The value, or the default in place of an invalid one.
+    /// The value, or the default if the value is invalid.
     pub(super) fn get_on(&self, reader: &Reader<'_>, protocol: Protocol) -> T
     where
         T: Default,
@@ -94,7 +94,7 @@ impl<T> Key<T> {
         self.read_on(reader, protocol).or_else(default).unwrap_or_default()
     }
 
-    /// The value of a key with a default, which also stands in for an invalid value.
+    /// The value of a key with a default. The default also replaces an invalid value.
     pub(super) fn get(&self, reader: &Reader<'_>) -> T
     where
         T: Default,
@@ -478,7 +478,7 @@ impl<T> Form<Vec<T>> for List<T> {
     }
 }
 
-/// A value that the loader reads itself, by the reader of the key.
+/// A value that the loader reads itself, with the reader of the key.
 pub(super) struct Own {
     pub(super) schema: fn() -> Value,
     pub(super) range: &'static str,

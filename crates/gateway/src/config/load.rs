@@ -131,7 +131,7 @@ pub(super) fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String
     (loaded, known)
 }
 
-/// The profiles that drives name, and what is wrong in the files of profiles.
+/// The profiles that drives use, and the problems in the files of profiles.
 #[derive(Default)]
 struct OfProfiles {
     named: BTreeSet<String>,
@@ -244,7 +244,7 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
     })
 }
 
-/// The options of a section. An invalid section invalidates the whole; an absent one has none.
+/// The options of a section. An invalid section makes all options invalid; without a section there are no options.
 fn options_of<S, T>(section: Option<S>, of: impl FnOnce(S) -> Option<T>) -> Result<Option<T>, Unusable> {
     section.map(|section| of(section).ok_or(Unusable)).transpose()
 }

@@ -29,7 +29,7 @@ pub(super) struct ModbusTcp {
     pub(super) stale_written: bool,
     pub(super) stale_place: Place,
     pub(super) addresses: Vec<Address>,
-    /// The buses that each listener shows, `None` for all.
+    /// The buses that each listener shows, `None` for all buses.
     pub(super) selections: Vec<Option<Vec<String>>>,
     /// The drives at units 0 and 255.
     pub(super) default_drives: Vec<DefaultDrive>,
@@ -291,8 +291,8 @@ const PRIVATE: [&str; 8] = [
     "fe80::/10",
 ];
 
-/// Warns where the share of one address is probably too small: fewer connections are possible than requested, or
-/// clients come through a NAT and share an address.
+/// Warns if the share of one address is probably too small: fewer connections are possible than requested, or
+/// clients share an address because of a NAT.
 fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_address: usize) {
     let hosts = |network: &IpNet| match network.network().is_loopback() {
         true => 1,

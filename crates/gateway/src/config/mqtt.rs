@@ -70,7 +70,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
         );
     }
     for (place, broker) in all().enumerate().filter(|(_, broker)| broker.tls) {
-        // The gateway's own certificate is the same for all.
+        // All brokers use the gateway's own certificate.
         let identity = identity.as_ref().filter(|_| place == 0);
         check_certificates(reader, &broker.host, ca.as_deref(), identity);
     }
@@ -133,7 +133,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     })
 }
 
-/// The discovery prefix; `home_assistant = false` means the same as no table.
+/// The discovery prefix; `home_assistant = false` has the effect of an absent table.
 fn read_home_assistant(reader: &Reader<'_>) -> Option<String> {
     let off = |node| bool::from_node(node).is_ok_and(|on| !on);
     if reader.raw(MQTT.home_assistant.name).is_some_and(off) {

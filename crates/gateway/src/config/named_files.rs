@@ -16,7 +16,7 @@ pub enum FileKind {
     Configuration,
     /// A profile of the user.
     Profile,
-    /// Certificates or revocation lists, which are no secret.
+    /// Certificates or revocation lists, which are not secret.
     Certificate,
     /// A private key, passwords or tokens.
     Secret,

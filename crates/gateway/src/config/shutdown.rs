@@ -53,8 +53,9 @@ impl ShutdownTime {
 }
 
 impl BusSettings {
-    /// How long the stops of `on_shutdown = "stop"` take. A stop is one write; if the run command is a bit of a word, the
-    /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
+    /// How long the stops of `on_shutdown = "stop"` take. A stop is one write. If the run command is a bit of a
+    /// word, the word may have to be read first. If a drive does not answer, the write is repeated but the read is
+    /// not.
     pub fn shutdown_time(&self) -> ShutdownTime {
         let mut time = ShutdownTime::default();
         if let Some(stop) = stop_of_line(&self.spec, &self.drives).filter(|_| self.drives.iter().all(is_stopped)) {

@@ -6,7 +6,7 @@ use crate::drive::{ModelPoint, Profile};
 use crate::process_image::Access;
 use crate::start_guard::{Guard, Interlock};
 
-/// Guard and interlocks as configured, with the places of the keys that depend on other drives.
+/// Start guard and interlocks as configured, with the places of the keys that depend on other drives.
 #[derive(Debug, Default)]
 pub(super) struct Guards {
     pub(super) guard: Option<Guard>,

@@ -70,7 +70,7 @@ pub(super) fn divide(
 mod tests {
     use super::*;
 
-    /// Files with a fault each: what a drive of that profile makes an error, and what stays a warning.
+    /// Files with one fault each. The fault is an error if a drive uses the profile, and otherwise a warning.
     #[test]
     fn a_fault_counts_where_a_drive_depends_on_its_file() {
         let folder = tempfile::TempDir::new().unwrap();

@@ -1,4 +1,4 @@
-//! Texts of the configuration that TOML has no type for.
+//! Values of the configuration that are texts because TOML has no type for them.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};

@@ -33,7 +33,7 @@ pub(super) fn fit(mut settings: Settings) -> Settings {
     settings
 }
 
-/// Raises the soft limit to `wanted` or to the hard limit; the limit then.
+/// Raises the soft limit to `wanted` or to the hard limit. Returns the resulting limit.
 fn raise(wanted: usize) -> usize {
     let number = |limit: Option<u64>| limit.map_or(usize::MAX, |limit| usize::try_from(limit).unwrap_or(usize::MAX));
     let limit = getrlimit(Resource::Nofile);

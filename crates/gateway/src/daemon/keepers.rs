@@ -41,7 +41,7 @@ impl Daemon {
         Ok(())
     }
 
-    /// Reads parameters every so often, where that is configured.
+    /// Reads parameters at regular intervals, if this is configured.
     pub(super) fn apply_params(&mut self, settings: &Settings) {
         let params = &settings.params;
         let vault = &self.north.parameters;

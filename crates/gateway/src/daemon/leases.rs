@@ -15,7 +15,7 @@ use crate::process_image::{Access, DriveSpec, Machine};
 
 /// Time for which the lease of a drive is kept after a reload left the drive out.
 const RETURN: Duration = Duration::from_secs(120);
-/// Buses of which that is kept, the latest ones.
+/// Maximum number of buses whose leases are kept; the latest ones are kept.
 const MOST_BUSES: usize = 64;
 
 /// The leases and states of buses stopped by a reload, until another bus continues them.
@@ -46,7 +46,7 @@ struct Kept {
 }
 
 impl Kept {
-    /// Drops what is too old for a return.
+    /// Drops the leases that are too old to continue.
     fn forget(&mut self, now: Instant) {
         let is_kept = |at: &Instant| now.saturating_duration_since(*at) <= RETURN;
         self.leases.retain(|_, (at, _)| is_kept(at));
@@ -59,7 +59,8 @@ impl Parted {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Drops what is too old for a return: buses that ended hold memory. How long that is after a reload.
+    /// Drops the leases that are too old to continue, because buses that ended occupy memory. Returns how long
+    /// leases are kept after a reload.
     pub(super) fn forget(&self, now: Instant) -> Duration {
         self.lock().forget(now);
         RETURN

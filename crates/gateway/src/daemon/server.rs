@@ -25,7 +25,7 @@ pub(super) enum Prepared<S: Reconfigure> {
     Changed(S::Options, S::Change),
 }
 
-/// A server that runs with some options, or none.
+/// A place for a server: contains the running server and its options, or no server.
 #[derive(Debug)]
 pub(super) struct ServerSlot<S: Server>(Option<Running<S>>);
 

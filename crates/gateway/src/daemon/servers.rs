@@ -57,7 +57,7 @@ impl Daemon {
             self.mqtt.stop().await;
         }
         let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await;
-        // Events that came while no client was configured are not published later.
+        // Events that occurred while no client was configured are not published later.
         self.north.mqtt_left.discard();
         applied
     }

@@ -2,7 +2,7 @@
 
 use crate::config::keys::documentation;
 
-/// `page`, with the first table of each section generated anew.
+/// `page`, with the first table of each section generated again.
 fn with_tables(page: &str) -> String {
     let sections = [
         ("[gateway]", "Gateway"),

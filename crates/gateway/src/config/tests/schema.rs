@@ -96,7 +96,7 @@ fn the_defaults_of_the_schema_are_those_of_the_loader() {
     assert!(filled == settings(&FULL), "a default of the schema is not the loader's");
 }
 
-/// A value of any kind, sound or not.
+/// A value of any kind, valid or not.
 fn any_value() -> impl Strategy<Value = String> {
     prop_oneof![
         any::<i64>().prop_map(|n| n.to_string()),

@@ -32,7 +32,8 @@ fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
         .remove(0)
 }
 
-/// The leases with which `after` continues when the first drive of `before` had one and the second had none, and the events.
+/// Returns the events and the leases with which `after` continues, if the first drive of `before` had a lease and
+/// the second had none.
 fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String>) {
     let mut leases = Leases::default();
     leases.left(before, vec![held(Instant::now()), Carried::default()]);
