@@ -53,7 +53,7 @@ impl Arrival {
         self.inotify.as_fd()
     }
 
-    /// Whether anything that appeared concerns the device; clears what has appeared.
+    /// Whether the arrivals since the last call concern the device; forgets these arrivals.
     pub fn take(&self) -> bool {
         let mut buffer = [MaybeUninit::uninit(); 4096];
         let mut reader = Reader::new(&self.inotify, &mut buffer);

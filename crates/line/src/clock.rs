@@ -11,7 +11,7 @@ use thread_priority::unix::{
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
-/// Precedence of a thread that serves a line, in real time (1 to 99). Interrupt threads of the kernel stand at 50.
+/// Real-time priority (1 to 99) of a thread that serves a line. Interrupt threads of the kernel have priority 50.
 const REAL_TIME: u8 = 10;
 /// Priority on the scale of `nice`, where real time is not allowed.
 const NICE: i32 = -10;

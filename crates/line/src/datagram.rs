@@ -9,7 +9,7 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 
 use super::{Lost, Names, OpenError};
 
-/// The way to a device by datagrams.
+/// The connection to a device by datagrams.
 #[derive(Debug)]
 pub(super) struct Datagrams {
     device: SocketAddr,
@@ -19,7 +19,7 @@ pub(super) struct Datagrams {
 
 impl Datagrams {
     /// # Errors
-    /// When the name has no address, or the system gives no socket.
+    /// If the name has no address, or the system provides no socket.
     pub(super) fn open(
         names: &mut Names,
         port: &str,
@@ -53,7 +53,7 @@ impl Datagrams {
         }
     }
 
-    /// Reads a datagram that answers the last request; returns 0 if none has arrived.
+    /// Reads a datagram that answers the last request. Returns 0 if no such datagram has arrived.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         match self.socket.borrow().recv(buffer) {
             Ok(count) => Ok(count),

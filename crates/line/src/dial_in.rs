@@ -1,4 +1,4 @@
-//! Devices that dial in (`tcp-listen://`): modems and converters that connect to the gateway and say a text first.
+//! Devices that dial in (`tcp-listen://`): modems and converters that connect to the gateway and first send a text.
 //!
 //! One thread for each address accepts connections and assigns each to a bus by the text that it sends first. A bus
 //! whose port has no text accepts any connection. A device that dials in again replaces its connection, which may
@@ -174,7 +174,7 @@ impl Dialled {
     /// Waits for the device of the port `tcp-listen://place`.
     ///
     /// # Errors
-    /// When the address cannot be listened at, or the device has not come within two seconds.
+    /// If the gateway cannot listen at the address, or the device has not connected within two seconds.
     pub(super) fn wait(
         names: &mut Names,
         port: &str,
@@ -312,7 +312,7 @@ fn accept_all(listener: &TcpListener, shared: &Shared) {
     }
 }
 
-/// Whether no bus has wanted the address for a while.
+/// Whether no bus has asked for the address for some time.
 fn is_unwanted(shared: &Shared, now: Instant) -> bool {
     let since = shared.state().free_since;
     since.is_some_and(|since| now.saturating_duration_since(since) > KEPT)
@@ -378,7 +378,7 @@ enum Greeting {
     Gone,
 }
 
-/// Reads the text that a device sends first, and no byte further: the bytes behind the text belong to the line.
+/// Reads the text that a device sends first, and no byte more: the bytes after the text belong to the line.
 fn read_greeting(one: &mut Pending) -> Greeting {
     let mut byte = [0];
     match one.stream.read(&mut byte) {

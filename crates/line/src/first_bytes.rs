@@ -1,4 +1,4 @@
-//! Recognises the server behind a connection that should be a raw serial port, by its first bytes.
+//! Recognises by its first bytes which kind of server is at the other end of a connection that should be a raw serial port.
 
 use super::rfc2217::is_greeting;
 use crate::codec::checksum::crc16;

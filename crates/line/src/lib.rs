@@ -109,7 +109,8 @@ pub enum OpenError {
 }
 
 impl OpenError {
-    /// Whether the connection was not accepted, as for a moment at a server that still closes the one before.
+    /// Whether the connection was refused. A server that still closes the previous connection refuses a new one for
+    /// a moment.
     pub fn is_refused(&self) -> bool {
         use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
         let refused = [ConnectionAborted, ConnectionRefused, ConnectionReset];
@@ -150,11 +151,11 @@ impl Lost {
 /// The event that ended a wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Woken {
-    /// Bytes can be read (or the port is gone, which reading shows).
+    /// Bytes can be read, or the port has disappeared: a read shows which.
     Readable,
     /// A command arrived.
     Command,
-    /// The time to wait for has come.
+    /// The time until which to wait has been reached.
     Time,
 }
 
@@ -282,7 +283,7 @@ impl Line {
     /// Passes a complete frame to the port, without waiting until it is on the wire.
     ///
     /// # Errors
-    /// When the port is gone or does not take the frame within 100 ms.
+    /// If the port has disappeared or does not accept the frame within 100 ms.
     pub fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         match &self.port {
             Port::Serial(fd) => write_all(fd.as_fd(), frame).map_err(Lost::of_adapter),
@@ -508,7 +509,7 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
 }
 
 impl Line {
-    /// Drops what was received before the line was ours.
+    /// Discards bytes that were received before the gateway used the line.
     fn clear(&self) {
         let mut buffer = [0u8; 512];
         while matches!(self.receive(&mut buffer), Ok(count) if count > 0) {}

@@ -45,7 +45,7 @@ impl Mbap {
     /// Reads the reply to the last request as an RTU frame; returns 0 if there is none.
     ///
     /// # Errors
-    /// When the port is gone, or the bytes are not Modbus TCP.
+    /// If the port has disappeared, or the bytes are not Modbus TCP.
     pub(super) fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         let mut raw = [0; 512];
         let count = read(self.stream.as_fd(), &mut raw)?;
@@ -74,7 +74,7 @@ struct Session {
 }
 
 impl Session {
-    /// The frame for the network of an RTU frame; `None` if the RTU frame is broken.
+    /// Converts an RTU frame into a frame for the network; `None` if the RTU frame is invalid.
     fn ask(&mut self, frame: &[u8]) -> Option<Vec<u8>> {
         let (unit, pdu) = rtu::open_frame(frame)?;
         let length = u16::try_from(pdu.len() + 1).ok()?;

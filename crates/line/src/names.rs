@@ -123,7 +123,7 @@ impl Names {
         let (ask, address) = (self.ask.clone(), address.to_string());
         std::thread::Builder::new().name("names".to_string()).spawn(move || {
             clock::be_ordinary();
-            // The receiver is gone when the bus has ended.
+            // The receiver no longer exists if the bus has ended.
             let _ = answer.send(ask(&address));
         })?;
         Ok(asked)

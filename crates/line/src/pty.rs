@@ -89,8 +89,8 @@ impl Pty {
         let _ = tcflush(&self.slave, QueueSelector::IFlush);
     }
 
-    /// Does what the last close of a serial port does, which the open slave end prevents here: discards unread bytes, and
-    /// releases the exclusive access of a program that was killed.
+    /// Does what the last close of a serial port does and the open slave end prevents here: discards unread bytes,
+    /// and releases the exclusive access of a program that was killed.
     pub fn settle(&self) {
         self.discard_unread();
         let _ = ioctl_tiocnxcl(&self.slave);

@@ -6,8 +6,8 @@ use std::time::Instant;
 use super::{Level, Line, LineOptions, Lost, Names, OpenError, Rs485, Spin, Woken};
 use crate::codec::LineFormat;
 
-/// How such a port is set up: the kernel switches no direction, and RTS, which enables the driver of many adapters, is lowered.
-/// Linux raises RTS and DTR itself when a port is opened, for the moment until then.
+/// Settings of such a port: the kernel switches no direction, and RTS, which enables the driver of many adapters,
+/// is lowered. Linux raises RTS and DTR when a port is opened; they stay raised until these settings are applied.
 const OPTIONS: LineOptions = LineOptions {
     rs485: Rs485::Off,
     rts_before_send: std::time::Duration::ZERO,

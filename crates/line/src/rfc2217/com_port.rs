@@ -25,7 +25,7 @@ const DTR: (u8, u8) = (8, 9);
 const RTS: (u8, u8) = (11, 12);
 const BOTH_BUFFERS: u8 = 3;
 
-/// The settings for the port behind the server.
+/// The settings of the port at the server.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Settings {
     pub(crate) format: LineFormat,

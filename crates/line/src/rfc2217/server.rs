@@ -76,7 +76,7 @@ impl ServedPort {
         }
     }
 
-    /// A setting is confirmed as requested; a question, which is the value 0, is answered with what the line has.
+    /// A setting is confirmed as requested. The value 0 is a question; the answer is the present setting of the line.
     fn asked(&self, content: &[u8], replies: &mut Vec<u8>) {
         let [COM_PORT, command, value @ ..] = content else {
             return;

@@ -1,6 +1,6 @@
 //! Telnet as far as RFC 2217 needs it: data and commands in one stream of bytes (RFC 854, 855).
 
-/// "Interpret as command"; sent twice, it stands for the byte 255.
+/// "Interpret as command"; two such bytes represent the byte 255.
 pub(super) const IAC: u8 = 255;
 pub(super) const SE: u8 = 240;
 pub(super) const SB: u8 = 250;
