@@ -87,7 +87,7 @@ mod tests {
         }
         let at = |byte, line, column| Err(NotText::Byte { byte, line, column });
         assert_eq!(text(b"\x7FELF\x02\x01\x01\x00\xFF"), at(0, 1, 8));
-        // Latin-1, behind a letter of two bytes and one column.
+        // Latin-1, after a character of two bytes and one column.
         assert_eq!(text(b"a = 1\n# \xC3\x9Cbergabe 20 \xB0C\n"), at(0xB0, 2, 15));
         assert_eq!(text(b"\xB0\x00"), at(0xB0, 1, 1));
         assert_eq!(text(b"a = 1\n\x00\xB0"), at(0, 2, 1));

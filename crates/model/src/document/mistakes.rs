@@ -24,7 +24,7 @@ fn other_format(source: &str) -> Option<Finding> {
     ))
 }
 
-/// The key in front of a colon that stands for an equals sign, and the value.
+/// The key before a colon that was written instead of an equals sign, and the value.
 fn colon(line: &str) -> Option<(&str, &str)> {
     let (key, value) = line.split_once(':')?;
     let is_key = !key.is_empty() && key.chars().all(|c| c.is_alphanumeric() || "_-. ".contains(c));
@@ -61,7 +61,7 @@ fn decimal_comma(value: &str) -> Option<Finding> {
     })
 }
 
-/// The mistake of a word without quotes, or of a number with a unit.
+/// The mistake in a word without quotes, or in a number with a unit.
 fn word(word: &str) -> Option<Finding> {
     if let Some(number) = word
         .strip_suffix('%')

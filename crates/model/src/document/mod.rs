@@ -1,4 +1,4 @@
-//! TOML documents that keep the place of every value, for the configuration and the profiles.
+//! TOML documents that record the place of every value, for the configuration and the profiles.
 //!
 //! A [`Reader`] returns the values of one table. Keys that are missing, unknown or have the wrong type are
 //! collected as [`Problem`]s with file, line and key, so that one run reports every error of a file. A key counts
@@ -101,7 +101,7 @@ fn as_text<S: Serializer>(finding: &Finding, serializer: S) -> Result<S::Ok, S::
     serializer.collect_str(finding)
 }
 
-/// The place where a value is written.
+/// The place of a value in a document.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Place {
     /// Line of the file, from 1.

@@ -55,7 +55,7 @@ impl<'d> Reader<'d> {
         self.problem(key, what, remedy);
     }
 
-    /// The value of `outcome`; an error becomes a problem at `key`, and `None` is returned.
+    /// The value of `outcome`. An error is reported as a problem at `key`, and `None` is returned.
     pub fn accept<T, E: Into<Finding>>(&self, key: &str, outcome: Result<T, E>) -> Option<T> {
         outcome.map_err(|error| self.finding(key, error)).ok()
     }

@@ -1,4 +1,4 @@
-//! The tree of a document: values with their places, from TOML or from an environment variable.
+//! The tree of a document: values with their places, read from TOML or from an environment variable.
 
 use toml::de::{DeTable, DeValue};
 

@@ -23,8 +23,8 @@ pub enum Bound {
 /// How a value is derived from other points, given by their indices in the profile. All of these are raw points.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Derived {
-    /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`. A minimum above zero is that of either
-    /// direction: a negative percentage is the same magnitude in reverse.
+    /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`. A minimum above zero applies to both
+    /// directions: a negative percentage is the same magnitude in reverse.
     Band {
         /// Index of the point in percent.
         of: PointIndex,
@@ -234,7 +234,7 @@ fn in_band(percent: f64, (low, high): (f64, f64)) -> f64 {
     }
 }
 
-/// The percentage at which a band has `value`; `None` between the minima of the two directions.
+/// The percentage at which a band has `value`; `None` if the value is between the minima of the two directions.
 fn percentage(value: f64, (low, high): (f64, f64)) -> Option<f64> {
     if low <= 0.0 {
         return Some((value - low) / (high - low) * 100.0);

@@ -10,7 +10,7 @@ fn profile(name: &str) -> std::sync::Arc<Profile> {
     Profiles::built_in().get(name).unwrap().clone()
 }
 
-/// A point as `table address[.bit] x scale`, `!` for an inverted bit, `derive` for a derived one, `-` for none.
+/// A point as text: `table address[.bit] x scale`, `!` for an inverted bit, `derive` for a derived point, `-` for no point.
 fn place(profile: &Profile, name: &str) -> String {
     let Some(point) = profile.point_index(name).and_then(|i| profile.points.get(i)) else {
         return "-".to_string();
@@ -164,7 +164,7 @@ fn modbus_families() {
     }
 }
 
-/// The place of an N2 object by the map of the contract.
+/// The place of an N2 object, as the map of the contract defines it.
 fn object(name: &str) -> String {
     let (kind, number) = name.split_once(' ').unwrap_or(("-", "0"));
     let (number, scale) = number
@@ -266,7 +266,7 @@ fn n2_families() {
     }
 }
 
-/// How many objects of each kind the maps have (6.6, 6.7), and none twice.
+/// Each map has the number of objects of each kind that 6.6 and 6.7 require, and no object twice.
 #[test]
 fn n2_maps_are_whole() {
     for (name, ai, bi, ao, bo) in [
@@ -580,7 +580,7 @@ fn process_data_in_by_application() {
     );
 }
 
-/// Points that no manual of the family states, or that manuals state in two ways.
+/// Points that no manual of the family states, or that manuals state differently.
 #[test]
 fn what_is_not_confirmed() {
     for (name, points) in [

@@ -115,7 +115,7 @@ impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
         self.elements.push(element);
     }
 
-    /// The index of the first element that is as wanted.
+    /// The index of the first element for which `is_wanted` is true.
     pub fn position(&self, is_wanted: impl FnMut(&T) -> bool) -> Option<I> {
         self.elements.iter().position(is_wanted).map(I::from)
     }

@@ -95,7 +95,7 @@ impl Value {
         exact.then_some(number)
     }
 
-    /// Whether the value is not zero; a text says neither.
+    /// Whether the value is not zero; `None` for a text.
     pub fn as_bool(self) -> bool {
         let number = self.as_f64();
         number != 0.0 && !number.is_nan()

@@ -83,7 +83,7 @@ pub struct Parameter {
     pub address: u16,
     /// Name and unit of the parameter.
     pub label: Label,
-    /// The accepted range, in the parameter's unit; in counts if the scale is unknown. `None` without a manual.
+    /// The accepted range, in the unit of the parameter; in counts if the scale is unknown. `None` if no manual states it.
     pub range: Option<RangeInclusive<f64>>,
 }
 

@@ -128,7 +128,7 @@ pub struct AddressRange {
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
     pub holes: bool,
-    /// When the drive accepts a write, as a note; empty if the manual does not say.
+    /// A note about when the drive accepts a write; empty if the manual does not state it.
     pub write_when: String,
     /// Note for the user.
     pub note: String,
@@ -168,7 +168,7 @@ impl WriteFunctions {
         }
     }
 
-    /// Differences from the usual, as text; empty if none.
+    /// Differences from other drives, as text; empty if there are none.
     pub fn notes(self) -> Vec<&'static str> {
         let notes = [
             (self.registers_by_16, "one register is written by function 16"),
@@ -259,8 +259,8 @@ pub struct Point {
     pub class: PollClass,
     /// Whether this slow point is read in the fast class on lines that can carry it.
     pub fast_if_carried: bool,
-    /// The point that always has the same value, where a selector of the drive decides what this one has: the two are compared
-    /// when the drive comes online.
+    /// The point that always has the value which this point has only with a certain selector setting of the drive:
+    /// the two are compared when the drive comes online.
     pub monitor: Option<PointIndex>,
     /// Whether the point can be commanded.
     pub write: bool,
@@ -308,7 +308,7 @@ pub enum Source {
 }
 
 impl Point {
-    /// A point of the common model that is only derived, or not read by itself.
+    /// A point of the common model that is derived, or that is never read as a separate value.
     pub(super) fn of_model(model: ModelPoint, source: Source) -> Point {
         Point {
             name: model.name().to_string(),
@@ -461,7 +461,7 @@ impl Profile {
         }
     }
 
-    /// The `[control]` table; none where points of one bit each define the commands.
+    /// The `[control]` table; `None` if points of one bit each define the commands.
     pub fn control_table(&self) -> Option<&Control> {
         self.control
             .as_ref()

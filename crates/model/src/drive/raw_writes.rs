@@ -177,7 +177,7 @@ mod tests {
     fn no_family_loses_its_control_word() {
         for profile in Profiles::built_in().iter() {
             let control = profile.control.as_ref();
-            // A family that is only read has none.
+            // A family that can only be read has no control register.
             let Some((table, address)) = control.map(|control| (control.at.table, control.at.address)) else {
                 assert_eq!(profile.ranges.iter().map(|range| range.write).max(), Some(0));
                 continue;

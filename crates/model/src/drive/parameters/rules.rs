@@ -11,9 +11,10 @@ pub type Addresses = Vec<RangeInclusive<u16>>;
 pub struct WriteRules {
     /// Written only if the user names the parameter; and why.
     pub only_by_name: Vec<(RangeInclusive<u16>, String)>,
-    /// Ratings of the drive itself: drives of one kind have the same. Written only if the user names the parameter.
+    /// Parameters with the ratings of the drive itself, equal in all drives of one kind. Such a parameter is
+    /// written only if the user names it.
     pub nameplate: Addresses,
-    /// Ratings of what is connected to the drive: supply and motor.
+    /// Parameters with the ratings of the supply and the motor, which are connected to the drive.
     pub ratings: Addresses,
     /// Parameters that are not kept without power, even if saved.
     pub volatile: Addresses,
@@ -24,7 +25,7 @@ pub struct WriteRules {
     pub save: Option<(u16, u16)>,
     /// Parameters that the drive takes in one mode only.
     pub lock: Option<Lock>,
-    /// A note to read before writing; empty if none.
+    /// A note that the user should read before writing the parameter; empty if there is none.
     pub note: String,
 }
 

@@ -45,12 +45,12 @@ pub struct Raw {
     pub factor_from: Vec<PointIndex>,
 }
 
-/// The count that makes a point true, or false.
+/// The number for which a point is true, or false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Equals {
     /// The count that means true.
     pub count: i64,
-    /// Whether the value means false, any other true.
+    /// Whether this number means false and any other number means true.
     pub invert: bool,
 }
 
@@ -331,7 +331,7 @@ fn whole_value(whole: i128) -> Option<Value> {
     signed.or_else(|_| u64::try_from(whole).map(Value::Unsigned)).ok()
 }
 
-/// Binary-coded decimals, four bits a digit; `None` if one is above 9.
+/// Decodes binary-coded decimals, four bits for each digit; `None` if a digit is above 9.
 fn of_digits(bits: u64) -> Option<u64> {
     (0..8).rev().try_fold(0, |number, place| {
         let digit = (bits >> (4 * place)) & 0xF;

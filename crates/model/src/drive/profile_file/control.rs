@@ -286,7 +286,7 @@ pub(super) fn read_steps(form: &Reader<'_>, around: &Around<'_>) -> Option<Vec<S
     steps.into_iter().collect()
 }
 
-/// Reads `also_stop`; `None` if a form is wrong, which is reported.
+/// Reads `also_stop`; `None` if one of its forms is invalid. The problem is reported.
 fn read_stops(table: &Reader<'_>, around: &Around<'_>) -> Option<Vec<Setting>> {
     let forms = table.tables("also_stop");
     if forms.len() > MOST_STOPS {
@@ -397,7 +397,7 @@ pub(super) fn read_mask(table: &Reader<'_>, around: &Around<'_>, key: &str) -> O
     })
 }
 
-/// `refresh`: how often what was ordered is written again, where the family needs that.
+/// Reads `refresh`: how often ordered values are written again, if the family needs this.
 fn read_refresh(table: &Reader<'_>) -> Option<Duration> {
     let key = "refresh";
     let every: Duration = table.optional(key)?;

@@ -13,7 +13,7 @@ pub(super) fn apply(reader: &Reader<'_>, names: &[String], raw: Raw, invert: boo
     read_factor_from(reader, names, raw)
 }
 
-/// A mask of neighbouring bits of one register is the same as `at` with these bits.
+/// Replaces a mask of neighbouring bits of one register by the equivalent `at` with these bits.
 fn read_mask(reader: &Reader<'_>, mut raw: Raw) -> Raw {
     let Some(mask) = reader.optional::<i64>("mask") else {
         return raw;

@@ -8,7 +8,7 @@ use crate::codec::{N2Options, Protocol};
 use crate::document::Reader;
 use crate::drive::profile::Point;
 
-/// Time between two polls: drives assume that the master is gone after about 10 minutes.
+/// Time between two polls: drives assume that the master has failed after about 10 minutes without a poll.
 const POLLS: RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(480);
 
 pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options {

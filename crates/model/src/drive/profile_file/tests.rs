@@ -275,7 +275,7 @@ unit = "°C"
         "{}",
         mistakes("m", &wrong)
     );
-    // Problems in what comes from the base name the base.
+    // Problems in the part that comes from the base name the base.
     let wrong = source.replace("\"sensor_feedback\", \"pid_setpoint\"", "\"maximum_frequency\"");
     let all = mistakes("m", &wrong);
     assert!(
@@ -389,7 +389,7 @@ fn the_page_names_every_key() {
         let _ = read_profile(&document.reader(), true, &Profiles::default());
         known.extend(document.known_keys());
     }
-    // Codes and tables are not keys; what is merged beforehand is not read.
+    // Codes and tables are not keys. Keys that are merged beforehand are not read here.
     known.retain(|key| {
         ![
             "faults.",

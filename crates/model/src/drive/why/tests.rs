@@ -20,7 +20,7 @@ struct Says {
     held: Option<String>,
 }
 
-/// A drive of each family: online, ready, run ordered at half speed, and the motor stands.
+/// A drive of each family: online, ready, ordered to run at half speed, and its motor is at standstill.
 fn stands(family: &str) -> Says {
     let says = Says {
         profile: profile(family),

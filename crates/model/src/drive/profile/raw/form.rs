@@ -3,7 +3,7 @@
 /// How a value is encoded in registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// A bit of a register (0 = least significant), or the bit itself in a bit table.
+    /// A bit of a register (0 = least significant), or the bit itself if the table is one of bits.
     Bit {
         /// Number of the bit in its register.
         bit: u8,

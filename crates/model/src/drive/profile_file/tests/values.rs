@@ -1,4 +1,4 @@
-//! Keys that say how a value is read.
+//! Keys that state how a value is read.
 
 use super::*;
 
