@@ -12,7 +12,7 @@ use x509_cert::spki::SubjectPublicKeyInfoOwned;
 
 use super::certificate::{common_name, printable, subject_name};
 
-/// Keys of RSA, in bits: what signatures are verified with, and what the gateway can sign with.
+/// Sizes of RSA keys, in bits: keys with which signatures are verified, and keys with which the gateway can sign.
 const RSA_VERIFY: std::ops::RangeInclusive<usize> = 2048..=8192;
 const RSA_SIGN: std::ops::RangeInclusive<usize> = 2048..=4096;
 /// Supported kinds of keys, for messages.
@@ -51,7 +51,7 @@ pub(super) struct Kind {
     /// Issuer of the certificate, for messages.
     pub(super) issuer: String,
     pub(super) self_issued: bool,
-    /// Whether the certificate is of a version before 3, which has no extensions.
+    /// Whether the certificate has a version below 3. Such certificates have no extensions.
     pub(super) is_old: bool,
     /// Whether the certificate may issue others.
     pub(super) is_ca: bool,

@@ -268,7 +268,7 @@ impl ConnectionPermit {
     }
 }
 
-/// A new connection that needs a place.
+/// A new connection that asks for a connection place.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Newcomer<'c> {
     /// Address of the client.

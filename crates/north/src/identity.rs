@@ -1,4 +1,4 @@
-//! Certificate and private key of a server, read from files and checked; what is wrong with certificate files.
+//! Certificate and private key of a server: reads them from files, checks them, and reports problems in certificate files.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -214,7 +214,7 @@ pub(super) fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> I
     }
 }
 
-/// The one cryptographic provider of the gateway.
+/// The cryptographic provider that the whole gateway uses.
 pub(super) fn provider() -> Arc<CryptoProvider> {
     Arc::new(crypto::ring::default_provider())
 }

@@ -27,8 +27,8 @@ impl Refusals {
         }
     }
 
-    /// A place under `limit` for a connection that `judge` allows. Anyone who is refused or displaced is counted and
-    /// logged, with the remedy for the limit that was reached.
+    /// Asks for a place under `limit` for a connection that `judge` allows. Every connection that is refused or
+    /// displaced is counted and logged, with the remedy for the limit that was reached.
     pub(super) fn acquire(
         &self,
         limit: &Arc<ConnectionLimit>,

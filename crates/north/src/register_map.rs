@@ -273,7 +273,7 @@ impl<'r> DriveView<'r> {
         self
     }
 
-    /// Registers of the blocks from 0x8000 on, all from the same reading. A drive that is offline or stale has a state
+    /// Registers of the blocks from 0x8000 on, all from one reading. A drive that is offline or stale has a state
     /// and an age but no values.
     ///
     /// # Errors

@@ -61,6 +61,6 @@ pub trait Reconfigure: Server {
     /// Accepts no more requests; requests in progress complete.
     async fn retire(&mut self);
 
-    /// Whether all requests have completed and all clients are gone after the server retired.
+    /// Whether, after the server stopped accepting clients, all requests are completed and all clients have disconnected.
     fn is_drained(&self) -> bool;
 }

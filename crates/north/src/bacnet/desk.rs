@@ -1,5 +1,5 @@
-//! Connects the protocol with the drives: waiting writes, slots that await a reading, leases, drives that come back. No
-//! sockets, no clock: `task` and `offline` provide both.
+//! Connects the protocol with the drives: waiting writes, slots that wait for a reading, leases, drives that come
+//! online again. Has no sockets and no clock: `task` and `offline` provide both.
 
 use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::net::SocketAddrV4;

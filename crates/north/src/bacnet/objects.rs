@@ -1,5 +1,5 @@
-//! The objects of a drive and of the gateway (`docs/bacnet.md`). Numbers are fixed: object n means the same point at every drive; a
-//! point that a family lacks leaves a gap. Pure.
+//! The objects of a drive and of the gateway (`docs/bacnet.md`). The numbers are fixed: object n means the same
+//! point of every drive. A point that a family lacks leaves a gap in the numbers. Pure.
 
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -54,7 +54,7 @@ pub enum Meaning {
     BusLoad(usize),
 }
 
-/// A device, with the meaning of each of its objects in the same order.
+/// A device and, in the order of its objects, the meaning of each object.
 #[derive(Debug, Clone)]
 pub struct Shown {
     /// The device as shown to BACnet clients.
@@ -142,7 +142,8 @@ pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item =
 /// Numbers of objects of one drive, where all belong to the gateway's device.
 const PER_DRIVE: u32 = 1000;
 
-/// The objects of one device for all drives, with the unit of each object's drive; `None` for objects of the gateway.
+/// The objects of one device that represents all drives, with the unit of the drive of each object; `None` for
+/// objects of the gateway.
 #[derive(Debug, Clone)]
 pub struct Flat {
     /// The device as shown to BACnet clients.
@@ -393,7 +394,7 @@ fn analog(spec: &DriveSpec, index: PointIndex, model: Option<ModelPoint>, limits
     }
 }
 
-/// Form and scale of the register behind a point.
+/// Form and scale of the register from which the point is read.
 fn raw_of(spec: &DriveSpec, index: PointIndex, depth: usize) -> Option<(Form, f64)> {
     let point = spec.profile.points.get(index)?;
     match &point.source {

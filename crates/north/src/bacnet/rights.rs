@@ -11,7 +11,7 @@ use drivegate_bacnet::Address;
 use super::Options;
 use crate::order::{Grants, Right};
 
-/// The rights of all hosts; none of them may write once the server retires.
+/// The rights of all hosts. When the server shuts down, no host may write any more.
 #[derive(Debug, Clone)]
 pub(super) struct HostRights(Arc<ArcSwapOption<Options>>);
 

@@ -15,7 +15,7 @@ pub(super) struct Sockets {
     pub(super) prefix: u8,
     pub(super) broadcast_to: SocketAddrV4,
     pub(super) unicast: UdpSocket,
-    /// Sockets for broadcasts; empty where the first socket receives broadcasts itself.
+    /// Sockets for broadcasts; empty if the first socket also receives broadcasts.
     pub(super) broadcasts: Vec<UdpSocket>,
 }
 
@@ -34,7 +34,7 @@ impl Sockets {
         let prefix = prefix(*listen.ip(), &routes);
         let to = broadcast_of(*listen.ip(), prefix);
         let broadcast_to = SocketAddrV4::new(to, port);
-        // A socket that is bound to no address receives broadcasts itself.
+        // A socket that is bound to no particular address also receives broadcasts.
         let mut broadcasts = Vec::new();
         if !listen.ip().is_unspecified() {
             broadcasts.push(shared(broadcast_to)?);
@@ -75,7 +75,7 @@ fn prefix(address: Ipv4Addr, routes: &str) -> u8 {
     let networks = routes.lines().skip(1).filter_map(|line| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let number = |place: usize| Some(u32::from_str_radix(fields.get(place)?, 16).ok()?.swap_bytes());
-        // Networks behind a gateway are not on the interface.
+        // A network that is reached through a gateway is not on the interface.
         let (network, gateway, mask) = (number(1)?, number(2)?, number(7)?);
         let own = gateway == 0 && mask != 0 && u32::from(address) & mask == network;
         own.then_some(mask.leading_ones())

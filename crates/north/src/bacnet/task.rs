@@ -220,7 +220,7 @@ impl Task {
         self.kept.keep(path, &self.desk.view.plant, now);
     }
 
-    /// Shows another plant, or the same with other options.
+    /// Shows a new plant, or the present plant with new options.
     fn see(&mut self) {
         self.desk.see(self.options.clone());
         self.seen.clear();

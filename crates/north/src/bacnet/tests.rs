@@ -105,7 +105,7 @@ impl ControlledDrive {
         writes::begin(&self.view, &job, Arrival::now(self.now), self.now)
     }
 
-    /// Result of a write that is refused, or done, at once.
+    /// The immediate result of a write: the write is refused or done.
     fn at_once(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Result<(), Error> {
         match self.begin(client, object, priority, value) {
             Begun::Answered(result) => result,

@@ -197,8 +197,8 @@ fn slot(
     }
 }
 
-/// Handles a write from which no order follows: it is in force at once. The lease of the drive is that of the client
-/// whose slot governs.
+/// Handles a write that leads to no order: the write is in force at once. The lease of the drive belongs to the
+/// client whose slot governs.
 fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Option<Begun> {
     let governs = handle.priorities(|all| {
         if all.plan(write) != Follows::Nothing {

@@ -105,7 +105,7 @@ struct Known {
     stops: u64,
     /// Hash of topic and `id`.
     identity: u64,
-    /// Hash of where the command's result goes.
+    /// Hash of the address to which the result of the command is sent.
     answer_to: u64,
 }
 
@@ -122,9 +122,9 @@ pub(crate) struct Fingerprint {
 /// Whether and how a message repeats a command.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Repetition<R> {
-    /// A command whose result is the same now.
+    /// A command whose result is already known.
     Answered(R),
-    /// A command whose result is pending, to the same address.
+    /// A command whose result is pending and goes to the same address.
     Pending,
     /// A command whose result does not answer this message, and why.
     Outdated(&'static str),
@@ -143,8 +143,8 @@ impl<R: Clone> Memory<R> {
         }
     }
 
-    /// The command that a message repeats: one that the broker marks as repeated, or one with the same topic, payload
-    /// and `id`. `stops` is the number of stops of the drive now.
+    /// The earlier command that a message repeats: the broker marks the message as repeated, or the message has the
+    /// topic, payload and `id` of the earlier one. `stops` is the present number of stops of the drive.
     pub(crate) fn repeated(
         &mut self,
         taken: &Taken<'_>,

@@ -8,7 +8,7 @@ use super::Id;
 use crate::order::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
 use crate::plant::Shown;
 
-/// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
+/// The only result of a command: `confirmed` if a read showed the effect in time, otherwise the answer of the bus.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
 pub(crate) struct CommandResult<'r> {
     #[schema(value_type = serde_json::Value)]

@@ -6,7 +6,7 @@ fn host(n: u8) -> IpAddr {
     IpAddr::from([10, 0, 0, n])
 }
 
-/// Connection places as a test opens and closes them.
+/// Connection places; a test opens and closes the connections.
 struct LimitedPlaces {
     limit: Arc<ConnectionLimit>,
     cancel: CancellationToken,
@@ -187,7 +187,8 @@ fn limits() -> impl Strategy<Value = Limits> {
 }
 
 fn newcomer() -> impl Strategy<Value = (u8, bool, u8)> {
-    // Few addresses come often, many seldom; the connection then stays silent, is used, or one closes.
+    // A few addresses connect often and many connect seldom. After that, each connection stays silent, is used, or
+    // is closed.
     (prop_oneof![0..4_u8, 0..64_u8], prop::bool::weighted(0.3), 0..4_u8)
 }
 
@@ -241,7 +242,7 @@ proptest! {
         }
     }
 
-    /// However many silent connections come from elsewhere, an operator gets in at every try.
+    /// An operator always gets a connection, regardless of how many silent connections other addresses open.
     #[test]
     fn silence_locks_no_operator_out(
         limits in limits().prop_filter("one place for an operator", |l| l.reserved > 0),

@@ -36,7 +36,7 @@ pub(super) enum AccessError {
 }
 
 impl AccessError {
-    /// Whether another proof of identity can take the place of the token.
+    /// Whether another proof of identity can replace the token.
     pub(super) fn is_for_want_of_a_token(&self) -> bool {
         matches!(
             self,
@@ -83,7 +83,7 @@ impl Access {
     }
 }
 
-/// The scope a token needs for this path; `None` if no token is needed, for health checks.
+/// The scope that a token needs for this path; `None` for health checks, which need no token.
 fn scope(path: &str) -> Option<Scope> {
     match path {
         "/healthz" | "/readyz" => None,

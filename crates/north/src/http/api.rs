@@ -73,7 +73,7 @@ pub(super) struct Drive<'d> {
     /// Time for which an ordinary stop still waits.
     #[serde(skip_serializing_if = "Option::is_none")]
     stop_waits_ms: Option<u64>,
-    /// Whether what was ordered last is being written again for the drive's own timeout.
+    /// Whether the last orders are being written again because of the drive's own timeout.
     refreshing: bool,
     /// Holder of the drive, where `[authority]` is on.
     #[serde(flatten)]
@@ -84,7 +84,7 @@ pub(super) struct Drive<'d> {
     stops: Option<Vec<StopProof>>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
-    /// Number of starts; `null` where the drive does not say whether it runs.
+    /// Number of starts; `null` if the drive does not report whether it runs.
     starts: Option<u64>,
     running_seconds: Option<f64>,
     /// Energy; `null` where the drive does not count it.

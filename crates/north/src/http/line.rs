@@ -66,7 +66,7 @@ struct DriveLine<'b> {
 /// Number of replies of the drive, by the time until each reply began.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Turnarounds {
-    /// Upper bound of each count; the last has none.
+    /// Upper bound of each count; the last count has no bound.
     le_ms: Vec<Option<f64>>,
     counts: Vec<u64>,
     count: u64,

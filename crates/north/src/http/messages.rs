@@ -47,7 +47,7 @@ pub struct HoldAct {
 pub struct DrillWish {
     /// The drive.
     pub drive: String,
-    /// The ways; all where absent or empty.
+    /// The kinds of messages; all kinds if absent or empty.
     #[serde(default)]
     pub kinds: Vec<Kind>,
     /// Speed at which the motor is stopped, %; `max_speed` of `[drill]` where absent.

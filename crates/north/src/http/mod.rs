@@ -84,7 +84,7 @@ pub use self::loopback::Loopback;
 pub use self::tokens::{Scope, Token, Tokens};
 pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, Users};
 
-/// Whether `text` can stand in [`Options::hosts`]: a host name or an address, without a port.
+/// Whether `text` is valid in [`Options::hosts`]: a host name or an address, without a port.
 pub fn is_host(text: &str) -> bool {
     Host::configured(text).is_some()
 }
@@ -137,8 +137,9 @@ impl TcpService<Options> for HttpService {
         Terms::new(options)
     }
 
-    /// Connections and streams end if hosts or tokens change, or the listener is another, those with a command behind its
-    /// reply; new certificates are for new connections.
+    /// Applies the new options. If hosts or tokens change, or the listener is replaced, connections and streams
+    /// end; a connection with a command in progress ends after its reply. New certificates apply to new
+    /// connections.
     fn commit(
         &mut self,
         options: Options,

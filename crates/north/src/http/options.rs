@@ -15,7 +15,7 @@ pub struct Options {
     pub listen: SocketAddr,
     /// Host names and addresses by which the gateway is reached, in addition to its own and those of the loopback.
     pub hosts: Vec<String>,
-    /// The tokens for reading; `None`: everything is open.
+    /// The tokens for reading; `None` means that every client may read.
     pub tokens: Option<Tokens>,
     /// The users who may command; `None` if commands are disabled.
     pub users: Option<Users>,

@@ -51,7 +51,7 @@ pub(crate) struct LocalUser {
     pub(crate) proof: Proof,
     /// Right of the user to write.
     pub(crate) right: Right,
-    /// The gateway itself, where that has a configuration file.
+    /// Control of the gateway itself; `None` if it has no configuration file.
     pub(crate) control: Option<Control>,
 }
 

@@ -39,7 +39,7 @@ impl Wanted {
         let to_text = to.clone().unwrap_or_default();
         let to = time("to", to, now)?.min(now);
         let from = time("from", from, to.checked_sub(SHOWN).unwrap_or(to))?;
-        // No trend goes back further than this.
+        // No trend goes further back than this one.
         let [.., Range { span, .. }] = RANGES;
         let from = now.checked_sub(span).map_or(from, |oldest| from.max(oldest));
         if from > to {

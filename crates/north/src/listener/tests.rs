@@ -26,7 +26,7 @@ impl Accept for Failing {
     }
 }
 
-/// A handler with one place, which records what happens.
+/// A handler that admits one connection and records all calls.
 struct Recorder {
     events: mpsc::UnboundedSender<&'static str>,
     taken: Mutex<bool>,

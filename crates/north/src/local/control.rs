@@ -1,4 +1,4 @@
-//! Commands of local clients to the gateway itself rather than to a drive.
+//! Commands of local clients that concern the gateway itself and not a drive.
 
 use std::path::{Path, PathBuf};
 

@@ -174,7 +174,7 @@ async fn accept(bound: Bound, door: Arc<Door>, connections: TaskTracker, cancel:
     }
 }
 
-/// Answers a client beyond the limit. Bytes that do not fit into the socket's buffer at once are dropped.
+/// Answers a client beyond the limit. The part of the answer that does not fit into the buffer of the socket is discarded.
 fn turn_away(stream: &UnixStream) {
     let body = format!("{{\"error\":\"{MAX_CLIENTS} local clients are already connected; try again\"}}");
     let head =

@@ -11,7 +11,7 @@ use tokio::net::{UnixListener, UnixSocket, UnixStream};
 
 /// Directory of the default path where neither systemd nor the session of a user gives one.
 const SYSTEM_DIRECTORY: &str = "/run/drivegate";
-/// Sockets in one directory: gateways of one user that run at the same time with the default path.
+/// Maximum number of sockets in one directory: one for each gateway of one user that runs with the default path.
 const MAX_GATEWAYS: usize = 16;
 /// Owner and group may read and write, which both take to connect.
 const MODE: u32 = 0o660;
@@ -33,7 +33,7 @@ pub enum SocketPath {
     Off,
 }
 
-/// The variables of the environment that say where runtime files belong.
+/// The environment variables that name the directory for runtime files.
 #[derive(Debug, Clone, Default)]
 pub struct RuntimeDirectories {
     /// `RUNTIME_DIRECTORY`: that of a service, by systemd.

@@ -29,7 +29,7 @@ pub enum Format {
     OpenMetrics,
 }
 
-/// The content types, with the versions of OpenMetrics that can be requested: their texts are the same.
+/// The content types, with the versions of OpenMetrics that can be requested. The content is equal in all these versions.
 const TYPES: [(Format, &str, &str); 3] = [
     (
         Format::OpenMetrics,

@@ -231,8 +231,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// Reads what the client has sent behind data that is not Modbus: the system resets a connection that is closed with
-    /// unread input, and the client could lose the last answers.
+    /// Reads and discards the data that the client sent after data that is not Modbus. The system resets a
+    /// connection that is closed with unread input, and the client could then lose the last answers.
     async fn discard_input(&mut self) {
         let (mut space, mut discarded) = ([0; 1024], 0);
         while let Ok(count) = self.stream.read(&mut space).await

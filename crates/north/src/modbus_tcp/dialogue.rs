@@ -83,8 +83,8 @@ impl Dialogue {
         self.arrivals.add(count, arrival);
         self.filled = (self.filled + count).min(self.input.len());
         if self.filled == self.input.len() && self.filled < INPUT_MOST {
-            // A client that fills the buffer sends batches; with a larger buffer a whole batch is read and answered at
-            // once.
+            // A client that fills the buffer sends requests in batches; with a larger buffer, a whole batch is read
+            // and answered at once.
             self.input.resize(INPUT_MOST, 0);
         }
     }

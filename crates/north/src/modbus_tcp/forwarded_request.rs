@@ -45,7 +45,7 @@ pub(super) enum BusWork {
     Order(Order),
     /// The stop of a request whose rest is refused; the refusal is audited.
     Stop(Order, Refusal),
-    /// No work: the write is done, and only the read behind it is left.
+    /// The write is done; only the read after it remains.
     Written,
     /// No work, because the request is refused; the refusal is audited.
     Refused(Refusal),
@@ -299,8 +299,9 @@ impl AnsweredRequest {
     }
 }
 
-/// Splits a read that the process image cannot answer as a whole by object, for protocols that read one object per
-/// transaction (N2); `None` for protocols that read registers, where the request is forwarded unchanged.
+/// Splits a read that the process image cannot answer as a whole into one read for each object, for protocols that
+/// read one object in each transaction (N2). `None` for protocols that read registers: there the request is
+/// forwarded unchanged.
 ///
 /// # Errors
 /// If part of the read data is stale, was refused by the drive, or does not exist: contains the exception.

@@ -248,7 +248,7 @@ impl TcpService<Options> for ModbusTcp {
                         ..View::default()
                     },
                 ),
-                // The plain listeners are first and in the same order.
+                // The unencrypted listeners come first, in an unchanged order.
                 _ => plain.next().map_or_else(Policy::nobody, |l| {
                     let write = WriteAccess::ByAddress(l.write.clone());
                     let allow = l.allow.clone();

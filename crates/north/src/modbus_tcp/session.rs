@@ -82,7 +82,7 @@ impl ClientSession {
         }
     }
 
-    /// A session for another client of the same server.
+    /// A session for another client of this server.
     pub(super) fn beside(&self, client: Client) -> ClientSession {
         ClientSession::new(self.state.clone(), self.view.clone(), client)
     }
@@ -385,7 +385,8 @@ impl ClientSession {
         self.client.rights.authority() == Authority::Write && drive.image.spec.access == Access::Control
     }
 
-    /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
+    /// Unit 255: the input registers, which can also be read as holding registers, since many clients cannot read
+    /// input registers.
     fn gateway(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
         if WRITES.contains(&frame.function) {
             return self.stop_all(frame, now);

@@ -21,7 +21,7 @@ pub(super) struct BrokerLimits {
     pub(super) wildcards: bool,
     /// Maximum number of topic aliases.
     pub(super) aliases: u16,
-    /// Keep-alive interval that the broker set in place of ours, s.
+    /// Keep-alive interval, in s, that the broker set instead of the gateway's.
     pub(super) keep_alive: Option<u16>,
 }
 

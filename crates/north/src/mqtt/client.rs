@@ -54,7 +54,7 @@ const LOST_LOGGED: Duration = Duration::from_secs(60);
 /// Messages with an expiry are renewed after their expiry time divided by this number.
 const RENEWED: u32 = 2;
 
-/// An expiry in whole seconds: 0 would mean at once.
+/// An expiry in whole seconds; an expiry of 0 would end the message at once.
 fn seconds(expiry: Duration) -> u32 {
     u32::try_from(expiry.as_secs()).unwrap_or(u32::MAX).max(1)
 }

@@ -371,7 +371,7 @@ impl Commands {
         }
     }
 
-    /// The one result of a finished command, at `time`.
+    /// Publishes the only result of a finished command, at `time`.
     fn result(&mut self, pending: PendingCommand, answer: &Answer, shown: Shown, time: SystemTime) -> Message {
         let message = pending.reply.message(pending.id, answer, shown, time);
         self.memory

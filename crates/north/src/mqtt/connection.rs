@@ -55,9 +55,10 @@ const RECEIVE_MAXIMUM: u16 = 64;
 const SUBSCRIBE_BYTES: usize = 8 << 10;
 /// Filters of a packet with subscriptions, at most: AWS IoT Core closes the connection at the ninth, without a reason.
 const MOST_FILTERS: usize = 8;
-/// Packets with subscriptions, at most: the client takes [`REQUESTS`] at a time. Behind that they have more filters.
+/// Maximum number of packets with subscriptions: the client accepts [`REQUESTS`] at a time. Beyond this number,
+/// each packet contains more filters.
 const MOST_PACKETS: usize = REQUESTS / 2;
-/// Buffer of the system for sent messages: a result waits behind no more than that.
+/// Size of the system's buffer for sent messages: a result never waits for more than this.
 const SEND_BUFFER: u32 = 256 << 10;
 /// Time for the DISCONNECT of a connection that the gateway gives up.
 const LAST_PACKET: Duration = Duration::from_millis(500);
@@ -276,7 +277,7 @@ impl Connection {
         }
     }
 
-    /// Subscribes, in as many packets as the broker requires; false if the connection does not take it.
+    /// Subscribes, with as many packets as the broker requires. Returns false if the connection does not accept a packet.
     pub(super) fn subscribe(&mut self, filters: Vec<Filter>, limits: BrokerLimits) -> bool {
         (self.wanted, self.answers) = (filters.len(), Vec::new());
         self.question = filters.first().map(|first| Filter {

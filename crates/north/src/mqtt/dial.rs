@@ -42,8 +42,8 @@ impl Pace {
 pub(super) struct Dial(Arc<Mutex<Pace>>);
 
 impl Dial {
-    /// Connects to the first address that takes the connection, beginning with that of number `first`: an address behind which no
-    /// broker answers does not keep the others from being tried.
+    /// Connects to the first address that accepts the connection, beginning with number `first`. An address at
+    /// which no broker answers does not prevent the others from being tried.
     pub(super) async fn connect(self, broker: Broker, first: usize, options: NetworkOptions) -> io::Result<TcpStream> {
         // rumqttc and TLS require IPv6 addresses without brackets.
         let found = tokio::net::lookup_host((broker.bare_host(), broker.port)).await?;

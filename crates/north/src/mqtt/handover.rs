@@ -9,7 +9,7 @@ use super::commands::OrdersLeft;
 use super::sparkplug::NodeOrdersLeft;
 use crate::event::Event;
 
-/// State that the last clients left, until the next ones take it.
+/// State that the last clients left, until the next clients take it over.
 #[derive(Debug, Default)]
 pub struct Handover(Mutex<Left>);
 
@@ -28,7 +28,7 @@ pub(super) struct Left {
 /// State that one of the clients left.
 #[derive(Debug)]
 pub(super) struct ClientLeft<Orders> {
-    /// The commands whose results are still owed.
+    /// The commands whose results are not yet published.
     pub(super) orders: Option<Orders>,
     /// The broker that was in use.
     pub(super) broker: Option<Broker>,

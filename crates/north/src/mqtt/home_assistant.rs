@@ -42,7 +42,7 @@ pub(super) struct Announcer {
     devices: Vec<Announced>,
     /// Largest packet of the broker, bytes.
     max_packet: usize,
-    /// Places of the devices that are still to be announced.
+    /// Indices of the devices that have not been announced yet.
     pending: VecDeque<usize>,
     /// Topics of messages given to the outbox, some of which may still wait there.
     under_way: Vec<Arc<str>>,

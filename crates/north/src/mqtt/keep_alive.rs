@@ -27,7 +27,7 @@ pub(super) enum Verdict {
 pub(super) struct Silence {
     /// Time of the broker's last packet.
     heard: Instant,
-    /// Whether a test subscription was sent, and the answer is still to come.
+    /// Whether a test subscription was sent and has not been answered yet.
     asked: bool,
     /// When the library sent a ping; `None` once the broker has sent anything since.
     pinged: Option<Instant>,
@@ -62,10 +62,10 @@ impl Silence {
         std::mem::take(&mut self.asked)
     }
 
-    /// `interval` is the one that the broker set instead of the gateway's, s; 0: no keep-alive. A broker that is pinged
-    /// less often than the gateway requires, or never, has no reason to send, and gets a test subscription. The library
-    /// closes the connection an interval after a ping without an answer, and sends no DISCONNECT then: the connection is
-    /// lost a little earlier.
+    /// `interval`, in s, is the one that the broker set instead of the gateway's; 0 means no keep-alive. A broker
+    /// that is pinged less often than the gateway requires, or never, has no reason to send anything, and gets a
+    /// test subscription. If a ping is not answered, the library closes the connection one interval later without a
+    /// DISCONNECT; the connection is declared lost slightly before that.
     pub(super) fn judge(&self, interval: Option<u16>, now: Instant) -> Verdict {
         let silent = now.saturating_duration_since(self.heard);
         let interval = interval.unwrap_or(KEEP_ALIVE_S);

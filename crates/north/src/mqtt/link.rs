@@ -248,7 +248,7 @@ impl BrokerLink {
         Ok(())
     }
 
-    /// The connection that the broker accepted, and what the broker can do.
+    /// The connection that the broker accepted, and the capabilities of the broker.
     fn accepted(&mut self) -> Option<(&mut Connection, BrokerLimits)> {
         match &mut self.state {
             State::Up(connection, phase) => phase.limits().map(|limits| (&mut **connection, *limits)),

@@ -527,7 +527,7 @@ impl MessageLog {
             .flatten()
     }
 
-    /// Keeps a copy of bytes that are no records.
+    /// Keeps a copy of bytes that are not valid records.
     fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) -> io::Result<()> {
         let Some(MessageLogDir { dir, name, .. }) = &self.place else {
             return Ok(());

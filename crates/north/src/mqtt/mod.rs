@@ -129,7 +129,7 @@ pub struct Options {
     pub telemetry_qos: Qos,
     /// Quality of service of events and history.
     pub event_qos: Qos,
-    /// Whether messages are retained; otherwise none is, not even the last will.
+    /// Whether messages are retained. If not, no message is retained, not even the last will.
     pub retain: bool,
     /// Time after which the broker drops telemetry; never if absent.
     pub expiry: Option<Duration>,
@@ -218,7 +218,7 @@ pub struct Mqtt {
 
 impl server::Server for Mqtt {
     const NAME: &'static str = "MQTT";
-    // The commands in progress come first: the successor would be another client for the broker.
+    // The commands in progress are finished first, because the broker would treat the successor as another client.
     const STOP_TIMEOUT: Duration = Duration::from_secs(6);
     type Options = Options;
 

@@ -29,9 +29,9 @@ pub(super) struct StateContent {
     pub(super) blocked_by: Vec<String>,
     /// How long `min_run` still delays an ordinary stop, in whole seconds.
     pub(super) stop_waits: Option<u64>,
-    /// Whether the drive's orders are being written again; `None` where orders never are.
+    /// Whether the orders of the drive are being written again; `None` for a drive whose orders are never written again.
     pub(super) refreshing: Option<bool>,
-    /// Holder of the drive; none where `[authority]` is off.
+    /// Holder of the drive; `None` if `[authority]` is off.
     pub(super) hold: Option<HoldFields>,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,

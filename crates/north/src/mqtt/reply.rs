@@ -97,7 +97,7 @@ impl Reply {
         self.topic.len() + self.correlation.as_ref().map_or(0, Vec::len)
     }
 
-    /// The one result: `confirmed` if a read showed the effect in time, else the answer of the bus.
+    /// The only result: `confirmed` if a read showed the effect in time, otherwise the answer of the bus.
     pub(super) fn message(&self, id: Option<Id>, answer: &Answer, shown: Shown, time: SystemTime) -> Message {
         self.with(CommandResult::new(id.as_ref(), &self.drive, answer, shown, time).to_json())
     }

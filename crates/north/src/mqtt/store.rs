@@ -318,7 +318,7 @@ impl Thread {
         thread
     }
 
-    /// Works until all senders of jobs are gone.
+    /// Executes jobs until all senders of jobs have been dropped.
     fn work(mut self, jobs: &Receiver<Job>) {
         loop {
             let mut load = None;

@@ -247,7 +247,7 @@ const AGAIN: Duration = Duration::from_secs(600);
 /// Time between two looks at which drives are due.
 const LOOK: Duration = Duration::from_secs(10);
 
-/// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.
+/// Reads the parameters of all drives at regular intervals and never ends; on each bus, one drive at a time.
 pub async fn keep_reading(plant: SharedPlant, vault: Arc<Vault>, every: Duration) {
     let mut begun: BTreeMap<Machine, SystemTime> = BTreeMap::new();
     loop {

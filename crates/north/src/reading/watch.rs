@@ -1,5 +1,5 @@
-//! Whether the threads that read sockets run. A task that wakes ten times a second, and with every stop, shows that of a
-//! runtime; what a reader finds before that task ran again counts, too.
+//! Whether the threads that read sockets run. A task that wakes ten times a second, and at every stop, shows that
+//! the threads of a runtime run. Data that a reader finds before the task has run again is counted as well.
 //!
 //! The workers of a multi-threaded runtime share a watch: a stall of one of them counts as a stall of all, since
 //! its tasks may continue on another worker.
@@ -142,7 +142,7 @@ impl Watch {
         }
     }
 
-    /// The time in ns; never 0, which stands for no time.
+    /// The time in ns. Never 0, because 0 means that there is no time.
     fn nanos(&self, at: Instant) -> u64 {
         in_nanos(at.saturating_duration_since(self.base)).max(1)
     }

@@ -1,4 +1,4 @@
-//! The gateway itself: registers of the buses.
+//! Registers about the gateway itself: the registers of the buses.
 
 use std::time::Duration;
 

@@ -403,7 +403,7 @@ fn refused_command_writes() {
         (&nx(), 0x8101, &[5000, 2500], value),
         (&lacking, 0x8100, &[3], value),
         (&lacking, 0x8102, &[2500], address),
-        // The address is wrong and the value too: the address comes first.
+        // Both the address and the value are wrong: the error reports the address.
         (&lacking, 0x8100, &[9, 100, 2500], address),
     ];
     for (profile, start, values, wanted) in table {
@@ -439,7 +439,7 @@ fn a_word_without_run_stops_whatever_is_wrong_with_the_rest() {
             "{start:04X} {values:04X?}"
         );
     }
-    // A reset that is refused is none: the next one is a change of the bit again.
+    // A refused reset does not count as a reset: the next one is a change of the bit again.
     let words = |last, word| {
         command(&nx(), 0x8100, &[word, 0x8000], before(last, false))
             .unwrap()

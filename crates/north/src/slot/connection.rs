@@ -84,7 +84,8 @@ impl<S: AsyncRead + AsyncWrite + Source + Unpin> Connection<S> {
         tracing::info!(target: "drivegate::north::slot", tool = self.dialogue.who(), "tool slot: {end}");
     }
 
-    /// Waits for the answer to the tool's last request, which comes within a second or not at all.
+    /// Waits for the answer to the last request of the tool. If the answer does not arrive within a second, it
+    /// never arrives.
     async fn finish(&mut self) -> Result<(), End> {
         self.dialogue.finished().await;
         self.flush().await

@@ -188,7 +188,7 @@ impl Dialogue {
         }
     }
 
-    /// A request goes to the bus, or is answered here.
+    /// Passes a request to the bus, or answers it here.
     fn go(&mut self, held: Held, now: Instant) {
         let Held {
             request,
@@ -238,7 +238,7 @@ impl Dialogue {
     fn answer(&mut self, pending: &Pending, outcome: &Outcome, frame: Option<Vec<u8>>, now: Instant) {
         let protocol = self.tool.protocol();
         if pending.request.is_broadcast(protocol) {
-            // A broadcast that was sent has no reply.
+            // A broadcast has no reply; it only counts whether it was sent.
             let sent = outcome.is_ok();
             return self.tool.count(if sent {
                 SlotOutcome::Answered

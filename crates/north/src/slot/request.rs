@@ -40,7 +40,7 @@ pub(super) enum Refused {
 }
 
 impl ToolRequest {
-    /// The request in a complete frame; `None` if the frame is invalid, which is not answered.
+    /// The request in a complete frame; `None` if the frame is invalid. An invalid frame is not answered.
     pub(super) fn of(protocol: Protocol, frame: &[u8]) -> Option<ToolRequest> {
         let (address, pdu) = match protocol {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec()))?,
@@ -76,7 +76,7 @@ impl ToolRequest {
     }
 }
 
-/// The N2 error code for what a Modbus client is refused with.
+/// The N2 error code that corresponds to the exception for a Modbus client.
 fn nak(code: Exception) -> n2::Answer {
     n2::Answer::Nak(match code {
         Exception::VALUE => n2::command::DATA,

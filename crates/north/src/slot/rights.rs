@@ -10,12 +10,12 @@ use arc_swap::ArcSwap;
 use super::{Options, Slot, SlotAccess};
 use crate::order::{Grants, Proof, Right};
 
-/// The way by which a tool is connected.
+/// The kind of connection by which a tool is connected.
 #[derive(Debug, Clone)]
 enum Way {
     Address(IpAddr),
     Pty(PathBuf),
-    /// No way at all: a test without sockets.
+    /// Without a connection: a test that uses no sockets.
     Within,
 }
 

@@ -163,7 +163,7 @@ impl Tool {
         pace
     }
 
-    /// The configured drives that a request reaches: one, none, or all.
+    /// The configured drives to which a request applies: one, none, or all.
     fn asked(&self, plant: &Plant, request: &ToolRequest) -> Vec<DriveHandle> {
         let broadcast = request.is_broadcast(self.protocol());
         let on_bus = plant
@@ -222,7 +222,7 @@ impl Tool {
         }
     }
 
-    /// A write to a configured drive: the same checks as those of a Modbus TCP client.
+    /// Orders a write to a configured drive, after the checks that a Modbus TCP client must pass.
     fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, arrival: Arrival, now: Instant) -> Decision {
         if !self.writes() {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);

@@ -359,7 +359,7 @@ impl Operating {
 
     /// The stored mark of a verified user and password.
     fn mark(&self, given: &Credentials) -> Option<[u8; 32]> {
-        // A name has no zero byte: a user would not be found.
+        // A name with a zero byte would belong to no user, because no name contains one.
         let text = format!("{}\0{}", given.user, given.password);
         hmac::sign(self.key.as_ref()?, text.as_bytes()).as_ref().try_into().ok()
     }

@@ -15,7 +15,7 @@ use crate::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
 use crate::order::Refusal;
 use crate::stop_all::NothingToStop;
 
-/// 200 if every drive stands, 504 if one is not proven to.
+/// Replies 200 if every drive is at standstill, 504 if the standstill of a drive is not proven.
 pub(in crate::http) async fn stop(State(app): State<Arc<AppState>>, Ordered(operator, payload): Ordered) -> Replied {
     let (plant, origin, now) = (app.plant.load_full(), operator.origin(), Instant::now());
     let refuse = |refusal: Refusal| refuse_stop_all(&plant, refusal, &origin, now);

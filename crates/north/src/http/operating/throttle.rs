@@ -176,7 +176,7 @@ mod tests {
         assert!(tried < 40, "{tried} guesses in 100 s from ten addresses");
         assert_eq!(throttle.begin(address(200), ALICE, now), Ok(0), "another address");
         assert_eq!(throttle.begin(Source::Known(7), ALICE, now), Ok(0), "a known browser");
-        // The attacker at the same address, behind one proxy: the known browser gets in.
+        // The attacker has the same address, because both use one proxy: the known browser is admitted.
         assert!(throttle.begin(address(3), ALICE, now).is_err());
         throttle.succeeded(Source::Known(7), ALICE);
         assert_eq!(throttle.begin(Source::Known(7), ALICE, now), Ok(0));

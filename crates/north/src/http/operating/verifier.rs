@@ -25,7 +25,7 @@ struct Waiting {
     address: IpAddr,
     /// Hash of the user, if the user exists.
     hash: Option<String>,
-    /// Dummy hashes, computed only so that the time is the same.
+    /// Hashes of other passwords, computed only so that a check always takes equally long.
     others: Vec<String>,
     password: String,
     answer: oneshot::Sender<bool>,

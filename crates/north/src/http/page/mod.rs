@@ -1,9 +1,9 @@
 //! The status page: one document, its styles and its scripts, all served by this server.
 //!
-//! The scripts show the JSON interface live; `page.js` opens the views: `overview.js`, `drive.js`, `lines.js`, `events.js`,
-//! `recording.js`. `texts.js` chooses the language: English stands in the scripts, another language is a file such as `de.js`, named
-//! in `texts.js` and below. Without scripts the page has the tables rendered here and reloads every few seconds; their columns are in
-//! `COLUMNS`.
+//! The scripts show the JSON interface with live values. `page.js` opens the views: `overview.js`, `drive.js`,
+//! `lines.js`, `events.js`, `recording.js`. `texts.js` chooses the language. The English texts are in the scripts;
+//! the texts of another language are in a file such as `de.js`, which `texts.js` and this module name. Without
+//! scripts, the page has the tables rendered here and reloads every few seconds; their columns are in `COLUMNS`.
 
 use std::fmt::{self, Write as _};
 use std::time::Instant;

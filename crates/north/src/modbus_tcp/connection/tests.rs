@@ -27,7 +27,7 @@ struct PipedClient {
     place: Arc<ConnectionPlace>,
 }
 
-/// A connection over a pipe that holds `pipe` bytes each way.
+/// A connection through a pipe whose buffer has `pipe` bytes in each direction.
 fn rig(pipe: usize) -> PipedClient {
     rig_with(pipe, None)
 }

@@ -101,7 +101,8 @@ impl PlainClient {
         }
     }
 
-    /// Clears the topics of earlier runs that are no longer published: drives that were removed, another base.
+    /// Clears the topics of earlier runs that are no longer published, because a drive was removed or the base
+    /// topic changed.
     pub(super) fn clear_old(&mut self, topics: Vec<String>) {
         let status = self.topics.status();
         let sound = |topic: &String| !topic.is_empty() && !topic.contains(['+', '#', '\0']) && *topic != status;

@@ -1,4 +1,4 @@
-//! Discovery for Home Assistant, and what is subscribed to.
+//! Discovery for Home Assistant, and the subscriptions of the client.
 
 use rumqttc::RetainForwardRule;
 

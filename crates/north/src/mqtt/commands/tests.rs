@@ -34,12 +34,12 @@ impl SetTopics {
         }
     }
 
-    /// Starts the client anew, as a reload does.
+    /// Replaces the client, as a reload does.
     fn reload_client(&mut self) {
         self.commands = commands(&self.memory, &self.stop_all);
     }
 
-    /// Starts the client anew, as a reload does; the new client continues with what the old one has left.
+    /// Replaces the client, as a reload does; the new client continues with the state that the old client left.
     fn succeed_client(&mut self) {
         let after = |left| {
             let topics = Topics::new("drivegate", "hall");
@@ -55,7 +55,7 @@ impl SetTopics {
         self.commands = after(before.leave(Vec::new()));
     }
 
-    /// Starts the bus anew, as a reload does.
+    /// Replaces the bus, as a reload does.
     fn reload_bus(&mut self) {
         let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
         self.plant.buses[0].take_over(&stopped, self.now);

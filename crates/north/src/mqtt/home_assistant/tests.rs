@@ -27,7 +27,7 @@ fn announced(names: &[&str]) -> (Announcer, Vec<Update>) {
     (announcer, updates)
 }
 
-/// Messages published while the broker takes everything at once.
+/// Returns the messages that are published while the broker accepts everything at once.
 fn all(announcer: &mut Announcer, now: Instant) -> Vec<Update> {
     let next = || Some(announcer.next(now, |_| false)).filter(|updates| !updates.is_empty());
     std::iter::from_fn(next).flatten().collect()

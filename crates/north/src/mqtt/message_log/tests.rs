@@ -219,7 +219,7 @@ fn a_disk_that_takes_nothing_leaves_the_order_alone() {
     let inner = dir.path().join("buffer");
     let mut journal = open(&inner, 256 << 10);
     append(&mut journal, 0..100);
-    // A new segment cannot be created, and the last one has no room.
+    // A new segment cannot be created, and the last segment is full.
     let moved = dir.path().join("moved");
     fs::rename(&inner, &moved).unwrap();
     for n in 100..400 {
@@ -422,7 +422,7 @@ fn what_a_full_disk_left_of_a_file_does_not_keep_the_others_from_being_read() {
     let last = files(dir.path(), SUFFIX).len() + 1;
     let torn = dir.path().join(format!("mqtt-events-{last:012}{SUFFIX}"));
     fs::write(&torn, [7; 100]).unwrap();
-    // The disk has no room for a copy.
+    // The disk has no space for a copy.
     let copy = dir.path().join(format!("mqtt-events-{last:012}-0{DAMAGED}"));
     std::os::unix::fs::symlink("/dev/full", &copy).unwrap();
     let mut journal = open(dir.path(), 64 << 10);

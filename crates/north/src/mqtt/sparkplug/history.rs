@@ -8,7 +8,7 @@ use super::metric::Sample;
 /// Collects changes while the host is away.
 #[derive(Debug, Default)]
 pub(super) struct Recorder {
-    /// Place and value of each metric, the oldest first.
+    /// Index and value of each metric, the oldest first.
     entries: VecDeque<(usize, Sample)>,
     at: Option<Instant>,
 }

@@ -109,7 +109,7 @@ impl DriveMetrics {
     fn sample(&self, source: Source, reading: &Reading<'_>, moment: Moment) -> Sample {
         let of = |index| {
             let sample = reading.sample(index);
-            // A sample that is no longer good has the present time.
+            // For a sample that is no longer good, the present time is used.
             let at = sample.at.filter(|_| sample.quality == Quality::Good);
             (sample.good(), sample.quality, at)
         };

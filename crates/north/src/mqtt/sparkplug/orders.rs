@@ -154,7 +154,8 @@ impl Orders {
         None
     }
 
-    /// A bridge that loops cannot start a motor a second time: the same payload, with its time, is not executed again.
+    /// A bridge that forwards messages in a loop cannot start a motor a second time: a payload with an unchanged
+    /// time is not executed again.
     fn remember(&self, incoming: &Incoming, now: Instant) -> Result<(), &'static str> {
         let taken = Taken {
             topic: &incoming.topic,
@@ -204,7 +205,7 @@ impl Orders {
 
 /// The request contained in a message.
 struct Request {
-    /// The metrics in the order of the message, with their places in the session.
+    /// The metrics in the order of the message, with their indices in the session.
     metrics: Vec<(Metric, Option<usize>)>,
     timestamp: Option<u64>,
 }

@@ -101,7 +101,7 @@ impl Topics {
         (!self.primary_host.is_empty()).then(|| format!("STATE/{}", self.primary_host))
     }
 
-    /// `None` for topics that were not subscribed to.
+    /// Parses a topic; `None` for topics to which the client did not subscribe.
     pub(super) fn parse<'t>(&self, topic: &'t str) -> Option<Received<'t>> {
         if self.state().is_some_and(|state| state == topic) {
             return Some(Received::State(StateForm::Object));

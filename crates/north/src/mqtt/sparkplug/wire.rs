@@ -135,7 +135,7 @@ pub(super) fn is_unsigned(datatype: u32) -> bool {
 mod tests {
     use super::*;
 
-    /// The bytes are written by hand from the field numbers of the specification.
+    /// The test writes the bytes itself, from the field numbers of the specification.
     #[test]
     fn fields_have_the_published_numbers() {
         let mut properties = PropertySet::default();

@@ -145,7 +145,7 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
 
 /// Waits until the disk has finished all its jobs.
 async fn settle(store: &mut Store) {
-    // The second answer comes after the work of the first.
+    // The second answer arrives after the first job is done.
     for _ in 0..2 {
         store.disk.as_ref().unwrap().jobs.send(Job::Load(0)).unwrap();
         let report = store.next().await;

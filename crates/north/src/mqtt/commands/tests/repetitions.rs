@@ -1,4 +1,4 @@
-//! Commands that come again, with the same id.
+//! Commands that arrive again, with an unchanged id.
 
 use super::*;
 
@@ -19,7 +19,8 @@ fn a_repetition_gets_the_previous_result() {
     let result = bench.acknowledge();
     assert_eq!(json(&bench.take(repeated.clone()).unwrap()), result);
     assert!(bench.commands.is_idle() && bench.queued() == 0);
-    // Published again by a client that did not see the acknowledgement: the same id, not marked by the broker.
+    // A client that did not receive the acknowledgement publishes the command again: with an unchanged id, and
+    // without the broker's mark.
     let again = Incoming {
         packet: 2,
         ..first.clone()
@@ -36,7 +37,7 @@ fn a_repetition_gets_the_previous_result() {
         ("other", Some(&[1][..]))
     );
     assert_eq!(json(&to_other), result);
-    // Another payload with the same id is a new command; the first one is still not executed again.
+    // Another payload with the same id is a new command. The first command is still not executed a second time.
     let other = set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#);
     assert_eq!(bench.take(other.clone()), None);
     bench.acknowledge();

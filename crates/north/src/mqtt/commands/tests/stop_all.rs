@@ -12,7 +12,7 @@ fn stop(payload: &str) -> Incoming {
 }
 
 impl SetTopics {
-    /// The drive acknowledges the stop that waits, and a read shows the motor standing.
+    /// The drive acknowledges the waiting stop, and a read shows the motor at standstill.
     fn stand(&mut self) {
         let (order, _) = self.take_order().expect("a stop");
         assert!(matches!(order, Order::Points(points) if points[0].1 == Value::Bool(false)));

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Numbers by chance, the same for each seed.
+/// Pseudo-random numbers, reproducible from the seed.
 struct Dice(u64);
 
 impl Dice {
