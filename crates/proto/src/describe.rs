@@ -144,7 +144,7 @@ fn answer(reply: &Reply) -> String {
     }
 }
 
-/// The objects behind code, conformity, more-follows, next object and count.
+/// The objects, which follow code, conformity, more-follows, next object and count.
 fn identification(bytes: &[u8]) -> String {
     let mut text = "device identification".to_string();
     let mut rest = bytes.get(5..).unwrap_or_default();

@@ -48,7 +48,7 @@ pub struct Piece {
     pub ended: Instant,
 }
 
-/// Result of looking for a frame at one place in the bytes.
+/// Result of a search for a frame at one position in the bytes.
 enum FrameSearch {
     Is(usize, Cut),
     /// The bytes may become a frame when more arrive. `true` means that the received part already makes a reply likely.

@@ -53,8 +53,8 @@ pub enum Decoded {
         /// The reply that was decoded.
         reply: Reply,
     },
-    /// A sound frame of someone else (other address, function or length): drop `used` bytes and
-    /// read on, the deadline stays.
+    /// A valid frame of another device or to another request (other address, function or length): drop `used` bytes
+    /// and continue to read; the deadline is unchanged.
     Foreign {
         /// Bytes of the buffer to drop.
         used: usize,

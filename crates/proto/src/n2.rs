@@ -28,7 +28,7 @@ use super::modbus::{Reply, RequestPdu, Table};
 use super::{Decoded, Exception, Request};
 use command::hex_value;
 
-/// Least pause between two requests to the same drive (reference/n2.md 4).
+/// Minimum pause between two requests to one drive (reference/n2.md 4).
 pub const GAP: Duration = Duration::from_millis(5);
 
 /// Longest message, lead and CR included (reference/n2.md 4).
@@ -62,7 +62,7 @@ pub enum Session {
     },
 }
 
-/// The N2 command for a request; `None` if the request means no object.
+/// The N2 command for a request; `None` if no object corresponds to the request.
 pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
     match pdu {
         RequestPdu::Read { table, start, count } => {
@@ -180,7 +180,7 @@ impl Form {
     }
 }
 
-/// The form of the regular reply to a request; `None` for a request that means no object.
+/// The form of the regular reply to a request; `None` if no object corresponds to the request.
 pub fn form(pdu: &RequestPdu) -> Option<Form> {
     if matches!(pdu, RequestPdu::Other(_)) {
         return Some(Form::Any);
@@ -268,7 +268,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
     }
 }
 
-/// The state in a status byte. A value that the drive calls unreliable is none.
+/// The state in a status byte. A value that the drive marks as unreliable is treated as absent.
 fn state(status: u8, options: &N2Options) -> Reply {
     let bit = |number: u8| status.checked_shr(u32::from(number)).unwrap_or(0) & 1 == 1;
     if options.unreliable_bit.is_some_and(bit) {

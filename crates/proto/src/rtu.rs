@@ -107,7 +107,7 @@ fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
     Some(pdu + OVERHEAD)
 }
 
-/// 43/14 replies list objects of id, length and text behind a header of seven bytes.
+/// Length of a 43/14 reply. The reply has a header of seven bytes and then objects, each with id, length and text.
 fn device_identification_len(bytes: &[u8]) -> Option<usize> {
     let objects = usize::from(*bytes.get(7)?);
     let mut at = 8;

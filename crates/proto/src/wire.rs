@@ -34,7 +34,7 @@ pub struct LineFormat {
 pub struct BadFormat(pub String);
 
 impl LineFormat {
-    /// Stands for a network without a serial line: characters take no time that counts.
+    /// Represents a network without a serial line: the time of a character is negligible.
     pub const NETWORK: LineFormat = LineFormat {
         baud: 100_000_000,
         data_bits: 8,

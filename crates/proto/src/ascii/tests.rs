@@ -407,7 +407,7 @@ proptest! {
             frame.remove(at);
         }
         let decoded = decode_reply(&request, &frame);
-        // A doubled colon starts the same frame again.
+        // A doubled colon begins the frame a second time.
         let sound = matches!(decoded, Decoded::Reply { .. });
         prop_assert_eq!(sound, doubled && at == 0, "{:?}", decoded);
     }

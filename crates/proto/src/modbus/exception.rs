@@ -37,7 +37,8 @@ impl Exception {
         (self.0 & 0x80 != 0).then_some(self.0 & 0x7F)
     }
 
-    /// Whether the same request would be refused again: function, address or value, not the state of the drive.
+    /// Whether the repeated request would be refused again, because function, address or value are the reason and
+    /// not the state of the drive.
     pub fn is_about_request(self) -> bool {
         matches!(self.0, 0x01..=0x03 | 0x21 | 0x81 | 0x85 | 0x90..=0x92)
     }

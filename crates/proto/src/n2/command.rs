@@ -160,7 +160,7 @@ impl Command {
         Some((address, Command::of(body)))
     }
 
-    /// The command in the digits behind the address.
+    /// The command in the digits after the address.
     fn of(body: &[u8]) -> Result<Command, u8> {
         let exactly = |command: Command, length: usize| {
             if body.len() == length { Ok(command) } else { Err(SIZE) }
@@ -294,7 +294,7 @@ fn open(text: &[u8]) -> Result<&[u8], &'static str> {
     }
 }
 
-/// Sum of the characters behind the lead, modulo 256 (reference/n2.md 1).
+/// Sum of the characters after the leading character, modulo 256 (reference/n2.md 1).
 pub fn checksum(text: &[u8]) -> u8 {
     text.iter().fold(0, |sum: u8, byte| sum.wrapping_add(*byte))
 }
