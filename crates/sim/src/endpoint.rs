@@ -151,7 +151,7 @@ impl Endpoint {
         }
     }
 
-    /// Hands bytes to the master; returns how many bytes the master accepted.
+    /// Sends bytes to the master; returns how many bytes the master accepted.
     ///
     /// # Errors
     /// If the port no longer exists.
@@ -171,7 +171,7 @@ impl Endpoint {
         }
     }
 
-    /// Dials in where the line does that and has no connection.
+    /// Dials in, if the line does so and has no connection.
     pub(super) fn connect(&mut self) {
         if let Endpoint::Network(network) = self {
             network.connect();

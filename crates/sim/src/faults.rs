@@ -37,7 +37,7 @@ pub enum Fault {
     Corrupt,
     /// The reply arrives twice.
     Double,
-    /// The reply comes later by that much.
+    /// The reply is later by this time.
     Late(Duration),
     /// A foreign reply arrives instead of the true one.
     Foreign(Foreign),
@@ -63,7 +63,7 @@ pub enum Fault {
     CutEcho,
     /// A zero byte arrives directly before the reply: the line floats until the drive takes it over.
     ZeroBefore,
-    /// A stray character comes after the reply, while no device sends.
+    /// A stray character arrives after the reply, while no device sends.
     IdleNoise,
     /// Another drive has the same address, and its reply begins slightly later.
     Twin,
@@ -185,7 +185,7 @@ pub struct FaultPlan {
     /// A register that one drive refuses to read: address, table, register.
     refused: Option<(u8, Table, u16)>,
     while_running: bool,
-    /// A second plan, used for requests that meet no fault in this plan.
+    /// A second plan, which is used for requests without a fault in this plan.
     other: Option<Box<FaultPlan>>,
     random: Random,
     asked: u64,
@@ -198,7 +198,7 @@ impl Default for FaultPlan {
 }
 
 impl FaultPlan {
-    /// Random faults; the seed determines which request meets which.
+    /// Random faults; the seed determines which request gets which fault.
     pub fn new(rates: Rates, seed: u64) -> FaultPlan {
         FaultPlan {
             rates,
@@ -212,8 +212,8 @@ impl FaultPlan {
         }
     }
 
-    /// Sets the fault for the request with this number. The first sound request to a drive that answers, counted from
-    /// when the plan takes effect, is number 1.
+    /// Sets the fault for the request with this number. Number 1 is the first valid request to a drive that answers
+    /// after the plan takes effect.
     #[must_use]
     pub fn on_request(mut self, number: u64, fault: Fault) -> FaultPlan {
         self.script.insert(number, fault);
@@ -399,7 +399,7 @@ mod tests {
         assert_eq!(decode(&shaped("noise-before")[1].bytes), truth);
     }
 
-    /// A foreign reply to a write or an exception is sound as well.
+    /// A foreign reply to a write or an exception is a valid frame as well.
     #[test]
     fn foreign_frames_to_any_reply_are_sound() {
         for pdu in [

@@ -55,7 +55,7 @@ pub(crate) fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::Receive
     }
 }
 
-/// The PDU in a sound Modbus frame.
+/// The PDU of a valid Modbus frame.
 pub(crate) fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
     match protocol {
         Protocol::ModbusRtu => rtu::open_frame(frame).map(|(_, pdu)| pdu.to_vec()),

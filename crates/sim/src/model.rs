@@ -24,7 +24,7 @@ pub struct Command {
     pub run: bool,
     /// Whether the direction is counterclockwise.
     pub reverse: bool,
-    /// Speed reference, 0.01 % of what the drive calls 100 %, -10000..=10000.
+    /// Speed reference in units of 0.01 % of the drive's 100 %, -10000..=10000.
     pub reference: i16,
 }
 
@@ -102,7 +102,7 @@ pub(crate) trait Model: fmt::Debug {
     /// Advances the drive by one update period, which ends at `now`.
     fn step(&mut self, now: SimTime);
 
-    /// Brings what a master reads up to date, after the last of some steps.
+    /// Updates the values that a master can read; called after the last of several steps.
     fn refresh(&mut self) {}
 
     /// Whether the drive would run on a run command.
@@ -298,8 +298,8 @@ impl Latch {
         self.fault
     }
 
-    /// Trips with a fault; returns false if a fault is active already, because the first one stays, or if `code` is
-    /// none.
+    /// Trips with a fault. Returns false if a fault is already active, because the first fault remains, or if
+    /// `code` means no fault.
     pub(super) fn trip(&mut self, code: u16) -> bool {
         let fresh = self.fault == 0 && code != 0;
         if fresh {

@@ -1,4 +1,4 @@
-//! The motor behind every simulated drive: ramps, shaft, load, heat (reference/drives.md, section 10).
+//! The motor of every simulated drive: ramps, shaft, load, heat (reference/drives.md, section 10).
 
 /// The motor's nameplate data and the drive's ramps, from the parameters of any drive model.
 #[derive(Debug, Clone, Copy)]
@@ -62,7 +62,7 @@ const DC_SAG: f64 = 6.0;
 /// How the inverter feeds the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Feed {
-    /// The inverter does not feed the motor, which coasts or stands.
+    /// The inverter does not feed the motor: the motor coasts or is at standstill.
     Off,
     /// The inverter drives the motor towards this frequency, Hz; negative is counterclockwise.
     To(f64),

@@ -152,7 +152,7 @@ fn the_parameters_of_any_drive_go_to_any_other_of_its_family_and_back() {
         assert_eq!(left, left_out, "{}", profile.name);
         check_wear(&mut rig, &plan);
 
-        // A restore that was cut half way is undone completely.
+        // A restore that was interrupted half way is completely undone.
         let mut rig = DriveOnLine::filled(&profile, seed + 1000);
         for write in &plan.writes[..half] {
             assert_eq!(rig.write(write), Reply::Written);

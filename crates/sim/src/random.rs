@@ -1,4 +1,4 @@
-//! A small reproducible random number generator: the same seed gives the same demo and the same faults.
+//! A small reproducible random number generator: each seed always gives the same demo and the same faults.
 
 use std::ops::RangeInclusive;
 

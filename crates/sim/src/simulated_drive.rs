@@ -293,7 +293,7 @@ impl SimulatedDrive {
         self.power_cycles = self.power_cycles.wrapping_add(1);
     }
 
-    /// Power cycles so far; a device with the same supply has restarted as often.
+    /// Number of power cycles so far; a device with the same supply has restarted equally often.
     pub(crate) fn power_cycles(&self) -> u32 {
         self.power_cycles
     }

@@ -18,7 +18,7 @@ const BROADCAST: u8 = 0;
 /// Meaning of a frame to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum FrameMeaning {
-    /// The check code is wrong, or the bytes are no frame at all.
+    /// The check code is wrong, or the bytes are not a frame.
     BadFrame,
     /// No drive with this address is on the line, or it is switched off.
     Nobody(u8),
@@ -101,8 +101,8 @@ impl Slaves {
         self.drives.values_mut().for_each(|drive| drive.advance(now));
     }
 
-    /// Advances one drive to `now`, the next one with each call: a drive that is not polled has little to catch up when a
-    /// request comes at last.
+    /// Advances one drive to `now`, and the next drive at the next call: a drive that is not polled is then nearly
+    /// up to date when a request arrives.
     pub(crate) fn advance_next(&mut self, now: SimTime) {
         let next = self
             .drives

@@ -53,7 +53,7 @@ impl std::iter::Sum for Statistics {
     }
 }
 
-/// How late the simulator delivered, against the true wire time.
+/// How much later the simulator delivered bytes than a real line would.
 #[derive(Debug, Clone, Default)]
 pub struct Lateness {
     recent: VecDeque<Duration>,
@@ -87,7 +87,7 @@ impl Lateness {
 pub enum Direction {
     /// From the master to the drives.
     ToDrives,
-    /// A drive, or a fault in place of a drive.
+    /// Bytes from a drive, or from a fault that replaces a drive.
     FromDrives,
 }
 

@@ -1,4 +1,4 @@
-//! The simulated line as a thread behind a port, with true wire timing.
+//! The simulated line as a thread that uses a port, with the timing of a real line.
 //!
 //! Each simulated line has one thread, which owns the port. The thread sleeps in `ppoll` until bytes arrive or the
 //! next character is due, with the timer slack of the kernel switched off, and busy-waits for the last microseconds
@@ -36,7 +36,7 @@ pub struct SimulatedBusOptions {
     pub boards: BoardOptions,
     /// Faults on the line.
     pub faults: FaultPlan,
-    /// Frames that the transcript keeps; 0 for none.
+    /// Maximum number of frames that the transcript keeps; 0 keeps none.
     pub transcript: usize,
 }
 
@@ -294,7 +294,7 @@ impl SimulatedBus {
         drop(self.shared.wait_for(|found| !matches!(found, Found::Present(_))));
     }
 
-    /// The adapter is plugged in again: a new pseudo-terminal stands under the same link.
+    /// Plugs the adapter in again: the link now leads to a new pseudo-terminal.
     ///
     /// # Errors
     /// If the port cannot be opened again.

@@ -63,7 +63,7 @@ pub(super) async fn serve(shared: &Shared, mut stream: TcpStream, peer: SocketAd
     client.run(stream, &wake, ended).await;
 }
 
-/// Receives the CONNECT; `None` if the connection ends before it.
+/// Receives the CONNECT; `None` if the connection ends before that.
 async fn receive_connect(stream: &mut TcpStream, input: &mut Vec<u8>) -> Option<Result<Connect, Fault>> {
     loop {
         match packet::packet_length(input) {
@@ -98,7 +98,7 @@ struct Client<'a> {
     id: String,
     version: Version,
     max_packet: usize,
-    /// QoS 1 messages under way at most.
+    /// Maximum number of QoS 1 messages in transit.
     window: usize,
     /// Packet identifiers of messages that are not acknowledged yet.
     inflight: BTreeSet<u16>,

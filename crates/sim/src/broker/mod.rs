@@ -28,7 +28,8 @@ use tokio_util::task::TaskTracker;
 
 use state::State;
 
-/// Connections at a time, before CONNECT too; more are closed at once.
+/// Maximum number of connections at a time, including those that have not sent CONNECT. Further connections are
+/// closed at once.
 const MAX_CONNECTIONS: usize = 128;
 /// Largest packet taken from a client, bytes.
 const MAX_PACKET_BYTES: usize = 256 * 1024;

@@ -104,7 +104,7 @@ const fn protocol(what: &'static str) -> Fault {
     fault(reason::PROTOCOL_ERROR, what)
 }
 
-/// A message on its way through the broker.
+/// A message that the broker passes on.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Message {
     pub(super) topic: String,

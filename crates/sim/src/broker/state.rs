@@ -87,7 +87,7 @@ impl State {
         self.clients.insert(number, client);
     }
 
-    /// The connection of that number is gone.
+    /// Removes the connection with this number, which has ended.
     pub(super) fn detach(&mut self, number: u64, leave: Leave, now: Instant) {
         let will = self.clients.remove(&number).and_then(|client| client.will);
         if let (Leave::Lost, Some(will)) = (leave, will) {
@@ -190,7 +190,7 @@ impl State {
 impl Client {
     fn end(&mut self, reason: u8, what: &'static str) {
         if let Some(end) = self.end.take() {
-            // A connection that is gone already needs no end.
+            // A connection that has already ended need not be ended.
             let _ = end.send(Fault { reason, what });
         }
     }

@@ -7,7 +7,7 @@ fn place_of(setting: &Setting, control: &Control) -> ControlItem {
     setting.place.unwrap_or(control.at)
 }
 
-/// The effect of a word written to one of the places of the profile's commands.
+/// The effect of a word that is written to one of the addresses of the profile's commands.
 pub(super) fn effect_of(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> WordEffect {
     let own = place == control.at;
     let here = |setting: &Setting| place_of(setting, control) == place;

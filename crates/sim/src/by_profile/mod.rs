@@ -28,7 +28,7 @@ use crate::drive::{Bound, ModelPoint, PointIndex, Profile, Source, Value};
 
 /// Time that a drive takes to reach the next state of its start sequence.
 const SETTLE: Duration = Duration::from_millis(30);
-/// Maximum frequency where the profile does not say one, Hz.
+/// Maximum frequency in Hz if the profile states none.
 const MAXIMUM: f64 = 50.0;
 /// Registers for causing a fault, each followed by one for panel control: the first pair that is not in the profile
 /// is used.
@@ -42,7 +42,7 @@ pub struct ProfileOptions {
     /// Whether the simulator's own registers exist: a fault code trips the drive, and 1 in the register after it
     /// switches to panel control.
     pub trip_register: bool,
-    /// Time before a reply; with `None` the line decides.
+    /// Time before a reply; with `None`, the line determines it.
     pub turnaround: Option<Duration>,
     /// Values of points that the motor does not change, by index.
     pub values: BTreeMap<PointIndex, Given>,

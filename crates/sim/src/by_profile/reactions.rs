@@ -57,7 +57,7 @@ pub(super) struct Family {
     pub(super) other: fn(Table, u16, u16) -> Option<WordEffect>,
     /// Whether words act once, when they are written, and do not stay as a command.
     pub(super) acts_once: bool,
-    /// A reset while a run command stands starts the motor.
+    /// A reset while a run command is in effect starts the motor.
     pub(super) restarts_on_reset: bool,
     /// The status words of the family with all their bits.
     pub(super) status: fn(&Shows) -> Words,
@@ -248,7 +248,7 @@ fn mitsubishi(_: &Known<'_>, word: u16) -> WordEffect {
     effect(pair(word >> 1 & 3), false, word)
 }
 
-/// Register 1 restarts the drive: the motor coasts, and the fault is gone.
+/// A write to register 1 restarts the drive: the motor coasts, and the fault is cleared.
 fn mitsubishi_restart(table: Table, address: u16, word: u16) -> Option<WordEffect> {
     ((table, address) == (Table::Holding, 1)).then(|| effect(MotorEffect::Coasts, true, word))
 }
@@ -275,7 +275,7 @@ fn weg(known: &Known<'_>, word: u16) -> WordEffect {
     effect(does, rises(known, word, 0x0080), word)
 }
 
-/// Rising bit 15 resets, and the run command that stands starts the motor then.
+/// The rising edge of bit 15 resets the drive; a run command that is in effect then starts the motor.
 fn fuji(known: &Known<'_>, word: u16) -> WordEffect {
     effect(pair(word & 3), rises(known, word, 0x8000), word)
 }

@@ -6,10 +6,10 @@ use crate::drive::profile::Part;
 /// The state that a status word shows.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Shows {
-    /// How far the start sequence has come.
+    /// The number of steps of the start sequence that are completed.
     pub(super) position: usize,
     pub(super) running: bool,
-    /// A run command holds; else a running motor comes down.
+    /// Whether a run command is in effect. If not, a running motor decelerates.
     pub(super) commanded: bool,
     /// The direction that was last ordered.
     pub(super) ordered_reverse: bool,

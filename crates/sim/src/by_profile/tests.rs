@@ -250,7 +250,7 @@ fn a_drive_at_its_panel_does_not_obey_the_bus() {
     }
 }
 
-/// A Delta drive shows for how long the motor comes down.
+/// A Delta drive that shows how long the motor has been decelerating.
 #[test]
 fn a_motor_that_comes_down() {
     let delta = cases()

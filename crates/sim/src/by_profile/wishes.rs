@@ -1,4 +1,4 @@
-//! Bits of registers that are to show some states at once. Pure.
+//! Bits of registers that must show several states at the same time. Pure.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use crate::drive::profile::Part;
 /// A register, or an item of a bit table.
 pub(super) type Key = (Table, u16);
 
-/// Bits in registers, all of which make one state.
+/// Bits in registers that together represent one state.
 pub(super) type Bits = Vec<(Key, Part)>;
 
 /// A state that any of these bits represent must be on, or off.

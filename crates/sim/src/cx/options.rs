@@ -49,7 +49,7 @@ impl AddressOffset {
     }
 }
 
-/// `holding=1,discrete-input=1`; tables that are not named have none.
+/// Text such as `holding=1,discrete-input=1`; a table that is not named has no offset.
 impl FromStr for AddressOffset {
     type Err = String;
 

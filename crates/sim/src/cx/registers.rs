@@ -9,11 +9,11 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 /// Function codes that the board supports.
 pub(super) const FUNCTIONS: [u8; 7] = [1, 2, 3, 4, 5, 6, 8];
 
-/// Item of the active fault among the input registers; the monitoring variables n1 to n99 lie below.
+/// Item of the active fault among the input registers; the monitoring variables n1 to n99 have lower numbers.
 const FAULT: u16 = 100;
 /// Item of the frequency reference among the holding registers.
 const REFERENCE: u16 = 0;
-/// Items of the references; parameters lie above.
+/// Items of the references; parameters have higher numbers.
 const REFERENCES: std::ops::Range<u16> = 0..100;
 /// Version number of the control program, n18.
 const PROGRAM: u16 = 115;
@@ -66,7 +66,7 @@ impl CxDrive {
             .collect()
     }
 
-    /// The item of the manual's tables behind an address, see [`AddressOffset`](super::AddressOffset).
+    /// The item of the manual's tables that this address means, see [`AddressOffset`](super::AddressOffset).
     fn item(&self, table: Table, address: u16) -> Result<u16, Exception> {
         let offset = self.options.offset.of(table);
         address.checked_sub(offset).ok_or(Exception::ADDRESS)

@@ -237,7 +237,7 @@ fn an_address_offset_per_table() {
         },
         ..CxOptions::default()
     });
-    // The frames of the start-up test: the reference goes to 1, and the run state is read at 3.
+    // The frames of the start-up test: the reference is written to 1, and the run state is read from 3.
     rig.coil(0, true).unwrap();
     rig.write(1, &[1000]).unwrap();
     rig.wait(8000);

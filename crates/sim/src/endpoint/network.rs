@@ -1,4 +1,4 @@
-//! The simulated line behind a network: Modbus TCP, datagrams, and a modem that dials in.
+//! The simulated line on a network: Modbus TCP, datagrams, and a modem that dials in.
 
 use std::io::{self, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};

@@ -86,7 +86,7 @@ impl FaultPlan {
 /// How a burst of bytes relates to the reply that the master expects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// The burst comes where the reply is expected.
+    /// The burst occurs at the time at which the reply is expected.
     Regular,
     /// The regular reply, delivered character by character.
     Split,

@@ -23,7 +23,7 @@ pub struct Entry {
     /// Region of the object.
     pub region: Region,
     pub number: u8,
-    /// The register or bit of the drive behind the object.
+    /// The register or bit of the drive that the object represents.
     pub place: Backing,
     /// Limits of the drive's parameter; if absent, the limits of the register hold.
     pub limits: Option<(f64, f64)>,
@@ -151,7 +151,7 @@ macro_rules! nx_entries {
     };
 }
 
-/// Vacon NX (tables 19 to 23). The model keeps no counters: AI 5 and 11 to 14 stand still.
+/// Vacon NX (tables 19 to 23). The model has no counters: AI 5 and AI 11 to 14 do not change.
 pub(crate) const NX: Map = Map {
     entries: nx_entries![
         entry(Bi, 7, Bit(HOLDING, 2100, 6)),

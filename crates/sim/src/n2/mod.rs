@@ -25,7 +25,7 @@ pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BoardOptions {
-    /// A byte, the object's status, stands before the value of a read.
+    /// Whether a byte with the status of the object precedes the value in the reply to a read.
     pub leading_byte: bool,
     /// Whether refusals have a checksum.
     pub nak_checksum: bool,
@@ -49,7 +49,7 @@ impl Default for BoardOptions {
     }
 }
 
-/// The drive behind a board, which may give no reply.
+/// The drive to which the board belongs; it may give no reply.
 pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 
 /// The N2 board of one drive.

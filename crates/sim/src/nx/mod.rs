@@ -194,7 +194,7 @@ impl NxDrive {
         self.busy_until = until;
     }
 
-    /// Hands control to the fieldbus, the panel or the terminals, as parameter ID 125 does.
+    /// Gives control to the fieldbus, the panel or the terminals, as parameter ID 125 does.
     pub fn set_control_place(&mut self, place: ControlPlace) {
         let _ = self.parameters.set(parameters::CONTROL_PLACE, place.parameter());
         self.settings = self.parameters.settings();

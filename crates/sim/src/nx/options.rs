@@ -14,7 +14,7 @@ pub enum Values {
     Tagged(u8),
 }
 
-/// The range that 100 % of the speed reference stands for (reference/drives.md 9.2).
+/// The range that 100 % of the speed reference represents (reference/drives.md 9.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Base {
     /// The band from the minimum frequency (0 %) to the maximum frequency (100 %).
@@ -37,7 +37,7 @@ pub enum Unit {
 pub struct SpeedReference {
     /// Whether a negative reference is allowed, which reverses the direction.
     pub signed: bool,
-    /// The range that 100 % stands for.
+    /// The range that 100 % represents.
     pub base: Base,
     /// Unit of one count of ID 2003; ID 2103 is always 0.01 %.
     pub unit: Unit,

@@ -1,7 +1,7 @@
 //! Parameters of the simulated Vacon NX, IDs 101 to 1999.
 //!
-//! The IDs are those of reference/drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
-//! of the All in One applications.
+//! The IDs are those of reference/drives.md 3.11 and 11.1. Ranges and defaults that no available manual states are
+//! plausible values of the All in One applications.
 
 use std::collections::BTreeMap;
 
@@ -113,7 +113,7 @@ impl Parameters {
         writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
     }
 
-    /// Random values for all, but that the control place stays.
+    /// Sets all parameters except the control place to random values.
     pub(super) fn fill(&mut self, random: &mut Random) {
         self.0.fill(random, &[CONTROL_PLACE]);
     }

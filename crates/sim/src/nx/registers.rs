@@ -15,7 +15,7 @@ pub struct Limits {
     pub write: u16,
     /// Most process data items per message.
     pub process: u16,
-    /// The answer to a count beyond the limit; the manuals do not say which.
+    /// The answer to a count beyond the limit; the manuals do not state it.
     pub beyond: Beyond,
 }
 

@@ -139,7 +139,7 @@ impl TecoDrive {
         !self.operation_digit(1)
     }
 
-    /// Whether bus or terminals say that the motor is to run.
+    /// Whether the bus or the terminals order the motor to run.
     fn is_told_to_run(&self) -> bool {
         match self.run_from_bus() {
             true => self.control.operation & operation::RUN != 0,
@@ -184,8 +184,8 @@ impl TecoDrive {
             .min(bound(parameters::CN_14))
     }
 
-    /// Effects that a change of a command or a terminal has at once: an external fault, and a run command that is
-    /// switched off.
+    /// Applies the effects that a change of a command or a terminal has at once: an external fault, and a run
+    /// command that is switched off.
     fn take_over(&mut self) {
         if self.control.operation & operation::EXTERNAL_FAULT != 0 || self.terminals & terminal::EXTERNAL_FAULT != 0 {
             self.trip(fault::EXTERNAL);

@@ -52,8 +52,8 @@ pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
     }
 }
 
-/// The reply to a PDU that is not a valid request, for which a plain slave returns `exception`. Incomplete messages get
-/// none, nor do those whose byte count does not match the bytes (reference/drives.md 5.6, 9.8).
+/// The reply to a PDU that is not a valid request; a plain slave replies with `exception`. Incomplete messages get
+/// no reply, nor do messages whose byte count does not match the bytes (reference/drives.md 5.6, 9.8).
 pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     let (&function, body) = pdu.split_first()?;
     if !FUNCTIONS.contains(&function) {

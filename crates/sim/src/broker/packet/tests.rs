@@ -47,7 +47,7 @@ fn a_connect_is_read_with_its_will() {
     }
 }
 
-/// Subscribers receive what was published, read here with the MQTT library of the gateway.
+/// Subscribers receive the message as it was published; the test reads it with the MQTT library of the gateway.
 #[test]
 fn a_message_keeps_its_properties_and_its_life_counts_down() {
     let now = Instant::now();

@@ -5,7 +5,8 @@ use std::time::Instant;
 use super::super::MAX_PACKET_BYTES;
 use super::{Message, Qos, Version, property, reason};
 
-/// CONNACK with that reason code; an acceptance lists what the broker does not serve (section 3.2.2.3).
+/// A CONNACK with this reason code. If the connection is accepted, the CONNACK lists the features that the broker
+/// does not support (section 3.2.2.3).
 pub(in super::super) fn connack(version: Version, reason: u8, assigned: Option<&str>) -> Vec<u8> {
     if version == Version::V311 {
         // Return codes of table 3.1 in MQTT 3.1.1; a reason without a code there becomes "server unavailable".
