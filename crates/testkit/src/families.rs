@@ -47,7 +47,7 @@ pub fn orders(text: &str) -> Vec<Order> {
     each.flatten().collect()
 }
 
-/// A number of a table: decimal, or hexadecimal behind `0x`.
+/// A number of a table: decimal, or hexadecimal after `0x`.
 pub fn number(text: &str) -> u16 {
     let text = text.trim();
     let number = match text.strip_prefix("0x") {
