@@ -68,7 +68,7 @@ fn persistent_names(dev: &Path) -> Vec<(PathBuf, PathBuf)> {
         .collect()
 }
 
-/// Whether a driver found hardware behind the port: of the many ports of a PC's UART most have none.
+/// Whether a driver found hardware for the port: most of the many UART ports of a PC have no hardware.
 fn has_hardware(port: &Path) -> bool {
     let kind = fs::read_to_string(port.join("type")).unwrap_or_default();
     port.join("device").exists() && kind.trim() != "0"

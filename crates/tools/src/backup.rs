@@ -14,7 +14,7 @@ use super::{ConfigFile, report};
 use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
 use crate::history::store;
 
-/// Endings of files in the state directory that a backup does not need: locks, and what is being written.
+/// Endings of files in the state directory that a backup does not need: locks, and partially written files.
 const TRANSIENT: [&str; 2] = ["lock", "partial"];
 
 /// Writes configuration, profiles and state into one file, from which `restore` sets the gateway up again.

@@ -27,8 +27,8 @@ use crate::north::http::messages::{ErrorReply, Expected};
 
 /// Time limit for connecting.
 const CONNECT: Duration = Duration::from_secs(10);
-/// How often a request that only reads is sent in all where the connection is cut off: a gateway that just ends does that, and
-/// has gone a moment later.
+/// Maximum number of attempts for a request that only reads, if the connection is interrupted. A gateway that is
+/// shutting down interrupts connections, and has ended a moment later.
 const TRIES: u32 = 5;
 /// Pause between two attempts to reach the gateway.
 const PAUSE: Duration = Duration::from_millis(200);
@@ -53,7 +53,7 @@ pub(crate) enum ClientError {
     /// The gateway refused, with a reason.
     #[error("{0}")]
     Refused(String),
-    /// The reply did not come, or not whole.
+    /// The reply did not arrive, or arrived incomplete.
     #[error("{0}")]
     Lost(String),
     /// The reply is not that of a gateway.
@@ -119,7 +119,7 @@ pub(crate) struct Client {
 }
 
 impl Client {
-    /// A client of any gateway behind this door.
+    /// A client of the gateway that listens at this address, whichever gateway this is.
     pub(crate) fn through(door: Door) -> Client {
         Client {
             doors: vec![door],
@@ -128,7 +128,7 @@ impl Client {
         }
     }
 
-    /// The places where the client looks for the gateway.
+    /// The addresses at which the client looks for the gateway.
     pub(crate) fn doors(&self) -> &[Door] {
         &self.doors
     }

@@ -59,7 +59,7 @@ impl<C: Filed> CredentialsFile<C> {
         parsed(&self.path, &self.read()?)
     }
 
-    /// Adds a credential; one of the same name is replaced if `may_replace`. Returns whether there was one.
+    /// Adds a credential. An existing one with this name is replaced if `may_replace`. Returns whether one existed.
     ///
     /// # Errors
     /// If the name exists and may not be replaced, or the file cannot be read or written.
@@ -110,7 +110,7 @@ impl<C: Filed> CredentialsFile<C> {
         self.write(&file, &change(&text)?)
     }
 
-    /// The directory of the file, locked: the file itself is replaced at each change.
+    /// Locks the directory of the file, because the file itself is replaced at each change.
     fn lock(&self, file: &Path) -> Result<File, String> {
         let (what, shown) = (C::FILE, self.path.display());
         let failed = |error: io::Error| format!("cannot lock the {what} file: {error}; {shown}; check the directory");

@@ -86,7 +86,7 @@ use crate::drive::profile::Profiles;
 
 /// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
-/// Exit code of a wrong command line, the same as clap's.
+/// Exit code for a wrong command line; clap uses this code as well.
 pub const EXIT_USAGE: u8 = 2;
 /// Exit code for input data that is not valid (sysexits EX_DATAERR).
 pub const EXIT_DATA: u8 = 65;

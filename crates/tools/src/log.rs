@@ -147,9 +147,10 @@ fn subscribe(level: &str, form: Form, writer: BoxMakeWriter) -> reload::Handle<E
     handle
 }
 
-/// The filter of a valid `level`. Audit lines pass at any level but `off`, of everything or of the audit itself.
+/// The filter for a valid `level`. Audit lines pass at any level except `off`, be it set for everything or for the
+/// audit itself.
 fn filter(level: &str) -> EnvFilter {
-    // The last one of a target wins, as in the filter itself.
+    // The last level for a target is used, as in the filter itself.
     let last = |wanted: Option<&str>| {
         let mut parts = level.split(',').map(|part| match part.split_once('=') {
             Some((target, level)) => (Some(target), level),

@@ -461,7 +461,7 @@ pub(super) fn place(profile: &Profile, point: &Point) -> (String, String, String
     }
 }
 
-/// The end of a band that only the configuration of a drive says.
+/// Text for the end of a band that only the configuration of a drive states.
 const CONFIGURED: &str = "frequency_range of the drive";
 
 /// How a derived point is computed, as text.

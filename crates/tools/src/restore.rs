@@ -121,7 +121,7 @@ fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
-/// Checks the unpacked configuration, with the certificates and keys that are in place and not in the backup.
+/// Checks the unpacked configuration together with the existing certificates and keys, which the backup does not contain.
 fn check(staging: &Staging, name: &std::ffi::OsStr, manifest: &Manifest, base: &Path) -> Result<Loaded, String> {
     let old_base = manifest.config.parent().unwrap_or(Path::new(""));
     for left_out in &manifest.left_out {

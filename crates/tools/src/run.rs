@@ -1,4 +1,4 @@
-//! `drivegate run`: the daemon under systemd, in a container or by hand.
+//! `drivegate run`: the daemon, started by systemd, in a container or by a user.
 
 mod reloads;
 mod serving;
@@ -71,7 +71,7 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
     Ok(code)
 }
 
-/// Loads the configuration; `None` if the gateway is to stop before that is done.
+/// Loads the configuration; `None` if the gateway must stop before the configuration is loaded.
 async fn load(path: &Path, signals: &mut Signals) -> io::Result<Option<Loaded>> {
     let mut loading = Loading::begin(path, None)?;
     loop {

@@ -34,7 +34,7 @@ fn form(target: &Target) -> Result<String, String> {
     Ok(text(profile, &rows, &time))
 }
 
-/// The form. What a person fills in is left empty.
+/// The form as text. The fields for the user are left empty.
 fn text(profile: &Profile, rows: &[PointValue], time: &str) -> String {
     let mut text = format!(
         "# Profile {}\n\n{}; drivegate {}; read at {time}\n\n",

@@ -50,7 +50,7 @@ pub(super) enum NotConnected {
     Nobody,
     /// A gateway may exist there; the text says why it was not reached.
     Because(String),
-    /// The error is final: no other way is tried.
+    /// The error is final: no further address is tried.
     Final(ClientError),
 }
 

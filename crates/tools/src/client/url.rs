@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use hyper::Uri;
 
-/// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.
+/// Address of a gateway's HTTP server: `http://host:port`, with a path if a proxy adds one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Url {
     pub(super) tls: bool,

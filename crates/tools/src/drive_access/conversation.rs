@@ -1,4 +1,4 @@
-//! Several requests about one drive, all by the same way.
+//! Several requests about one drive, all through one connection.
 
 use super::direct::{Direct, Needs};
 use super::{Target, Way};
@@ -72,7 +72,7 @@ impl Conversation {
     }
 }
 
-/// The command reports what happens itself; of the log only the audit is left.
+/// The command itself reports what happens; only the audit lines of the log are kept.
 fn log_audit_only() {
     crate::log::start_in_order(&LogSettings {
         level: "off,audit=info".to_string(),

@@ -47,7 +47,7 @@ pub(super) struct Direct {
 }
 
 impl Direct {
-    /// Opens the port and waits until the drive answers, and has answered what the request needs.
+    /// Opens the port and waits until the drive has answered and the values that the request needs have been read.
     ///
     /// # Errors
     /// If the bus cannot be started: contains the message with place and remedy.

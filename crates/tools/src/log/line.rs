@@ -129,7 +129,7 @@ fn priority(level: Level) -> u8 {
     }
 }
 
-/// A place in the source of a library: target and line.
+/// A line in the source of a library: target and line number.
 type Kind = (String, Option<u32>);
 
 /// Messages of libraries seen recently: how often libraries log is outside the gateway's control.

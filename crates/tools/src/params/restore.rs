@@ -177,7 +177,7 @@ fn plan_text(prepared: &Restore) -> String {
     plan + &risks.collect::<String>()
 }
 
-/// Whether what is prepared is to be written.
+/// Asks whether the prepared restore is to be written.
 ///
 /// # Errors
 /// If the restore is not confirmed; without a message if only the plan was requested.
@@ -195,7 +195,7 @@ fn agrees(drive: &str, how: &How) -> Result<(), Failure> {
                 .into(),
         );
     }
-    // A terminal that is gone gives no answer.
+    // A terminal that has been closed gives no answer.
     let _ = write!(stderr, "Write that to {drive}? [y/N] ");
     let mut answer = String::new();
     let _ = stdin.lock().read_line(&mut answer);

@@ -53,7 +53,7 @@ impl Reloads<'_> {
         self.loads.loaded().await
     }
 
-    /// The one that was in progress has ended.
+    /// Handles the end of the reload that was in progress.
     pub(super) fn ended(&mut self, outcome: ReloadOutcome, watch: &mut Watch<'_>) {
         watch.reloaded(&outcome);
         let [current, next] = &mut self.waiting;

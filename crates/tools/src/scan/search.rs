@@ -28,7 +28,7 @@ use crate::port_users;
 pub(crate) struct StrayBytes {
     /// Settings and addresses that were answered with invalid frames.
     pub(crate) garbage: Vec<(Setting, u8)>,
-    /// Bytes that came in transactions, echoes of requests aside.
+    /// Number of bytes that arrived during transactions, without echoes of requests.
     pub(crate) bytes: usize,
     /// Bytes received while no request was open.
     pub(crate) unasked: usize,
@@ -149,7 +149,7 @@ impl<'a> Search<'a> {
         Ok(())
     }
 
-    /// Time that the addresses take if none answers.
+    /// Time that the search of the addresses takes if no drive answers.
     fn patience(&self, part: &Part) -> Duration {
         let Setting { protocol, format } = part.setting;
         let silence = protocol.silence(Silence::Spec, &format);

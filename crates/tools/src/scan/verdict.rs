@@ -12,7 +12,7 @@ use crate::drive::profile::{Profile, Profiles};
 /// Number of bytes that may result from switching the port on, or from single disturbances.
 const FEW_BYTES: usize = 8;
 
-/// Error and remedy if bytes came before anything was sent.
+/// Error and remedy if bytes arrived before the tool sent anything.
 pub(crate) fn somebody_speaks(heard: &StrayBytes, port: &str, listened: Duration) -> Option<String> {
     (heard.unasked >= FEW_BYTES).then(|| {
         format!(

@@ -92,7 +92,7 @@ impl<W: Write> Capture<W> {
         self.out.write_all(&packet)
     }
 
-    /// Writes what was added to the file.
+    /// Writes the added data to the file.
     ///
     /// # Errors
     /// If the buffered packets cannot be written to the file.

@@ -160,7 +160,7 @@ pub(super) fn write_new(file: &Path, text: &str) -> Result<(), String> {
     check_new(file)?;
     let opened = std::fs::File::options().write(true).create_new(true).open(file);
     let written = opened.and_then(|mut opened| {
-        // Half a file would be in the way of the next try.
+        // An incomplete file would prevent the next attempt.
         let remove = |_: &std::io::Error| drop(std::fs::remove_file(file));
         opened.write_all(text.as_bytes()).inspect_err(remove)
     });
