@@ -30,7 +30,7 @@ pub(crate) fn tokio_modbus(port: &str, baud: u32, pause: Duration, time: Duratio
                 }
                 client.set_slave(Slave(address));
                 let patience = TIMEOUT + Duration::from_secs_f64(270.0 / f64::from(baud));
-                // A read that fails shows in the transcript of the line, which is what is measured.
+                // A failed read appears in the transcript of the line. The transcript is what this benchmark measures.
                 let _ = tokio::time::timeout(patience, client.read_holding_registers(2100, 11)).await;
                 // The timer of the runtime ticks once a millisecond, so the pause blocks the thread instead.
                 wait_until(Instant::now() + pause, SPIN);

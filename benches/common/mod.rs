@@ -101,7 +101,7 @@ pub fn option<T: std::str::FromStr>(name: &str, default: T) -> Result<T, String>
     })
 }
 
-/// The value in the middle; 0 of none.
+/// The median of the values; 0 if there are none.
 pub fn median(values: &[f64]) -> f64 {
     quantile(values, 0.5)
 }

@@ -29,7 +29,7 @@ pub(crate) struct Load {
 struct Connection {
     stream: TcpStream,
     sent: Instant,
-    /// Bytes of the batch that are still to come.
+    /// Number of bytes of the batch that have not arrived yet.
     missing: usize,
 }
 

@@ -107,7 +107,7 @@ impl Drop for Process {
 
 /// Runs the server `name` in this process until standard input ends.
 pub(crate) fn serve(name: &str) -> Result<(), Box<dyn Error>> {
-    // The runtime is of the same kind as in the daemon.
+    // The benchmark uses a runtime of the kind that the daemon uses.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     match name {
         "drivegate" => runtime.block_on(drivegate()),
@@ -121,7 +121,7 @@ async fn until_input_ends() {
     let _ = tokio::task::spawn_blocking(|| std::io::stdin().lines().for_each(drop)).await;
 }
 
-/// A drive at 115200 baud behind a server.
+/// Settings of a gateway with one drive at 115200 baud behind a server.
 fn one_drive(port: &str) -> Result<Settings, Box<dyn Error>> {
     let bus = Bus {
         name: "line",

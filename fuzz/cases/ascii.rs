@@ -1,9 +1,9 @@
 //! Modbus ASCII in both directions: answers that a drive may send to a request, frames that a slave may receive,
 //! and a whole transaction.
 //!
-//! Input: a byte of choices; length and bytes of a request PDU; then what comes from the line. By choice the line is
-//! made of sound frames, one of each 16 bytes, or the fuzzer would hardly get past digits and check code; and the
-//! exchange gets the line in pieces of 1 to 16 characters.
+//! Input: a byte of choices; length and bytes of a request PDU; then the bytes from the line. One choice makes the
+//! line consist of valid frames, one from each 16 bytes, because the fuzzer would otherwise hardly get past the
+//! digits and the check code. The exchange gets the line in pieces of 1 to 16 characters.
 
 use std::time::{Duration, Instant};
 

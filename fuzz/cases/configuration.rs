@@ -1,6 +1,6 @@
 //! A configuration file with any content.
 //!
-//! Input: the file; what is not UTF-8 is replaced.
+//! Input: the file; bytes that are not UTF-8 are replaced.
 
 use drivegate::config::Settings;
 

@@ -20,7 +20,7 @@ static SERVER: LazyLock<Loopback> = LazyLock::new(|| {
 });
 
 pub(crate) fn run(data: &[u8]) {
-    // Hyper refuses what is no target of a request.
+    // Hyper refuses text that is not a valid request target.
     let Some(status) = SERVER.get(data) else { return };
     // 421: the target names another host.
     assert!([200, 400, 404, 421].contains(&status), "{status}");

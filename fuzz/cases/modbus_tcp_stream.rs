@@ -102,7 +102,7 @@ fn next_command(plant: &SharedPlant) -> Option<Command> {
     })
 }
 
-/// The frames of a client up to the first that is none, read by the letter of the specification.
+/// The frames of a client up to the first invalid one, decoded strictly by the specification.
 fn frames(mut bytes: &[u8]) -> Vec<(u16, u8, u8)> {
     let mut found = Vec::new();
     while let [t1, t2, 0, 0, l1, l2, rest @ ..] = bytes {
@@ -154,7 +154,7 @@ pub(crate) fn run(data: &[u8]) {
         sent.extend_from_slice(&piece);
         answers.extend(client.receive(&piece, Instant::now()));
     }
-    // The bus answers what is left, or everybody's commands would fill the queue.
+    // The bus answers the remaining commands; otherwise the commands of all clients would fill the queue.
     loop {
         while let Some(command) = next_command(&plant) {
             answer(command, 7);

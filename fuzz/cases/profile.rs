@@ -1,6 +1,6 @@
 //! A user profile with any content.
 //!
-//! Input: the file; what is not UTF-8 is replaced.
+//! Input: the file; bytes that are not UTF-8 are replaced.
 
 use drivegate::drive::Profile;
 

@@ -411,7 +411,7 @@ fn slots_and_other_sides_see_each_other() {
     plant.site.until_state("pump-1", "ready");
     start();
     assert_eq!(slots(&plant), [], "a start withdraws the inactives that protect nobody");
-    // Inactives that protect people stay, even behind an active that governs.
+    // Inactive values that protect people stay, even if an active value governs.
     let orders = [run_at(1, true), run_at(4, false), run_at(12, false)];
     assert_eq!(
         plant.bacpypes(20, &orders),

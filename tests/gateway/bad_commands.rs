@@ -10,7 +10,7 @@ use drivegate_testkit::rows;
 use crate::support::process::{PATIENCE, Running, api, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive, functions};
 
-/// A drive that runs or stands, and has neither references nor a second direction.
+/// A drive that runs or is at standstill, and has neither references nor a second direction.
 const PLAIN: &str = r#"
 name = "plain"
 protocols = ["modbus-rtu"]
@@ -51,7 +51,7 @@ fn rig() -> RecordedSite {
         drive("watched", 3, ""),
         controlled("gone", 9, ""),
     ];
-    // The line is not long with the drive that is gone.
+    // The drive that does not answer does not occupy the line for long.
     let bus = LINE1.replace("\"2s\"", "\"1s\"");
     let site = Site::of(&[&bus, &drives.concat(), MODBUS_TCP, MQTT, HTTP]);
     site.write("plain.toml", PLAIN);
@@ -176,7 +176,7 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
         ((of("mqtt"), of("modbus_tcp")) == (20, 16)).then_some(())
     });
 
-    // A good command that comes again, as QoS 1 allows, is not written again and has the same result.
+    // A valid command that arrives again, as QoS 1 allows, is not written again and gets the same result.
     let (again, first) = (1..)
         .map(|id| format!(r#"{{"id": "order-{id}", "speed_reference": 12.5}}"#))
         .map(|order| (order.clone(), rig.site.ask("pump/set", &order)))

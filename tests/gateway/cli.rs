@@ -1,4 +1,4 @@
-//! The program itself: exit codes, output, help.
+//! Tests of the program itself: exit codes, output, help.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -609,7 +609,7 @@ fn a_bad_log_level_of_the_demo_is_a_wrong_command_line() {
         ("nonsense=1", "unknown word `1`; write \"off\", \"error\""),
         ("inof", "did you mean \"info\"?"),
     ] {
-        // A demo that started would not end by itself.
+        // A demo that was started by mistake would never end by itself.
         let mut child = drivegate(&["demo", "--log", level])
             .stdout(Stdio::null())
             .stderr(Stdio::piped())

@@ -1,5 +1,5 @@
-//! The way of a command from outside: leases and clients that are killed, a stop under a full queue, a broker that is
-//! away, repetitions, refusals, the audit.
+//! Commands from outside, from the client to the drive: leases and clients that are killed, a stop while the queue
+//! is full, a broker that is not available, repetitions, refusals, the audit.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -109,7 +109,7 @@ fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
     site.until_point("pump-1", "speed_reference", 10.0);
     drop(broker);
     site.until_connected(false);
-    // The client's library keeps the message until the broker is back; the message has expired by then.
+    // The library of the client keeps the message until the broker is available again; by then the message has expired.
     let port = site.mqtt.to_string();
     let client = ["-h", "127.0.0.1", "-p", &port, "-t", SET];
     let message = ["-m", "{\"run\": true, \"expires_ms\": 100}"];

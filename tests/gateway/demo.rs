@@ -8,7 +8,7 @@ use crate::support::process::{
 use crate::support::site::curl;
 use crate::support::tools::{root, tool};
 
-/// The number behind `mark` in what the demo printed.
+/// The number that follows `mark` in the output of the demo.
 fn port(printed: &str, mark: &str) -> u16 {
     let rest = printed
         .split_once(mark)

@@ -21,7 +21,7 @@ fn told(arguments: &[&str]) -> (Option<i32>, Value, String) {
     )
 }
 
-/// A gateway with two drives, of which one does not answer.
+/// A gateway with two drives; one of them does not answer.
 fn site() -> Site {
     let gateway = LINE1.replace("[gateway]\n", "[gateway]\nstate_dir = \"state\"\n");
     let rest = "[drill]\n[authority]\nmode = \"exclusive\"\nlease = \"30s\"\n";
@@ -47,8 +47,7 @@ fn every_command_with_a_list_or_a_result_prints_it_as_json() {
         ("write", vec!["write", "pump-1", "run=true"]),
         ("watch", vec!["watch", "--once"]),
     ]);
-    // Refusals are documents as well. Without a gateway, `write` opens the port itself, and here the port does not
-    // exist.
+    // Refusals are JSON documents as well. Without a gateway, `write` opens the port itself; the port does not exist here.
     for (name, command) in &commands {
         let (code, document, said) = with(command);
         assert_eq!(code, Some(1), "{name}: {document}");
@@ -185,7 +184,7 @@ fn the_variable_names_the_configuration_where_the_option_is_missing() {
     assert!(code == Some(0), "{text}");
     let (code, text) = run(&["health"]);
     assert!(code == Some(1) && text.contains(&site.config()), "{text}");
-    // The option is stronger, and --url needs none.
+    // The option takes precedence over the configuration; `--url` needs no configuration.
     let (code, text) = run(&["check", "--config", &site.path("other.toml")]);
     assert!(code == Some(78) && text.contains("other.toml"), "{text}");
     let (code, text) = run(&["health", "--url", "http://127.0.0.1:9"]);

@@ -547,7 +547,7 @@ fn drives_at_the_last_addresses_of_n2_are_found() {
     assert_eq!(read.code, 0, "{}{}", read.out, read.err);
 }
 
-/// The way of docs/commissioning.md to a CX board that counts from 1.
+/// Carries out the steps of docs/commissioning.md with a CX board that counts from 1.
 #[test]
 fn a_board_that_counts_from_one_shows_by_reading() {
     let directory = TempDir::new().unwrap();

@@ -311,7 +311,8 @@ fn obeys_the_common_model(case: &Case) {
     done(command(false, false, false));
 }
 
-/// A start that the drive does not follow fails where the family has a sequence, and leaves no run command behind.
+/// A start that the drive does not carry out fails if the family has a start sequence, and leaves no run command in
+/// the drive.
 fn fails_to_start(case: &Case) {
     let rig = Rig::new(case, true);
     rig.order(&case.reference);

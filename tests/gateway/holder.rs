@@ -72,7 +72,7 @@ fn busy(written: Result<(), String>) {
 fn who_sees_and_may_what() {
     let plant = plant();
     assert_eq!(plant.seen(), (0, 0, json!("free"), json!(null)));
-    // The first command takes the drive, and everybody sees that.
+    // The first command takes the drive, and all clients see this.
     write_registers(plant.site.modbus, 1, 0x8100, &[1, 5000]);
     plant.site.until_point("pump-1", "output_frequency", 25.0);
     assert_eq!(plant.seen(), (1, 1, json!("held"), json!("plc")));

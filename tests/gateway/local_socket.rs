@@ -246,7 +246,8 @@ fn clients_that_fall_silent_flood_or_read_nothing_harm_nobody() {
     cut.send(command.strip_suffix('}').unwrap());
     cut.0.get_ref().shutdown(std::net::Shutdown::Write).unwrap();
     assert!(cut.next().is_none_or(|(status, _)| status != 200));
-    // Silent clients hinder no other client: the one that is silent longest gets a message and is closed.
+    // Silent clients do not prevent other clients from connecting: the client that is silent for longest gets a
+    // message and is disconnected.
     let mut silent: Vec<Client> = (0..40).map(|_| Client::connect(&line.socket())).collect();
     let (status, busy) = silent[0].next().unwrap();
     assert!(status == 503 && busy["error"].is_string(), "{busy}");

@@ -50,7 +50,7 @@ impl Plant {
         let simulator = site.simulate(&["--addresses", "1", "--baud", "38400"]);
         let broker = site.broker();
         let gateway = site.run_ready();
-        // The local socket comes last; connections made before are accepted later.
+        // The local socket is opened last; connections made before that are accepted later.
         gateway.until_printed("drivegate is running");
         site.until_connected(true);
         site.until_state("pump-1", "ready");
@@ -80,7 +80,7 @@ impl Plant {
         until("a reading", || self.site.point("pump-1", "running").as_bool())
     }
 
-    /// The motor stands, by a new connection.
+    /// Resets the motor to standstill through a new connection.
     fn reset(&self) {
         self.modbus().says(0);
         until("standstill", || {
@@ -107,7 +107,7 @@ impl Plant {
 
     fn slot(&self) -> Client {
         let stream = TcpStream::connect(("127.0.0.1", self.slot)).unwrap();
-        // A tool gets no reply to what a stop has overtaken.
+        // A tool gets no reply to a request that a stop has overtaken.
         stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
         Client {
             stream: Box::new(stream),

@@ -78,7 +78,7 @@ fn on_shutdown_stop_stops_and_hold_holds() {
             last.map(|function| (Direction::ToDrives, function)),
             "on_shutdown = {action}"
         );
-        // The port closes behind the acknowledgement, which repeats the request.
+        // The port closes after the acknowledgement, which repeats the request.
         assert_eq!(writes.next().map(|f| f.direction), last.map(|_| Direction::FromDrives));
         assert_eq!(writes.count(), 0);
     }
@@ -147,7 +147,7 @@ fn a_port_that_is_not_there_is_waited_for() {
     until("values", || mbpoll_read(site.modbus, 1, 2100, 11).ok());
 }
 
-/// The address of an interface that comes up after the gateway.
+/// The address belongs to an interface that comes up after the gateway has started.
 #[test]
 fn an_address_that_is_not_there_keeps_no_drive_from_being_polled() {
     let site = site("");

@@ -49,7 +49,7 @@ impl Plant {
         (output.status.code(), text(output.stdout), text(output.stderr))
     }
 
-    /// Runs a command that must succeed; returns what the command printed.
+    /// Runs a command that must succeed; returns its output.
     fn well(&self, arguments: &[&str]) -> (String, String) {
         let (code, printed, said) = self.ran(arguments);
         assert_eq!(code, Some(0), "{arguments:?}: {printed}{said}");

@@ -185,7 +185,7 @@ fn a_retained_stop_of_all_stops_nothing_and_is_told() {
             (results.output().matches("the message was retained").count() == times).then_some(())
         });
     }
-    // Further refusals of the same client are only counted.
+    // Further refusals of this client are only counted.
     let of_all = |record: &Json| record["drive"] == "all drives" && record["result"] == "not_allowed";
     assert!(plant.site.audit().iter().any(of_all));
     let (_, log) = get(plant.site.http, "/api/v1/events/log?kind=refused_command").unwrap();

@@ -142,11 +142,11 @@ enum Way {
     /// The body, and the status of the reply.
     Http(&'static str, u16),
     Socket(&'static str, u16),
-    /// Arguments of `drivegate write`, and a word from the error that must follow.
+    /// Arguments of `drivegate write`, and a word that the error must contain.
     CommandLine(&'static [&'static str], &'static str),
     /// Object, value and priority of writes, and class and code of the error.
     Bacnet(&'static [(&'static str, f64)], [u8; 2]),
-    /// A PDU at the slot of the bus at that place, and the exception.
+    /// A PDU that is sent to the slot of the bus with this index, and the exception.
     Slot(usize, Vec<u8>, u8),
 }
 

@@ -47,7 +47,7 @@ impl Plant {
         format!("http://127.0.0.1:{}", self.site.http)
     }
 
-    /// The frames that `--count` frames of a trace say.
+    /// The first `count` frames that the trace prints.
     fn trace(&self, count: usize, more: &[&str]) -> Vec<Shown> {
         let (url, count) = (self.url(), count.to_string());
         let arguments = [&["trace", "--url", &url, "--bus", "line1", "--count", &count], more].concat();

@@ -149,8 +149,8 @@ fn the_energy_meter_of_the_page_is_served() {
         assert!(metrics.contains(&line), "{line} is missing in\n{metrics}");
     }
     assert!(!metrics.contains("neutral_current"), "{metrics}");
-    // An unavailable value is bad in every interface. A helper point appears in none. A value that a metric would round
-    // is not a metric.
+    // An unavailable value is bad in every interface. A helper point is shown in none. A value that a metric would
+    // round is not exported as a metric.
     assert_eq!(
         (&points["motor_current"]["value"], &points["motor_current"]["quality"]),
         (&().into(), &"bad".into())

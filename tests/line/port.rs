@@ -1,4 +1,4 @@
-//! The port: unplugged and plugged in again, busy, missing, no serial port; device servers behind TCP.
+//! Tests of the port: unplugged and plugged in again, busy, missing, not a serial port; device servers on TCP.
 
 use std::io::Read;
 use std::net::{SocketAddr, TcpListener};
@@ -62,7 +62,7 @@ async fn after_a_replug_everything_is_read_and_nothing_written() {
 
 #[tokio::test]
 async fn a_command_that_loses_its_port_is_answered_once() {
-    // The long time limit keeps the request open until the port goes.
+    // The long time limit keeps the request open until the port disappears.
     let rig = Rig::of(Setup {
         response_timeout: Duration::from_secs(60),
         ..Setup::default()

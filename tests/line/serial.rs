@@ -168,7 +168,7 @@ fn simulated_drives_in_ascii_run_and_meet_faults() {
     until("half the speed", || {
         (value("actual_speed").as_f64() == Some(50.0)).then_some(())
     });
-    // A test in virtual time proves that a sound line has no failures.
+    // A test in virtual time proves that a line without faults has no failures.
     assert!(counted(site.http, "ok") > 10.0);
 
     let url = format!("http://127.0.0.1:{}", site.http);

@@ -127,7 +127,7 @@ impl Raw {
         assert_eq!(answer, bytes);
     }
 
-    /// Reads to the end, which has to come.
+    /// Reads until the connection is closed, which must happen.
     fn until_closed(&mut self) -> Vec<u8> {
         let mut rest = Vec::new();
         match self.0.read_to_end(&mut rest) {
@@ -231,7 +231,8 @@ fn v5_properties_pass_through_and_a_request_gets_its_response() {
     assert_eq!(client.line(), "|||c|||y");
 }
 
-/// Connects, subscribes, publishes at QoS 0 and 1, retained too, and leaves; the will of a second client comes.
+/// Connects, subscribes, publishes at QoS 0 and 1 and also retained messages, and disconnects. The will of a second
+/// client is published.
 const PAHO: &str = r#"
 import queue, sys
 import paho.mqtt.client as mqtt
@@ -279,7 +280,7 @@ fn paho_works_in_both_versions() {
     }
 }
 
-/// The next packet that comes in, or the error that ends the connection.
+/// The next packet that arrives, or the error that ends the connection.
 async fn next(events: &mut EventLoop) -> Result<Packet, ConnectionError> {
     let packet = async {
         loop {

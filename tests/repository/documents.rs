@@ -141,7 +141,7 @@ fn every_profile_that_is_shown_is_sound() {
     let shown: Vec<String> = all.filter(|b| is_profile(b)).collect();
     assert!(shown.len() >= 5);
     for (i, mut block) in shown.into_iter().enumerate() {
-        // A block that shows one section stands in a profile.
+        // A block that shows one section of a profile is inserted into a complete profile.
         for (section, base) in [("[n2]", "vacon-nx-n2"), ("[parameters]", "teco-7300pa")] {
             if block.starts_with(section) {
                 block = format!("name = \"part-{i}\"\nbase = \"{base}\"\n{block}");

@@ -70,7 +70,7 @@ fn pages() -> Vec<PathBuf> {
     found
 }
 
-/// The prose of a page with the number of each line: without fenced blocks and without what stands between backticks.
+/// The prose of a page with the number of each line: without fenced blocks and without text between backticks.
 fn prose(text: &str) -> Vec<(usize, String)> {
     let (mut inside, mut found) = (false, Vec::new());
     for (number, line) in text.lines().enumerate() {

@@ -1,4 +1,4 @@
-//! Helpers for tests of several targets: outside programs and processes, a gateway's site, plants made by hand.
+//! Helpers for tests of several targets: external programs and processes, a gateway's site, plants that tests set up.
 #![allow(dead_code, reason = "each target takes what it needs")]
 
 pub(crate) mod mqtt;

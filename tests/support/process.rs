@@ -130,7 +130,8 @@ pub(crate) fn drivegate(arguments: &[&str]) -> Command {
     command
 }
 
-/// The socket by which systemd hears of a service, for one that runs with a watchdog of a second.
+/// The socket through which systemd receives notifications of a service, for a service that runs with a watchdog of
+/// one second.
 pub(crate) struct Notifications(UnixDatagram, PathBuf);
 
 impl Notifications {

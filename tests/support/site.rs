@@ -89,8 +89,7 @@ impl Site {
         std::fs::write(self.file(name), text).unwrap();
     }
 
-    /// Writes the configuration, with the ports of the site where `{modbus}`, `{mqtt}` and `{http}` stand. The local socket is in
-    /// the folder unless the configuration says otherwise: the default one is shared by all gateways of a user, and thus of all tests.
+    /// Writes the configuration; `{modbus}`, `{mqtt}` and `{http}` are replaced by the ports of the site.
     pub(crate) fn configure(&self, parts: &[&str]) {
         let ports = [("{modbus}", self.modbus), ("{mqtt}", self.mqtt), ("{http}", self.http)];
         let text = ports.iter().fold(parts.concat(), |text, (place, port)| {

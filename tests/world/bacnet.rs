@@ -249,7 +249,7 @@ impl BacnetWorld {
         .collect()
     }
 
-    /// A register of the drive, read from the drive itself.
+    /// A register of the drive, read directly from the simulated drive.
     fn register(&mut self, table: Table, start: u16) -> u16 {
         let read = RequestPdu::Read { table, start, count: 1 };
         match self.rig.with_drive(DRIVE, |drive, now| drive.answer(&read, now)) {
@@ -326,7 +326,7 @@ impl Rules {
     fn elsewhere(&mut self, run: Option<bool>, sets: bool) {
         if let Some(run) = run {
             let other = |slot: &(f64, usize)| (slot.0 != 0.0) != run;
-            // An inactive that protects people outlives a start, even behind an active that governs.
+            // An inactive value that protects people stays after a start, even if an active value governs.
             let protects = |place: usize| run && place < 5;
             for (place, slot) in self.run.iter_mut().enumerate() {
                 *slot = slot.filter(|slot| !other(slot) || protects(place));

@@ -1,4 +1,4 @@
-//! A bus of a world: the real core, and a simulated line in place of the port.
+//! A bus of a world: the real core, and a simulated line instead of the port.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -440,8 +440,7 @@ impl WorldBus {
             };
             let spec = &image.spec;
             if spec.address != act.address {
-                // A repeated reply was accepted as the reply to a later request, and the bus was started anew after
-                // that.
+                // A repeated reply was accepted as the reply to a later request, and the bus was restarted after that.
                 assert!(self.late, "drive {} acted that was not asked", act.address);
                 continue;
             }

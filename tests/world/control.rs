@@ -85,7 +85,7 @@ impl World {
         outcome
     }
 
-    /// The motor does what the orders allow, now and for a while.
+    /// Moves the motor as the orders allow, now and for some time.
     fn look(&mut self, points: &[(&str, f64)]) {
         for _ in 0..4 {
             let state = self.rig.with_drive(1, |drive, _| drive.state());

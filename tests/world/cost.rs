@@ -20,7 +20,7 @@ fn rig(line: &Line) -> Rig {
     Rig::new(line, Parts::of(0, line, 5))
 }
 
-/// Exchanges that went well in ten minutes behind the first.
+/// Number of successful exchanges in the ten minutes after the first one.
 fn exchanges(line: &Line) -> f64 {
     let mut rig = rig(line);
     rig.run(MINUTE);

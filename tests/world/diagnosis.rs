@@ -1,4 +1,4 @@
-//! Line diagnosis: each cause on a simulated line, and lines that are sound.
+//! Line diagnosis: each cause on a simulated line, and lines without faults.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -463,7 +463,7 @@ fn a_drive_that_counts_tells_which_direction_is_bad() {
             .find(|verdict| verdict.verdict == Cause::OneDrive);
         let counted = diagnosis.drives[1].by_drive;
         assert!(counted.is_some_and(|counted| counted.own > 100), "{counted:?}");
-        // The counters of a drive with a sound line are not read.
+        // The counters of a drive on a line without faults are not read.
         assert_eq!(diagnosis.drives[0].by_drive, None);
         of_it.map(|verdict| verdict.evidence.clone()).unwrap_or_default()
     };

@@ -236,7 +236,7 @@ fn what_does_not_stop_is_named() {
         }
     });
     ends(&mut play, &report, DrillState::Failed, "the motor still turns");
-    // The drive takes too long to stand.
+    // The drive takes too long to reach standstill.
     let mut play = of();
     play.rig.at_the_drive(1, DECELERATION, 6000);
     let report = play.drill(&[Kind::Order], |_, _| {});

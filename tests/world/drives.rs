@@ -193,5 +193,5 @@ impl Truth {
     }
 }
 
-/// Time for what an incident leaves behind.
+/// Time for the consequences of an incident.
 pub const AFTERMATH: Duration = Duration::from_secs(12);

@@ -24,7 +24,7 @@ const LEASE: Duration = Duration::from_secs(3);
 const DRIVES: u8 = 2;
 /// The clients, each with a separate interface. A client's reference identifies its frames: 10 % plus its index.
 const CLIENTS: [&str; 6] = ["plc", "op", "cloud", "socket:7", "host", "nobody"];
-/// Ranks of the clients; the last client has none.
+/// Index of the rank of each client; the last client has no rank.
 const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
 
 /// The drives of every second world are guarded as well: that changes who is refused with what, and nothing of who holds.
@@ -94,7 +94,7 @@ struct Play {
     rules: Arc<Rules>,
     began: Instant,
     stops: Vec<(usize, Placed)>,
-    /// Orders that are no stop, by drive and client.
+    /// Orders other than stops, by drive and client.
     orders: Vec<(usize, usize, Placed)>,
     results: BTreeMap<&'static str, u32>,
     frames: u32,
@@ -198,7 +198,7 @@ impl Play {
         placed
     }
 
-    /// An order that needs the drive: a client that must be refused is refused at once.
+    /// Places an order that needs the drive: a client that must be refused is refused at once.
     fn steer(&mut self, client: usize, drive: usize, points: &[(&str, f64)]) {
         let (state, holder) = self.holder(drive);
         let other = CLIENTS

@@ -60,7 +60,7 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     assert_eq!(all(&[(&one, 5), (&two, 900), (&said, 5)]), []);
     let later = [(&one[..], 5), (&two, 200), (&said, 5), (&two, 1100), (&said, 5)];
     assert_eq!(all(&later), [(1, 20, vec![5])]);
-    // A late reply of one drive is none of another.
+    // A late reply of one drive is not taken for a reply of another drive.
     assert_eq!(all(&[(&one, 5), (&other, 200), (&said_by_2, 5)]), [(2, 20, vec![6])]);
     // A glitch before the reply does not matter; more bytes may have been another request.
     let behind = |count: usize| [vec![0xFE; count], said.clone()].concat();
@@ -72,7 +72,7 @@ fn a_reply_is_believed_only_where_it_is_sure_what_it_answers() {
     assert_eq!(all(&[(&mangled, 5), (&one, 200), (&said, 5)]), []);
     let answered = [(&mangled[..], 5), (&said, 5), (&one, 200), (&said, 5)];
     assert_eq!(all(&answered), std::slice::from_ref(&first));
-    // A frame with an unknown function is nevertheless sound.
+    // A frame with an unknown function is nevertheless a valid frame.
     let unknown = framed(1, &[0x41, 9]);
     assert_eq!(all(&[(&unknown, 5), (&one, 200), (&said, 5)]), [first]);
 }
@@ -151,7 +151,7 @@ struct Talk {
     fate: Fate,
     began: Instant,
     now: Duration,
-    /// Frames of drives that are still to come.
+    /// Frames of drives that have not been sent yet.
     coming: Vec<(Duration, Vec<u8>)>,
     said: BTreeMap<(u8, u16), VecDeque<Vec<u16>>>,
     heard: Vec<Traffic>,

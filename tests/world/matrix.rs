@@ -24,13 +24,13 @@ use super::orders::unique_reference;
 use super::rig::{Counts, Rig, line, write};
 
 const DRIVES: u8 = 3;
-/// Time for which faults come at a high rate.
+/// Time during which faults occur at a high rate.
 const STORM: Duration = Duration::from_secs(30);
 /// The storm on N2, which is slow.
 const N2_STORM: Duration = Duration::from_secs(150);
 /// Time between the answer to a write and the next one.
 const PAUSE: Duration = Duration::from_millis(7);
-/// Time in which all drives are back behind a storm: the longest back-off, and a round.
+/// Time within which all drives are online again after a storm: the longest back-off, and one round.
 const BACK: Duration = Duration::from_secs(15);
 
 /// Blocks of process data, two of which look alike on the wire.
@@ -284,7 +284,7 @@ impl Watched {
         self.online[asked.drive] = online;
     }
 
-    /// The longest time from a request that meets the fault to the next exchange that goes well.
+    /// The longest time from a request with the fault to the next successful exchange.
     fn recovery(&mut self, fault: Fault) -> Duration {
         let mut longest = Duration::ZERO;
         for _ in 0..10 {
@@ -305,7 +305,7 @@ fn storm(protocol: Protocol) -> Duration {
     if protocol == Protocol::N2 { N2_STORM } else { STORM }
 }
 
-/// Good exchanges of a sound line in the time of a storm.
+/// Number of successful exchanges of a line without faults in the time of a storm.
 fn sound(protocol: Protocol, delivery: Delivery) -> u64 {
     let mut watched = Watched::new(protocol, delivery);
     let before = watched.rig.counts();
@@ -370,8 +370,8 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
         s.silence_violations == 0,
         format!("{} silence violations", s.silence_violations),
     );
-    // A late reply to a repeated request is accepted, correctly; the drive's second reply then meets the next request.
-    // That cannot be avoided without knowing the future.
+    // A late reply to a repeated request is accepted, correctly; the second reply of the drive then arrives during
+    // the next request. This cannot be avoided without knowing the future.
     let late = row.rates.contains("late");
     must(late || s.collisions == 0, format!("{} collisions", s.collisions));
     must(s.bad_crc == 0, format!("{} broken requests", s.bad_crc));

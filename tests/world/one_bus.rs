@@ -134,7 +134,7 @@ fn after_a_replug_everything_is_read_and_nothing_written() {
     rig.until("both drives are read", PATIENCE, all_read);
     assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());
     rig.until_state(1, State::Running);
-    // The last time the first exchange meets a fault, too.
+    // The third time, the first exchange also has a fault.
     for lost in [false, false, true] {
         rig.bus.set_open(false, rig.now);
         for address in [1, 2] {

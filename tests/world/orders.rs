@@ -94,7 +94,7 @@ pub struct Record {
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
     /// Number of orders to the same drive that were waiting when this one was accepted and that go before it.
     pub before: usize,
-    /// Whether a newer reference took the order's place.
+    /// Whether a newer reference replaced the order.
     pub succeeded: bool,
 }
 
@@ -268,7 +268,7 @@ fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
             start: address - address % 2,
             values: vec![0; 2],
         },
-        // The process data behind the general control word.
+        // The process data that follow the general control word.
         _ if most > 1 && number.is_multiple_of(2) => RequestPdu::WriteRegisters {
             start: address,
             values: vec![0; 2],

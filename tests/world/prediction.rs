@@ -1,4 +1,4 @@
-//! The prediction of `predict` for a bus, against the bus itself.
+//! Compares the prediction of `predict` for a bus with the bus itself.
 
 use std::time::Duration;
 

@@ -60,7 +60,7 @@ struct RestoreWorld {
     next: Instant,
     /// Whether events disturb the restore.
     troubled: bool,
-    /// The motor was last started by somebody at the drive.
+    /// When a person at the drive last started the motor.
     started: Option<Instant>,
     /// Time at which a person stops the motor, or puts the drive back on the line.
     mended: Option<Instant>,

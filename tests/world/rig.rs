@@ -152,7 +152,7 @@ impl Rig {
         placed
     }
 
-    /// Starts the bus anew, as a reload does.
+    /// Restarts the bus, as a reload does.
     pub fn restart(&mut self) {
         while self.bus.core.asked().is_some() {
             self.step(self.now + Duration::from_secs(1));
@@ -266,7 +266,7 @@ impl Rig {
             .unwrap();
     }
 
-    /// A holding register, read from the drive itself.
+    /// A holding register, read directly from the simulated drive.
     pub fn word(&mut self, address: u8, start: u16) -> u16 {
         let (table, count) = (Table::Holding, 1);
         let read = RequestPdu::Read { table, start, count };

@@ -15,7 +15,8 @@ pub struct Scenario {
     pub time: Duration,
     pub buses: Vec<Line>,
     pub clients: Vec<Habit>,
-    /// Mean time between two incidents (a drive that trips, restarts, vanishes ...); `None` in a calm world.
+    /// Mean time between two incidents (for example, a drive trips, restarts or vanishes); `None` in a world
+    /// without incidents.
     pub incidents: Option<Duration>,
     /// Whether the gateway loads a new configuration now and then.
     pub reloads: bool,
@@ -36,7 +37,7 @@ pub struct Line {
     pub retries: u32,
     pub cycle: Duration,
     pub slow_cycle: Duration,
-    /// Faults of the wire, as `simulate --faults` takes them; empty for a sound one.
+    /// Faults of the wire, in the form of `simulate --faults`; empty for a line without faults.
     pub faults: String,
     /// Share of the frames to the gateway in which one more bit is wrong.
     pub flips: f64,

@@ -46,7 +46,7 @@ fn differing(
     told
 }
 
-/// The drive comes back with another selection.
+/// The drive comes online again with another selection.
 fn back_with(rig: &mut Rig, selector: u16, item: u16) {
     rig.set_alive(1, false);
     rig.until_state(1, State::Offline);

@@ -1,4 +1,4 @@
-//! Situations that chance meets too seldom, each brought about on one bus.
+//! Situations that random worlds meet too seldom; each test sets one up on one bus.
 
 use std::time::{Duration, Instant};
 
@@ -36,7 +36,7 @@ fn faults(rates: &str, seed: u64) -> FaultPlan {
     FaultPlan::new(rates.parse().unwrap(), seed)
 }
 
-/// The answer to an order, which is to come within `most`.
+/// The answer to an order, which must arrive within `most`.
 fn answer(rig: &mut Rig, mut placed: Placed, most: Duration) -> Outcome {
     let until = rig.now + most;
     loop {

@@ -231,7 +231,7 @@ impl ToolRig {
             );
             self.figures.refused += 1;
         } else {
-            // A write may have been answered with the same bytes after several exchanges.
+            // A write may have been answered with these bytes after several exchanges.
             assert!(question.said.contains(&frame), "{question:?} was answered {frame:02X?}");
             self.figures.answered += 1;
         }
@@ -421,7 +421,7 @@ fn a_stop_waits_for_the_exchange_on_the_line_at_most() {
     for round in 0..40u64 {
         tool.ask(1 + round % 5);
         let address = 1 + (round % 3) as u8;
-        // The stop comes at different moments of a tool's exchange.
+        // The stop arrives at different moments of an exchange of the tool.
         tool.next = tool.rig.now;
         for _ in 0..=round % 17 {
             tool.step(true);
@@ -512,7 +512,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
     tool.pass(&frame(&reference));
     tool.pass(&frame(&set(1)));
     assert!(tool.slot.is_waiting() && tool.slot.wake_at().is_some_and(|at| at > now));
-    // A stop of another client comes before the held start is sent.
+    // A stop of another client arrives before the delayed start is sent.
     let stop = tool.rig.points(1, &[("run", 0.0)]);
     assert!(tool.rig.ordered(1, stop).is_ok());
     for _ in 0..200 {

@@ -473,7 +473,7 @@ impl World {
             self.note(move || format!("order {id} is answered {exception:02X?}"));
             self.promised.answered(id, self.now, exception);
             let order = &self.promised.orders[id];
-            // A slow line has no recent frequency range: no matter of stalls.
+            // A slow line has no recent frequency range; this has nothing to do with stalls.
             let not_known = order.does == Does::Other && exception == Some(2);
             assert!(
                 !self.healthy || exception.is_none() || not_known,

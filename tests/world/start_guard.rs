@@ -439,7 +439,7 @@ fn an_ordinary_stop_waits_for_min_run_and_a_second_one_does_not() {
     rig.run(12 * SECOND);
     assert!(first.answer().unwrap().outcome.is_ok() && !turns(&mut rig));
     assert_eq!(rig.drive(1).stop_waits(rig.now), None);
-    // A second stop, that of another client, and one of HTTP are sent at once.
+    // A second stop of the first client, a stop of another client, and a stop through HTTP are sent at once.
     for (kind, who) in [
         (SourceKind::Mqtt, "test"),
         (SourceKind::Mqtt, "other"),

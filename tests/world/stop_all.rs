@@ -24,7 +24,7 @@ fn works() -> Line {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Meanwhile {
     Nothing,
-    /// The bus is started anew, as by a reload.
+    /// The bus is restarted, as a reload does.
     Reload,
     /// A drive is offline since before the order, and returns long after the answer.
     Away,

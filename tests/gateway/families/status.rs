@@ -37,7 +37,7 @@ ls-g100            | 13
 teco-f510          | 0x2520
 vacon-10           | 2100";
 
-/// Longer than any of the drives takes to come to a state.
+/// Time that is longer than any of the drives needs to reach a state.
 const SETTLED: Duration = Duration::from_secs(20);
 
 /// Time that the independent drives need to reach half of their speed.

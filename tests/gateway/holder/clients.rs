@@ -57,7 +57,7 @@ impl Client {
         ["plc", "alice", "cloud", "host", "nobody"][self as usize]
     }
 
-    /// Place of the client's rank among site, operator, automation, remote.
+    /// Index of the client's rank among site, operator, automation, remote.
     fn rank(self) -> usize {
         [2, 1, 3, 2, usize::MAX][self as usize]
     }

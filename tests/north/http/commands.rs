@@ -601,7 +601,7 @@ async fn long_and_slow_bodies_hold_nobody_up() {
     )
     .await;
     assert_eq!(refused.status, 413);
-    // Bodies that never end, of commands and of logins, from the same address.
+    // Bodies of commands and of logins that never end, from one address.
     let mut slow = Vec::new();
     for (path, headers) in [
         (PUMP, alice.as_str()),
@@ -664,7 +664,7 @@ async fn a_removed_user_is_out_with_the_reload() {
     assert_eq!(rig.bus.orders().len(), 3);
 }
 
-/// A command under way when the gateway reloads is executed and answered.
+/// A command that is in progress during a reload is executed and answered.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_reload_in_between_loses_no_command() {
     let all = users(&["alice"]);

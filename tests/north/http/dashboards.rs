@@ -44,7 +44,7 @@ fn is_total(query: &str) -> bool {
         .any(|start| query.starts_with(start))
 }
 
-/// The expressions of all alerts without their comparisons, which a sound plant has as well.
+/// The expressions of all alerts without their comparisons: a plant without faults has values for them as well.
 fn alerts() -> Vec<String> {
     let text = std::fs::read_to_string(root().join("deploy/compose/prometheus/alerts.yml")).unwrap();
     let mut alerts: Vec<String> = Vec::new();

@@ -1,4 +1,4 @@
-//! Status page, health, readiness and JSON; methods, unknown places and bad clients.
+//! Status page, health, readiness and JSON; methods, unknown paths and invalid requests.
 
 use std::io::ErrorKind;
 use std::net::SocketAddr;
@@ -432,7 +432,7 @@ async fn bad_requests_harm_nobody() {
     );
     let many: String = (0..1000).map(|i| format!("h{i}: x\r\n")).collect();
     assert_eq!(request(server.address, "GET", "/", &many).await.status, 431);
-    // A request that never ends, and a body that never comes.
+    // A request that never ends, and a body that never arrives.
     let mut half = TcpStream::connect(server.address).await.unwrap();
     half.write_all(b"GET /healthz HT").await.unwrap();
     let body = "GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 1000000\r\n\r\n";

@@ -95,7 +95,7 @@ async fn health_has_places_of_its_own() {
         let refused = get(server.address, "/api/v1/buses").await;
         assert_eq!((refused.status, refused.header("retry-after")), (503, Some("5")));
         assert_eq!(status_from([127, 0, 0, 2], server.address, "/api/v1/buses").await, 200);
-        // Silent connections cannot take these places, either.
+        // Silent connections cannot occupy these places, either.
         silent.push(TcpStream::connect(server.address).await.unwrap());
     }
     assert!(turned_away(&server, ConnectionRefusal::AddressFull) > 0);

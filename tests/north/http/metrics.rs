@@ -392,7 +392,7 @@ async fn promtool_has_no_complaint() {
     plant::count_a_write(&plant);
     let server = Server::of(plant).await;
     assert_eq!(promtool(&scrape(&server).await), (true, String::new()));
-    // The one name of the contract that the linter would have otherwise, from families that count hours.
+    // The only name of the contract to which the linter objects; it comes from families that count hours.
     let (_, reported) = promtool(&scrape(&everything().await).await);
     assert_eq!(
         reported,

@@ -1,5 +1,5 @@
-//! The HTTP interface against a hand-made plant, with plain clients, promtool, a real Prometheus and a
-//! real browser.
+//! The HTTP interface with a plant that the test sets up, tested with plain clients, promtool, a real Prometheus
+//! and a real browser.
 
 mod access;
 mod client;

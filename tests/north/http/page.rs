@@ -91,7 +91,7 @@ async fn a_running_drive_is_taken_over() {
     browse("hold.js", Vec::new()).await;
 }
 
-/// The overview of 60 drives after login: compact rows, colour only where a person is wanted.
+/// The overview of 60 drives after login: compact rows, and colours only for drives that need the attention of a person.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn sixty_drives_are_seen_at_a_glance() {
     browse("rows.js", Vec::new()).await;

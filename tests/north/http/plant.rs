@@ -1,4 +1,4 @@
-//! A plant made by hand: no bus runs, the images are filled here.
+//! A plant that the test sets up: no bus runs, and the test fills the process images.
 
 use std::fmt::Write as _;
 use std::net::SocketAddr;

@@ -1,4 +1,5 @@
-//! Bytes that no sound client sends: the right exception or a closed connection, without an effect on other clients.
+//! Bytes that no correct client sends lead to the right exception or a closed connection, without an effect on
+//! other clients.
 
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;

@@ -16,7 +16,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use super::rig::{Client, PATIENCE, Rig, frame, options, registers, until, words};
 use crate::support::process::{Running, free_port};
 
-/// Random enough for disorder, and the same in each run.
+/// Numbers that are random enough to mix the order, and equal in each run.
 mod rand_free {
     pub(super) struct Dice(pub(super) u64);
 
@@ -176,7 +176,7 @@ async fn a_flood_is_served_fairly() {
     rig.end().await;
 }
 
-/// Registers that belong together come from one poll, while the image is rewritten as fast as a thread can.
+/// Registers that belong together have values of one poll, while a thread rewrites the image as fast as possible.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_is_torn() {
     let rig = Rig::new().await;

@@ -46,7 +46,7 @@ fn plant(settings: &Settings) -> Plant {
             .map(|d| Arc::new(DriveImage::new(d.clone(), bus.spec.slow_cycle)))
             .collect();
         for drive in &drives {
-            // Rising values make a lowest frequency lie below the highest one.
+            // Rising values would make a lowest frequency smaller than the highest one.
             testkit::read_all(drive, now, |address| address);
         }
         testkit::up(testkit::bus(bus.spec.clone(), drives))

@@ -1,5 +1,5 @@
-//! The Modbus TCP server over real sockets, with simulated buses behind it: every answer and exception of the
-//! contract, bad input of all kinds, and independent clients.
+//! The Modbus TCP server with real sockets and simulated buses: every answer and exception of the contract, invalid
+//! input of all kinds, and independent clients.
 
 mod answers;
 mod bad_input;

@@ -242,7 +242,7 @@ async fn an_ambiguous_role_is_refused() {
     rig.end().await;
 }
 
-/// SIGHUP with a new list in the same file. A broken list changes nothing.
+/// SIGHUP with a new list in the file. An invalid list changes nothing.
 #[test]
 fn the_daemon_takes_a_new_list() {
     let dir = copy(&[

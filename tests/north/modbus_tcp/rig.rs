@@ -126,7 +126,7 @@ impl FakeBus {
         *self.script.lock().unwrap() = Box::new(script);
     }
 
-    /// Leaves commands in the queue while `paused`, or takes them again.
+    /// With `paused`, leaves commands in the queue; otherwise takes them again.
     pub(crate) fn pause(&self, paused: bool) {
         self.paused.store(paused, Ordering::SeqCst);
         self.queue.wake();
@@ -136,7 +136,7 @@ impl FakeBus {
         self.queue.lock().len()
     }
 
-    /// The orders that came since the last call.
+    /// The orders that arrived since the last call.
     pub(crate) fn orders(&self) -> Vec<Order> {
         self.seen.lock().unwrap().drain(..).map(|(_, order)| order).collect()
     }

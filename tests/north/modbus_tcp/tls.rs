@@ -282,7 +282,7 @@ async fn who_is_not_known_is_refused() {
         count += 1;
         until("it is counted", || refused(&rig) == count).await;
     }
-    // A silent client has a place but blocks no other.
+    // A silent client occupies a place but blocks no other client.
     let silent = Client::connect(address).await;
     let mut client = TlsClient::connect(address, WORKS.client(Some("own/hmi"), &TLS13))
         .await

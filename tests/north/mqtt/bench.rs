@@ -195,7 +195,7 @@ pub(crate) struct Watcher {
 }
 
 impl Watcher {
-    /// Watches `filter`; returns when the subscription stands.
+    /// Receives messages of `filter`; returns when the subscription is in effect.
     pub(crate) fn new(broker: &Broker, filter: &str) -> Watcher {
         Watcher::with(broker, filter, &[])
     }

@@ -93,7 +93,7 @@ impl Site {
         Gateway::start(options, plant(&["p1"]))
     }
 
-    /// Whether `mosquitto_pub` publishes with the same trust.
+    /// Whether `mosquitto_pub` publishes with these trusted certificates.
     fn others_accept(&self, broker: &Broker, ca: &str) -> bool {
         let ca = self.file(&format!("{ca}.crt")).display().to_string();
         let arguments = ["-q", "1", "-t", "x", "-m", "x", "--cafile", &ca];

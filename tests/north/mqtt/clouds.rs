@@ -207,8 +207,8 @@ fn beyond_limits(first: u8, body: &[u8]) -> Option<String> {
     }
 }
 
-/// A way to the broker that closes a connection, without a reason, at what AWS IoT Core does not take: its port, and what
-/// that was.
+/// A proxy in front of the broker. As AWS IoT Core does, it closes a connection without a reason if it does not
+/// accept a packet. Returns its port and the packets that it did not accept.
 fn limited(broker: u16) -> (u16, Arc<Mutex<Vec<String>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();

@@ -165,7 +165,7 @@ fn a_broker_that_comes_back_does_not_say_that_a_gateway_elsewhere_is_online() {
 #[test]
 fn what_expires_is_renewed_before() {
     let broker = Broker::start();
-    // The expiry in place of the payload.
+    // The output shows the expiry instead of the payload.
     let watcher = Watcher::with(&broker, "#", &["-F", "%r|%q|%t|%E"]);
     let options = Options {
         message_expiry: Some(Duration::from_secs(2)),

@@ -540,7 +540,7 @@ fn without_wildcards_the_gateway_subscribes_drive_by_drive() {
 
 #[test]
 fn two_gateways_with_one_client_id_are_told_apart_from_a_broken_broker() {
-    // Mosquitto 2.0 closes the connection of the first without a word.
+    // Mosquitto 2.0 closes the connection of the first client without stating a reason.
     let broker = Broker::with("allow_anonymous true\n");
     let first = Gateway::start(options(broker.port), plant(&["p1"]));
     let second = Gateway::start(options(broker.port), plant(&["p1"]));

@@ -195,7 +195,7 @@ fn a_false_status_is_repaired() {
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     let watcher = Watcher::new(&broker, "drivegate/hall/status");
     watcher.wait_payload("drivegate/hall/status", "online");
-    // The second false status comes within a second of the first.
+    // The second false status arrives within a second of the first.
     for repaired in 1..=2 {
         broker.publish("drivegate/hall/status", "offline", &["-r"]);
         wait_for("the status to be repaired", || {

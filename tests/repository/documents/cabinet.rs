@@ -41,7 +41,7 @@ fn family(profile: &Profile, other: Option<&Profile>) -> String {
     for step in Step::ALL {
         let known = other.map_or(&[][..], |other| other.commissioning.lines(step));
         let own = profile.commissioning.lines(step);
-        // A line takes the place of one with the same beginning.
+        // A line replaces one with the same beginning.
         let beginning = |line: &String| line.split(':').next().map(str::to_string);
         let is_replaced = |line: &String| own.iter().any(|one| beginning(one) == beginning(line));
         let all_hold = known.iter().all(is_replaced);

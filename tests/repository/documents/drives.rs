@@ -266,7 +266,7 @@ fn family(profile: &Profile) -> String {
     text
 }
 
-/// The fault texts of a family, or which other family has the same.
+/// The fault texts of a family, or the name of another family that has these texts.
 fn faults(profiles: &Profiles, profile: &Profile) -> String {
     let earlier = MODBUS.iter().chain(&N2).take_while(|name| **name != profile.name);
     let same = earlier

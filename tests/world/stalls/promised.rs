@@ -1,4 +1,4 @@
-//! Orders that the clients of a world wanted for each machine, and what must follow from that.
+//! Orders that the clients of a world placed for each machine, and the resulting state that must be reached.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

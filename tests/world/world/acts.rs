@@ -4,7 +4,7 @@ use super::*;
 use drivegate_world::drive::PointIndex;
 use drivegate_world::plant::OrderRequest;
 
-/// Additional time that a client waits whose order was answered at once.
+/// Additional time that a client waits after an order that was answered at once.
 const TURNED_AWAY: Duration = Duration::from_millis(40);
 
 impl World {
@@ -212,7 +212,7 @@ impl World {
         id
     }
 
-    /// The order is in the queue, or was answered at once.
+    /// Notes that the order is in the queue, or was answered at once.
     pub(super) fn accepted(&mut self, id: usize, unique: Option<Unique>) {
         let Record {
             bus,

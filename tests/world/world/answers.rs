@@ -1,4 +1,4 @@
-//! The answers that clients get: one each, and each is true.
+//! The answers that clients get: each client gets exactly one, and each answer is true.
 
 use super::*;
 
@@ -243,7 +243,7 @@ impl World {
         );
     }
 
-    /// A confirmed stop: the motor does not run, or stands.
+    /// Checks a confirmed stop: the motor does not run, or is at standstill.
     pub(super) fn check_stands(&mut self, id: usize) {
         let record = &self.records[id];
         let (sim, troubled) = (

@@ -5,7 +5,7 @@ use drivegate_world::queue::NotStopped;
 use super::*;
 
 impl World {
-    /// The gateway stops: every online drive that is to be stopped is, and everybody has one answer.
+    /// Stops the gateway: every online drive that must be stopped is stopped, and each client gets one answer.
     pub(super) fn stop(&mut self) {
         self.stopping = true;
         self.note(|| "the gateway stops".to_string());

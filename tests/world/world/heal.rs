@@ -72,7 +72,8 @@ impl World {
         report * bus.line.response_timeout + bus.handle.image.spec.format.chars(160)
     }
 
-    /// Drives, ports, lines, clients and brokers are sound from now on. The drives that the gateway has online.
+    /// From now on, drives, ports, lines, clients and brokers have no faults. Returns the drives that are online in
+    /// the gateway.
     fn end_faults(&mut self) -> Vec<(usize, usize)> {
         let now = self.now;
         self.note(|| "every fault ends".to_string());
@@ -276,7 +277,7 @@ impl World {
                         PollClass::Fast => *best + round + probe + self.exchange(bus) / 2 + STEP,
                         _ => 2 * bus.slow_round.max(bus.line.slow_cycle) + 2 * round,
                     };
-                    // The sound world has no orders and no refresh.
+                    // The world without faults has no orders and no refresh.
                     let most = if bus.line.refresh.is_some() { 3 * most / 2 } else { most };
                     assert!(
                         age.is_some_and(|age| age <= most),

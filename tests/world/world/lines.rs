@@ -113,7 +113,7 @@ impl World {
         self.check_unique(bus, drive, pdu);
     }
 
-    /// The only broadcast that the gateway sends of itself: the stop of a line all of whose drives are to be stopped.
+    /// The only broadcast that the gateway sends of its own accord: the stop of a line on which all drives must be stopped.
     fn line_stopped(&mut self, bus: usize, pdu: &RequestPdu) {
         let stops = run_command(&self.buses[bus].profile, pdu) == Some(false);
         assert!(self.buses[bus].ending && stops, "a broadcast {pdu:?}");
@@ -290,7 +290,7 @@ impl World {
         self.note_ordered(bus, drive, asked);
     }
 
-    /// Checks, after an exchange, that the image has what the drive answered.
+    /// Checks, after an exchange, that the process image contains the values that the drive answered.
     pub(super) fn over(&mut self, bus: usize, asked: &Asked) {
         let (Some(RequestPdu::Read { table, start, count }), true) = (Some(asked.pdu.clone()), asked.is_poll) else {
             return;

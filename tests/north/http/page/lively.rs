@@ -1,5 +1,5 @@
-//! A plant with a past: an hour of two lines, polled by hand in virtual time, with a trip and its recording. The values are the
-//! same at each run; only the times of day differ.
+//! A plant with a history: an hour of two lines, polled by the test in virtual time, with a trip and its recording.
+//! The values are equal in each run; only the times of day differ.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -112,7 +112,7 @@ impl Play {
         let speed = self.speed(t);
         let runs = speed > 0.0;
         let tripped = self == Play::Trips && t >= PAST - TRIP;
-        // A hum that is the same at each run.
+        // A hum that is equal in each run.
         let hum = ((t.as_millis() as f64 / 700.0).sin() + (t.as_millis() as f64 / 1900.0).sin()) / 2.0;
         let to_trip = (PAST - TRIP).saturating_sub(t).as_secs_f64();
         let overload = match self {
