@@ -94,7 +94,7 @@ fn its_file_is_for_owner_and_group_is_replaced_after_a_kill_and_removed_at_the_e
     });
     let stop = line.command("write", &["pump-1", "run=false"]);
     assert!(stop.out.contains("through the gateway"), "{}{}", stop.out, stop.err);
-    // A second one leaves the socket to the first.
+    // A second gateway does not take the socket from the first one.
     let text = std::fs::read_to_string(line.config()).unwrap();
     let file = line.directory.path().join("second.toml");
     std::fs::write(&file, text.split("[modbus_tcp]").next().unwrap()).unwrap();

@@ -122,7 +122,7 @@ struct Row {
     fault: String,
     rates: String,
     shows: Shows,
-    /// Least share of good exchanges, compared with a line without faults.
+    /// Minimum share of good exchanges, compared with a line without faults.
     share: f64,
     /// Whether drives are sometimes considered offline; `None` in a storm of all faults, where both are possible.
     vanish: Option<bool>,

@@ -155,7 +155,7 @@ pub struct Commands {
 }
 
 impl Device {
-    /// A device of these objects; of several with one identifier the first counts.
+    /// A device with these objects. If several objects have one identifier, only the first one is used.
     pub fn new(
         instance: u32,
         station: Option<Mac>,

@@ -31,7 +31,7 @@ use crate::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
 };
 
-/// Most stops to a drive that are sent before the end of a pulse in progress.
+/// Maximum number of stops to a drive that are sent before the end of a pulse in progress.
 const MOST_STOPS: u32 = 8;
 
 /// The next thing a command needs.

@@ -61,8 +61,8 @@ struct Connection {
     vain: u32,
 }
 
-/// Most consecutive connections that may end during a transaction. A server may have a shorter time limit for a
-/// drive that is off, or close after one request; but a server that never replies does not reach the drives.
+/// Maximum number of consecutive connections that may end during a transaction. A server may have a shorter time limit
+/// for a drive that is off, or close after one request; but a server that never replies does not reach the drives.
 const MOST_IN_VAIN: u32 = 3;
 
 /// Interval of the checks whether a thread that reads orders is stalled; short beside the stall that counts.

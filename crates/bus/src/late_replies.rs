@@ -34,7 +34,8 @@ use crate::codec::RequestPdu;
 pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
 /// How long a look-alike request waits before the request whose reply is late is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Most attempts of one write that may be acknowledged late: neither the drive nor any device in between buffers more.
+/// Maximum number of attempts of one write that may be acknowledged late: neither the drive nor any device in between
+/// buffers more.
 const KEPT: u32 = 3;
 
 /// Late replies of one drive that may still arrive.

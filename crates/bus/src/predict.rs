@@ -29,7 +29,7 @@ const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 1
 /// their profile.
 const MOST_LOAD: f64 = 0.8;
 
-/// Least share of the line that polls have while refreshes run.
+/// Minimum share of the line that polls have while refreshes run.
 const LEAST_LEFT: f64 = 0.5;
 
 /// Relative deviation from a cadence that is not reported as missed.
@@ -94,7 +94,7 @@ pub struct Missed {
 pub enum Remedy {
     /// The least higher baud rate of all profiles that does.
     Baud(u32),
-    /// Least number of buses to deal the drives to.
+    /// Minimum number of buses among which the drives must be divided.
     Split {
         /// Number of buses to split the drives over.
         buses: usize,

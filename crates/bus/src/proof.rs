@@ -19,7 +19,8 @@ use crate::order::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
 };
 
-/// Most requests of a command, including the reads of a state that it waits for; a command that sends more has no end.
+/// Maximum number of requests of a command, including the reads of a state that it waits for; a command that sends more
+/// has no end.
 const MOST_FRAMES: usize = 1000;
 /// Duration of a request, and the pause before a state is read again.
 const EXCHANGE: Duration = Duration::from_millis(10);

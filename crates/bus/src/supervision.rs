@@ -24,7 +24,7 @@ use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// Time after which an action that was not acknowledged is written again.
 const AGAIN: Duration = Duration::from_secs(1);
-/// Most reasons for a failed action that are distinguished; each is reported once.
+/// Maximum number of reasons for a failed action that are distinguished; each is reported once.
 const MOST_REASONS: usize = 8;
 
 /// The lease of a drive, as handed over to the next bus.

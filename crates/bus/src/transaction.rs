@@ -15,7 +15,7 @@ use super::n2_late_replies::{N2LateReplies, Taken};
 use crate::codec::n2::Session;
 use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
-/// Most bytes considered in one transaction: further bytes are noise.
+/// Maximum number of bytes considered in one transaction: further bytes are noise.
 const MOST_BYTES: usize = 1024;
 /// Silence, in characters, after which no more garbage is expected.
 const GARBAGE_GAP: u32 = 4;

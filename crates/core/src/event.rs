@@ -18,8 +18,8 @@ pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
-/// Most events by which a listener may lag behind: one event for each drive of 66 full lines, or 16 events for each
-/// of a thousand drives.
+/// Maximum number of events by which a listener may lag behind: one event for each drive of 66 full lines, or 16 events
+/// for each of a thousand drives.
 pub const BURST: usize = 16_384;
 /// Number of events that a listener of a small plant may lag behind: 16 for each of 256 drives. This buffer is
 /// allocated at the start.

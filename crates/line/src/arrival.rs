@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::inotify::{self, CreateFlags, Reader, WatchFlags};
 
-/// Most nested links that are followed.
+/// Maximum number of nested links that are followed.
 const MOST_LINKS: usize = 8;
 /// A node or link is created, or its permissions change, which is the last step of the system.
 const SEEN: WatchFlags = WatchFlags::CREATE

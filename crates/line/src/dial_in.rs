@@ -17,7 +17,7 @@ use super::{Lost, Names, OpenError, UNACKNOWLEDGED, clock, poll_until, read, wri
 
 /// Time after which a connection that has not sent the text is closed.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Most simultaneous connections whose text has not arrived; further ones are closed.
+/// Maximum number of simultaneous connections whose text has not arrived; further ones are closed.
 const MOST_PENDING: usize = 32;
 /// Longest text that identifies a device.
 pub const LONGEST_ID: usize = 64;

@@ -5,7 +5,7 @@ use crate::codec::checksum::crc16;
 
 /// Number of bytes that decide: the length of an exception of Modbus TCP.
 const ENOUGH: usize = 9;
-/// Most requests whose first bytes are remembered.
+/// Maximum number of requests whose first bytes are remembered.
 const ASKED: usize = 32;
 
 /// The kind of server at the other end.

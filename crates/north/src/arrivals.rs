@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use crate::order::Arrival;
 
-/// Most chunks whose arrival times are kept separately; later chunks get the time of the last one.
+/// Maximum number of chunks whose arrival times are kept separately; later chunks get the time of the last one.
 const MOST_PIECES: usize = 64;
 
 /// How and when the unread bytes arrived, the first bytes first.

@@ -18,7 +18,7 @@ const MAX_CLOSING: usize = 32;
 /// How many connections a server may have open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Limits {
-    /// Most connections of all clients in total.
+    /// Maximum number of connections of all clients in total.
     pub(super) total: usize,
     /// How many of all connections are kept for clients that may write.
     pub(super) reserved: usize,

@@ -64,7 +64,7 @@ impl Table {
             .find(|t| t.name() == name)
     }
 
-    /// Most items of the table that the protocol allows in one read.
+    /// Maximum number of items of the table that the protocol allows in one read.
     pub fn max_read(self) -> u16 {
         if self.is_bits() { 2000 } else { 125 }
     }

@@ -81,7 +81,7 @@ impl LineRules {
 const FRAGMENT: Duration = Duration::from_millis(20);
 /// Share of the silence before a request that may be missing.
 const TOLERANCE: f64 = 0.03;
-/// Most bursts that wait for delivery; late replies beyond that are lost.
+/// Maximum number of bursts that wait for delivery; late replies beyond that are lost.
 const MOST_OUTGOING: usize = 64;
 
 /// How the start of a request relates to the traffic before it.

@@ -8,7 +8,7 @@ use super::random::Random;
 pub(crate) struct Parameter {
     /// ID or address of the parameter.
     pub key: u16,
-    /// Least valid value.
+    /// Minimum valid value.
     pub min: u16,
     /// Greatest valid value.
     pub max: u16,

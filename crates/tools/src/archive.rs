@@ -16,9 +16,9 @@ pub(super) const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
 /// Largest manifest, bytes.
 const MOST_MANIFEST: u64 = 64 << 20;
-/// Most files in an archive.
+/// Maximum number of files in an archive.
 const MOST_MEMBERS: usize = 100_000;
-/// Most bytes of all files together.
+/// Maximum number of bytes of all files together.
 const MOST_BYTES: u64 = 8 << 30;
 
 /// The manifest of an archive.

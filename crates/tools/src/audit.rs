@@ -10,7 +10,7 @@ use crate::order::chain::{Hash, Verifier, seq};
 
 /// Longest line that is read, bytes; any entry is far shorter.
 const LONGEST_LINE: u64 = 16 << 20;
-/// Most findings that are printed.
+/// Maximum number of findings that are printed.
 const PRINTED: usize = 20;
 
 /// Checks the file of commands that the gateway writes ([audit])

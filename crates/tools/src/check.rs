@@ -232,7 +232,7 @@ fn refused(drive: &DriveSpec) -> impl Iterator<Item = Refused<'_>> {
     })
 }
 
-/// Most drives that one line of output names.
+/// Maximum number of drives that one line of output names.
 const NAMED: usize = 4;
 
 /// Values that raw writes may not set, one line for the drives that have them in common; empty without Modbus TCP,

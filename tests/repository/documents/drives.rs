@@ -199,7 +199,7 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     }
 }
 
-/// Most points read on request only for which all are listed.
+/// Maximum number of points read on request only for which all are listed.
 const MOST_ON_REQUEST: usize = 30;
 
 /// The points of a family beyond the common model.

@@ -18,7 +18,7 @@ struct Entry {
 /// The table of foreign devices.
 #[derive(Debug, Default)]
 pub(super) struct ForeignDevices {
-    /// Most entries; with 0, no device can register.
+    /// Maximum number of entries; with 0, no device can register.
     most: usize,
     entries: Vec<Entry>,
 }

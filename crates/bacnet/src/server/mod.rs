@@ -49,7 +49,7 @@ pub struct Options {
     pub version: Arc<str>,
     /// The BBMD at which the server registers as a foreign device.
     pub bbmd: Option<SocketAddrV4>,
-    /// Most foreign devices that the server serves as a BBMD.
+    /// Maximum number of foreign devices that the server serves as a BBMD.
     pub foreign_devices: usize,
 }
 

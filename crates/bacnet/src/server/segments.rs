@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use crate::apdu::{self, SEGMENT_HEADER};
 use crate::types::Address;
 
-/// Most segments sent without an acknowledgement.
+/// Maximum number of segments sent without an acknowledgement.
 const WINDOW: u8 = 4;
 const WAIT: Duration = Duration::from_secs(3);
 const TRIES: u8 = 3;

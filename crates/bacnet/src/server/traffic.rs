@@ -13,9 +13,9 @@ const GRANT: u64 = 16 * 1024;
 const WAITING: usize = 64 * 1024;
 /// Octets that may wait for all addresses together.
 const WAITING_IN_ALL: usize = 1024 * 1024;
-/// Most broadcasts sent within a second.
+/// Maximum number of broadcasts sent within a second.
 const BROADCASTS: u64 = 100;
-/// Most addresses that are tracked at a time.
+/// Maximum number of addresses that are tracked at a time.
 const ADDRESSES: usize = 1024;
 /// Step in which a second of traffic is counted.
 const STEP: Duration = Duration::from_millis(100);

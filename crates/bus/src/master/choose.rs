@@ -13,10 +13,10 @@ use crate::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEn
 use crate::queue::{Chosen, Ready};
 use crate::schedule::{Decision, Poll};
 
-/// Most transactions of one rank in a row while a lower rank waits; then the lower one is served.
+/// Maximum number of transactions of one rank in a row while a lower rank waits; then the lower one is served.
 const IN_A_ROW: u32 = 8;
-/// Most decisions without a transaction before the rest waits for the next call: commands that end without one are
-/// answered.
+/// Maximum number of decisions without a transaction before the rest waits for the next call: commands that end without
+/// one are answered.
 const MOST_DECISIONS: usize = 1000;
 
 /// The ranks of commands, highest first.

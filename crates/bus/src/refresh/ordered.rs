@@ -6,7 +6,7 @@ use crate::codec::Table;
 use crate::drive::control::{Control, ControlItem};
 use crate::process_image::Reading;
 
-/// Most registers of a reference.
+/// Maximum number of registers of a reference.
 const LONGEST: usize = 2;
 
 /// The command in force: run or stop.

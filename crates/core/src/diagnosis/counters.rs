@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 pub const STEPS: usize = 12;
 /// Part of the counters without steps that is left after each step: half in two minutes.
 pub(super) const FADE: f32 = 0.97;
-/// A state that is older is not that of the drives at all.
+/// A state that is older than this says nothing about the present state of the drives.
 pub(super) const LONGEST_AGE: Duration = Duration::from_secs(10);
 /// The latency timer of usual USB adapters, ms.
 pub const LATENCY: usize = 16;
@@ -139,7 +139,7 @@ pub(super) struct Running {
     pub(super) contrast: Contrast,
 }
 
-/// Least time for which a change of the running state may stay unknown.
+/// Minimum time for which a change of the running state may stay unknown.
 const UNKNOWN: Duration = Duration::from_secs(1);
 
 impl Running {

@@ -4,7 +4,7 @@ use super::{Cause, Certainty, Finding};
 
 /// Steps of 5 s after which a verdict whose rule no longer holds is withdrawn.
 const GOES_AFTER: u32 = 12;
-/// Most verdicts of one line that are kept at a time.
+/// Maximum number of verdicts of one line that are kept at a time.
 const MOST_VERDICTS: usize = 24;
 
 /// A finding with the time for which its rule holds.

@@ -22,7 +22,7 @@ const ABSENCE: u16 = 12;
 const LATE: Duration = Duration::from_secs(5);
 /// Time for which the rest of a damaged reply may be on the line.
 const LEFT_OVER: Duration = Duration::from_millis(50);
-/// Most bytes between two transactions that are kept until it is clear whether they are a frame.
+/// Maximum number of bytes between two transactions that are kept until it is clear whether they are a frame.
 const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;

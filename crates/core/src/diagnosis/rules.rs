@@ -14,7 +14,7 @@ use crate::drive::DriveIndex;
 const FEW_OF_LINE: u32 = 10;
 /// Requests after which a drive that never replied is reported.
 const IN_VAIN: u16 = 6;
-/// Most silent drives that are reported one by one.
+/// Maximum number of silent drives that are reported one by one.
 const NAMED: usize = 6;
 /// Share of transactions below which a drive is good.
 const GOOD: f64 = 0.003;

@@ -6,7 +6,7 @@ use super::Cause;
 use crate::drive::commissioning::{Shared, gather};
 use crate::drive::{Profile, Step};
 
-/// Most steps reported with a verdict.
+/// Maximum number of steps reported with a verdict.
 const MOST_STEPS: usize = 96;
 
 impl Cause {

@@ -3,7 +3,7 @@
 use super::{Cause, Certainty, Finding};
 use crate::drive::{DriveIndex, PlannedRead, Profile};
 
-/// Most registers and points that one verdict lists.
+/// Maximum number of registers and points that one verdict lists.
 const NAMED: usize = 6;
 
 /// The finding about reads of a drive of this profile that get no reply and cannot be divided further. `answered`

@@ -26,7 +26,7 @@ use crate::process_image::{Access, DriveSpec, Machine};
 pub const ARMED: Duration = Duration::from_secs(60);
 /// Interval at which a drill in progress is evaluated.
 pub const LOOK: Duration = Duration::from_millis(20);
-/// Most drill reports that are kept.
+/// Maximum number of drill reports that are kept.
 const MOST_REPORTS: usize = 200;
 /// Maximum number of combinations of machine and way to stop whose last proof is kept.
 const MOST_PROOFS: usize = 16_384;

@@ -21,7 +21,7 @@ use crate::stop_all::OneStop;
 const KEEP: Duration = Duration::from_secs(5);
 /// Time within which the start command of a drill may be sent; a guard may delay it.
 const START: Duration = Duration::from_secs(60);
-/// How long a start is retried that needs a value not yet read, and the pause between retries.
+/// How long a start is retried if it needs a value that has not been read yet, and the pause between retries.
 const START_AGAIN: Duration = Duration::from_secs(15);
 const AGAIN: Duration = Duration::from_millis(500);
 /// Maximum time to reach the speed.

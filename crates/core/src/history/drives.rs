@@ -11,7 +11,7 @@ use super::trend::{DriveTrend, Reach};
 use crate::drive::Profile;
 use crate::process_image::{BusImage, DriveSpec, Reading, TapedRead};
 
-/// Most unconfigured drives whose counters are kept, in case they return.
+/// Maximum number of drives removed from the configuration whose counters are kept, in case they return.
 const MOST_ABSENT: usize = 4096;
 
 /// The past of all drives and buses.

@@ -26,7 +26,7 @@ const TICK: Duration = Duration::from_secs(1);
 const COUNTERS_EVERY: Duration = Duration::from_secs(45);
 /// Size of all files of events, bytes, and their number.
 pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);
-/// Most events that wait for the disk.
+/// Maximum number of events that wait for the disk.
 const WAITING: usize = 4096;
 /// Maximum number of drives with counters in a file. A file with more drives was not written by the gateway.
 const MOST_DRIVES: usize = 16_384;

@@ -59,7 +59,7 @@ pub struct RecorderOptions {
     pub after: Duration,
     /// Size of all recordings on disk at most, bytes.
     pub max_bytes: u64,
-    /// Most recordings on disk; with 0, no recordings are made.
+    /// Maximum number of recordings on disk; with 0, no recordings are made.
     pub max_count: usize,
     /// Whether a warning of a drive makes a recording.
     pub warnings: bool,

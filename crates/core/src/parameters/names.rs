@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::file::Id;
 use crate::drive::parameters::Label;
 
-/// Most rows of a list.
+/// Maximum number of rows of a list.
 const MOST_ROWS: usize = 10_000;
 
 /// Names of parameters by id.

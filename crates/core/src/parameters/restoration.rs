@@ -22,7 +22,7 @@ const BUSY_PAUSE: Duration = Duration::from_millis(200);
 const PAUSE: Duration = Duration::from_secs(1);
 /// How often progress is noted in the journal.
 const NOTED: Duration = Duration::from_secs(1);
-/// Most saves of one restore: a drive that loses unsaved values is written and saved again.
+/// Maximum number of saves of one restore: a drive that loses unsaved values is written and saved again.
 const MOST_SAVES: u32 = 3;
 
 /// What the restore needs next.

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use super::file::{MOST_BYTES, ParameterFile};
 use crate::files;
 
-/// Most readings kept for one drive.
+/// Maximum number of readings kept for one drive.
 const KEPT: usize = 100;
 /// The end of the name of a file.
 const EXTENSION: &str = "params";

@@ -19,7 +19,7 @@ use crate::order::{Command, Connection, Effect, Intent, LastStops, Origin, Outco
 use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Clearance};
 
-/// Most clients of a drive that are remembered.
+/// Maximum number of clients of a drive that are remembered.
 const MOST_CLIENTS: usize = 64;
 
 /// A drill in progress on a drive: no other order to the drive is sent.

@@ -10,7 +10,7 @@ use std::time::Instant;
 use crate::codec::Table;
 use crate::drive::DriveIndex;
 
-/// Most bytes of entries that wait for the recorder; further entries are counted and dropped.
+/// Maximum number of bytes of entries that wait for the recorder; further entries are counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;
 
 /// How a transaction ended on the line.

@@ -21,10 +21,10 @@ use crate::drive::DriveIndex;
 use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Urgency};
 use crate::permit::{Facts, Gate, Stage, Verdict};
 
-/// Most clients and drives for which the queue remembers when they were last served.
+/// Maximum number of clients and drives for which the queue remembers when they were last served.
 const SERVED_KEPT: usize = 4 * CAPACITY;
-/// Most commands refused when their turn came that wait to be reported, which happens before the next transaction;
-/// the oldest is dropped.
+/// Maximum number of commands refused when their turn came that wait to be reported, which happens before the next
+/// transaction; the oldest is dropped.
 const MOST_DENIED: usize = 256;
 
 /// The waiting commands: pure, time is an argument.

@@ -8,7 +8,7 @@ pub const MOST_STARTS: u32 = 120;
 /// The limits in `guard` of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Guard {
-    /// Most starts within any hour.
+    /// Maximum number of starts within any hour.
     pub starts_per_hour: Option<u32>,
     /// Minimum time that the motor must be at standstill before another start.
     pub min_off: Duration,

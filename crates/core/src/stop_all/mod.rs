@@ -31,7 +31,7 @@ pub const LONGEST_WAIT: Duration = Duration::from_secs(60);
 pub const LOOK: Duration = Duration::from_millis(20);
 /// Time within which the broadcast is sent; the stops of the single drives do not wait for it.
 const BROADCAST: Duration = Duration::from_millis(500);
-/// Most commands that wait for their answers; beyond that the oldest is answered with what is known.
+/// Maximum number of commands that wait for their answers; beyond that the oldest is answered with what is known.
 const MOST_ORDERS: usize = 256;
 
 /// The result of the stop for a drive.

@@ -21,7 +21,7 @@ use crate::process_image::{
     Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
 };
 
-/// Most points that a message names.
+/// Maximum number of points that a message names.
 const MOST_NAMED: usize = 4;
 
 type Limits = BTreeMap<String, RangeInclusive<f64>>;

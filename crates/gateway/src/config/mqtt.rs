@@ -13,7 +13,7 @@ use crate::document::{Finding, FromNode, Reader, format_duration};
 use crate::north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
-/// Most brokers: with three attempts per second, all of them are tried within 10 s.
+/// Maximum number of brokers: with three attempts per second, all of them are tried within 10 s.
 const MOST_BROKERS: usize = 16;
 
 /// `url` and `urls`, in this order.

@@ -43,7 +43,7 @@ impl Verb {
 pub(super) enum Command {
     /// A verb about an option.
     Option(Verb, u8),
-    /// A subnegotiation: option and content, both in one; longer ones than [`MOST_SUB`] are left out.
+    /// A subnegotiation: the option, followed by the content. One that is longer than [`MOST_SUB`] is ignored.
     Sub(Vec<u8>),
 }
 

@@ -268,7 +268,7 @@ pub fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&
     having
 }
 
-/// Most words that a message suggests.
+/// Maximum number of words that a message suggests.
 const MOST_CANDIDATES: usize = 4;
 /// Shortest part of a word that identifies it.
 const LEAST_PART: usize = 3;

@@ -117,7 +117,8 @@ impl Setting {
         word & !self.mask | !self.value & self.mask
     }
 
-    /// The word as between two pulses of these bits. Bits of a separate register are not in the word.
+    /// The word with these bits in the state that they have between two pulses. Bits of a separate register are not in
+    /// the word.
     pub fn released(&self, word: u16) -> u16 {
         match self.place {
             None if self.value == 0 => word | self.mask,

@@ -202,7 +202,8 @@ impl Profile {
         if self.protocols.contains(&Protocol::N2) { 2 } else { 1 }
     }
 
-    /// Most parameters in one read at `address`, and whether the read may include addresses without a parameter.
+    /// Maximum number of parameters in one read at `address`, and whether the read may include addresses without a
+    /// parameter.
     pub fn parameter_read(&self, address: u16) -> (u16, bool) {
         let range = self.range(Table::Holding, address);
         range.map_or((1, false), |range| {

@@ -17,7 +17,7 @@ use crate::permit::Settled;
 use crate::plant::{Plant, SharedPlant};
 use crate::process_image::{LeaseAction, Machine};
 
-/// Most batches of datagrams whose arrival times are kept until their writes are processed.
+/// Maximum number of batches of datagrams whose arrival times are kept until their writes are processed.
 const MOST_KEPT: usize = 64;
 /// The name of the vendor without an identifier of one's own.
 const VENDOR: &str = "drivegate";

@@ -79,7 +79,7 @@ pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], no
 }
 
 impl KeptSlot {
-    /// The event for one that is not taken up.
+    /// The event for a slot that is not restored.
     fn void(&self, time: SystemTime) -> Event {
         let Machine { port, address, .. } = &self.machine;
         let text = format!(

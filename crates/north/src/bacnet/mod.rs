@@ -60,7 +60,7 @@ pub struct Options {
     pub device: u32,
     /// Number of the virtual network of the drives; `None` if all objects belong to the gateway's device (`layout = "flat"`).
     pub network: Option<u16>,
-    /// Most foreign devices that the gateway serves as a BBMD.
+    /// Maximum number of foreign devices that the gateway serves as a BBMD.
     pub foreign_devices: usize,
     /// The behaviour of an offline drive.
     pub offline: WhenOffline,

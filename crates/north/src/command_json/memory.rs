@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 /// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
 const RECENT: usize = 1024;
-/// Least time for which a command with an `id` is remembered.
+/// Minimum time for which a command with an `id` is remembered.
 pub(crate) const REMEMBERED: Duration = Duration::from_secs(600);
 /// Longest time that a command is remembered, whatever the expiry of its message.
 const LONGEST: Duration = Duration::from_secs(86_400);

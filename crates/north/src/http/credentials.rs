@@ -6,7 +6,7 @@ use std::str::FromStr;
 pub trait Credential: FromStr<Err = CredentialError> + std::fmt::Display {
     /// Kind of credential: `token` or `user`.
     const KIND: &'static str;
-    /// Most entries of a file, more than any plant needs.
+    /// Maximum number of entries of a file, more than any plant needs.
     const MOST_ENTRIES: usize;
 
     /// Name of the credential, unique in the file.

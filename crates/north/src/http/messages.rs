@@ -221,7 +221,7 @@ pub struct StoredReading {
 }
 
 impl StoredReading {
-    /// Reads the file of a stored reading; `file` is how the reader of the list gets to know it.
+    /// Reads the file of a stored reading; `file` is the path that the list shows.
     pub fn of(kept: &Kept, file: String) -> StoredReading {
         let (reading, error) = match read(&kept.path) {
             Ok(reading) => (Some(reading), None),

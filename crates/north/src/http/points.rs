@@ -17,7 +17,7 @@ use crate::order::{self, Authority, Order, Origin};
 use crate::plant::{DriveHandle, OrderRequest};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
-/// Most points in one request, more than a profile has.
+/// Maximum number of points in one request, more than a profile has.
 const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);

@@ -109,7 +109,7 @@ pub struct InProcess {
     cancel: CancellationToken,
 }
 
-/// Most connections of a command, and the buffer size of each.
+/// Maximum number of connections of a command, and the buffer size of each.
 const CONNECTIONS: usize = 4;
 const BUFFER: usize = 64 * 1024;
 

@@ -23,9 +23,9 @@ const SALT: usize = 16;
 const COST: &str = "$argon2id$v=19$m=12288,t=3,p=1$";
 /// Salt and hash verified for unknown users, so timing reveals nothing.
 const NOBODY: &str = "bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
-/// Least number of characters of a password.
+/// Minimum number of characters of a password.
 pub const MIN_PASSWORD: usize = 10;
-/// Most bytes of a password.
+/// Maximum number of bytes of a password.
 pub const MAX_PASSWORD: usize = 256;
 /// The fields of a line, for error messages.
 const FORM: CredentialError = CredentialError::Form("name hash");

@@ -6,7 +6,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use crate::http::messages::ReloadOutcome;
 
-/// Most waiting commands; no more than this many clients can exist.
+/// Maximum number of waiting commands; no more than this many clients can exist.
 const WAITING: usize = super::MAX_CLIENTS;
 
 /// A request to reload the configuration.

@@ -34,7 +34,7 @@ use crate::{NorthState, ServerError};
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
 
-/// Most simultaneous clients.
+/// Maximum number of simultaneous clients.
 const MAX_CLIENTS: usize = 32;
 /// The address under which all local clients are counted, so that they share one limit.
 const THIS_MACHINE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);

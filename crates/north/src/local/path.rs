@@ -15,7 +15,7 @@ const SYSTEM_DIRECTORY: &str = "/run/drivegate";
 const MAX_GATEWAYS: usize = 16;
 /// Owner and group may read and write, which both take to connect.
 const MODE: u32 = 0o660;
-/// Most clients that wait to be accepted.
+/// Maximum number of clients that wait to be accepted.
 const BACKLOG: u32 = 16;
 /// Tries to lock the directory, while another gateway starts, and the time between them.
 const LOCK_TRIES: u32 = 50;

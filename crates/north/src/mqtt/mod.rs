@@ -115,7 +115,7 @@ pub struct Options {
     pub password: Option<Password>,
     /// Host and port of an HTTP proxy, by whose CONNECT all brokers are reached.
     pub proxy: Option<(String, u16)>,
-    /// Most messages per second that each connection publishes; 0 sets no limit.
+    /// Maximum number of messages per second that each connection publishes; 0 sets no limit.
     pub publish_limit: usize,
     /// CA certificates (PEM) for the broker; if absent, the certificates of the system.
     pub ca: Option<PathBuf>,

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-/// Most bytes of a secret: a longer file cannot be a password.
+/// Maximum number of bytes of a secret: a longer file cannot be a password.
 const LONGEST: u64 = 16 << 10;
 
 /// A secret that is not printed in logs.

@@ -19,8 +19,8 @@ use super::outbox::{KEPT_BYTES, Message};
 use crate::files::names::MQTT_TOPICS;
 use crate::{MqttKind, NorthState};
 
-/// Most jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at
-/// most [`KEPT_BYTES`].
+/// Maximum number of jobs that wait for the disk: a burst of events and its acknowledgements. The size of their
+/// messages is at most [`KEPT_BYTES`].
 const JOBS: usize = 2 * crate::event::BURST;
 /// Messages that are written at a time.
 const BATCH: usize = 1024;

@@ -23,7 +23,7 @@ use crate::process_image::{Access, Machine};
 const EXPIRY: Duration = Duration::from_secs(60);
 /// Time without an answer after which the reading of a drive ends.
 const AWAY: Duration = Duration::from_secs(3600);
-/// Most changes that an event names.
+/// Maximum number of changes that an event names.
 const NAMED_CHANGES: usize = 5;
 
 /// How a drive is read.

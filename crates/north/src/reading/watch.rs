@@ -25,7 +25,7 @@ thread_local! {
     static WORKER_RAN: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Most pauses that wait to be reported; they are reported ten times a second.
+/// Maximum number of pauses that wait to be reported; they are reported ten times a second.
 const MOST_UNTOLD: usize = 8;
 
 /// Watches whether the threads of a runtime run.
@@ -74,13 +74,14 @@ impl Watch {
         })
     }
 
-    /// The watch of the runtime of this thread; one that sees no stalls if the runtime has none.
+    /// The watch of the runtime to which this thread belongs. If the runtime has no watch, returns a watch that reports
+    /// no stalls.
     pub fn of_this_thread() -> Arc<Watch> {
         let own = WATCH.with(|watch| watch.try_borrow().ok().and_then(|watch| watch.clone()));
         own.unwrap_or_else(|| Watch::new(false))
     }
 
-    /// Makes this thread one of the runtime that is watched.
+    /// Adds this thread to the threads of the watched runtime.
     pub fn enter(self: &Arc<Watch>) {
         WATCH.with(|watch| {
             if let Ok(mut watch) = watch.try_borrow_mut() {

@@ -37,7 +37,7 @@ use crate::tcp_server::{TcpServer, TcpService};
 
 pub use self::loopback::Loopback;
 
-/// Most tools that one address of a slot serves at a time, in turns.
+/// Maximum number of tools that one address of a slot serves at a time, in turns.
 pub const MAX_TOOLS: usize = 4;
 
 /// The rights of the tools of a slot.

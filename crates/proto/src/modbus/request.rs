@@ -12,7 +12,7 @@ pub enum RequestPdu {
         table: Table,
         /// First PDU address.
         start: u16,
-        /// Items, 1..=125 registers or 1..=2000 bits.
+        /// Number of items: 1..=125 registers or 1..=2000 bits.
         count: u16,
     },
     /// Write of one coil by function 5.

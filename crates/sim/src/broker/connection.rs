@@ -15,7 +15,7 @@ use super::packet::{self, Connect, Fault, Incoming, Qos, Version, fault, reason}
 use super::state::Leave;
 use super::{CONNECT_LIMIT, FAREWELL_LIMIT, MAX_INFLIGHT, STALL_LIMIT, Shared};
 
-/// Most bytes read at once.
+/// Maximum number of bytes read at once.
 const READ_BYTES: usize = 16 * 1024;
 /// Bytes to send above which nothing is read and no message is taken from the queue.
 const OUTPUT_BYTES: usize = 64 * 1024;

@@ -35,10 +35,10 @@ const MAX_CONNECTIONS: usize = 128;
 const MAX_PACKET_BYTES: usize = 256 * 1024;
 /// Longest client id, bytes.
 const MAX_CLIENT_ID_BYTES: usize = 256;
-/// Most subscriptions of one client.
+/// Maximum number of subscriptions of one client.
 const MAX_SUBSCRIPTIONS: usize = 64;
-/// Most retained messages. A further message is passed on but not retained, and the message that it would replace
-/// is deleted.
+/// Maximum number of retained messages. A further message is passed on but not retained, and the message that it would
+/// replace is deleted.
 const MAX_RETAINED_MESSAGES: usize = 5_000;
 /// All retained messages together, bytes.
 const MAX_RETAINED_BYTES: usize = 8 * 1024 * 1024;

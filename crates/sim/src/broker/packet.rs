@@ -144,7 +144,7 @@ pub(super) struct Connect {
     pub(super) client_id: String,
     /// Keep-alive time; zero means no supervision.
     pub(super) keep_alive: Duration,
-    /// Most unacknowledged QoS 1 messages that the client accepts.
+    /// Maximum number of unacknowledged QoS 1 messages that the client accepts.
     pub(super) receive_maximum: usize,
     /// Largest packet that the client takes, bytes.
     pub(super) max_packet: usize,

@@ -18,9 +18,9 @@ pub(super) struct Wish {
     pub(super) want: bool,
 }
 
-/// Most nodes of a search for bits; no profile has that many states in one register.
+/// Maximum number of nodes of a search for bits; no profile has that many states in one register.
 const MOST_TRIES: usize = 4000;
-/// Most ways to keep a state off that the search follows.
+/// Maximum number of ways to keep a state off that the search follows.
 const MOST_WAYS: usize = 24;
 
 /// Bits whose values are fixed already.

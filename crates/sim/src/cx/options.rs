@@ -8,7 +8,7 @@ use std::str::FromStr;
 /// Items per message; the manual states no limits and shows one item everywhere (reference/drives.md 9.7).
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
-    /// Most coils or discrete inputs per message.
+    /// Maximum number of coils or discrete inputs per message.
     pub bits: u16,
     pub registers: u16,
     /// The reaction to more items.

@@ -11,9 +11,9 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 pub struct Limits {
     /// Reading actual values, the fault code and parameters.
     pub read: u16,
-    /// Most parameters per write.
+    /// Maximum number of parameters per write.
     pub write: u16,
-    /// Most process data items per message.
+    /// Maximum number of process data items per message.
     pub process: u16,
     /// The answer to a count beyond the limit; the manuals do not state it.
     pub beyond: Beyond,

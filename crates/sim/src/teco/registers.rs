@@ -7,7 +7,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 
 /// Function codes that the card supports.
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
-/// Most registers per message.
+/// Maximum number of registers per message.
 const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
 pub(super) const CHECK_ERROR: Exception = Exception(0x00);

@@ -16,7 +16,7 @@ use crate::printable;
 
 /// Shortest time between two lines of one kind that a library logs.
 const INTERVAL: Duration = Duration::from_secs(60);
-/// Most kinds of lines that are distinguished; they are places in the source code, so this is never reached.
+/// Maximum number of kinds of lines that are distinguished; they are places in the source code, so this is never reached.
 const KINDS: usize = 1024;
 /// Start of the targets of our own log lines.
 const OWN: &str = "drivegate";

@@ -32,7 +32,7 @@ const COLUMNS: [&str; 17] = [
 const MAX: &str = "max";
 /// Items of a read request, where the list gives no number.
 const READ: u16 = 16;
-/// Most rows of a point list.
+/// Maximum number of rows of a point list.
 const MOST_ROWS: usize = 10_000;
 
 /// The profile that the list `text` of the file `path` makes.

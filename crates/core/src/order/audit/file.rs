@@ -16,7 +16,7 @@ use super::AuditRecord;
 use super::chain::{self, Chain, Entry, Hash, Tail};
 use crate::files::Rotated;
 
-/// Most records that wait for the disk: those of commands that were sent, and all others.
+/// Maximum number of records that wait for the disk: those of commands that were sent, and all others.
 const WAITING: (usize, usize) = (8192, 1024);
 /// Time after which written records survive a power failure, and after which a disk that failed is tried again.
 const SYNC: Duration = Duration::from_secs(1);

@@ -10,8 +10,8 @@ use crate::order::{Asks, Command, Holder, Origin, Refusal};
 use crate::permit::holder::{Claim, Denial, HoldChange, HoldView, Holding, Mode, Rules, Verb};
 use crate::permit::judge::Ask;
 
-/// Most changes of holds that wait to be published, which happens several times a second; beyond that the oldest is
-/// dropped.
+/// Maximum number of changes of holds that wait to be published, which happens several times a second; beyond that the
+/// oldest is dropped.
 const MOST_TOLD: usize = 256;
 /// Interval at which commands of a client that does not hold the drive are logged.
 const UNHELD_LOGGED: Duration = Duration::from_secs(60);

@@ -11,7 +11,7 @@ use crate::order::Asks;
 const FORGOTTEN_AFTER: u32 = 10;
 /// The name of the gateway's own stop after a client went silent.
 const SUPERVISION: &str = "supervision";
-/// Most clients whose last command word is remembered.
+/// Maximum number of clients whose last command word is remembered.
 const MOST_STOOD: usize = 256;
 
 /// An action on the hold of a drive.

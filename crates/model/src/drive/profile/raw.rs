@@ -12,7 +12,7 @@ pub use standing::Part;
 
 /// Whole numbers up to here are exact as a number with a fraction.
 const EXACT: u64 = 1 << 53;
-/// Most registers of one value.
+/// Maximum number of registers of one value.
 pub const MOST_REGISTERS: usize = 32;
 /// Powers of ten by which another register may scale a value; no unit of measure needs more.
 const LEAST_POWER: i32 = -20;
@@ -62,7 +62,7 @@ pub enum Unwritable {
     Type {
         /// The requested value.
         value: f64,
-        /// Least value of the register in engineering units.
+        /// Minimum value of the register in engineering units.
         least: f64,
         /// Greatest value of the register in engineering units.
         most: f64,
@@ -136,7 +136,7 @@ impl Raw {
         text
     }
 
-    /// Least and greatest whole count, after `mask`.
+    /// Smallest and greatest whole number, after `mask`.
     pub(in crate::drive) fn counts(&self) -> (i128, i128) {
         let most = |mask: u64| (0, i128::from(mask.checked_shr(mask.trailing_zeros()).unwrap_or(0)));
         match (self.mask, self.form) {

@@ -3,7 +3,7 @@
 use super::super::commissioning::{Commissioning, Step};
 use crate::document::Reader;
 
-/// Most lines of a step, and most characters of a line: they are also shown with verdicts.
+/// Maximum number of lines of a step, and of characters of a line: they are also shown with verdicts.
 const MOST_LINES: usize = 16;
 const MOST_CHARACTERS: usize = 240;
 

@@ -80,7 +80,7 @@ const BUILT_IN: &[(&str, &str)] = files![
     "yaskawa-v1000.toml",
 ];
 
-/// Most nested bases that are followed; no valid set of files has that many.
+/// Maximum number of nested bases that are followed; no valid set of files has that many.
 const MOST_BASES: usize = 16;
 
 impl Profiles {

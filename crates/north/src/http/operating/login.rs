@@ -21,7 +21,7 @@ use super::sessions::Session;
 use super::state::{Credentials, Denied, Operating, is_own_origin};
 use super::throttle::Source;
 
-/// Most bytes of the body of a login.
+/// Maximum number of bytes of the body of a login.
 const MAX_LOGIN: usize = 4096;
 
 /// A session, for the page.

@@ -16,7 +16,7 @@ use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, relea
 use crate::parameters::{Id, ParameterFile, Wishes};
 use crate::plant::DriveHandle;
 
-/// Most bytes of a request: a parameter file with some thousand parameters.
+/// Maximum number of bytes of a request: a parameter file with some thousand parameters.
 const MAX_BODY: usize = 256 * 1024;
 
 /// `POST …/params/reading`: starts a reading, unless one is in progress.

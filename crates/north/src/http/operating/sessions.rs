@@ -12,9 +12,9 @@ use crate::hex;
 pub(super) const IDLE: Duration = Duration::from_secs(30 * 60);
 /// Longest time from login to the end of a session, however active its user is.
 const LONGEST: Duration = Duration::from_secs(12 * 3600);
-/// Most sessions of one user; a further login ends the one that was unused longest.
+/// Maximum number of sessions of one user; a further login ends the one that was unused longest.
 const MOST_OF_USER: usize = 8;
-/// Most sessions of all users; a further login ends the one that was unused longest.
+/// Maximum number of sessions of all users; a further login ends the one that was unused longest.
 const MOST_SESSIONS: usize = 128;
 
 /// Random numbers for one session.

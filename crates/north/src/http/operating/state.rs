@@ -26,9 +26,9 @@ use crate::log_throttle::LogThrottle;
 use crate::order::{Authority, Grants, Proof, Right, SourceKind};
 /// Time for which a password that a program sends with each request is not hashed again.
 const VERIFIED: Duration = Duration::from_secs(300);
-/// Most remembered passwords, and most addresses that are known to belong to a user.
+/// Maximum number of remembered passwords, and of addresses that are known to belong to a user.
 const MOST_REMEMBERED: usize = 256;
-/// Most commands with pending results, except stops.
+/// Maximum number of commands with pending results, except stops.
 pub(super) const IN_PROGRESS: usize = 256;
 
 /// Header with the token of a session.

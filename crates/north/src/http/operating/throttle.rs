@@ -18,7 +18,7 @@ const FREE_OF_USER: u32 = 20;
 const PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 /// Time without a failed login after which earlier failures are forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(15 * 60);
-/// Most addresses and browsers, and most users, that are counted separately; beyond it the oldest is forgotten.
+/// Maximum number of addresses and browsers, and of users, that are counted separately; beyond it the oldest is forgotten.
 const MOST_SOURCES: usize = 4096;
 
 /// The source of a login attempt.

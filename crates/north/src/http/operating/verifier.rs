@@ -8,9 +8,9 @@ use tokio::sync::oneshot;
 
 use super::super::users::Workspace;
 
-/// Most passwords that wait to be verified.
+/// Maximum number of passwords that wait to be verified.
 const MOST_WAITING: usize = 16;
-/// Most waiting passwords from one address.
+/// Maximum number of waiting passwords from one address.
 const MOST_OF_ADDRESS: usize = 4;
 /// Niceness of the thread.
 const NICE: i32 = 10;

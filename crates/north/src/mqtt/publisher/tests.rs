@@ -13,7 +13,7 @@ struct PublishedPlant {
 }
 
 impl PublishedPlant {
-    /// Drives `p1` (running at 25 Hz) and `p2` (never read); 100 ms to 60 s.
+    /// Drives `p1` (running at 25 Hz) and `p2` (never read), published at intervals of 100 ms to 60 s.
     fn new() -> PublishedPlant {
         let plant = fixture::plant(&["p1", "p2"]);
         let topics = Topics::new("drivegate", "hall");

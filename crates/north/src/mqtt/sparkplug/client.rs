@@ -34,9 +34,9 @@ use crate::plant::{Plant, SharedPlant};
 use crate::process_image::Snapshot;
 use crate::{MqttKind, NorthState};
 
-/// Most messages published before other events are handled.
+/// Maximum number of messages published before other events are handled.
 const MESSAGES: usize = 64;
-/// Least time between two log lines of one kind.
+/// Minimum time between two log lines of one kind.
 const LOGGED: Duration = Duration::from_secs(60);
 
 /// Time for a broker to report that the primary host is online, before another broker is tried.

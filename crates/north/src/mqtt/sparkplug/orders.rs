@@ -23,7 +23,7 @@ use crate::plant::{Placed, Plant};
 const AWAITED: usize = 4096;
 /// Name in the audit of a command that could not be read.
 const UNREAD: &str = "a Sparkplug command";
-/// Most metrics in a command.
+/// Maximum number of metrics in a command.
 const METRICS: usize = 64;
 
 /// The command processing of the Sparkplug node.

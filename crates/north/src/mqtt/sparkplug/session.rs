@@ -13,9 +13,10 @@ use super::topics::{Kind, StateForm, Topics};
 use super::wire::{DataType, Metric, Payload};
 use crate::drive::Quality;
 
-/// Least time between two births of the node on one connection: requests in between are served together.
+/// Minimum time between two births of the node on one connection: requests in between are served together.
 const REBIRTH: Duration = Duration::from_millis(250);
-/// Most values in one history message, and the minimum interval between two of them, so that live values take precedence.
+/// Maximum number of values in one history message, and the minimum interval between two of them, so that live values
+/// take precedence.
 const HISTORY_VALUES: usize = 250;
 const HISTORY_PACE: Duration = Duration::from_millis(25);
 /// Values of an outage that are kept, of all drives together.
@@ -35,7 +36,7 @@ pub(super) struct Rules {
     pub(super) alias: bool,
     /// Values of an outage are published afterwards.
     pub(super) history: bool,
-    /// Least time between two messages of a device.
+    /// Minimum time between two messages of a device.
     pub(super) min_interval: Duration,
 }
 

@@ -191,7 +191,7 @@ impl Form {
         count as u64 & all
     }
 
-    /// Least and greatest count that the form can hold.
+    /// Smallest and greatest number that the type can represent.
     pub(super) fn span(self) -> (f64, f64) {
         match self {
             Form::Bit { .. } => (0.0, 1.0),

@@ -7,7 +7,7 @@ use crate::mqtt::sparkplug::history::Recorder;
 use crate::mqtt::sparkplug::metric::{Definition, Moment, Naming, Pace, Sample};
 use crate::mqtt::sparkplug::wire::Metric;
 
-/// Least time between two messages because of figures alone.
+/// Minimum time between two messages because of figures alone.
 const FIGURES: Duration = Duration::from_secs(1);
 
 /// The node itself, or a drive.
