@@ -85,7 +85,7 @@ fn stays_as_it_is(case: &Case) {
     }
 }
 
-/// Orders given while the motor stood take effect with the next start.
+/// Orders that are given while the motor is at standstill take effect at the next start.
 #[test]
 fn a_direction_that_waits_is_that_of_the_next_start() {
     for name in [

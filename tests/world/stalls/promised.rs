@@ -50,7 +50,7 @@ pub struct Promised {
     /// When each write that a drive carried out was sent to it.
     told: BTreeMap<u8, Vec<Instant>>,
     running: Vec<bool>,
-    /// When each drive was last stopped by anything but the line.
+    /// When each drive was last stopped by an incident and not by a command on the line.
     befell: BTreeMap<u8, Instant>,
 }
 

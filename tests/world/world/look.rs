@@ -160,8 +160,8 @@ impl World {
     pub(super) fn check_probes(&self) {
         for (bus, truths) in self.buses.iter().zip(&self.truths) {
             let round = bus.handle.image.health().fast.last.unwrap_or_default();
-            // A report on N2 that does not come is waited for as long as the longest one takes: the report of this
-            // drive before the pause, and that of another one after it.
+            // On N2, the bus waits for a missing report as long as the longest report takes. This happens twice: for
+            // the report of this drive before the pause, and for the report of another drive after it.
             let reports = match bus.line.protocol {
                 Protocol::N2 => 2 * (bus.line.response_timeout + Duration::from_secs(1)),
                 Protocol::ModbusRtu | Protocol::ModbusAscii => Duration::ZERO,

@@ -86,7 +86,7 @@ mod tests {
         (left, events.recent().len())
     }
 
-    /// An inactive, an active and a reference of that client.
+    /// Enters three values of this client into the slots: `run` inactive, `run` active, and a reference.
     fn occupied(bus: &BusHandle, origin: &Origin) {
         let mut queue = bus.queue.lock();
         let all = queue.gate.priorities(crate::drive::DriveIndex::new(0));

@@ -27,7 +27,7 @@ pub struct ParamsSettings {
 }
 
 impl ParamsSettings {
-    /// Readings below that state directory, and nothing else.
+    /// Settings that only state where readings are stored: in a subdirectory of `state_dir`.
     pub(super) fn below(state_dir: &Path) -> ParamsSettings {
         ParamsSettings {
             dir: state_dir.join(names::PARAMS),

@@ -349,7 +349,7 @@ impl ClientSession {
                 };
                 Decision::Drive(Box::new((forwarded, work)))
             }
-            // The write is only a heartbeat, or the hold.
+            // The write needs no command on the bus: it only renews the lease or concerns the hold of the drive.
             Decision::Reply(request, _) => match refused {
                 Some(code) => code.into(),
                 None => {

@@ -14,7 +14,7 @@ pub(super) enum Packet {
     Publish(Arc<str>, usize, bool),
     /// A packet with this number of filters.
     Subscribe(usize),
-    /// The question whether the broker is there.
+    /// A PINGREQ, which the broker must answer.
     Ping,
 }
 
