@@ -263,7 +263,7 @@ fn every_family_shows_what_http_tells() {
         .collect();
     let lists = plant.bacpypes(20, &orders);
     let lists: Vec<Vec<Json>> = lists.iter().map(|list| list.as_array().unwrap().clone()).collect();
-    // Values of a standing motor do not change, but one may be read for the first time between two comparisons.
+    // Values of a motor at standstill do not change, but one may be read for the first time between two comparisons.
     let mut left: Vec<usize> = units.clone().collect();
     let mut objects = 0;
     until("all is as HTTP tells", || {

@@ -123,7 +123,7 @@ impl Line {
         );
     }
 
-    /// Checks that `why` explains why the motor stands although its run command is on.
+    /// Checks that `why` explains why the motor is at standstill although its run command is on.
     fn is_explained(&self) {
         let why = self.command("why", &["pump-1"]);
         assert_eq!(why.code, 0, "{}", why.err);

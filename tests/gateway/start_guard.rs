@@ -21,7 +21,7 @@ fn curl(site: &Site, drive: &str, body: &str) -> (u16, Json) {
     site.curl("alice", &format!("drives/{drive}/commands"), &["-d", body])
 }
 
-/// Stops `pump-1` and waits until its motor stands.
+/// Stops `pump-1` and waits until its motor is at standstill.
 fn stop(site: &Site) {
     write_registers(site.modbus, 1, COMMAND, &[0]);
     site.until_point("pump-1", "running", false);

@@ -64,7 +64,7 @@ struct RestoreWorld {
     started: Option<Instant>,
     /// Time at which a person stops the motor, or puts the drive back on the line.
     mended: Option<Instant>,
-    /// When the drive reported that its motor stands, if that was the last transaction on the line.
+    /// When the drive reported that its motor is at standstill, if that was the last transaction on the line.
     stands: Option<Instant>,
     stops: Vec<Placed>,
     refused: usize,
@@ -168,7 +168,7 @@ impl RestoreWorld {
         self.rig.drive(DRIVE).image.restore_lock.set(why);
     }
 
-    /// Checks the line: a parameter is written only directly after the reply that the motor stands, and with the
+    /// Checks the line: a parameter is written only directly after the reply that the motor is at standstill, and with the
     /// journal on disk.
     fn look(&mut self, seen: Vec<Seen>) {
         let profile = self.rig.drive(DRIVE).image.spec.profile.clone();

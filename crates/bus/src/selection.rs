@@ -17,7 +17,7 @@ const DIFFERING: u8 = 3;
 /// Matching comparisons in a row after which process data is trusted again.
 const AGREEING: u8 = 2;
 /// First and longest pause before a value is compared again after a comparison that proved nothing, such as 0 of a
-/// standing motor.
+/// motor at standstill.
 const PAUSE: (Duration, Duration) = (Duration::from_secs(10), Duration::from_secs(600));
 /// Pause between two looks at process data that is 0 in a motor that does not run.
 const LOOK: Duration = Duration::from_millis(500);

@@ -46,7 +46,8 @@ enum State {
     Held(Instant),
     /// The lease expired while the drive ran, and the action is not acknowledged yet.
     RanOut,
-    /// The lease has ended: the motor stood without a run command when it expired, or the action was acknowledged.
+    /// The lease has ended: the motor was at standstill without a run command when the lease expired, or the action was
+    /// acknowledged.
     Ended,
 }
 

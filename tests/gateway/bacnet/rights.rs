@@ -28,7 +28,7 @@ impl Plant {
         until("the reload", || (count() > before).then_some(()));
     }
 
-    /// Whether a slot blocks a start over Modbus TCP. The motor stands afterwards.
+    /// Whether a slot blocks a start over Modbus TCP. The motor is at standstill afterwards.
     fn is_locked(&self) -> bool {
         let locked = until("an answer", || match mbpoll_write(self.site.modbus, 1, 33_024, &[1]) {
             Ok(()) => Some(false),

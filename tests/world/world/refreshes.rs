@@ -4,7 +4,7 @@ use super::*;
 
 impl World {
     /// Checks the frame of a refresh: only values that an order wrote, only the stop word after a stop, and no run
-    /// word for a standing motor.
+    /// word for a motor at standstill.
     pub(super) fn check_refresh(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         self.collect();
         let now = self.now;

@@ -33,7 +33,7 @@ pub(super) enum Word {
     Run(Option<bool>),
     /// The word with this number in the start sequence.
     Sequence(usize, Option<bool>),
-    /// Prepares a pulse of these bits, usually a reset: clears the bits, and the run command if the motor stands.
+    /// Prepares a pulse of these bits, usually a reset: clears the bits, and the run command if the motor is at standstill.
     ResetLow(Setting),
     /// Sets the bits of a reset pulse.
     ResetHigh(Setting),
@@ -397,7 +397,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
                 let run = if reverse { back } else { forward };
                 match runs && run.place.is_none() {
                     true => sent(at, run.applied(stays)),
-                    // While the motor stands, no bit of the drive stores the direction.
+                    // While the motor is at standstill, no bit of the drive stores the direction.
                     false => Made::AtNextStart(reverse),
                 }
             }

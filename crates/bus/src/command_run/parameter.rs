@@ -20,7 +20,7 @@ enum Stage {
     Value,
     /// The drive is being read to see whether its motor runs.
     Running,
-    /// The motor stands: the write must be the next transaction on the line.
+    /// The motor is at standstill: the write must be the next transaction on the line.
     Write,
     /// Releases the N2 override of the parameter.
     Release,

@@ -289,7 +289,7 @@ impl CommandRun {
     }
 
     /// Decides how a command continues whose word cannot be read from the drive. A stop is sent anyway; so is a
-    /// command to a standing motor, and one that sets every bit. Any other command could stop or turn a running
+    /// command to a motor at standstill, and one that sets every bit. Any other command could stop or turn a running
     /// motor, and ends with `outcome`.
     fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
         if self.urgency != Urgency::Stop && self.known.running && !self.scope.whole {

@@ -146,7 +146,7 @@ fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
     let mut bench = ObedientDrive::new(0);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 4), (20, 2000, 0)]);
-    // The reset bit is already set, and so is the run bit, although the motor stands with a fault.
+    // The reset bit is already set, and so is the run bit, although the motor is at standstill with a fault.
     let mut bench = ObedientDrive::new(0x0005);
     let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(bench.run(&mut reset), [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0)]);

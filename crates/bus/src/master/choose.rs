@@ -159,7 +159,7 @@ impl Master {
         }
     }
 
-    /// The write of a parameter to a drive that has just reported that its motor stands: only a stop may come
+    /// The write of a parameter to a drive that has just reported that its motor is at standstill: only a stop may come
     /// between the two.
     fn checked_write(&mut self, now: Instant) -> Option<NextStep> {
         let (slot, rank) = (Urgency::Command, Urgency::Command);

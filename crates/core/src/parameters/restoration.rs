@@ -2,7 +2,7 @@
 //! I/O.
 //!
 //! Every parameter is a separate command, which the bus carries out only if the drive has the former value or the
-//! new one, and only while the motor stands; a drive that already has the new value is not written. So an
+//! new one, and only while the motor is at standstill; a drive that already has the new value is not written. So an
 //! interrupted restore can be resumed or undone by going through all of its parameters again, whatever had reached
 //! the drive.
 

@@ -14,7 +14,7 @@ const SPEEDS: [(ModelPoint, f64); 3] = [
 ];
 
 impl Reading<'_> {
-    /// Whether the point is a good speed that is not zero although a newer sample shows that the motor stands, or
+    /// Whether the point is a good speed that is not zero although a newer sample shows that the motor is at standstill, or
     /// zero although a newer one shows that it turns. Other points are not checked: current, torque and power can
     /// have any value at any speed.
     pub fn is_contradicted(&self, point: PointIndex) -> bool {

@@ -1,4 +1,4 @@
-//! Whether a motor stands, as far as readings show. Pure.
+//! Whether a motor is at standstill, as far as readings show. Pure.
 
 use std::time::Instant;
 
@@ -14,7 +14,7 @@ const STANDS: f64 = 0.5;
 /// The state of a motor in readings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Standstill {
-    /// The motor stands.
+    /// The motor is at standstill.
     Stands,
     /// The motor turns, with the evidence.
     Turns(String),

@@ -275,7 +275,7 @@ impl Ledger {
         }
     }
 
-    /// Notes that a word of a command that would start a standing motor is being sent.
+    /// Notes that a word of a command that would start a motor at standstill is being sent.
     pub(super) fn start_written(&mut self, machine: &Machine, number: u64, client: &Arc<str>, now: Instant) {
         if self.with(machine, |motor| motor.start_written(number, client, now)) == Some(true) {
             self.generation += 1;

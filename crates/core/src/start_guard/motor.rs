@@ -197,7 +197,7 @@ impl Motor {
         }
     }
 
-    /// Notes that a word of a command that would start a standing motor is being sent. Returns whether this is a start.
+    /// Notes that a word of a command that would start a motor at standstill is being sent. Returns whether this is a start.
     pub(super) fn start_written(&mut self, number: u64, client: &Arc<str>, now: Instant) -> bool {
         let is_next = self.reserved.take_if(|reserved| reserved.number == number).is_some();
         match &mut self.passage {

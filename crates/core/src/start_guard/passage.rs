@@ -43,7 +43,7 @@ pub(super) enum Progress {
     Turns,
     /// The motor was seen running.
     Ran,
-    /// The start is over: the motor stands again, or the drive did not accept the command.
+    /// The start is over: the motor is at standstill again, or the drive did not accept the command.
     Over,
     /// The drive could not start, and did not.
     Vain,

@@ -281,7 +281,7 @@ fn min_off_counts_from_the_first_reading_that_shows_the_motor_standing() {
     rig.read(0, false, 71.2);
     rig.read(0, false, 72.5);
     assert_eq!((rig.refused(0, 102.4), rig.refused(0, 102.5)), (Some("min_off"), None));
-    // Stops to a standing motor change nothing.
+    // Stops to a motor at standstill change nothing.
     rig.guards.stop_written(DriveIndex::new(0), rig.at(102.6));
     rig.read(0, false, 102.7);
     assert_eq!(rig.refused(0, 102.8), None);

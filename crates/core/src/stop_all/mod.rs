@@ -1,4 +1,5 @@
-//! Stop all: stops every controlled drive of the gateway, of a bus or of a group, and watches each until its motor stands.
+//! Stop all: stops every controlled drive of the gateway, of a bus or of a group, and watches each until its motor is at
+//! standstill.
 //!
 //! All interfaces use one mechanism: [`StopAll::order`] places the stops before it returns, a task of the gateway
 //! calls [`StopAll::look`] while a command is in progress, and [`StopAll::begun`] wakes it. If every drive of a bus
@@ -38,7 +39,7 @@ const MOST_ORDERS: usize = 256;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Stopped {
-    /// The drive acknowledged its stop, and a later read shows that the motor stands.
+    /// The drive acknowledged its stop, and a later read shows that the motor is at standstill.
     Standing,
     /// The drive acknowledged its stop, and the motor still turns.
     Stopping,
@@ -79,7 +80,7 @@ impl StopReport {
 pub struct StopOrder {
     /// Resolves when every stop was acknowledged or failed once: whether none failed.
     pub acknowledged: oneshot::Receiver<bool>,
-    /// Resolves when every motor stands, or the time limit has passed.
+    /// Resolves when every motor is at standstill, or the time limit has passed.
     pub report: oneshot::Receiver<StopReport>,
 }
 

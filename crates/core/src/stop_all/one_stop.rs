@@ -24,7 +24,7 @@ pub(crate) struct OneStop {
     failed: Option<String>,
     /// Wait before the stop is repeated.
     pause: Duration,
-    /// A read after the acknowledgement showed that the motor stands, and no later read shows it turning.
+    /// A read after the acknowledgement showed that the motor is at standstill, and no later read shows it turning.
     stood: bool,
     /// Whether the motor was seen to turn again after it had been standing.
     restarted: bool,

@@ -502,7 +502,7 @@ fn every_family_shows_each_state_and_no_other() {
         let check = |rig: &mut ProfiledDrive, when: &str, expected: [bool; 8]| {
             for (point, expected) in ModelPoint::STATUS_WORD.into_iter().zip(expected) {
                 let found = shown(rig, &profile, point);
-                // Some families are ready only while the motor stands.
+                // Some families are ready only while the motor is at standstill.
                 let moving = point == ModelPoint::Ready && !["stopped", "tripped"].contains(&when);
                 // WEG belongs to the bus with the first word.
                 let early = point == ModelPoint::Remote && when == "switched on";

@@ -93,7 +93,7 @@ impl FamilyDrive {
         self.show(ModelPoint::Ready, true);
     }
 
-    /// The mains were switched off and on: the motor stands, and the words are lost.
+    /// The mains were switched off and on: the motor is at standstill, and the words are lost.
     pub(super) fn power_cycle(&mut self) {
         *self = FamilyDrive::new(&self.profile.clone());
     }

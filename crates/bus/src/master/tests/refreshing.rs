@@ -398,7 +398,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
                 plant.rig.step();
                 assert!(plant.rig.now < until, "{name}");
             }
-            // The motor stands now, which no read has shown yet.
+            // The motor is at standstill now, which no read has shown yet.
             plant.drive().stand();
             happens(&mut plant.rig);
             let from = plant.rig.wire.len();

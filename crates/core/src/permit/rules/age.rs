@@ -21,7 +21,7 @@ pub(in crate::permit) const RULE: Rule = Rule {
 enum OrderKind {
     /// The order takes the run command away.
     Stop,
-    /// The order can start a standing motor.
+    /// The order can start a motor at standstill.
     Start,
     /// Does anything else, such as setting a reference.
     Other,

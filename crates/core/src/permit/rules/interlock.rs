@@ -29,7 +29,7 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
     Verdict::unless(unmet.map(|unmet| Refusal::Interlocked(unmet.why)))
 }
 
-/// Whether the run command of the drive is on and the motor stands: a reference can then make it turn.
+/// Whether the run command of the drive is on and the motor is at standstill: a reference can then make it turn.
 fn waits_for_a_reference(reading: &Reading<'_>) -> bool {
     let stands = || match reading.model(ModelPoint::OutputFrequency).good().map(Value::as_f64) {
         Some(hertz) => hertz.abs() < TURNS,
