@@ -205,7 +205,7 @@ fn read_place(form: &Reader<'_>, around: &Around<'_>) -> Result<Option<ControlIt
         None => {
             form.problem(
                 "point",
-                format!("`{name}` is not a register or coil that is written as it is"),
+                format!("`{name}` is not a register or coil that is written without conversion"),
                 "name a point with `write = true`, type u16 and no scale, or a coil",
             );
             Err(Unusable)

@@ -83,7 +83,7 @@ fn warn_of_running_at_power_up(reader: &Reader<'_>, profile: &Profile, control: 
                 "0 in {} {} is a run command: a drive that is switched on may start",
                 place.table, place.address
             ),
-            "check in the manual that a 1 runs it; if not, see to it that the drive holds another value then",
+            "check in the manual that 1 starts the drive; if not, make sure that it has another value when it is switched on",
         );
     }
 }

@@ -74,7 +74,11 @@ fn read_equals(reader: &Reader<'_>, mut raw: Raw, invert: bool) -> Raw {
         .into_iter()
         .filter(|key| reader.has(key))
     {
-        reader.problem(key, "what is compared is the count", "leave the key out");
+        reader.problem(
+            key,
+            "`equals` compares the number in the register, without conversion",
+            "leave the key out",
+        );
     }
     raw.equals = Some(Equals { count, invert });
     raw

@@ -455,7 +455,7 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
     if protocols.len() > 1 && protocols.contains(&Protocol::N2) {
         reader.problem(
             "protocols",
-            "n2 has its own map",
+            "n2 cannot share a profile with another protocol",
             "write one profile for n2 and another for Modbus",
         );
     }

@@ -358,7 +358,11 @@ pub(super) fn check_object(reader: &Reader<'_>, index: PointIndex, points: &PerP
     match raw.form {
         Form::F32 if !integer && raw.address % 2 == 0 && raw.order == Order::Abcd => {}
         Form::U16 | Form::I16 if integer => {}
-        _ if integer => reader.problem("at", "an ADI is one register", "write type = \"i16\" and no bit"),
+        _ if integer => reader.problem(
+            "at",
+            "an ADI has exactly one register",
+            "write type = \"i16\" and no bit",
+        ),
         _ => reader.problem(
             "at",
             "AI and AO of N2 are floats at even addresses, number n at 2(n-1)",

@@ -185,7 +185,7 @@ fn each_mistake_of_the_whole() {
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[\"modbus-rtu\", \"n2\"]"),
-            "n2 has its own map; m:4, protocols",
+            "n2 cannot share a profile with another protocol; m:4, protocols",
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[]"),

@@ -28,7 +28,7 @@ fn each_mistake_of_a_value() {
         ("type = \"f32\"\nequals = 4", "not compared with a whole number; m:14"),
         (
             "equals = 4\nscale = 2",
-            "what is compared is the count; m:14, point[0].scale",
+            "`equals` compares the number in the register, without conversion; m:14, point[0].scale",
         ),
         (
             "invalid = [0x10000]",
@@ -150,7 +150,10 @@ fn each_mistake_of_a_value_of_several_registers() {
         ("type = \"i8\"\nwrite = true", "cannot be converted back"),
         ("factor_from = \"b\"", "there is no point `b`"),
         ("factor_from = \"a\"", "`a` is not a number of a register of its own"),
-        ("equals = 1\nfactor_from = \"c\"", "what is compared is the count"),
+        (
+            "equals = 1\nfactor_from = \"c\"",
+            "`equals` compares the number in the register, without conversion",
+        ),
         ("factor_from = \"c\"\nwrite = true", "cannot be converted back"),
         ("factor_from = \"n\"", "`n` is never read"),
     ];
