@@ -267,7 +267,7 @@ fn a_right_that_a_reload_took_away_serves_no_request_that_had_begun() {
     let audit = rights.site.audit();
     let told = audit.iter().filter(|record| {
         let text = record["text"].as_str().unwrap_or_default();
-        record["result"] == "not_allowed" && text.contains("a reload took its right away")
+        record["result"] == "not_allowed" && text.contains("a reload removed its right")
     });
     let refused: u64 = told.filter_map(|record| record["count"].as_u64()).sum();
     assert_eq!(refused, 4, "three over HTTP, one by the socket: {audit:?}");

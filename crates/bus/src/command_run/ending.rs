@@ -36,7 +36,7 @@ impl CommandRun {
             }
             Outcome::Interrupted(Interruption::RightLost) => {
                 self.leave_motor();
-                let why = "a reload took the right of this client to write away; nothing was written";
+                let why = "a reload removed the right of this client to write; nothing was written";
                 let refusal = Refusal::NotAllowed(why.to_string());
                 self.unless_begun(Outcome::Refused(refusal), Interruption::RightLost)
             }

@@ -22,7 +22,7 @@ pub enum Interruption {
     ShuttingDown,
     /// Another client took the exclusive right to the drive.
     Taken,
-    /// A reload took the right of the client away.
+    /// A reload removed the right of the client.
     RightLost,
 }
 
@@ -184,7 +184,7 @@ impl fmt::Display for Outcome {
                     Interruption::Offline => "the drive went offline",
                     Interruption::ShuttingDown => "the gateway shuts down, or a reload restarts its bus",
                     Interruption::Taken => "another client took the drive",
-                    Interruption::RightLost => "a reload took the right of its client away",
+                    Interruption::RightLost => "a reload removed the right of its client",
                 };
                 write!(
                     f,

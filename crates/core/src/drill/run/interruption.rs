@@ -31,7 +31,7 @@ impl Run {
             return Some("a reload changed the drive or its bus".to_string());
         }
         if !self.who.right().allows(&self.report.bus) {
-            return Some("a reload took the right of its client to write away".to_string());
+            return Some("a reload removed the right of its client to write".to_string());
         }
         if let Some(why) = self.others() {
             return Some(why);

@@ -38,9 +38,9 @@ pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusa
     let why = match (stage, may_write) {
         (_, true) => return Ok(()),
         (Stage::Turn | Stage::Write, false) if is_stop => return Ok(()),
-        (Stage::Accept, false) => "this client may no longer write: a reload took its right away",
+        (Stage::Accept, false) => "this client may no longer write: a reload removed its right",
         (Stage::Turn | Stage::Write, false) => {
-            "a reload took the right of this client to write away while the command waited"
+            "a reload removed the right of this client to write while the command waited"
         }
     };
     Err(Refusal::NotAllowed(format!("{why}; nothing was written")))
@@ -84,7 +84,7 @@ mod tests {
             assert_eq!(judged.is_ok(), passes, "{stage:?} stop {is_stop} right {may_write}");
             if let Err(refusal) = judged {
                 assert_eq!(refusal.code(), "not_allowed");
-                assert!(refusal.to_string().contains("a reload took"), "{refusal}");
+                assert!(refusal.to_string().contains("a reload removed"), "{refusal}");
             }
         }
     }

@@ -118,7 +118,7 @@ pub(in crate::http) enum Denied {
     #[error("the request comes from another origin")]
     OtherOrigin,
     /// The user lost the right while the request was coming in.
-    #[error("a reload took the right of this user away while the request came in; nothing was done")]
+    #[error("a reload removed the right of this user while the request arrived; nothing was done")]
     RightLost,
     /// The token of the session is missing or wrong.
     #[error("the header X-CSRF-Token does not have the token of this session")]

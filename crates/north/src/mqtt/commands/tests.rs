@@ -170,7 +170,7 @@ fn what_was_on_its_way_when_the_right_went_is_refused() {
         refused["error"]
             .as_str()
             .unwrap()
-            .contains("a reload took its right away"),
+            .contains("a reload removed its right"),
         "{refused}"
     );
     assert_eq!(bench.queued(), 1);
