@@ -111,7 +111,7 @@ impl Watched {
 /// Text with the cause of a start or stop: the client that gave the command.
 fn cause(who: &str) -> String {
     match who.split_once(' ') {
-        Some(("supervision", Origin::LOCAL)) => ": its local control place took it over".to_string(),
+        Some(("supervision", Origin::LOCAL)) => ": the drive was switched to its local control place".to_string(),
         Some(("supervision", _)) => ": supervision timed out".to_string(),
         Some(("shutdown", _)) => ": the gateway is shutting down".to_string(),
         Some(("interlock", _)) => ": an interlock is not satisfied".to_string(),

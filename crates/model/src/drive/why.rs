@@ -474,7 +474,7 @@ impl Examination<'_> {
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::LocalControl) => (
                 "stopped_by_gateway",
                 format!(
-                    "its local control place took it over, and {}",
+                    "the drive was switched to its local control place, and {}",
                     stopped(order.fate, text)
                 ),
                 "send run again",

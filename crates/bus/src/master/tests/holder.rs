@@ -279,5 +279,8 @@ fn nothing_starts_when_local_control_ends() {
     let why = drive.why(&drive.reading(rig.now));
     let stopped = why.causes.iter().find(|cause| cause.cause == "stopped_by_gateway");
     let evidence = stopped.map(|cause| cause.evidence.as_str()).unwrap_or_default();
-    assert!(evidence.contains("its local control place took it over"), "{why:?}");
+    assert!(
+        evidence.contains("the drive was switched to its local control place"),
+        "{why:?}"
+    );
 }
