@@ -40,7 +40,7 @@ impl Refusals {
         match limit.acquire(newcomer, Instant::now(), judge) {
             Ok((permit, displaced)) => {
                 if let Some(displaced) = displaced {
-                    let text = format!("a connection of {displaced} was closed in its favour");
+                    let text = format!("a connection of {displaced} was closed to make room for it");
                     self.report(ConnectionRefusal::Displaced, client, &text);
                 }
                 Some(permit)

@@ -237,7 +237,7 @@ impl State {
 
 /// Adds a stop that joins another one to the audit.
 fn note_joined(plant: &Plant, drive: &DriveHandle, origin: &Origin, now: Instant) {
-    let text = "the stop that is under way is also that of this client; nothing more was written";
+    let text = "a stop is already in progress and now counts for this client too; nothing more was written";
     let what = (drive.image.spec.name.as_str(), "run=false");
     plant.writes.audit().note(origin, what, ("acknowledged", text), now);
 }
