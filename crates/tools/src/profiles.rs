@@ -314,7 +314,7 @@ fn formats_of(profile: &Profile) -> String {
 }
 
 fn assumptions(profile: &Profile) -> String {
-    let mut table = report::table(["key", "value", "what is assumed", "what it rests on"]);
+    let mut table = report::table(["key", "value", "what is assumed", "reason"]);
     for assumption in ASSUMPTIONS {
         table.add_row([
             assumption.key.unwrap_or(""),

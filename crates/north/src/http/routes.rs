@@ -157,7 +157,7 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/commands",
-            Doc::object::<operating::Commandable<'_>>("What can be commanded"),
+            Doc::object::<operating::Commandable<'_>>("The points that can be commanded"),
             operating::commands_of,
         )
         .post(
