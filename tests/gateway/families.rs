@@ -5,6 +5,7 @@
 mod behind_its_back;
 mod cases;
 mod confirmed;
+mod direction;
 mod other_stops;
 mod own_timeout;
 mod path;

@@ -26,6 +26,7 @@ use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, unsen
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Reply, Table};
+use crate::drive::control::Run;
 use crate::drive::{ModelPoint, Profile};
 use crate::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
@@ -129,6 +130,8 @@ pub struct CommandRun {
     look: Option<StateRead>,
     /// The ordered direction, if it takes effect at the next start.
     next_start: Option<bool>,
+    /// The direction that a stop orders, where no word of the family has it while the motor stands.
+    at_stop: Option<bool>,
     /// Whether the command sets the direction, or starts the motor.
     turns: bool,
     /// Whether the command waited for a late reply since its last step was chosen.
@@ -174,6 +177,7 @@ impl CommandRun {
             motor: None,
         };
         let turns = turns(profile, &order);
+        let at_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
             Order::Points(_) | Order::Write(_) | Order::Read(_) => None,
@@ -224,6 +228,7 @@ impl CommandRun {
             control: profile.run_place().map(|place| (place.table, place.address)),
             look: None,
             next_start: None,
+            at_stop,
             turns,
             held_up: false,
             overtaken: 0,
@@ -458,6 +463,18 @@ impl CommandRun {
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && self.may_write_on()
     }
+}
+
+/// The direction that an order names, where the family has it in its run commands only.
+fn direction_at_stop(profile: &Profile, order: &Order) -> Option<bool> {
+    let control = profile.control.as_ref()?;
+    let (Order::Points(values), Run::Pair { .. }) = (order, &control.run) else {
+        return None;
+    };
+    let index = profile.model_index(ModelPoint::Reverse)?;
+    let written = profile.points.get(index)?.write_to.unwrap_or(index);
+    let mut values = values.iter();
+    values.find(|(of, _)| *of == written).map(|(_, value)| value.as_bool())
 }
 
 /// Whether an order sets the direction or starts the motor. A raw write to one of the places of these commands

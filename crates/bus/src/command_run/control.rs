@@ -197,8 +197,18 @@ impl Ordered {
             return Vec::new();
         };
         let mut actions = Vec::new();
+        let elsewhere = control
+            .reverse
+            .and_then(|setting| Some((setting, setting.place?)))
+            .filter(|_| !matches!(control.run, Run::Pair { .. }));
+        let turned = self.reverse.zip(elsewhere).map(|(reverse, (setting, place))| {
+            let word = if reverse { setting.applied(0) } else { setting.undone(0) };
+            Action::Send(write(place, word, profile))
+        });
         if stop && self.run == Some(false) {
             actions.extend(stops(control, profile, self.reverse));
+            // No word of the stop has the direction: the next run command alone would turn the motor as before.
+            actions.extend(turned.clone());
         }
         if self.reset {
             actions.extend(resets(control, profile, stopped || stop));
@@ -206,19 +216,13 @@ impl Ordered {
         if stop {
             return actions;
         }
-        let elsewhere = control
-            .reverse
-            .and_then(|setting| Some((setting, setting.place?)))
-            .filter(|_| !matches!(control.run, Run::Pair { .. }));
         match (self.reverse, elsewhere) {
-            (Some(reverse), Some((setting, place))) => {
-                let word = if reverse { setting.applied(0) } else { setting.undone(0) };
+            (Some(reverse), Some(_)) => {
                 let may = self
                     .run
                     .is_none()
                     .then_some(Action::Word(Word::DirectionElsewhere(reverse)));
-                actions.extend(may);
-                actions.push(Action::Send(write(place, word, profile)));
+                actions.extend(may.into_iter().chain(turned));
             }
             (None, Some(_)) if self.run == Some(true) => actions.push(Action::Word(Word::KeptDirection)),
             _ => {}
@@ -439,8 +443,10 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Kno
         Word::ResetLow(_) | Word::ResetHigh(_) if runs && control.restarts_on_reset => {
             Made::Refused(Refusal::NotAllowed(RESTARTS_ON_RESET.to_string()))
         }
-        // Nothing is written if the motor runs and the reset has a separate register, or if the drive already has the word.
-        Word::ResetLow(reset) if runs && reset.place.is_some() || own == Some(stays) => Made::Nothing,
+        // The word of a motor that runs stays as it is, as does one that the drive has. The coil of a motor that stands is written
+        // in any case: no other write of the reset takes away a run command that another master has set since the last reading.
+        Word::ResetLow(reset) if runs && reset.place.is_some() => Made::Nothing,
+        Word::ResetLow(_) if own == Some(stays) && (known.running || coil_of(control).is_none()) => Made::Nothing,
         Word::ResetHigh(reset) => sent(at, reset.applied(stays)),
         Word::ResetLow(_) | Word::ResetEnd(_) => sent(at, stays),
         Word::Others(bits) => sent(at, bits.applied(stays)),

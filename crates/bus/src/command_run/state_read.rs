@@ -215,7 +215,7 @@ impl CommandRun {
 
     /// Keeps the direction that the command ordered; if it set another one, drops the kept one.
     pub(crate) fn note_direction(&self, words: &mut KnownWords) {
-        match self.next_start {
+        match self.next_start.or(self.at_stop) {
             Some(reverse) => words.keep_direction(reverse),
             None if self.turns => words.forget_direction(),
             None => {}

@@ -11,6 +11,7 @@ use crate::drive::profile::Profiles;
 use crate::drive::{DriveIndex, Value};
 use crate::order::{Admitted, Answer, Origin, SourceKind, WriteStats};
 
+mod directions;
 mod elsewhere;
 mod functions;
 mod looking;
