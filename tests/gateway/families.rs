@@ -8,6 +8,7 @@ mod confirmed;
 mod direction;
 mod other_stops;
 mod own_timeout;
+mod parameters;
 mod path;
 mod status;
 mod words;

@@ -2,11 +2,18 @@
 
 6 shutdown, 7 switch on, 15 enable operation, each only from the state before it; bit 4 of ETA is the mains, bit 15 reverse. Bit 3 off stops by
 ramp, bit 2 off is the quick stop, bit 1 off takes the voltage away. Bit 11 turns the motor round, bit 7 resets on its edge.
+Settings: tFr 3103, HSP 3104, LSP 3105 (0.1 Hz), ACC 9001, dEC 9002 in steps of Inr 9020, the motor from 9601 on.
 """
 
 import drive
 
 CMD, LFR, ETA = 8501, 8502, 3201
+SETTINGS = {
+    **{3015: 50, 3103: 600, 3104: 500, 3105: 0, 6005: 100},
+    **{8401: 1, 8413: 164, 8423: 20},
+    **{9001: 30, 9002: 30, 9020: 1, 9201: 150},
+    **{9601: 400, 9602: 500, 9603: 52, 9604: 1420, 9606: 80, 9613: 22, 9622: 52},
+}
 DISABLED, READY, ON, ENABLED, QUICK, FAULT = 0x40, 0x21, 0x23, 0x27, 0x07, 0x08
 
 
@@ -17,6 +24,7 @@ class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding = {CMD: 0, LFR: 0, 8604: 0, 7121: 0, 9630: 0, **dict.fromkeys(range(7201, 7205), 0), **dict.fromkeys(range(3201, 3212), 0)}
+        self.holding.update(SETTINGS)
         self.read_only = {8604, 7121, 9630, *range(7201, 7205), *range(3201, 3212)}
         self.state = DISABLED
         self.following = None  # the state at the end of the ramp

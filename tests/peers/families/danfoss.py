@@ -8,6 +8,8 @@ import drive
 
 WORD, REFERENCE, STATUS = 49999, 50009, 50199
 ACTUAL = 50209
+# 1-22 V, 1-23 Hz, 1-25 rpm, 3-41 and 3-42 two words of 0.01 s, 4-12 and 4-14 0.1 Hz.
+PARAMETERS = {1219: 400, 1229: 50, 1249: 1420, 3409: 0, 3410: 300, 3419: 0, 3420: 300, 4119: 0, 4139: 500}
 READINGS = [ACTUAL, 15009, 15010, 15019, 15020, 16119, 16129, 16299, 16339]
 
 
@@ -16,7 +18,7 @@ class Drive(drive.Drive):
 
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
-        self.holding = {WORD: 0, REFERENCE: 0, STATUS: 0, **dict.fromkeys(READINGS, 0)}
+        self.holding = {WORD: 0, REFERENCE: 0, STATUS: 0, **dict.fromkeys(READINGS, 0), **PARAMETERS}
         self.read_only = {STATUS, *READINGS}
         self.word = 0
 

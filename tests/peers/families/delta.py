@@ -2,7 +2,7 @@
 
 Bits 1 and 0: 01 stop, 10 run; bits 5 and 4: 01 forward, 10 reverse. A code acts when it is written: 0 does nothing. Status 0x2100
 (low byte fault) and 0x2101 (1..0 state, 4..3 00 forward, 11 reverse, 01 to forward, 10 to reverse, 10 bus). As on the MH300,
-0x2001 and 0x2002 cannot be read.
+0x2001 and 0x2002 cannot be read. Parameters: group x 256 + number.
 """
 
 import drive
@@ -14,6 +14,8 @@ class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding = dict.fromkeys([0x2000, 0x2001, 0x2002, *range(0x2100, 0x2110)], 0)
+        self.holding.update({0x0100: 6000, 0x0101: 5000, 0x0102: 4000, 0x0107: 0, 0x010A: 5000, 0x010B: 0})
+        self.holding.update({**dict.fromkeys(range(0x010C, 0x0114), 1000), 0x0902: 3, 0x0903: 0})
         self.read_only = set(range(0x2100, 0x2110))
         self.write_only = {0x2001, 0x2002}
         self.facing = 1

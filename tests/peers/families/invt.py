@@ -1,5 +1,5 @@
 """INVT Goodrive: word 0x2000 (1 forward, 2 reverse, 5 stop, 6 coast, 7 reset; each acts when written), reference 0x2001
-(0.01 Hz), state 0x2100 (1 forward, 2 reverse, 3 stop, 4 fault), fault 0x2102, monitors 0x3000.."""
+(0.01 Hz), state 0x2100 (1 forward, 2 reverse, 3 stop, 4 fault), fault 0x2102, monitors 0x3000.. Parameters: group x 256 + number."""
 
 import drive
 
@@ -10,6 +10,8 @@ class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding = dict.fromkeys([0x2000, 0x2001, 0x2100, 0x2101, 0x2102, *range(0x3000, 0x3008)], 0)
+        # P00.01 to P00.12 in the order of their numbers, and the timeout of the line.
+        self.holding.update({0x0001: 2, 0x0002: 0, 0x0003: 5000, 0x0006: 8, 0x000B: 100, 0x000C: 100, 0x0E04: 0})
         self.read_only = {0x2100, 0x2101, 0x2102, *range(0x3000, 0x3008)}
 
     def wrote(self, table, address, value):

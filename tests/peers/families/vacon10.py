@@ -1,5 +1,5 @@
 """Vacon 10: word 2000 (bit 0 run, 1 reverse, 2 reset), reference 2002 (0.01 %), status 2100 as Vacon NX (0 ready, 1 run, 2
-reverse, 3 fault, 4 warning, 5 at reference, 6 zero speed), monitors 2103 to 2110."""
+reverse, 3 fault, 4 warning, 5 at reference, 6 zero speed), monitors 2103 to 2110. Parameters: ID - 1."""
 
 import drive
 
@@ -10,8 +10,8 @@ class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
         self.holding = dict.fromkeys([*range(2000, 2011), *range(2100, 2111)], 0)
-        self.holding.update({100: 0, 101: 5000, 102: 30, 103: 30})
-        self.read_only = {*range(100, 104), *range(2100, 2111)}
+        self.holding.update({100: 0, 101: 5000, 102: 30, 103: 30, 107: 0, 108: 0, 116: 3, 171: 3, 599: 0, 600: 60})
+        self.read_only = set(range(2100, 2111))
         self.inputs = {7: 35}
         self.word = 0
 

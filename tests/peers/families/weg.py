@@ -1,17 +1,26 @@
 """WEG CFW: word 682 (P0682), reference 683 (8192 = synchronous speed), status 680, actual speed 681.
 
 Bits 0 run and 1 general enable both, 2 direction (1 forward), 4 remote; bit 1 off coasts, bit 6 quick stop; bit 7 resets on its
-edge; bit 3 jogs. Status: 8 running, 10 direction, 12 remote, 13 undervoltage, 15 fault.
+edge; bit 3 jogs. Status: 8 running, 10 direction, 12 remote, 13 undervoltage, 15 fault. Parameter Pnnnn is register nnnn.
 """
 
 import drive
+
+PARAMETERS = {
+    **{100: 200, 101: 200, 102: 50, 103: 50},  # ramps, 0.1 s
+    **{133: 30, 134: 660, 135: 106, 156: 78, 157: 71, 158: 46},  # 0.1 Hz, 0.1 A
+    **{220: 2, 221: 0, 222: 9, 223: 2, 224: 1, 225: 1, 226: 4, 227: 2, 228: 2},
+    **{308: 1, 310: 1, 311: 1, 312: 2, 313: 1, 314: 50},
+    **{400: 400, 401: 71, 402: 1720, 403: 60, 404: 8, 407: 80},  # V, 0.1 A, rpm, Hz, code, 0.01
+}
 
 
 class Drive(drive.Drive):
     def __init__(self, unprepared=False):
         super().__init__(unprepared)
-        self.holding = dict.fromkeys([*range(2, 8), 48, 49, 680, 681, 682, 683], 0)
-        self.read_only = {*range(2, 8), 48, 49, 680, 681}
+        self.holding = dict.fromkeys([*range(2, 11), 48, 49, 50, 60, 70, 680, 681, 682, 683], 0)
+        self.read_only = {*range(2, 11), 48, 49, 50, 60, 70, 680, 681}
+        self.holding.update(PARAMETERS)
         self.word = 0
 
     def wrote(self, table, address, value):

@@ -6,6 +6,8 @@ pub mod control;
 pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
+#[cfg(test)]
+mod family_parameters_tests;
 pub mod identify;
 pub mod index;
 pub mod model;

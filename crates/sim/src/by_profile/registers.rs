@@ -11,7 +11,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, OwnWord};
 use crate::drive::identify::{PRODUCT, VENDOR};
 use crate::drive::profile::Part;
-use crate::drive::{Point, Profile, Value};
+use crate::drive::{Point, Profile, Value, parameters};
 
 /// Registers and bits by address; addresses not in the map do not exist.
 #[derive(Debug, Clone)]
@@ -34,8 +34,9 @@ impl Registers {
             let addresses = (0..probe.count).filter_map(|item| probe.start.checked_add(item));
             all.extend(addresses.map(|address| ((profile.canonical(probe.table), address), 0)));
         }
-        let parameters = profile.parameters.named.iter();
-        all.extend(parameters.map(|parameter| ((Table::Holding, parameter.address), 0)));
+        let parameters = profile.parameters.named.iter().map(|parameter| parameter.address);
+        let save = profile.parameters.rules.save.map(|(address, _)| address);
+        all.extend(parameters.chain(save).map(|address| ((Table::Holding, address), 0)));
         Registers(all)
     }
 
@@ -59,13 +60,19 @@ impl Registers {
     pub(super) fn keep_settings(&mut self, from: &Registers, profile: &Profile, control: Option<&Control>) {
         let places = control.map(effect::places).unwrap_or_default();
         let is_place = |key: Key| places.iter().any(|place| (place.table, place.address) == key);
+        let parameters = &profile.parameters;
+        let is_kept = |address: u16| {
+            let named = parameters.named.iter().any(|parameter| parameter.address == address);
+            named && !parameters::has(&parameters.rules.volatile, address)
+        };
         for (key, held) in &mut self.0 {
             let mut points = profile
                 .points
                 .iter()
                 .filter(|point| point.raw().is_some_and(|raw| raw.covers(key.0, key.1)));
             let setting = points.any(|point| point.write && point.model.is_none());
-            if setting && !is_place(*key) {
+            let parameter = key.0 == Table::Holding && is_kept(key.1);
+            if (setting || parameter) && !is_place(*key) {
                 *held = from.0.get(key).copied().unwrap_or(*held);
             }
         }

@@ -471,6 +471,25 @@ fn a_meter_holds_what_it_was_given() {
     assert_eq!(write(Word(9, 2)), Reply::Written);
 }
 
+/// A WEG keeps a parameter without supply, a Danfoss has it in its RAM; the save register of a Hitachi exists.
+#[test]
+fn parameters_without_supply() {
+    for (family, address, kept) in [
+        ("weg-cfw", 100, 50),
+        ("danfoss-fc", 4139, 0),
+        ("hitachi-wj200", 0x1203, 50),
+    ] {
+        let mut rig = ProfiledDrive::named(family);
+        assert_eq!(rig.ask(&Word(address, 50).pdu()), Reply::Written, "{family}");
+        assert_eq!(rig.register(Table::Holding, address), 50, "{family}");
+        rig.drive.power_off();
+        rig.drive.power_on(rig.now);
+        assert_eq!(rig.register(Table::Holding, address), kept, "{family}");
+    }
+    let mut hitachi = ProfiledDrive::named("hitachi-wj200");
+    assert_eq!(hitachi.ask(&Word(0x08FF, 1).pdu()), Reply::Written);
+}
+
 /// The state of a point of the common model as the registers of a drive show it; `None` if the family lacks it.
 fn shown(rig: &mut ProfiledDrive, profile: &Profile, point: ModelPoint) -> Option<bool> {
     let mut value = |index: PointIndex| {
