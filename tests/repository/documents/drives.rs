@@ -44,16 +44,38 @@ pub(crate) fn tables() -> String {
     text
 }
 
+/// Facts that public sources contradict or do not state.
+const LEFT_OUT: &str = "\nLeft out until a source or a drive settles it: currents of Danfoss (16-14, one or two words), Mitsubishi (201) and \
+    Yaskawa (0042H, unit by size), Fuji (080BH) and Toshiba (FE03H, percent of an unread rating); alarm bits of Danfoss (16-90); \
+    INVT 3002H (1 or 0.1 V by series); parameters of ACS580 (two words), Invertek (P2 and E2 differ), and where no source has \
+    them.\n";
+
 /// The families that are not confirmed on hardware, and their number.
 fn unverified(profiles: &Profiles) -> (String, usize) {
     let mut text = String::from(
         "\n## Families not verified on hardware\n\nMade from manuals and reports, not confirmed ([how to](verifying.md)); \
-         `drivegate profiles show NAME` has points and settings.\n\n|profile|drives|sources|\n|---|---|---|\n",
+         `drivegate profiles show NAME` has points and settings. Faults: texts with cause and remedy; *none*: no source of \
+         the codes; -: no code. Parameters: [named](parameters.md#in-a-profile).\n\n\
+         |profile|drives|sources|faults|parameters|\n|---|---|---|---|---|\n",
     );
     let all: Vec<&std::sync::Arc<Profile>> = profiles.iter().filter(|profile| !profile.verified).collect();
     for profile in &all {
-        let _ = writeln!(text, "|`{}`|{}|{}|", profile.name, profile.title, profile.source);
+        let faults = match (profile.faults.len(), profile.model_point(ModelPoint::FaultCode)) {
+            (0, None) => "-".to_string(),
+            (0, Some(_)) => "*none*".to_string(),
+            (known, _) => known.to_string(),
+        };
+        let parameters = match profile.parameters.named.len() {
+            0 => "-".to_string(),
+            known => known.to_string(),
+        };
+        let _ = writeln!(
+            text,
+            "|`{}`|{}|{}|{faults}|{parameters}|",
+            profile.name, profile.title, profile.source
+        );
     }
+    text += LEFT_OUT;
     text += &common_points(&all);
     (text, all.len())
 }
@@ -254,16 +276,31 @@ fn family(profile: &Profile) -> String {
             profile.name
         );
     }
-    let rules: Vec<String> = profile
-        .ranges
-        .iter()
-        .filter(|r| !r.write_when.is_empty())
-        .map(rule)
-        .collect();
-    if !rules.is_empty() {
-        let _ = write!(text, "\nWrites: {}.\n", rules.join("; "));
+    text + &writes(profile)
+}
+
+/// When a family takes writes; ranges of one rule are said together.
+fn writes(profile: &Profile) -> String {
+    let mut rules: Vec<(&str, Vec<&str>)> = Vec::new();
+    for range in profile.ranges.iter().filter(|range| !range.write_when.is_empty()) {
+        let what = if range.note.is_empty() {
+            "registers"
+        } else {
+            range.note.as_str()
+        };
+        match rules.iter_mut().find(|(when, _)| *when == range.write_when) {
+            Some((_, ranges)) => ranges.push(what),
+            None => rules.push((&range.write_when, vec![what])),
+        }
     }
-    text
+    let rules: Vec<String> = rules
+        .iter()
+        .map(|(when, ranges)| format!("{}: {when}", ranges.join(", ")))
+        .collect();
+    match rules.is_empty() {
+        true => String::new(),
+        false => format!("\nWrites: {}.\n", rules.join("; ")),
+    }
 }
 
 /// The fault texts of a family, or the name of another family that has these texts.
@@ -337,13 +374,4 @@ fn assumptions() -> String {
         let _ = writeln!(text, "|{key}|{value}|{}|{}|", one.what, one.why);
     }
     text
-}
-
-fn rule(range: &drivegate::drive::profile::AddressRange) -> String {
-    let what = if range.note.is_empty() {
-        "registers".to_string()
-    } else {
-        range.note.clone()
-    };
-    format!("{what}: {}", range.write_when)
 }
