@@ -232,7 +232,11 @@ fn enter_ends_the_search() {
     });
     trial.press("\x03");
     assert!(trial.ended().success(), "{}", trial.screen());
-    rig.is_only_read();
+    let functions = functions(&rig.line);
+    assert!(
+        functions.iter().all(|function| (1..=4).contains(function)),
+        "{functions:?}"
+    );
 }
 
 /// A drive of a family that no read shows: its make is asked, or named on the command line.

@@ -36,9 +36,9 @@ const RUNS_WITH: &str = "the gateway runs with ";
 #[derive(Debug, PartialEq, Eq)]
 struct Owner {
     bus: String,
-    /// Its configuration, where it has one.
+    /// Configuration of the gateway, where there is one.
     config: Option<PathBuf>,
-    /// Its name, where the configuration can be read.
+    /// Name of the gateway, where the configuration can be read.
     name: Option<String>,
 }
 

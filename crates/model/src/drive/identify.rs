@@ -102,7 +102,7 @@ pub fn fitting(profiles: &Profiles, protocol: Protocol, outcomes: &BTreeMap<Prob
     let most = fitting.iter().map(|p| p.identify.len()).max().unwrap_or(0);
     let fitting = fitting.into_iter().filter(|p| p.identify.len() == most);
     let mut fitting: Vec<Arc<Profile>> = fitting.cloned().collect();
-    // Of profiles that cannot be distinguished the first is used: one that was seen right on hardware.
+    // The first of profiles that cannot be distinguished is used: one that was seen right on hardware.
     fitting.sort_by_key(|profile| !profile.verified);
     fitting
 }

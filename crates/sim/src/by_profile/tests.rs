@@ -6,7 +6,6 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::codec::Protocol;
-use crate::codec::n2::Session;
 use crate::drive::identify::{self, Nameplate};
 use crate::drive::profile::Profiles;
 use crate::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
@@ -592,9 +591,6 @@ fn states_of_a_profile_of_ones_own() {
 
 /// What a search learns of a drive by its reads: the profiles that fit, and the nameplate.
 fn identified(drive: &mut SimulatedDrive, profiles: &Profiles, protocol: Protocol) -> Vec<String> {
-    if protocol == Protocol::N2 {
-        drive.answer(&RequestPdu::N2(Session::Identify), SimTime::ZERO);
-    }
     let outcomes = identify::probes(profiles, protocol).into_iter().filter_map(|probe| {
         let values = !matches!(drive.answer(&probe.pdu(), SimTime::ZERO)?, Reply::Exception(_));
         Some((probe, values))
@@ -616,7 +612,7 @@ fn identified(drive: &mut SimulatedDrive, profiles: &Profiles, protocol: Protoco
 #[test]
 fn a_drive_is_identified_as_its_own_family_or_not_at_all() {
     let profiles = Profiles::built_in();
-    // The same board, or the same registers.
+    // Families with one board, or with like registers.
     let alike = [("eaton-svx", "eaton-hvx"), ("vacon-nx", "vacon-10")];
     let mut silent = Vec::new();
     for profile in profiles.iter() {
@@ -624,7 +620,8 @@ fn a_drive_is_identified_as_its_own_family_or_not_at_all() {
             continue;
         };
         let mut drive = SimulatedDrive::new(DriveOptions::new(1, model), SimTime::ZERO);
-        for protocol in &profile.protocols {
+        // Over N2 drives answer by frames of that protocol; `every_family_is_found_by_reading` searches such lines.
+        for protocol in profile.protocols.iter().filter(|one| **one != Protocol::N2) {
             let names = identified(&mut drive, &profiles, *protocol);
             // A profile with a base is an application or a kind of the family, which no read shows.
             let family = profile.base.as_ref().unwrap_or(&profile.name);
