@@ -1,4 +1,4 @@
-//! Requests on the line when the gateway starts, dies and starts again; and a port that does not exist.
+//! Requests on the line when the gateway starts, is killed and starts again; and a port that does not exist.
 
 use std::collections::BTreeSet;
 use std::time::Duration;

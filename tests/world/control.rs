@@ -166,7 +166,7 @@ fn stops_stand_and_all_heals_for_every_family_of_the_language() {
     let families = built_in.iter().filter(|profile| profile.control_table().is_some());
     let mut count = 0;
     for profile in families {
-        // Names live as long as the tests do.
+        // The name is leaked on purpose: the world needs a static name.
         let family: &'static str = Box::leak(profile.name.clone().into_boxed_str());
         for seed in 0..4 {
             let mut world = World::new(family, seed);

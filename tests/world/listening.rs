@@ -36,7 +36,7 @@ struct Noise {
     garbled: f64,
     lost: f64,
     added: f64,
-    /// Bytes are handed over in lumps of up to that many.
+    /// Maximum number of bytes that are passed to the listener at once; 0 means no limit.
     lumps: usize,
 }
 

@@ -209,7 +209,7 @@ fn a_dead_drive_is_probed_by_identify_and_comes_back() {
     rig.bus.wire.record(10_000);
     rig.until("it is probed", PATIENCE, |rig| count(rig, ">02F") >= 1);
     assert_eq!(count(&rig, ">02"), count(&rig, ">02F"));
-    // Reads of this drive look like unanswered reads of the dead one: they wait until no late reply can arrive.
+    // Reads of this drive look like unanswered reads of the silent one: they wait until no late reply can arrive.
     rig.until_state(1, State::Ready);
     rig.set_alive(2, true);
     rig.until_state(2, State::Ready);

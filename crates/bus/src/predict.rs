@@ -413,7 +413,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Whether the achieved cadence misses the wanted one.
+/// Whether the achieved cadence misses the requested one.
 fn late(achieved: f64, wanted: Duration) -> bool {
     achieved > wanted.as_secs_f64() * (1.0 + TOLERANCE)
 }

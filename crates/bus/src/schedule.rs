@@ -291,7 +291,7 @@ impl Schedule {
                 self.commanded += took;
                 self.share.read(took);
             }
-            // Process data alone is charged neither for the minimum share of slow polls nor for an absent drive.
+            // The time of slow polls in their minimum share and of probes of absent drives is not charged to process data.
             Turn::OnCredit => self.share.polled(Duration::ZERO),
             Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
             Turn::Due => self.share.polled(took),

@@ -160,7 +160,7 @@ pub(crate) trait Model: fmt::Debug {
         self.body().powered
     }
 
-    /// Switches the supply off: the drive answers nothing and the motor coasts unseen.
+    /// Switches the supply off: the drive does not answer, and its coasting motor is not shown.
     fn power_off(&mut self) {
         self.body_mut().powered = false;
     }

@@ -280,7 +280,7 @@ fn plant_of(buses: Vec<BusHandle>) -> Plant {
     Plant::new("pump-house", HOUR, buses)
 }
 
-/// Unit 1 is a Vacon NX with an N2 board of which BI 6 and BI 7 and AI 2 were read.
+/// A plant in which unit 1 is a Vacon NX with an N2 board. Its objects BI 6, BI 7 and AI 2 were read.
 pub(crate) fn n2_plant() -> Plant {
     let drives = vec![supervised("fan-1", "n2", 1, &profile("vacon-nx-n2"), Access::Control)];
     let n2 = bus("n2", Protocol::N2, drives);

@@ -227,7 +227,7 @@ impl World {
             let remains = bus.core.remains(self.now);
             let wanted = Remains {
                 away: bus.line.dead.len(),
-                // Probes of dead drives may leave late replies open.
+                // Probes of silent drives may leave late replies open.
                 late_replies: if bus.line.dead.is_empty() {
                     0
                 } else {
@@ -261,7 +261,7 @@ impl World {
         for (bus, healed) in self.buses.iter().zip(&healed) {
             let sound = sound_ages(bus, window);
             let round = bus.round.max(bus.line.cycle);
-            // The probe of a dead N2 drive, and requests that wait for its late reply, come at other moments than
+            // The probe of a silent N2 drive, and requests that wait for its late reply, come at other moments than
             // in the world without faults.
             let probe = match bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
                 true => Duration::ZERO,

@@ -1,4 +1,4 @@
-//! Confirmed requests, and those that read (clauses 15.5, 15.7).
+//! Confirmed requests in general, and the requests that read properties (clauses 15.5, 15.7).
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

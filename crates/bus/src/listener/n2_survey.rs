@@ -20,7 +20,7 @@ type Seen = BTreeMap<String, u64>;
 pub struct N2Survey {
     /// Number of lines of master and drives whose checksum is, or is not, the sum of their characters.
     sums: [u64; 2],
-    /// Regions of overrides and releases by their digits.
+    /// Number of overrides and releases by the number of digits of the region.
     widths: Seen,
     /// Status bytes of binary objects that were seen.
     states: Seen,

@@ -35,7 +35,7 @@ fn plan() -> Plan {
     }
 }
 
-/// A line in virtual time: every exchange takes `COST`, a dead drive ten times that.
+/// A line in virtual time: every exchange takes `COST`, a drive that does not answer ten times that.
 struct PolledLine {
     schedule: Schedule,
     now: Instant,

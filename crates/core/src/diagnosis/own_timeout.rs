@@ -76,7 +76,7 @@ mod tests {
             found.map(|found| (found.certainty, found.evidence))
         };
         let said = |certainty, text: &str| Some((certainty, text.to_string()));
-        // A fieldbus fault of a family that polling feeds.
+        // A fieldbus fault of a family whose timeout polls restart.
         let fieldbus = "fault 53 (fieldbus fault) came 3.0 s after the last write to the drive";
         assert_eq!(of("vacon-nx", 53, 3, false), said(Certainty::Likely, fieldbus));
         assert_eq!(of("vacon-nx", 1, 3, false), None, "overcurrent");

@@ -1,6 +1,6 @@
-//! The newest of equal steps of time. Pure.
+//! Figures for the newest steps of time; all steps have the same length. Pure.
 
-/// A figure for each of the newest steps. Steps are numbered from a beginning on; step `n` is at `n % slots.len()`.
+/// A figure for each of the newest steps. Steps are numbered from the first one on; the figure of step `n` is at `n % slots.len()`.
 #[derive(Debug, Clone)]
 pub(super) struct Buckets<T> {
     slots: Box<[T]>,

@@ -334,7 +334,7 @@ fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_add
     }
 }
 
-/// Warns of who can reach a listener and who cannot, where that is probably a mistake.
+/// Warns if the clients that can reach a listener are probably not the intended ones.
 fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
     let (listen, write) = (MODBUS_TCP.listen.name, MODBUS_TCP.write.name);
     for network in &listener.write {

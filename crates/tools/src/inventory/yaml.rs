@@ -1,4 +1,5 @@
-//! Writes TOML as YAML that YAML 1.1 and 1.2 parse alike: strings always quoted, numbers with all their marks.
+//! Writes TOML as YAML that YAML 1.1 and 1.2 parse alike: strings are always quoted, and numbers have the notation that
+//! both versions parse as a number.
 
 use std::fmt::Write;
 
@@ -23,7 +24,7 @@ fn block(text: &mut String, value: &Value, depth: usize) {
             for item in items {
                 let mut lines = String::new();
                 block(&mut lines, item, depth + 1);
-                // The first line has `- ` where the others are two columns in.
+                // The first line begins with `- `; the other lines are indented by two columns instead.
                 let first = lines.get(indent.len() + 2..).unwrap_or_default();
                 text.push_str(&indent);
                 text.push_str("- ");

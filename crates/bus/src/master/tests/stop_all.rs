@@ -172,7 +172,7 @@ fn a_second_order_joins_stops_that_wait_and_sends_those_that_were_acknowledged_a
     let report = answered(&mut rig, &plant, &stop_all, &mut first);
     assert!(report.ok);
     assert_eq!(second.report.try_recv().unwrap(), report, "one answer for both");
-    // A motor that was started since is stopped by a new one.
+    // A new command stops a motor that was started after the previous one.
     rig.drives[2].holding.insert(2000, 1);
     let mut third = order(&rig, &plant, &stop_all, &Scope::Gateway);
     assert!(answered(&mut rig, &plant, &stop_all, &mut third).ok);

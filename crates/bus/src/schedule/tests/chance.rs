@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// A random bus: its drives, the cost of transactions, which drives are dead, and how often commands are sent.
+/// A random bus: its drives, the cost of transactions, which drives do not answer, and how often commands are sent.
 #[derive(Debug, Clone)]
 struct Case {
     plans: Vec<Vec<(u8, u16)>>,
@@ -28,7 +28,7 @@ fn case() -> impl Strategy<Value = Case> {
         any::<u64>(),
     )
         .prop_map(|(drives, cost_ms, cycle_ms, every_ms, seed)| Case {
-            // About one drive in four is dead.
+            // About one drive in four does not answer.
             dead: drives.iter().map(|(_, flag, dice)| *flag && *dice < 2).collect(),
             plans: drives.into_iter().map(|(reads, _, _)| reads).collect(),
             cost_ms,

@@ -64,7 +64,7 @@ fn a_prepared_bus_changes_nothing_until_it_begins() {
 #[test]
 fn a_drive_whose_bus_is_started_anew_counts_for_trips_as_it_counted_before() {
     let mut rig = GuardedDrives::of(Guard::default(), vec![trip("d3")]);
-    // When the process starts, nothing counts before it is read.
+    // After the start of the process, a point without a reading does not stop the drive for the first 10 s.
     assert_eq!(rig.tripped(0, 9.9), None);
     assert!(rig.tripped(0, 10.0).is_some_and(|why| why.contains("is unknown")));
     rig.read(2, true, 20.0);
