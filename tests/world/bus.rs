@@ -105,7 +105,7 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// The usual ones: drives of the family, all but the dead, and the faults of the description.
+    /// The usual options: drives of the family, except those that do not answer, and the faults of the description.
     pub fn of(index: usize, line: &Line, seed: u64) -> Parts {
         let mut profile = Profiles::built_in().get(line.family).unwrap().clone();
         Arc::make_mut(&mut profile).turnaround = line.turnaround;

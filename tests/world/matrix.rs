@@ -325,7 +325,7 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
     // When an echo stops, the acknowledgement of a write is lost with it.
     watched.run(Duration::from_secs(1), false);
     let ok = watched.rig.counts().since(before).ok;
-    // Waits for the effects of the last fault, and for drives that were taken for dead.
+    // Waits for the effects of the last fault, and until drives that counted as offline are online again.
     watched.rig.set_faults(FaultPlan::default());
     watched.run(BACK / 10, false);
     let counts = watched.rig.counts().since(before);

@@ -1,9 +1,9 @@
 //! Worlds in which threads stall, names and units move to other machines, and drives restart between two polls.
 //!
 //! The clients are bytes on connections that a thread must read: bytes sent while the reading thread is stalled
-//! wait, and a client may close the connection before they are read. A shadow model (`promised`) records what each
-//! client wanted of which machine, and when. Every run command to a drive, and every start of a motor, must result
-//! from an order that its client still wanted.
+//! wait, and a client may close the connection before they are read. A shadow model (`promised`) records which
+//! orders each client gave to which machine, and when. Every run command to a drive, and every start of a motor, must
+//! result from an order that its client has not withdrawn.
 
 mod befall;
 mod clients;

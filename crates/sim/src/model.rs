@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
-/// A drive lives in steps of that length: the update period of the Vacon boards (reference/drives.md 3.3).
+/// A simulated drive advances in steps of this length: the update period of the Vacon boards (reference/drives.md 3.3).
 pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
 
 /// A drive that was not advanced for longer skips the rest of the time.

@@ -1,5 +1,5 @@
-//! Drives whose own timeout counts only writes: `refresh` keeps them running while the gateway lives, and they trip
-//! when it is gone. The Python drives trip two seconds after the last write.
+//! Drives whose own timeout counts only writes: `refresh` keeps them running while the gateway runs, and they trip
+//! when it has ended. The Python drives trip two seconds after the last write.
 
 use std::time::Duration;
 

@@ -83,7 +83,7 @@ impl Master {
         self.due_refreshes().map(|(due, _)| due).min()
     }
 
-    /// Whether a drill wants nothing sent to this drive, so that the drive's own timeout acts.
+    /// Whether nothing may be sent to this drive because of a drill that tests the drive's own timeout.
     fn is_quiet(&self, index: DriveIndex) -> bool {
         self.waits.quiet.is_some_and(|(quiet, _)| quiet == index)
     }
@@ -135,8 +135,8 @@ impl Master {
         is_under_way && matches!(self.may_refresh(turn.drive, Stage::Write, now), May::Yes)
     }
 
-    /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, whoever holds the
-    /// drive now.
+    /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, regardless of
+    /// which client holds the drive now.
     fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
         let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
             return May::NotNow;
