@@ -1,8 +1,8 @@
 //! Decides whether an order that does not itself say whether the motor is to run may repeat the remembered run
 //! command, from the observed state of the drive. Pure.
 //!
-//! A drive that restarted, or was stopped at its panel, has lost its run command and stands: the remembered word
-//! would start it.
+//! A drive that restarted, or was stopped at its panel, has lost its run command: the remembered word would
+//! start its motor.
 
 use crate::order::Refusal;
 

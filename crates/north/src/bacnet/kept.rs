@@ -1,5 +1,5 @@
-//! State kept across a restart with `keep_priorities`: inactives of `run` at the priorities that protect people. They
-//! refuse starts as before; nothing is written to a drive.
+//! State kept across a restart with `keep_priorities`: inactive values of `run` at the priorities that protect
+//! people. After the restart these values refuse starts as before; nothing is written to a drive.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

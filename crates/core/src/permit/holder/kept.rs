@@ -1,4 +1,4 @@
-//! The reservation after a stop survives the process. Pure: both clocks are arguments.
+//! The reservation after a stop continues when the process is restarted. Pure: both clocks are arguments.
 
 use std::time::{Duration, Instant, SystemTime};
 
