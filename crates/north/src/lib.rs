@@ -1,5 +1,5 @@
-//! The north sides: Modbus TCP, MQTT, HTTP, BACnet/IP, the local socket and the tool slots. They read the process image and queue commands; they never
-//! name the bus.
+//! The north sides: Modbus TCP, MQTT, HTTP, BACnet/IP, the local socket and the tool slots. They read the process image and
+//! queue commands; they never name the bus.
 
 mod arrivals;
 pub mod bacnet;

@@ -1,7 +1,8 @@
 //! The drives of one line: whole frames in, replies out.
 //!
 //! A frame with a wrong check code gets no reply, unless a drive answers such frames; nor does a frame for another address
-//! or a broadcast, which acts on all drives (reference/drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
+//! or a broadcast, which acts on all drives (reference/drives.md 3.10). When a frame begins and ends is the wire's
+//! business, see [`half_duplex`](super::half_duplex).
 
 use super::SimTime;
 use super::framing;
