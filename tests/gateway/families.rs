@@ -34,7 +34,7 @@ pub(super) fn peers() -> impl Iterator<Item = (&'static str, &'static str)> {
 /// A gateway with the drive that it commands.
 struct Rig {
     site: Site,
-    /// The tool slot, by which addresses are reached that are the common model's over Modbus TCP.
+    /// Port of the tool slot. Through it, the tests reach addresses that belong to the common model over Modbus TCP.
     slot: u16,
     /// The slot that also passes broadcasts on.
     raw_slot: u16,

@@ -74,7 +74,7 @@ fn run_with(seed: u64, floods: bool) -> Figures {
     .run()
 }
 
-/// Runs the seeds, on all cores; each world is of one thread.
+/// Runs the seeds, on all cores; each world runs in one thread.
 fn run_all(seeds: Range<u64>) {
     let began = Instant::now();
     // Set to see how many seeds meet a fault, and which.

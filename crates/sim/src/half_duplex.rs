@@ -118,7 +118,7 @@ struct Outgoing {
 pub struct Wake {
     /// Time of the wake-up.
     pub at: SimTime,
-    /// Whether bytes are due at this time, so that every microsecond counts.
+    /// Whether bytes are due at this time: the thread must then wake exactly in time.
     pub delivery: bool,
 }
 

@@ -31,8 +31,8 @@ impl World {
         }
     }
 
-    /// Processes answers to orders that a newer one replaced before the newer one is recorded, because it takes
-    /// their place.
+    /// Processes the answers to orders that a newer order replaced. This happens before the newer order is recorded,
+    /// because its record replaces theirs.
     pub(super) fn replaced(&mut self) {
         self.collect();
         let Some((newest, before)) = self.records.split_last_mut() else {

@@ -220,7 +220,7 @@ impl Figures {
         &self.running.contrast
     }
 
-    /// Sum of the sign over all drives in the last minute.
+    /// How often this sign of a fault was counted in the last minute, for all drives together.
     pub fn sum(&self, sign: Sign) -> u32 {
         self.drives.iter().map(|drive| drive.sum(sign)).sum()
     }

@@ -65,7 +65,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
     }
 }
 
-/// Home Assistant takes no number whose lowest value is its highest, and would refuse the whole drive.
+/// Refuses limits whose lowest value equals the highest: Home Assistant would refuse the whole drive because of them.
 fn check_numbers_of_home_assistant(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let Some(spec) = drive.spec.as_ref().filter(|_| drive.access.0 == Access::Control) else {

@@ -100,7 +100,8 @@ impl Progress {
     }
 }
 
-/// Estimated time for the remaining steps, which take `patience` at most: as the last ones took of theirs.
+/// Estimated time for the remaining steps, which take `patience` at most: the share of their maximum time that the last
+/// steps took is expected again.
 fn left(steps: &VecDeque<(Duration, Duration)>, patience: Duration) -> Duration {
     let took: Duration = steps.iter().map(|(took, _)| *took).sum();
     let most: Duration = steps.iter().map(|(_, most)| *most).sum();
