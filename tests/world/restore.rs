@@ -9,8 +9,8 @@ use drivegate_world::codec::{Protocol, Reply, RequestPdu};
 use drivegate_world::drive::ModelPoint;
 use drivegate_world::order::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate_world::parameters::{
-    End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, Then,
-    Wanted, Wishes, differences, plan,
+    End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, RestoreNeed,
+    Then, Wishes, differences, plan,
 };
 use drivegate_world::plant::{OrderRequest, Placed};
 use drivegate_world::process_image::ParamsAccess;
@@ -384,25 +384,25 @@ impl RestoreWorld {
         let disk_takes = |dice: &mut Random| Duration::from_millis(dice.within(0..=60));
         loop {
             match restoration.wanted() {
-                Wanted::Record => {
+                RestoreNeed::Record => {
                     let takes = disk_takes(&mut self.dice);
                     self.run(takes)?;
                     self.disk = Some(restoration.journal().text(&profile));
                     restoration.recorded(Ok(()), self.rig.now);
                 }
-                Wanted::Set(order) => {
+                RestoreNeed::Set(order) => {
                     let outcome = self.set(order)?;
                     if let Then::Pause(time, _) = restoration.answered(&outcome, self.rig.now) {
                         self.run(time)?;
                     }
                 }
-                Wanted::Remove => {
+                RestoreNeed::Remove => {
                     let takes = disk_takes(&mut self.dice);
                     self.run(takes)?;
                     self.disk = None;
                     restoration.removed(Ok(()));
                 }
-                Wanted::Nothing => return Ok(restoration.end().expect("it is over").clone()),
+                RestoreNeed::Nothing => return Ok(restoration.end().expect("it is over").clone()),
             }
         }
     }

@@ -5,8 +5,8 @@
 //! orders each client gave to which machine, and when. Every run command to a drive, and every start of a motor, must
 //! result from an order that its client has not withdrawn.
 
-mod befall;
 mod clients;
+mod incidents;
 mod promised;
 
 use std::collections::VecDeque;

@@ -18,12 +18,12 @@ pub(super) struct ClosingServer {
     /// Number of replies over this connection, and when the last one arrived.
     replies: u32,
     last: Option<Instant>,
-    habit: Option<Habit>,
+    habit: Option<ClosePattern>,
 }
 
 /// The learned behaviour of a server: it closes a connection after this number of replies and within this time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Habit {
+struct ClosePattern {
     replies: u32,
     within: Duration,
 }
@@ -43,7 +43,7 @@ impl ClosingServer {
     pub(super) fn replied(&mut self, now: Instant) {
         self.replies = self.replies.saturating_add(1);
         self.last = Some(now);
-        let stays = |habit: &mut Habit| self.replies > habit.replies.saturating_add(STAYED);
+        let stays = |habit: &mut ClosePattern| self.replies > habit.replies.saturating_add(STAYED);
         self.habit.take_if(stays);
     }
 
@@ -57,7 +57,7 @@ impl ClosingServer {
         let replies = self.replies;
         match &mut self.habit {
             Some(habit) if habit.replies == replies => habit.within = habit.within.max(within),
-            _ if asked => self.habit = Some(Habit { replies, within }),
+            _ if asked => self.habit = Some(ClosePattern { replies, within }),
             _ => {}
         }
     }

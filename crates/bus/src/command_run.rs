@@ -8,7 +8,7 @@ mod known_words;
 mod next;
 mod parameter;
 mod replies;
-mod standing;
+mod standstill;
 mod state_read;
 mod steps;
 
@@ -17,12 +17,12 @@ use std::time::{Duration, Instant};
 
 pub use self::control::read_place;
 pub use self::known_words::KnownWords;
-pub(crate) use self::standing::Motor;
+pub(crate) use self::standstill::Motor;
 pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
 
 use self::parameter::ParameterRun;
-use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, unsendable, write_on_change};
+use self::steps::{Action, Check, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use crate::codec::{Reply, Table};
@@ -121,7 +121,7 @@ pub struct CommandRun {
     phase: Phase,
     reply: Reply,
     on_wire: OnWire,
-    known: Known,
+    known: RequestContext,
     /// The drive refused the function code of the present step, so the alternative function is being tried.
     by_other_function: bool,
     /// The register, or coil, of the run command.
@@ -167,7 +167,7 @@ impl CommandRun {
             reference_only,
             reads_back: matches!(&order, Order::Parameter(order) if order.from.is_some()),
         };
-        let known = Known {
+        let known = RequestContext {
             check: Check::NotYet,
             blind: false,
             names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
@@ -176,7 +176,7 @@ impl CommandRun {
             masks: false,
             motor: None,
         };
-        let turns = turns(profile, &order);
+        let turns = starts_or_sets_direction(profile, &order);
         let at_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
@@ -479,7 +479,7 @@ fn direction_at_stop(profile: &Profile, order: &Order) -> Option<bool> {
 
 /// Whether an order sets the direction or starts the motor. A raw write to one of the places of these commands
 /// counts as well.
-fn turns(profile: &Profile, order: &Order) -> bool {
+fn starts_or_sets_direction(profile: &Profile, order: &Order) -> bool {
     match order {
         Order::Points(values) => {
             let says = |point: ModelPoint, on: Option<bool>| {

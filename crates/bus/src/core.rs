@@ -63,7 +63,7 @@ struct Connection {
 
 /// Maximum number of consecutive connections that may end during a transaction. A server may have a shorter time limit
 /// for a drive that is off, or close after one request; but a server that never replies does not reach the drives.
-const MOST_IN_VAIN: u32 = 3;
+const MAX_BROKEN_CONNECTIONS: u32 = 3;
 
 /// Interval of the checks whether a thread that reads orders is stalled; short beside the stall that counts.
 const DEAF_CHECK: Duration = Duration::from_millis(20);
@@ -161,7 +161,7 @@ impl BusCore {
         let since = now.saturating_duration_since(self.deaf_checked);
         if since >= DEAF_CHECK {
             self.deaf_checked = now;
-            if self.report.is_deaf(now) {
+            if self.report.readers_are_blocked(now) {
                 self.master.prolong(since);
             }
         }
@@ -208,7 +208,7 @@ impl BusCore {
             // No reply arrived, but the connection lasted as long as a reply may take.
             return Closed::ReconnectToAsk;
         }
-        if asked && anew && vain + 1 < MOST_IN_VAIN {
+        if asked && anew && vain + 1 < MAX_BROKEN_CONNECTIONS {
             self.connection.vain = vain + 1;
             return Closed::Reconnect;
         }

@@ -9,7 +9,7 @@ use super::n2_late_replies::N2LateReplies;
 use super::refresh::{End, OrderEnd, Refresh};
 use super::repeated_stops::RepeatedStops;
 use super::supervision::Supervision;
-use super::vain_stops::VainStops;
+use super::unanswered_stops::VainStops;
 use crate::codec::{Reply, Table};
 use crate::drive::control::Control;
 use crate::drive::{ModelPoint, Point, Profile};
@@ -63,7 +63,7 @@ pub(super) struct DriveState {
 
 /// Next need of the started commands of a drive.
 #[derive(Debug)]
-pub(super) enum Wanted {
+pub(super) enum NextNeed {
     /// A step of the command of that rank.
     Step(Urgency, Step),
     /// Nothing is sent before this time.
@@ -144,7 +144,7 @@ impl DriveState {
     }
 
     /// The next need of the started commands at `now`, highest rank first. Commands that have ended get their result.
-    pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
+    pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> NextNeed {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
@@ -171,7 +171,7 @@ impl DriveState {
                             break;
                         }
                         if !run.asks_again() {
-                            return Wanted::Step(urgency, step);
+                            return NextNeed::Step(urgency, step);
                         }
                     }
                     Next::Wait(until) => {
@@ -186,7 +186,7 @@ impl DriveState {
                 }
             }
         }
-        wake_at.map_or(Wanted::Nothing, Wanted::Wait)
+        wake_at.map_or(NextNeed::Nothing, NextNeed::Wait)
     }
 
     /// Whether stops were sent repeatedly before the end of a pulse, and the next stop is not on the wire yet.
@@ -198,7 +198,7 @@ impl DriveState {
 
     /// The drive replied to a step of a started command. Returns the outcome when the command has ended.
     pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply, now: Instant) -> Option<Outcome> {
-        self.words.come_to(now);
+        self.words.advance_to(now);
         let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
         run.answered(step, reply, &mut self.words)
     }
@@ -329,7 +329,7 @@ impl DriveState {
     /// Sends a stop before the rest of a command in progress.
     pub(super) fn stop_goes_first(&mut self) {
         if let Some(run) = self.run(Urgency::Command) {
-            run.stop_goes_first();
+            run.note_stop_sent_first();
         }
     }
 

@@ -48,7 +48,7 @@ mod start_gate;
 pub mod supervision;
 mod tap;
 pub mod transaction;
-mod vain_stops;
+mod unanswered_stops;
 
 use drivegate_core::diagnosis;
 use drivegate_core::event;

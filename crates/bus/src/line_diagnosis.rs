@@ -129,7 +129,7 @@ impl LineDiagnosis {
             return;
         }
         if let Some(baud) = exchanged.beats {
-            self.figures.beats(baud);
+            self.figures.note_too_early(baud);
         }
         self.figures.exchange(&Exchange {
             drive,

@@ -103,7 +103,7 @@ impl BusTask {
     }
 
     /// Number of turns of the bus; a bus whose number does not advance for seconds hangs.
-    pub fn beats(&self) -> Arc<AtomicU64> {
+    pub fn heartbeat_counter(&self) -> Arc<AtomicU64> {
         self.beats.clone()
     }
 

@@ -9,11 +9,11 @@ use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::drive::plan::WireTime;
 
 /// Time after which the bus sends even on a line that never goes silent, so that a stop can get out.
-pub const BABBLE: Duration = Duration::from_millis(500);
+pub const MAX_WAIT_FOR_SILENCE: Duration = Duration::from_millis(500);
 
 /// Baud rates are off by at most 2 %, and times are not exact: a reply faster than this share of its wire time is
 /// too early.
-const ALMOST: f64 = 0.9;
+const EARLIEST_REPLY_SHARE: f64 = 0.9;
 
 /// Replies that are complete before the wire could have carried them show a line without wire time: a simulation,
 /// or another baud rate behind a device server. A single one may be a late or duplicate reply, and on a busy
@@ -174,7 +174,7 @@ impl LineState {
     pub(crate) fn clear_at(&self, since: Instant, own: Duration) -> Instant {
         let since = since.max(self.left_alone);
         let silence = self.silence_before(own);
-        let silent = (self.quiet_since + silence).min(since + silence + BABBLE);
+        let silent = (self.quiet_since + silence).min(since + silence + MAX_WAIT_FOR_SILENCE);
         silent.max(self.left_alone)
     }
 
@@ -195,7 +195,7 @@ impl LineState {
 
     /// Whether the line was never silent from `since` on for too long.
     pub(crate) fn babbles(&self, since: Instant) -> bool {
-        self.quiet_since > since + BABBLE
+        self.quiet_since > since + MAX_WAIT_FOR_SILENCE
     }
 
     /// Duration of a transaction without a reply.
@@ -210,7 +210,7 @@ impl LineState {
         let sent = now + self.format.chars(frame.len());
         // A reply cannot be complete before its wire time has passed.
         let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
-        let earliest = sent + least.mul_f64(ALMOST);
+        let earliest = sent + least.mul_f64(EARLIEST_REPLY_SHARE);
         let doubtful = is_doubtful(&request, sending);
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(
@@ -331,7 +331,7 @@ impl LineState {
     /// The baud rate at which request and reply take that time, or little longer.
     fn least_baud(&self, transaction: &Transaction, took: Duration) -> u32 {
         let chars = transaction.frame().len() + transaction.seen().len();
-        let at_baud = self.format.chars(chars).mul_f64(ALMOST).as_secs_f64();
+        let at_baud = self.format.chars(chars).mul_f64(EARLIEST_REPLY_SHARE).as_secs_f64();
         (f64::from(self.format.baud) * at_baud / took.as_secs_f64().max(1e-6)) as u32
     }
 

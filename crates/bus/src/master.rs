@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 pub use self::remains::Remains;
 
-use self::background::Begun;
+use self::background::ChosenTransaction;
 use self::choose::Turns;
 use self::holder::report_control;
 use self::shutdown::Shutdown;
@@ -148,7 +148,7 @@ pub struct TurnEnd {
 
 /// State of a drive that continues over a reload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Carried {
+pub struct CarriedState {
     /// Lease of the drive at the handover.
     pub lease: Lease,
     /// Refresh of orders for the drive's own timeout.
@@ -157,20 +157,20 @@ pub struct Carried {
     pub stops: RepeatedStops,
 }
 
-impl Carried {
+impl CarriedState {
     /// The lease without the data for refreshes and repetitions.
     #[must_use]
-    pub fn alone(self) -> Carried {
-        Carried {
+    pub fn alone(self) -> CarriedState {
+        CarriedState {
             lease: self.lease,
-            ..Carried::default()
+            ..CarriedState::default()
         }
     }
 
     /// The lease, with the time limit extended by a period in which the gateway did not run.
     #[must_use]
-    pub fn after(self, stood: Duration) -> Carried {
-        Carried {
+    pub fn after(self, stood: Duration) -> CarriedState {
+        CarriedState {
             lease: self.lease.after(stood),
             ..self.alone()
         }
@@ -181,7 +181,7 @@ impl Carried {
 #[derive(Debug, Clone, Default)]
 pub struct Handover {
     /// The leases of its drives, in their order, with the orders that are refreshed under them.
-    pub leases: Vec<Carried>,
+    pub leases: Vec<CarriedState>,
     /// Time until which a reply to its last request may arrive; `None` if no bus used the line before.
     pub quiet_until: Option<Instant>,
     /// What the line has shown to the previous bus.
@@ -204,7 +204,7 @@ pub struct Master {
     last_answered: Option<(DriveIndex, RequestPdu)>,
     turns: Turns,
     /// The background request that is next to be sent, or is on the line.
-    background: Option<Begun>,
+    background: Option<ChosenTransaction>,
     /// The last one was passed on to drives of the bus as a command.
     passed_on_last: bool,
     shutdown: Option<Shutdown>,
@@ -330,7 +330,7 @@ impl Master {
         }
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-            Carried {
+            CarriedState {
                 lease: drive.supervision.lease(),
                 repeated: drive.refresh.handed_over(),
                 stops: drive.repeated_stops,
@@ -445,7 +445,7 @@ impl Master {
         }
         let mut pending = bus.queue.lock();
         if pending.gate.has_cleared() {
-            let background = background.as_ref().and_then(Begun::number);
+            let background = background.as_ref().and_then(ChosenTransaction::number);
             let begun = drives
                 .iter_mut()
                 .filter_map(|drive| drive.run(Urgency::Command)?.start.as_ref());

@@ -27,7 +27,7 @@ pub struct N2LateReplies(Vec<Late>);
 
 /// A request to a drive whose reply may come late.
 #[derive(Debug, Clone, Copy)]
-pub struct Asked<'r> {
+pub struct LateRequest<'r> {
     /// The address of the drive.
     pub address: u8,
     /// The request that was sent.
@@ -68,7 +68,7 @@ pub enum Taken {
 
 impl N2LateReplies {
     /// Notes that no valid reply arrived until `now`; a late one can only arrive within `window`.
-    pub fn given_up(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
+    pub fn given_up(&mut self, asked: LateRequest<'_>, window: Duration, now: Instant) {
         self.0.retain(|late| late.until > now);
         let Some(form) = form(asked.pdu) else { return };
         let until = now + window;
@@ -194,7 +194,7 @@ impl N2LateReplies {
     }
 
     /// Notes a doubtful answer: if it was a late one, the reply itself may still arrive; otherwise the late one may.
-    pub(crate) fn doubted(&mut self, asked: Asked<'_>, window: Duration, now: Instant) {
+    pub(crate) fn doubted(&mut self, asked: LateRequest<'_>, window: Duration, now: Instant) {
         let alike = |late: &&mut Late| Some(late.form) == form(asked.pdu);
         if let Some(late) = self.0.iter_mut().find(alike) {
             late.until = late.until.max(now + window);
@@ -269,8 +269,8 @@ mod tests {
         RequestPdu::read(table, start, count)
     }
 
-    fn asked(address: u8, pdu: &RequestPdu, at: Instant) -> Asked<'_> {
-        Asked {
+    fn asked(address: u8, pdu: &RequestPdu, at: Instant) -> LateRequest<'_> {
+        LateRequest {
             address,
             pdu,
             device: 0x10,

@@ -80,7 +80,7 @@ pub struct Shortage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Missed {
     /// Cadence that was configured.
-    pub wanted: Duration,
+    pub configured: Duration,
     /// Cadence that the line can carry.
     pub achieved: Duration,
     /// Number of requests in one round.
@@ -298,7 +298,7 @@ impl<'a> Line<'a> {
         let missed = |class, wanted: Duration, achieved: Option<Duration>, round| {
             let missed = achieved.filter(|achieved| late(achieved.as_secs_f64(), wanted));
             missed.map(|achieved| Missed {
-                wanted,
+                configured: wanted,
                 achieved,
                 requests: prediction.requests.iter().filter(|r| r.read.class == class).count(),
                 round: seconds(round),
@@ -436,7 +436,7 @@ impl Shortage {
         for (key, class, missed) in [("cycle", "fast", &self.fast), ("slow_cycle", "slow", &self.slow)] {
             let Some(missed) = missed else { continue };
             let requests = if missed.requests == 1 { "request" } else { "requests" };
-            cadences.push(format!("{key} = \"{}\"", format_duration(missed.wanted)));
+            cadences.push(format!("{key} = \"{}\"", format_duration(missed.configured)));
             rounds.push(format!(
                 "{class} polling of {} {requests} takes {:.1} ms, every {:.1} ms",
                 missed.requests,

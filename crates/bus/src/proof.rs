@@ -396,7 +396,7 @@ impl<'p> Case<'p> {
         progress.now += if again { LOOK_AGAIN } else { EXCHANGE };
         self.check(&step, progress, stopped, stood)?;
         if step.purpose == StepPurpose::Look && matches!(fate, None | Some(Fate::Repeated)) {
-            run.sees(runs);
+            run.set_motor_state(runs);
             return Ok(None);
         }
         Ok(match (fate, reply) {
@@ -504,7 +504,7 @@ impl<'p> Case<'p> {
             }
         }
         // A drive that refuses the end of the pulse answers with an exception.
-        if progress.drive.reset_stands() && !matches!(outcome, Outcome::Exception(_)) {
+        if progress.drive.reset_is_set() && !matches!(outcome, Outcome::Exception(_)) {
             return Err(self.wrong("a reset bit is left set", progress));
         }
         let sequence = matches!(self.control.run, Run::Steps(_));

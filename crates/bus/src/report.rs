@@ -58,7 +58,7 @@ pub(super) struct Report {
 
 /// Reads that the master must make because of a result.
 #[derive(Debug, Default)]
-pub(super) struct Wanted {
+pub(super) struct RequiredReads {
     /// The drive that has a new fault.
     pub(super) fault: Option<DriveIndex>,
     /// Comparisons to make: drive, monitoring point and time.
@@ -103,7 +103,7 @@ impl Report {
     }
 
     /// Applies a result of the master.
-    pub(super) fn apply(&mut self, news: &News, now: Instant) -> Wanted {
+    pub(super) fn apply(&mut self, news: &News, now: Instant) -> RequiredReads {
         match news {
             News::FastRound(cycle) => self.fast_round(*cycle),
             News::SlowRound(cycle) => self.slow_round(*cycle),
@@ -155,18 +155,18 @@ impl Report {
             }),
         }
         let News::Read { drive, read, at, .. } = news else {
-            return Wanted::default();
+            return RequiredReads::default();
         };
         let index = *drive;
         let Some(drive) = self.drive(index) else {
-            return Wanted::default();
+            return RequiredReads::default();
         };
         let monitors = self.compare_selection((index, &drive), read, *at);
         let reading = drive.reading(now, RECENT);
         let new_fault = self.check_fault(index, &reading);
         self.report_state(index, &reading);
         self.check_own_response(index, &reading);
-        Wanted {
+        RequiredReads {
             fault: new_fault.then_some(index),
             monitors,
         }
@@ -195,8 +195,8 @@ impl Report {
     }
 
     /// Whether a thread that reads orders is blocked.
-    pub(super) fn is_deaf(&self, now: Instant) -> bool {
-        self.events.pauses().is_deaf(now)
+    pub(super) fn readers_are_blocked(&self, now: Instant) -> bool {
+        self.events.pauses().readers_are_blocked(now)
     }
 
     /// The thread of the bus was stalled.
@@ -543,7 +543,7 @@ fn goes_offline(drive: &DriveImage) -> bool {
     }
     drive.update(|s| {
         s.link = Link::Offline(SystemTime::now());
-        s.outlive();
+        s.expire_slow_values();
     });
     true
 }

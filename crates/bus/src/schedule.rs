@@ -114,7 +114,7 @@ pub struct RoundStart {
 
 /// The reason why a poll was chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Turn {
+enum PollReason {
     Due,
     /// A slow poll that is sent before fast ones.
     OnCredit,
@@ -140,7 +140,7 @@ pub struct Schedule {
     /// Share of all time that the credit grows by.
     slow_share: f64,
     /// Why the last poll was chosen.
-    turn: Turn,
+    turn: PollReason,
     /// Time up to which the credit is calculated.
     earned_until: Instant,
     /// Time on the line taken by commands, and by reads they caused, since the last poll.
@@ -202,7 +202,7 @@ impl Schedule {
             new_slow: None,
             slow_credit: Duration::ZERO,
             slow_share: slow_share(demand),
-            turn: Turn::Due,
+            turn: PollReason::Due,
             earned_until: now,
             commanded: Duration::ZERO,
             slow_took: Duration::ZERO,
@@ -236,7 +236,7 @@ impl Schedule {
             self.share.reads_before_commands(waiting.is_some()) && (poll.is_none() || self.share.reads_before_polls())
         });
         if let Some(asked) = asked {
-            self.turn = Turn::Asked;
+            self.turn = PollReason::Asked;
             return Decision::Poll(asked);
         }
         if let Some(urgency) = waiting.filter(|urgency| poll.is_none() || self.share.admits(*urgency)) {
@@ -252,7 +252,7 @@ impl Schedule {
     /// not to the polls that the command must wait for.
     pub(crate) fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
         match self.next(now, waiting) {
-            Decision::Poll(_) if self.turn != Turn::Asked => self.next(now, highest),
+            Decision::Poll(_) if self.turn != PollReason::Asked => self.next(now, highest),
             decision => decision,
         }
     }
@@ -283,18 +283,18 @@ impl Schedule {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
             // A read without a result is repeated among the slow polls.
-            item.wanted |= item.asked.take().is_some();
+            item.is_pending |= item.changed_at.take().is_some();
         }
-        let turn = std::mem::replace(&mut self.turn, Turn::Due);
+        let turn = std::mem::replace(&mut self.turn, PollReason::Due);
         match turn {
-            Turn::Asked => {
+            PollReason::Asked => {
                 self.commanded += took;
                 self.share.read(took);
             }
             // The time of slow polls in their minimum share and of probes of absent drives is not charged to process data.
-            Turn::OnCredit => self.share.polled(Duration::ZERO),
-            Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
-            Turn::Due => self.share.polled(took),
+            PollReason::OnCredit => self.share.polled(Duration::ZERO),
+            PollReason::Due if poll.probe => self.share.polled(Duration::ZERO),
+            PollReason::Due => self.share.polled(took),
         }
         if poll.read.class == PollClass::Fast {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
@@ -304,12 +304,12 @@ impl Schedule {
             self.probed = false;
         } else {
             self.slow_credit = match turn {
-                Turn::OnCredit => self.slow_credit.saturating_sub(took),
-                Turn::Asked => self.slow_credit,
+                PollReason::OnCredit => self.slow_credit.saturating_sub(took),
+                PollReason::Asked => self.slow_credit,
                 // There was room for this poll, so there will be room for the others too.
-                Turn::Due => Duration::ZERO,
+                PollReason::Due => Duration::ZERO,
             };
-            if turn != Turn::Asked {
+            if turn != PollReason::Asked {
                 self.slow_took += took;
             }
             self.note_slow(now);
@@ -406,7 +406,7 @@ impl Schedule {
         if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.postponed = true;
             item.due = item.due.max(until);
-            item.asked = item.asked.map(|since| since.max(until));
+            item.changed_at = item.changed_at.map(|since| since.max(until));
         }
     }
 
@@ -416,7 +416,7 @@ impl Schedule {
             let postponed = drive.items.iter_mut().filter(|item| item.postponed);
             for item in postponed.filter(|item| may_go(index, &item.read)) {
                 item.due = item.due.min(now);
-                item.asked = item.asked.map(|since| since.min(now));
+                item.changed_at = item.changed_at.map(|since| since.min(now));
             }
         }
     }
@@ -447,7 +447,7 @@ impl Schedule {
             .iter_mut()
             .filter(|i| i.read.class != PollClass::Fast && !i.refused && covers(&i.read))
         {
-            item.asked.get_or_insert(now);
+            item.changed_at.get_or_insert(now);
         }
     }
 
@@ -458,7 +458,7 @@ impl Schedule {
         };
         let again = |item: &&mut Item| !item.refused && item.read.class != PollClass::Fault;
         for item in drive.items.iter_mut().filter(again) {
-            item.wanted = true;
+            item.is_pending = true;
             item.due = item.due.min(now);
         }
         self.state_first(index, None);
@@ -497,11 +497,11 @@ impl Schedule {
         for item in items.into_iter().flatten() {
             match item.read.class {
                 PollClass::Fault => {
-                    (item.wanted, item.refused, item.failures) = (true, false, 0);
+                    (item.is_pending, item.refused, item.failures) = (true, false, 0);
                     item.due = now;
                 }
                 PollClass::Monitor if covers(&item.read) && !item.refused => {
-                    item.wanted = true;
+                    item.is_pending = true;
                     item.due = item.due.min(now);
                 }
                 PollClass::Slow if covers(&item.read) && !item.refused => item.due = item.due.min(now),
@@ -516,9 +516,9 @@ impl Schedule {
         let monitors = items
             .into_iter()
             .flatten()
-            .filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.wanted);
+            .filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.is_pending);
         for item in monitors.filter(|item| covers(&item.read)) {
-            (item.wanted, item.due) = (true, due);
+            (item.is_pending, item.due) = (true, due);
         }
     }
 
@@ -532,7 +532,7 @@ impl Schedule {
         if let Some(item) =
             sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor))
         {
-            item.wanted = true;
+            item.is_pending = true;
             item.due = item.due.min(now);
         }
     }
@@ -587,7 +587,7 @@ impl Schedule {
         for drive in &mut self.drives {
             drive.presence = Presence::Away(now, Duration::ZERO);
             drive.early.found_anew();
-            (drive.failures, drive.away_by) = (0, None);
+            (drive.failures, drive.failed_read) = (0, None);
         }
     }
 }

@@ -74,7 +74,7 @@ enum Verdict {
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Findings {
     /// Monitoring points to be read, and when.
-    pub(super) wanted: Vec<(PointIndex, Instant)>,
+    pub(super) reads: Vec<(PointIndex, Instant)>,
     /// The points whose value comes from their monitoring register from now on, if that has changed.
     pub(super) monitored: Option<Vec<PointIndex>>,
     /// Points now known to differ, with both values: the first ones of the drive.
@@ -188,7 +188,7 @@ impl Selections {
         &mut self,
         drive: DriveIndex,
         reading: &Reading<'_>,
-        wanted: Vec<(PointIndex, Instant)>,
+        reads: Vec<(PointIndex, Instant)>,
         differ: Vec<(PointIndex, f64, f64)>,
         restored: Vec<PointIndex>,
     ) -> Findings {
@@ -199,7 +199,7 @@ impl Selections {
         let is_new = !monitored.clone().eq(reading.snapshot.monitored.iter().copied());
         Findings {
             monitored: is_new.then(|| monitored.collect()),
-            wanted,
+            reads,
             differ,
             restored,
         }

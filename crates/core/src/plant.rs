@@ -1,8 +1,8 @@
 //! The plant as the servers use it: images to read, queues to write to. No clock: time is an argument.
 
+mod earlier_meanings;
 mod exchange;
 mod hold;
-mod meaning;
 mod orders;
 mod placed;
 mod slots;
@@ -22,8 +22,8 @@ use crate::permit::Priorities;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 use crate::queue::CommandQueue;
 
+pub use self::earlier_meanings::{EarlierMeanings, follow_names};
 pub use self::exchange::{Exchange, Question, Target};
-pub use self::meaning::{Formerly, follow_names};
 pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
 pub use self::why::explain;
@@ -45,7 +45,7 @@ pub struct BusHandle {
     /// The command queue of the bus.
     pub queue: Arc<CommandQueue>,
     /// Drives that the names and units of the bus meant before reloads.
-    pub formerly: Arc<Formerly>,
+    pub formerly: Arc<EarlierMeanings>,
 }
 
 impl BusHandle {

@@ -75,7 +75,7 @@ impl Stall {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Dated {
     /// Earliest time at which the bytes may have arrived.
-    pub asked: Instant,
+    pub earliest: Instant,
     /// The stall during which the bytes may have arrived.
     pub stall: Option<Stall>,
     /// The last pause, while bytes sent before its end may still arrive.
@@ -179,7 +179,7 @@ impl Stalls {
             (true, Some(stall)) => floor.max(stall.began),
         };
         Dated {
-            asked: asked.min(now),
+            earliest: asked.min(now),
             stall,
             pause: self.pause(now),
         }
@@ -230,7 +230,7 @@ mod tests {
         fn reads(&self, floor: u32, waited: bool, now: u32) -> (i64, Option<(i64, i64)>, bool) {
             let dated = self.stalls.date(self.at(floor), waited, self.at(now));
             let stall = dated.stall.map(|s| (self.ms(s.began), self.ms(s.ended)));
-            (self.ms(dated.asked), stall, dated.pause.is_some())
+            (self.ms(dated.earliest), stall, dated.pause.is_some())
         }
     }
 

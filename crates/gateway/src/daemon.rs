@@ -19,8 +19,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
-use self::leases::Parted;
-pub use self::pulse::Pulse;
+use self::leases::RemovedDrives;
+pub use self::pulse::BusHeartbeats;
 use self::reservations::ReservationsFile;
 use self::server::{ServerSlot, within};
 use crate::bus::line_state::Learned;
@@ -86,7 +86,7 @@ pub struct Daemon {
     plant: SharedPlant,
     buses: Vec<(BusSettings, BusTask)>,
     /// State of drives that reloads have left out.
-    parted: Parted,
+    parted: RemovedDrives,
     events: Events,
     writes: Arc<WriteStats>,
     north: Arc<NorthState>,
@@ -115,7 +115,7 @@ pub struct Daemon {
     reservations: ReservationsFile,
     /// Task that saves reservations on disk.
     reserver: tokio::task::JoinHandle<()>,
-    pulse: Pulse,
+    pulse: BusHeartbeats,
     /// Receiver of reload requests, and the file that the gateway runs with.
     control: Option<Control>,
 }
@@ -150,7 +150,7 @@ impl Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
-            parted: Parted::default(),
+            parted: RemovedDrives::default(),
             watcher: tokio::spawn(Watch::of_this_thread().run(events.clone())),
             events,
             writes,
@@ -172,7 +172,7 @@ impl Daemon {
             drills: drills_file,
             reserver: reservations::keep(shared, reservations.clone()),
             reservations,
-            pulse: Pulse::default(),
+            pulse: BusHeartbeats::default(),
             control,
         };
         // The keeper starts before anything happens: it has the earlier events.
@@ -221,7 +221,7 @@ impl Daemon {
     }
 
     /// Whether the bus threads make progress.
-    pub fn pulse(&self) -> Pulse {
+    pub fn pulse(&self) -> BusHeartbeats {
         self.pulse.clone()
     }
 
@@ -393,7 +393,9 @@ impl Daemon {
     }
 
     fn watch(&self, buses: &[(BusSettings, BusTask)]) {
-        let beats = buses.iter().map(|(bus, task)| (bus.spec.name.clone(), task.beats()));
+        let beats = buses
+            .iter()
+            .map(|(bus, task)| (bus.spec.name.clone(), task.heartbeat_counter()));
         self.pulse.watch(beats);
     }
 

@@ -10,7 +10,7 @@ use super::n2::{self, Command};
 use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
 
 /// Time for which a USB adapter may hold bytes back, with a margin.
-pub const HELD_BACK: Duration = Duration::from_millis(30);
+pub const ADAPTER_DELAY: Duration = Duration::from_millis(30);
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
 /// Up to this many characters before a reply count as a glitch of a line that changes direction, not as a damaged
@@ -99,7 +99,7 @@ impl Frames {
     pub fn patience(&self) -> Option<Instant> {
         let last = self.last.filter(|_| !self.bytes.is_empty())?;
         let held_back = match self.protocol {
-            Protocol::ModbusRtu if rtu::open_frame(&self.bytes).is_some() => self.held_back.min(HELD_BACK),
+            Protocol::ModbusRtu if rtu::open_frame(&self.bytes).is_some() => self.held_back.min(ADAPTER_DELAY),
             _ => self.held_back,
         };
         Some(last + self.format.silence_chars() + held_back)

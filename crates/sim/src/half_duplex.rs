@@ -11,7 +11,7 @@
 use super::SimTime;
 use super::faults::{Burst, Fault, FaultPlan, Kind};
 use super::framing;
-use super::slave::{Asked, FrameMeaning, Slaves, refuse};
+use super::slave::{FrameMeaning, ReceivedRequest, Slaves, refuse};
 use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
 use crate::codec::{Exception, LineFormat, Protocol, rtu};
 use std::collections::BTreeMap;
@@ -398,7 +398,7 @@ impl HalfDuplex {
         }
     }
 
-    fn reply(&mut self, frame: &Incoming, asked: &Asked, now: SimTime) {
+    fn reply(&mut self, frame: &Incoming, asked: &ReceivedRequest, now: SimTime) {
         self.statistics.requests += 1;
         let slaves = &self.slaves;
         let fault = self.faults.next(asked.address, || slaves.any_runs());
@@ -436,7 +436,7 @@ impl HalfDuplex {
     }
 
     /// Gives the drives the request without its last character.
-    fn cut_request(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, now: SimTime) {
+    fn cut_request(&mut self, frame: &Incoming, asked: &ReceivedRequest, fault: Option<Fault>, now: SimTime) {
         let cut = frame.bytes.split_last().map_or(&[][..], |(_, rest)| rest);
         self.statistics.bad_crc += 1;
         let heard = self.slaves.hear(self.rules.protocol, cut, now);
@@ -465,7 +465,14 @@ impl HalfDuplex {
     }
 
     /// Sends a reply on the wire, changed by the fault if there is one.
-    fn respond(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, reply: Vec<u8>, now: SimTime) {
+    fn respond(
+        &mut self,
+        frame: &Incoming,
+        asked: &ReceivedRequest,
+        fault: Option<Fault>,
+        reply: Vec<u8>,
+        now: SimTime,
+    ) {
         let gap = match self.rules.wire {
             Wire::Instant => Duration::ZERO,
             _ => self.rules.format.silence_chars(),

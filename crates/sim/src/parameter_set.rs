@@ -33,7 +33,7 @@ pub struct Writes {
     /// Number of writes during which the inverter fed the motor.
     pub while_fed: u32,
     /// Writes into the memory that keeps values without power; this memory endures a limited number of writes.
-    pub kept: u32,
+    pub stored_writes: u32,
 }
 
 /// The parameters of one drive.
@@ -129,7 +129,7 @@ impl ParameterSet {
 
     /// The memory that keeps the parameter without power was written.
     pub(crate) fn record_kept(&mut self, key: u16) {
-        self.writes.entry(key).or_default().kept += 1;
+        self.writes.entry(key).or_default().stored_writes += 1;
     }
 
     /// Writes received over the bus, by key.
@@ -197,7 +197,7 @@ mod tests {
         let writes = Writes {
             taken: 2,
             while_fed: 1,
-            kept: 1,
+            stored_writes: 1,
         };
         assert_eq!(set.writes(), &BTreeMap::from([(2, writes)]));
         let mut random = Random::new(1);

@@ -247,14 +247,14 @@ fn check_wear(rig: &mut DriveOnLine, plan: &Plan) {
     assert!(
         writes
             .values()
-            .all(|writes| writes.taken <= 1 && writes.kept <= 1 && writes.while_fed == 0)
+            .all(|writes| writes.taken <= 1 && writes.stored_writes <= 1 && writes.while_fed == 0)
     );
     // N2 objects have other addresses.
     for write in plan.writes.iter().filter(|_| !is_n2) {
         let expected = Writes {
             taken: 1,
             while_fed: 0,
-            kept: u32::from(!write.volatile),
+            stored_writes: u32::from(!write.volatile),
         };
         assert_eq!(writes[&write.address], expected, "{}", write.line);
     }

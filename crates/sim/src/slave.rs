@@ -26,14 +26,14 @@ pub enum FrameMeaning {
     /// A broadcast, which the drives carried out.
     Broadcast,
     /// A request to one drive.
-    Request(Asked),
+    Request(ReceivedRequest),
     /// The check code is wrong, and the drive whose address was received answers that by this exception.
-    Damaged(Asked, Exception),
+    Damaged(ReceivedRequest, Exception),
 }
 
 /// A request that a drive of the line has to answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Asked {
+pub struct ReceivedRequest {
     /// Protocol of the line.
     pub protocol: Protocol,
     /// The drive's address.
@@ -137,7 +137,7 @@ impl Slaves {
             Ok(request) => request.function(),
             Err((function, _)) => *function,
         };
-        FrameMeaning::Request(Asked {
+        FrameMeaning::Request(ReceivedRequest {
             protocol,
             address,
             function,
@@ -156,7 +156,7 @@ impl Slaves {
         let (address, function) = framing::damaged(protocol, frame)?;
         let drive = self.drives.get(&address).filter(|drive| drive.answers())?;
         let exception = drive.check_error()?;
-        let asked = Asked {
+        let asked = ReceivedRequest {
             protocol,
             address,
             function,
@@ -174,7 +174,7 @@ impl Slaves {
         if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
             return FrameMeaning::Nobody(address);
         }
-        FrameMeaning::Request(Asked {
+        FrameMeaning::Request(ReceivedRequest {
             protocol: Protocol::N2,
             address,
             function: 0,
@@ -186,7 +186,7 @@ impl Slaves {
 
     /// Lets the drive carry out the request and appends the frame of its reply to `out`. Nothing is appended if the
     /// drive stays silent.
-    pub fn answer(&mut self, asked: &Asked, now: SimTime, out: &mut Vec<u8>) {
+    pub fn answer(&mut self, asked: &ReceivedRequest, now: SimTime, out: &mut Vec<u8>) {
         let Some(drive) = self.drives.get_mut(&asked.address) else {
             return;
         };
@@ -224,7 +224,7 @@ impl Slaves {
 }
 
 /// Appends the frame of an exception to `out`; the request does not reach the drive.
-pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
+pub fn refuse(asked: &ReceivedRequest, exception: Exception, out: &mut Vec<u8>) {
     if asked.command.is_some() {
         Answer::Nak(code_of(exception)).encode(out);
         return;

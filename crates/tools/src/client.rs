@@ -20,7 +20,7 @@ pub(crate) use self::door::Door;
 use self::door::NotConnected;
 pub(crate) use self::events::EventStream;
 use self::exchange::Opened;
-pub(crate) use self::exchange::{Asked, Reply};
+pub(crate) use self::exchange::{GatewayRequest, Reply};
 pub(crate) use self::gateway::Gateway;
 pub(crate) use self::url::Url;
 use crate::north::http::messages::{ErrorReply, Expected};
@@ -137,7 +137,7 @@ impl Client {
     ///
     /// # Errors
     /// If no gateway is found, or it does not answer.
-    async fn open(&self, asked: &Asked) -> Result<Opened, ClientError> {
+    async fn open(&self, asked: &GatewayRequest) -> Result<Opened, ClientError> {
         let mut missed = NotFound {
             file: self.file.clone(),
             ..NotFound::default()
@@ -167,7 +167,7 @@ impl Client {
         Err(ClientError::NotFound(missed))
     }
 
-    async fn open_at(&self, door: &Door, asked: &Asked) -> Result<Opened, NotConnected> {
+    async fn open_at(&self, door: &Door, asked: &GatewayRequest) -> Result<Opened, NotConnected> {
         let authorization = door.authorization().map_err(NotConnected::Final)?;
         let mut tries = 1;
         loop {
@@ -198,7 +198,7 @@ impl Client {
     ///
     /// # Errors
     /// If no gateway is found, or it does not answer.
-    pub(crate) async fn ask(&self, asked: &Asked) -> Result<Reply, ClientError> {
+    pub(crate) async fn ask(&self, asked: &GatewayRequest) -> Result<Reply, ClientError> {
         self.open(asked).await?.whole(asked).await
     }
 
@@ -206,7 +206,7 @@ impl Client {
     ///
     /// # Errors
     /// The errors of [`Client::ask`], as a message.
-    pub(crate) fn ask_now(&self, asked: &Asked) -> Result<Reply, String> {
+    pub(crate) fn ask_now(&self, asked: &GatewayRequest) -> Result<Reply, String> {
         Ok(crate::runtime()?.block_on(self.ask(asked))?)
     }
 
@@ -215,7 +215,7 @@ impl Client {
     /// # Errors
     /// If no gateway is found, or it refuses.
     pub(crate) async fn view<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
-        let asked = Asked::view(path);
+        let asked = GatewayRequest::view(path);
         self.ask(&asked).await?.accepted(&asked)
     }
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::client::{Asked, Client, Gateway, encoded};
+use super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
 use crate::drill::{DrillReport, DrillState, Kind};
@@ -97,7 +97,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 async fn list(gateway: &Gateway, json: bool) -> Outcome {
-    let drills: Vec<DrillReport> = asked(&gateway.client()?, &Asked::view("/api/v1/drills")).await?;
+    let drills: Vec<DrillReport> = asked(&gateway.client()?, &GatewayRequest::view("/api/v1/drills")).await?;
     if json {
         return Ok(report::json(&drills));
     }
@@ -124,7 +124,7 @@ async fn list(gateway: &Gateway, json: bool) -> Outcome {
 }
 
 async fn printed(gateway: &Gateway, id: &str) -> Result<String, String> {
-    let drill = asked(&gateway.client()?, &Asked::view(path(id))).await?;
+    let drill = asked(&gateway.client()?, &GatewayRequest::view(path(id))).await?;
     Ok(page::of(&drill))
 }
 
@@ -132,7 +132,7 @@ fn path(id: &str) -> String {
     format!("/api/v1/drills/{}", encoded(id))
 }
 
-async fn asked<T: serde::de::DeserializeOwned>(client: &Client, asked: &Asked) -> Result<T, String> {
+async fn asked<T: serde::de::DeserializeOwned>(client: &Client, asked: &GatewayRequest) -> Result<T, String> {
     let reply = client.ask(asked).await.map_err(|error| error.to_string())?;
     reply.accepted(asked).map_err(|error| error.to_string())
 }
@@ -154,7 +154,7 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         kinds,
         speed: wish.speed,
     };
-    let armed: DrillReport = asked(&client, &Asked::post("/api/v1/drills", &body)).await?;
+    let armed: DrillReport = asked(&client, &GatewayRequest::post("/api/v1/drills", &body)).await?;
     let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
     let warning = format!(
         "Drive {} will be started at {} % and stopped by: {}. Time allowed: {} s each.\nType its name to start the \
@@ -170,12 +170,12 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
     };
     if typed.trim() != armed.drive {
         // Ends the armed drill at once; otherwise it would end after a minute.
-        let ended = asked::<DrillReport>(&client, &Asked::delete(path(&armed.id))).await;
+        let ended = asked::<DrillReport>(&client, &GatewayRequest::delete(path(&armed.id))).await;
         ended.map_err(|why| format!("{why}; nothing was started"))?;
         return Err("the name was not typed; nothing was started".to_string());
     }
     let lost = "it is unknown whether it started: check the motor, and stop it at the machine";
-    let start = Asked::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
+    let start = GatewayRequest::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
     let started: DrillReport = asked(&client, &start).await?;
     watch(&client, started).await
 }
@@ -202,9 +202,9 @@ async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, Str
             () = interrupted() => true,
         };
         let next = match ends {
-            true => Asked::delete(path(&now.id))
+            true => GatewayRequest::delete(path(&now.id))
                 .if_lost("it is unknown whether the drill ended: stop the motor at its switch"),
-            false => Asked::view(path(&now.id)),
+            false => GatewayRequest::view(path(&now.id)),
         };
         now = asked(client, &next).await?;
     }

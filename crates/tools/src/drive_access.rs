@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use self::conversation::Conversation;
 pub(super) use self::direct::Needs;
-use super::client::{Asked, Client, ClientError, Door, Gateway, NotFound, Reply, encoded};
+use super::client::{Client, ClientError, Door, Gateway, GatewayRequest, NotFound, Reply, encoded};
 use super::failure::Failure;
 use super::report;
 use crate::config::{BusSettings, Settings};
@@ -58,7 +58,7 @@ struct Configured {
 
 /// The way that a request took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Way {
+pub(super) enum RequestRoute {
     /// Through the running gateway.
     Gateway,
     /// Directly on the line.
@@ -116,7 +116,7 @@ impl Target {
     ///
     /// # Errors
     /// If there is no reply; contains the reason as a message.
-    pub(super) fn ask_gateway(&self, asked: &Asked) -> Result<Reply, String> {
+    pub(super) fn ask_gateway(&self, asked: &GatewayRequest) -> Result<Reply, String> {
         super::runtime()?
             .block_on(self.client.ask(asked))
             .map_err(|error| match (error, &self.configured) {
@@ -133,7 +133,7 @@ impl Target {
     ///
     /// # Errors
     /// If there is no reply; contains the reason as a message.
-    pub(super) fn ask(&self, asked: &Asked, needs: Needs<'_>) -> Result<(Reply, Way), String> {
+    pub(super) fn ask(&self, asked: &GatewayRequest, needs: Needs<'_>) -> Result<(Reply, RequestRoute), String> {
         super::runtime()?.block_on(async {
             let (conversation, reply) = Conversation::begin(self, asked, needs).await?;
             let way = conversation.way();

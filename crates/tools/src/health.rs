@@ -2,7 +2,7 @@
 
 use hyper::StatusCode;
 
-use super::client::{Asked, Gateway};
+use super::client::{Gateway, GatewayRequest};
 use super::failure::{Outcome, negative};
 use super::report;
 use crate::north::http::messages::Health;
@@ -43,7 +43,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 /// Why the gateway is not ready; empty if it is ready.
 async fn unready(gateway: &Gateway) -> Result<Vec<String>, String> {
     // The path `/readyz` needs no token.
-    let asked = Asked::view("/readyz");
+    let asked = GatewayRequest::view("/readyz");
     let reply = gateway.client()?.ask(&asked).await?;
     match (reply.status, reply.text()) {
         (StatusCode::OK, _) => Ok(Vec::new()),

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use serde_json::Value as Json;
 
-use super::client::{Asked, Gateway, encoded};
+use super::client::{Gateway, GatewayRequest, encoded};
 use super::failure::{Outcome, documented};
 use super::{printable, report};
 use crate::north::http::messages::HoldAct;
@@ -65,10 +65,10 @@ pub(super) fn run(args: &Args) -> Outcome {
 async fn hold(args: &Args) -> Result<(Hold, Json), String> {
     let path = format!("/api/v1/drives/{}/hold", encoded(&args.drive));
     let asked = match &args.action {
-        None => Asked::get(path),
+        None => GatewayRequest::get(path),
         Some(action) => {
             let lost = "it is unknown whether the hold changed: run it again without an action";
-            Asked::post(path, &HoldAct { action: action.clone() }).if_lost(lost)
+            GatewayRequest::post(path, &HoldAct { action: action.clone() }).if_lost(lost)
         }
     };
     let reply = args.gateway.client()?.ask(&asked).await?;

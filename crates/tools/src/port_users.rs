@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::client::{Asked, Client, ClientError, Door};
+use super::client::{Client, ClientError, Door, GatewayRequest};
 use crate::config::{Settings, environment};
 use crate::line::TAKEN;
 use crate::north::http::messages::Expected;
@@ -177,7 +177,7 @@ fn owner(port: &str) -> Option<Owner> {
 /// The configuration of the gateway at this socket: a gateway names it to a client that expects another.
 async fn config_of(socket: PathBuf) -> Option<PathBuf> {
     let client = Client::for_socket(&SocketPath::At(socket), Expected::Configuration(PathBuf::new()));
-    match client.ask(&Asked::view("/api/v1/health")).await {
+    match client.ask(&GatewayRequest::view("/api/v1/health")).await {
         Err(ClientError::NotFound(missed)) => {
             let file = missed.others.first()?.split_once(RUNS_WITH)?.1;
             Some(PathBuf::from(file))

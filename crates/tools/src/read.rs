@@ -1,6 +1,6 @@
 //! `drivegate read`: points of one drive, once.
 
-use super::client::{Asked, encoded};
+use super::client::{GatewayRequest, encoded};
 use super::drive_access::{Needs, OneDrive, Target, point};
 use super::failure::{Failure, Outcome, negative};
 use super::report;
@@ -42,7 +42,7 @@ pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>
         [] => String::new(),
         names => format!("?names={}", encoded(&names.join(","))),
     };
-    let asked = Asked::get(target.path("points") + &names);
+    let asked = GatewayRequest::get(target.path("points") + &names);
     let (reply, _) = target.ask(&asked, Needs::Points(points))?;
     Ok(reply.accepted(&asked)?)
 }

@@ -1,6 +1,6 @@
 //! `drivegate record`: makes the running gateway record a drive.
 
-use super::client::Asked;
+use super::client::GatewayRequest;
 use super::drive_access::OneDrive;
 use super::failure::Outcome;
 use super::report;
@@ -20,7 +20,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let target = args.drive.target()?;
-    let asked = Asked::post(target.path("recordings"), &serde_json::json!({}));
+    let asked = GatewayRequest::post(target.path("recordings"), &serde_json::json!({}));
     let asked = asked.if_refused("set max_count of [recordings] above 0 and reload");
     let record: Recorded = target.ask_gateway(&asked)?.accepted(&asked)?;
     report::note(&format!("it will be complete in {:.0} s", record.after_s));

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::client::{Asked, Client, Gateway, encoded};
+use super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::failure::{Failure, Outcome};
 use super::report;
 use crate::document::nearest;
@@ -127,14 +127,14 @@ fn list(args: &Args, json: bool) -> Outcome {
 
 /// The recordings listed by a gateway.
 fn listed_by(client: &Client) -> Result<Vec<Entry>, Failure> {
-    let asked = Asked::get("/api/v1/recordings");
+    let asked = GatewayRequest::get("/api/v1/recordings");
     Ok(client.ask_now(&asked)?.accepted(&asked)?)
 }
 
 /// A recording fetched from a gateway.
 fn fetched(client: &Client, id: &str) -> Result<Recording, Failure> {
     let path = format!("/api/v1/recordings/{}?format={}", encoded(id), recording::ENDING);
-    let asked = Asked::get(path).if_refused("choose one from `drivegate recordings list`");
+    let asked = GatewayRequest::get(path).if_refused("choose one from `drivegate recordings list`");
     let reply = client.ask_now(&asked)?;
     if !reply.status.is_success() {
         return Err(reply.refusal(&asked).into());

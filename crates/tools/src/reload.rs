@@ -4,7 +4,7 @@ use std::path::Path;
 
 use hyper::StatusCode;
 
-use super::client::{Asked, Client};
+use super::client::{Client, GatewayRequest};
 use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Settings, environment};
@@ -34,7 +34,7 @@ async fn reload(config: &Path) -> Result<ReloadOutcome, String> {
             config.display()
         ));
     }
-    let asked = Asked::post("/api/v1/reload", &serde_json::json!({})).if_lost("check its log");
+    let asked = GatewayRequest::post("/api/v1/reload", &serde_json::json!({})).if_lost("check its log");
     let reply = Client::of_configuration(config)?.ask(&asked).await?;
     match reply.status {
         StatusCode::OK | StatusCode::UNPROCESSABLE_ENTITY => Ok(reply.document()?),

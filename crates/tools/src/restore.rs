@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use self::staging::Staging;
 use super::archive::{self, Manifest, Root};
-use super::client::{Asked, Client};
+use super::client::{Client, GatewayRequest};
 use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::config::{Loaded, Settings, environment};
@@ -112,7 +112,7 @@ fn restore(args: &Args) -> Result<String, Failure> {
 /// Whether the gateway of the configuration answers.
 async fn is_running(config: &Path) -> bool {
     match Client::of_configuration(config) {
-        Ok(client) => client.ask(&Asked::view("/readyz")).await.is_ok(),
+        Ok(client) => client.ask(&GatewayRequest::view("/readyz")).await.is_ok(),
         Err(_) => false,
     }
 }

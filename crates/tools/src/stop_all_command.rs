@@ -1,6 +1,6 @@
 //! `drivegate stop-all`: stops all drives.
 
-use super::client::{Asked, Gateway};
+use super::client::{Gateway, GatewayRequest};
 use super::failure::{Outcome, documented, negative};
 use super::{printable, report};
 use crate::north::http::messages::StopBody;
@@ -49,7 +49,8 @@ async fn stop_all(args: &Args) -> Result<StopReport, String> {
         group: args.group.clone(),
         wait_s: None,
     };
-    let asked = Asked::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
+    let asked =
+        GatewayRequest::post("/api/v1/stop", &scope).if_lost("it is unknown whether the drives stopped: check them");
     let reply = args.gateway.client()?.ask(&asked).await?;
     match reply.parsed() {
         // Replies of success and of failure both carry the report.

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 use std::time::Duration;
 
-use super::client::Asked;
+use super::client::GatewayRequest;
 use super::drive_access::{Needs, OneDrive, Target};
 use super::failure::Outcome;
 use super::{printable, report};
@@ -34,7 +34,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 fn why(target: &Target) -> Result<Why, String> {
-    let asked = Asked::get(target.path("why"));
+    let asked = GatewayRequest::get(target.path("why"));
     let (reply, _) = target.ask(&asked, Needs::All)?;
     Ok(reply.accepted(&asked)?)
 }

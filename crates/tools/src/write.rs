@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize, Serializer};
 use serde_json::Value as Json;
 
-use super::client::Asked;
-use super::drive_access::{Needs, OneDrive, Target, Way, point};
+use super::client::GatewayRequest;
+use super::drive_access::{Needs, OneDrive, RequestRoute, Target, point};
 use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
 use crate::drive::model::Kind;
@@ -188,7 +188,7 @@ fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String
     let shown: Vec<&str> = settings.iter().map(|setting| setting.shown.as_str()).collect();
     let what = format!("{} {}", target.drive, shown.join(" "));
     let names: Vec<String> = settings.iter().map(|setting| setting.point.clone()).collect();
-    let asked = Asked::post(target.path("commands"), &Body(settings))
+    let asked = GatewayRequest::post(target.path("commands"), &Body(settings))
         .if_lost("it is unknown whether the drive executed the command: read before you repeat it");
     let (reply, way) = target.ask(&asked, Needs::Commands(&names))?;
     let Some((written, document)) = reply.parsed::<Written>().zip(reply.parsed()) else {
@@ -205,7 +205,7 @@ fn command(target: &Target, settings: &[Setting]) -> Result<(Json, Result<String
     Ok((document, told))
 }
 
-fn acknowledged(what: &str, write: &Written, way: Way) -> String {
+fn acknowledged(what: &str, write: &Written, way: RequestRoute) -> String {
     let confirmed = match write.confirmed_ms {
         Some(after) => format!("confirmed after {after:.0} ms"),
         None => match &write.note {
@@ -214,8 +214,8 @@ fn acknowledged(what: &str, write: &Written, way: Way) -> String {
         },
     };
     let way = match way {
-        Way::Gateway => ", through the gateway",
-        Way::Direct => "",
+        RequestRoute::Gateway => ", through the gateway",
+        RequestRoute::Direct => "",
     };
     format!(
         "{}: acknowledged after {:.0} ms, {confirmed}{way}\n",

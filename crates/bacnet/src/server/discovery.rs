@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::{Application, Server, Source, Target, To, Way};
+use super::{Application, Delivery, Server, Source, Target, To};
 use crate::apdu::{self, MAX_APDU};
 use crate::encoding::Writer;
 use crate::object::Device;
@@ -90,16 +90,16 @@ impl Server {
 
     fn has_room(&self, source: Source) -> bool {
         self.traffic.has_room(match source.way {
-            Way::Unicast => To::Host(source.address.host),
-            Way::Broadcast => To::Broadcast,
+            Delivery::Unicast => To::Host(source.address.host),
+            Delivery::Broadcast => To::Broadcast,
         })
     }
 
     /// Sends the answer to the sender of the question.
     fn answer_source(&mut self, source: Source, device: u32, apdu: &[u8], now: Instant) {
         match source.way {
-            Way::Unicast => self.send(source.address, device, apdu, now),
-            Way::Broadcast => {
+            Delivery::Unicast => self.send(source.address, device, apdu, now),
+            Delivery::Broadcast => {
                 let network = source.address.remote.map(|(network, _)| network);
                 self.send_to_all(device, network, apdu, now);
             }

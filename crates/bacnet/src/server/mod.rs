@@ -280,12 +280,12 @@ impl Server {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Source {
     address: Address,
-    way: Way,
+    way: Delivery,
 }
 
 /// How a message was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Way {
+enum Delivery {
     /// The message was sent to this host alone.
     Unicast,
     /// The message was sent to all hosts.

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::time::Instant;
 
 use super::segments::Message;
-use super::{Application, Server, Source, Target, Way};
+use super::{Application, Delivery, Server, Source, Target};
 use crate::apdu::{self, Apdu};
 use crate::bvlc::{self, Bvlc};
 use crate::npdu::{self, GLOBAL, Payload, message};
@@ -39,7 +39,7 @@ impl Server {
             return;
         }
         self.counters.received += 1;
-        let source = |host: SocketAddrV4, way: Way| Source {
+        let source = |host: SocketAddrV4, way: Delivery| Source {
             address: Address::local(host),
             way,
         };
@@ -55,14 +55,14 @@ impl Server {
             }
             Bvlc::Unicast(npdu) => {
                 self.traffic.received(*from.ip(), bytes.len(), now);
-                self.network(source(from, Way::Unicast), npdu, app, now);
+                self.network(source(from, Delivery::Unicast), npdu, app, now);
             }
             Bvlc::Broadcast(npdu) => {
                 self.distribute(from, npdu, now);
-                self.network(source(from, Way::Broadcast), npdu, app, now);
+                self.network(source(from, Delivery::Broadcast), npdu, app, now);
             }
             Bvlc::Forwarded(origin, npdu) if origin != self.options.address => {
-                self.network(source(origin, Way::Broadcast), npdu, app, now);
+                self.network(source(origin, Delivery::Broadcast), npdu, app, now);
             }
             Bvlc::Forwarded(..) => {}
         }
@@ -80,7 +80,7 @@ impl Server {
                 self.distribute(from, npdu, now);
                 let source = Source {
                     address: Address::local(from),
-                    way: Way::Broadcast,
+                    way: Delivery::Broadcast,
                 };
                 return self.network(source, npdu, app, now);
             }
@@ -154,7 +154,7 @@ impl Server {
             // These messages are answered by other routers, or are not meant for us.
             (message::WHO_IS_ROUTER | message::I_AM_ROUTER | message::REJECT, _) => {}
             // The message requests the routing table without changing it.
-            (message::INITIALIZE_TABLE, [0]) if source.way == Way::Unicast => {
+            (message::INITIALIZE_TABLE, [0]) if source.way == Delivery::Unicast => {
                 let table = [1, network[0], network[1], 1, 0];
                 self.between(source, message::INITIALIZE_TABLE_ACK, &table, now);
             }
@@ -170,7 +170,9 @@ impl Server {
             return;
         };
         match asked {
-            Some(source) if source.way == Way::Unicast => self.between(source, message::I_AM_ROUTER, &network, now),
+            Some(source) if source.way == Delivery::Unicast => {
+                self.between(source, message::I_AM_ROUTER, &network, now)
+            }
             _ => {
                 let npdu = npdu::encode(None, None, false, Payload::Network(message::I_AM_ROUTER, &network));
                 self.broadcast(&npdu, now);
@@ -185,7 +187,7 @@ impl Server {
 
     /// Refuses a message; a broadcast is not answered with that.
     fn reject(&mut self, source: Source, why: u8, network: u16, now: Instant) {
-        if source.way == Way::Unicast {
+        if source.way == Delivery::Unicast {
             let [high, low] = network.to_be_bytes();
             self.between(source, message::REJECT, &[why, high, low], now);
         }
@@ -206,7 +208,12 @@ impl Server {
             Target::Device(place) => place,
             Target::All | Target::Network => return,
         };
-        let Some(device) = self.devices.get(place).cloned().filter(|_| source.way == Way::Unicast) else {
+        let Some(device) = self
+            .devices
+            .get(place)
+            .cloned()
+            .filter(|_| source.way == Delivery::Unicast)
+        else {
             return;
         };
         let from = source.address;

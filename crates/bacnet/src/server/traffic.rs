@@ -67,14 +67,14 @@ impl Window {
 }
 
 #[derive(Debug, Default)]
-struct Known {
+struct AddressRecord {
     came: Window,
     left: Window,
     waiting: VecDeque<(SocketAddrV4, Vec<u8>)>,
     octets: usize,
 }
 
-impl Known {
+impl AddressRecord {
     fn may(&mut self, len: usize, step: u64) -> bool {
         let budget = self.came.sum(step) * FACTOR + GRANT;
         self.left.sum(step) + len as u64 <= budget
@@ -85,7 +85,7 @@ impl Known {
 #[derive(Debug)]
 pub(super) struct Traffic {
     begun: Instant,
-    known: HashMap<Ipv4Addr, Known>,
+    known: HashMap<Ipv4Addr, AddressRecord>,
     /// Octets that wait for addresses.
     held: usize,
     broadcasts: VecDeque<Vec<u8>>,
@@ -126,10 +126,10 @@ impl Traffic {
     }
 
     /// The state of this address. If the table is full, the address that was idle for longest is dropped.
-    fn known(&mut self, address: Ipv4Addr, step: u64) -> Option<&mut Known> {
+    fn known(&mut self, address: Ipv4Addr, step: u64) -> Option<&mut AddressRecord> {
         if !self.known.contains_key(&address) {
             if self.known.len() >= ADDRESSES {
-                let quiet = |known: &Known| known.came.last.max(known.left.last);
+                let quiet = |known: &AddressRecord| known.came.last.max(known.left.last);
                 let idle = self
                     .known
                     .iter()
@@ -139,7 +139,7 @@ impl Traffic {
                     .map(|(address, _)| *address)?;
                 self.known.remove(&oldest);
             }
-            self.known.insert(address, Known::default());
+            self.known.insert(address, AddressRecord::default());
         }
         self.known.get_mut(&address)
     }

@@ -43,7 +43,7 @@ pub struct Job {
     /// The slot, of an object with priorities.
     pub priority: Option<u8>,
     /// When the request of the write arrived.
-    pub asked: Instant,
+    pub requested_at: Instant,
     /// When this write was started: at the arrival of the request, or when the previous write of the request was answered.
     pub since: Instant,
 }
@@ -62,7 +62,7 @@ struct Exchange {
     invoke: u8,
     service: u8,
     request: Box<[u8]>,
-    asked: Instant,
+    requested_at: Instant,
     rest: VecDeque<WriteItem>,
     /// The write in progress.
     current: Option<(ObjectId, PropertyRef)>,
@@ -213,7 +213,7 @@ impl Server {
             invoke,
             service,
             request: data.into(),
-            asked: now,
+            requested_at: now,
             rest: items,
             current: None,
             failed: None,
@@ -244,7 +244,7 @@ impl Server {
                 return;
             };
             let Some(item) = exchange.rest.pop_front() else { break };
-            let (from, instance, asked) = (exchange.from, exchange.device, exchange.asked);
+            let (from, instance, asked) = (exchange.from, exchange.device, exchange.requested_at);
             let failed = exchange.failed.is_some();
             let is_stop = app.stops(instance, &item);
             if failed && !is_stop {
@@ -271,7 +271,7 @@ impl Server {
                         object: item.object,
                         value,
                         priority,
-                        asked,
+                        requested_at: asked,
                         since: now,
                     });
                     return;

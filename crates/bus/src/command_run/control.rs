@@ -7,8 +7,8 @@
 use std::time::{Duration, Instant};
 
 use super::known_words::KnownWords;
-use super::standing::{KnownRun, Motor, Verdict, Wants, depends_on_motor, judge};
-use super::steps::{Action, Check, Known, Step, StepPurpose};
+use super::standstill::{KnownRun, Motor, Verdict, Wants, depends_on_motor, judge};
+use super::steps::{Action, Check, RequestContext, Step, StepPurpose};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
 use crate::drive::model::Kind;
@@ -361,7 +361,7 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
 }
 
 /// The request that writes a word, based on the known control word; or the read of the control word if it is not known.
-pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Known) -> Made {
+pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: RequestContext) -> Made {
     let Some(control) = profile.control.as_ref() else {
         return Made::Nothing;
     };
@@ -472,7 +472,7 @@ fn may_stand(
     control: &Control,
     words: &KnownWords,
     released: Option<u16>,
-    known: Known,
+    known: RequestContext,
 ) -> Result<Verdict, Made> {
     let told = known.check == Check::Read;
     let Some(wants) = word.wants() else {
@@ -517,7 +517,7 @@ fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option
 
 /// Whether the word must first be read from the drive, because a bit is to keep its value. A stop and a start need
 /// no read, unless the other bits must be kept and are unknown.
-fn asks_first(word: Word, control: &Control, own: Option<u16>, known: Known) -> bool {
+fn asks_first(word: Word, control: &Control, own: Option<u16>, known: RequestContext) -> bool {
     let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
     if is_coil || known.blind || known.check != Check::NotYet {
         return false;

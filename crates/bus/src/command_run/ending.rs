@@ -69,7 +69,7 @@ impl CommandRun {
     }
 
     /// Notes that a stop of this motor is sent before the rest of the command, the end of a pulse.
-    pub fn stop_goes_first(&mut self) {
+    pub fn note_stop_sent_first(&mut self) {
         self.known.stopped = true;
     }
 

@@ -66,7 +66,7 @@ impl KnownWords {
     }
 
     /// Advances the known state to `now`, when the next reply that is applied arrived.
-    pub(crate) fn come_to(&mut self, now: Instant) {
+    pub(crate) fn advance_to(&mut self, now: Instant) {
         self.now = Some(now);
     }
 

@@ -193,7 +193,7 @@ impl CommandRun {
         }
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
         let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
-        if self.goes_on(kept_back && known) {
+        if self.continues_with_known_word(kept_back && known) {
             return None;
         }
         if kept_back || self.urgency == Urgency::Stop {
@@ -245,7 +245,7 @@ impl CommandRun {
                     .flatten();
             }
             StepPurpose::ReadWord if self.settings().is_some() => return over.then(|| self.without_answer()),
-            StepPurpose::ReadWord if self.goes_on(false) => return None,
+            StepPurpose::ReadWord if self.continues_with_known_word(false) => return None,
             StepPurpose::ReadWord if over || self.urgency == Urgency::Stop => {
                 return self.without_word(self.tries.unanswered.clone());
             }
@@ -279,7 +279,7 @@ impl CommandRun {
 
     /// The word could not be read. Returns whether the command continues with the known word: if the drive never
     /// reports it (`unreadable`), and at the end of a pulse, which must not wait for a read.
-    fn goes_on(&mut self, unreadable: bool) -> bool {
+    fn continues_with_known_word(&mut self, unreadable: bool) -> bool {
         let goes_on = self.known.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {
             self.known.check = Check::InVain;

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::control::Word;
-use super::standing::{self, Motor};
+use super::standstill::{self, Motor};
 use super::steps::Action;
 use super::{CommandRun, KnownWords, Step, StepPurpose};
 use crate::codec::{Protocol, Reply, RequestPdu, Table};
@@ -14,14 +14,14 @@ use crate::order::Outcome;
 
 /// A state of the drive with the registers or bits that show it, as one bit, a masked register or a derived value.
 #[derive(Debug, Clone, PartialEq)]
-struct Shown {
+struct StateBits {
     parts: Vec<(Raw, Kind)>,
     derived: Option<Derived>,
 }
 
-impl Shown {
+impl StateBits {
     /// The bits that show a point; `None` if the profile does not have the point.
-    fn of(profile: &Profile, point: ModelPoint) -> Option<Shown> {
+    fn of(profile: &Profile, point: ModelPoint) -> Option<StateBits> {
         let index = profile.model_index(point)?;
         let derived = match &profile.points.get(index)?.source {
             Source::Derived(derived) => Some(derived.clone()),
@@ -35,7 +35,7 @@ impl Shown {
             Some((point.raw()?.clone(), point.kind()))
         };
         let parts: Option<Vec<(Raw, Kind)>> = sources.into_iter().map(part).collect();
-        parts.map(|parts| Shown { parts, derived })
+        parts.map(|parts| StateBits { parts, derived })
     }
 
     fn value(&self, words: &BTreeMap<(Table, u16), u16>) -> Option<bool> {
@@ -54,9 +54,9 @@ impl Shown {
 /// A series of reads before a write: the remaining reads, and the words read so far.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct StateRead {
-    running: Shown,
-    fault: Option<Shown>,
-    remote: Option<Shown>,
+    running: StateBits,
+    fault: Option<StateBits>,
+    remote: Option<StateBits>,
     first: RequestPdu,
     more: Vec<RequestPdu>,
     /// Number of answered requests in this series.
@@ -78,8 +78,8 @@ impl StateRead {
 
     /// Reads of these points and of the running bit, which is read last so that it is the newest.
     fn of(profile: &Profile, more: &[ModelPoint]) -> Option<StateRead> {
-        let shown = |point: ModelPoint| more.contains(&point).then(|| Shown::of(profile, point)).flatten();
-        let running = Shown::of(profile, ModelPoint::Running)?;
+        let shown = |point: ModelPoint| more.contains(&point).then(|| StateBits::of(profile, point)).flatten();
+        let running = StateBits::of(profile, ModelPoint::Running)?;
         let (fault, remote) = (shown(ModelPoint::Fault), shown(ModelPoint::Remote));
         let all = [&fault, &remote].into_iter().flatten().chain([&running]);
         let mut more = Vec::new();
@@ -136,7 +136,7 @@ impl StateRead {
 
     /// State of the motor in relation to the gateway's word.
     pub(crate) fn motor(&self) -> Motor {
-        let is = |shown: &Option<Shown>| shown.as_ref().and_then(|shown| shown.value(&self.words));
+        let is = |shown: &Option<StateBits>| shown.as_ref().and_then(|shown| shown.value(&self.words));
         match (self.runs(), is(&self.fault), is(&self.remote)) {
             (None, ..) => Motor::NotShown,
             (Some(false), ..) | (_, Some(true), _) => Motor::Stands,
@@ -167,7 +167,7 @@ impl CommandRun {
     }
 
     /// Sets the result of a look without a reply to decode.
-    pub(crate) fn sees(&mut self, runs: bool) {
+    pub(crate) fn set_motor_state(&mut self, runs: bool) {
         self.look = None;
         self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
     }
@@ -180,7 +180,7 @@ impl CommandRun {
             self.tries.failures = 0;
             return None;
         }
-        let unsent = Outcome::Refused(standing::not_seen(why));
+        let unsent = Outcome::Refused(standstill::not_seen(why));
         let outcome = if self.has_begun() { begun } else { unsent };
         Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
     }
@@ -224,7 +224,7 @@ impl CommandRun {
 
     /// Note on an order whose direction waits for the next start.
     pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
-        self.next_start.map(|_| standing::AT_NEXT_START)
+        self.next_start.map(|_| standstill::AT_NEXT_START)
     }
 }
 

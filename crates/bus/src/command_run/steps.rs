@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
-use super::standing::Motor;
+use super::standstill::Motor;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
 use crate::drive::control::Setting;
@@ -110,7 +110,7 @@ pub(super) enum Check {
 
 /// What is known for building a step's request, in addition to the known words.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Known {
+pub(super) struct RequestContext {
     pub(super) check: Check,
     /// Whether the control word cannot be read.
     pub(super) blind: bool,
@@ -323,7 +323,7 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
 }
 
 /// The request for an action with the known words; a read if a word is unknown; `None` if nothing is to be done.
-pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: Known) -> Option<Step> {
+pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: RequestContext) -> Option<Step> {
     let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
     match action {
         // These actions become requests only when they are reached.
@@ -356,7 +356,7 @@ fn bits(
     changes: Vec<(u8, bool)>,
     words: &KnownWords,
     profile: &Profile,
-    known: Known,
+    known: RequestContext,
 ) -> Option<Step> {
     let only_if_set = matches!(action, Action::PulseLow { .. });
     let address = raw.address;

@@ -102,7 +102,7 @@ impl ObedientDrive {
                         }
                         _ => unreachable!(),
                     };
-                    self.words.come_to(self.now);
+                    self.words.advance_to(self.now);
                     if run.answered(&step, reply, &mut self.words).is_some() {
                         return writes;
                     }

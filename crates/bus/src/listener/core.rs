@@ -26,7 +26,7 @@ const LOOK: Duration = Duration::from_millis(100);
 
 /// The state of one drive apart from its image.
 #[derive(Debug)]
-struct Known {
+struct DriveRecord {
     address: u8,
     /// Requests in a row that got no reply.
     unanswered: u32,
@@ -47,7 +47,7 @@ pub struct ListenCore {
     decoder: Decoder,
     report: Report,
     writes: Arc<WriteStats>,
-    drives: PerDrive<Known>,
+    drives: PerDrive<DriveRecord>,
     /// Tries of the other master, after the first, before a drive is offline.
     retries: u32,
     /// Reads of process data in the present round of the other master, and when the round began.
@@ -68,7 +68,7 @@ impl ListenCore {
     ) -> ListenCore {
         let known = |drive: &Arc<crate::process_image::DriveImage>| {
             drive.update(|snapshot| snapshot.heard = Some(Cadence::default()));
-            Known {
+            DriveRecord {
                 address: drive.spec.address,
                 unanswered: 0,
                 heard: now,

@@ -18,11 +18,11 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::codec::frames::{Cut, Frames, GLITCH, HELD_BACK, Piece, are_sound, may_be_request};
+use crate::codec::frames::{ADAPTER_DELAY, Cut, Frames, GLITCH, Piece, are_sound, may_be_request};
 use crate::codec::n2::{self, N2Options};
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu};
 use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
-use crate::n2_late_replies::{Asked, N2LateReplies, Taken};
+use crate::n2_late_replies::{LateRequest, N2LateReplies, Taken};
 use crate::transaction::{Ended, MAY_BE_LATE};
 
 /// Time after which a request without a reply has ended, unless the next request comes first: the longest
@@ -128,7 +128,7 @@ impl Decoder {
     pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
         Decoder {
             protocol,
-            frames: Frames::new(protocol, format, HELD_BACK),
+            frames: Frames::new(protocol, format, ADAPTER_DELAY),
             n2,
             open: None,
             garbage: Vec::new(),
@@ -275,7 +275,7 @@ impl Decoder {
         if let Some(request) = open.request.as_ref().filter(|_| !mangled) {
             match self.protocol {
                 Protocol::N2 => {
-                    let asked = Asked {
+                    let asked = LateRequest {
                         address: request.address,
                         pdu: &request.pdu,
                         device: request.n2.device_type,

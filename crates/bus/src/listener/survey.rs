@@ -14,7 +14,7 @@ const MOST_REQUESTS: usize = 256;
 
 /// A request, each time it was received.
 #[derive(Debug, Clone)]
-pub struct Asked {
+pub struct SurveyedRequest {
     /// The request as text.
     pub what: String,
     /// Table, first address and count of a read.
@@ -29,7 +29,7 @@ pub struct Asked {
     last: Instant,
 }
 
-impl Asked {
+impl SurveyedRequest {
     /// Mean time between two of these requests, if it was received at least twice.
     pub fn cycle(&self) -> Option<Duration> {
         let intervals = u32::try_from(self.count.checked_sub(1)?).ok().filter(|n| *n > 0)?;
@@ -41,7 +41,7 @@ impl Asked {
 #[derive(Debug, Clone, Default)]
 pub struct Address {
     /// Each request of the other master, keyed by its text.
-    pub requests: BTreeMap<String, Asked>,
+    pub requests: BTreeMap<String, SurveyedRequest>,
     /// Requests that got an answer, perhaps a refusal.
     pub answered: u64,
     /// Number of requests without an answer.
@@ -142,7 +142,7 @@ impl Survey {
         if address.requests.len() >= MOST_REQUESTS && !address.requests.contains_key(&what) {
             return;
         }
-        let asked = address.requests.entry(what.clone()).or_insert_with(|| Asked {
+        let asked = address.requests.entry(what.clone()).or_insert_with(|| SurveyedRequest {
             what,
             read: match pdu {
                 Some(RequestPdu::Read { table, start, count }) => Some((*table, *start, *count)),
@@ -172,7 +172,7 @@ impl Survey {
     /// The cycle of the other master: the cycle of the request that it repeats most often.
     pub fn cycle(&self) -> Option<Duration> {
         let all = self.addresses.values().flat_map(|address| address.requests.values());
-        all.max_by_key(|asked| asked.count).and_then(Asked::cycle)
+        all.max_by_key(|asked| asked.count).and_then(SurveyedRequest::cycle)
     }
 }
 

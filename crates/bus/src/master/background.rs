@@ -32,7 +32,7 @@ pub(super) enum Sending {
 
 /// A background transaction that was chosen for sending.
 #[derive(Debug)]
-pub(super) struct Begun {
+pub(super) struct ChosenTransaction {
     pub(super) sending: Sending,
     /// The share that pays for the time of the transaction; `None` if it goes as a command.
     pub(super) admission: Option<Admission>,
@@ -40,7 +40,7 @@ pub(super) struct Begun {
     pub(super) sent: bool,
 }
 
-impl Begun {
+impl ChosenTransaction {
     /// The command to drives of the bus, if this is one.
     pub(super) fn command(&self) -> Option<&Command> {
         match &self.sending {
@@ -211,7 +211,7 @@ impl Master {
         let Some(request) = waiting.take(number) else {
             return Err(blocked);
         };
-        let begun = self.background.insert(Begun {
+        let begun = self.background.insert(ChosenTransaction {
             sending: Sending::Request(Box::new(request)),
             admission: Some(admission),
             sent: false,
@@ -367,7 +367,7 @@ impl Master {
 
     /// Forgets, for all drives that received an unchecked write, the words that it wrote, and all command words if
     /// the written words are unknown.
-    fn unchecked_write(&mut self, begun: &Begun, turn: &Turn, outcome: &Outcome, now: Instant) {
+    fn unchecked_write(&mut self, begun: &ChosenTransaction, turn: &Turn, outcome: &Outcome, now: Instant) {
         let writes = written(&turn.pdu);
         for index in begun.command().into_iter().flat_map(Command::reach) {
             let renews = self.bus.renews(index, begun.origin());
@@ -412,7 +412,7 @@ impl Master {
         self.stranger(turn) == Some(0) && self.waits.sessions.is_empty()
     }
 
-    fn is_broadcast_of(&self, begun: &Begun) -> bool {
+    fn is_broadcast_of(&self, begun: &ChosenTransaction) -> bool {
         let address = begun.passed_on().map(|passed_on| passed_on.address);
         address == Some(0) && begun.drive() == NO_DRIVE && self.waits.sessions.is_empty()
     }

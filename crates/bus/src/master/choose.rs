@@ -8,7 +8,7 @@ use super::{Before, Master, Purpose, Turn};
 use crate::codec::RequestPdu;
 use crate::command_run::{CommandRun, Step};
 use crate::drive::{DriveIndex, PerDrive};
-use crate::drive_state::{DriveState, Wanted};
+use crate::drive_state::{DriveState, NextNeed};
 use crate::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEnd, Urgency, Work};
 use crate::queue::{Chosen, Ready};
 use crate::schedule::{Decision, Poll};
@@ -170,7 +170,7 @@ impl Master {
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
         match state.next_need(image, &waits.n2_late, now) {
-            Wanted::Step(Urgency::Command, step)
+            NextNeed::Step(Urgency::Command, step)
                 if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
                 Some(NextStep {
@@ -209,7 +209,7 @@ impl Master {
             }
             let want = |drive: &mut DriveState| drive.next_need(image, &waits.n2_late, now);
             match next_need(bus, index, (drive, image), want, now) {
-                Wanted::Step(slot, step) => {
+                NextNeed::Step(slot, step) => {
                     // Late replies can block the session step that N2 needs first, as they block the step itself.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
                     let blocked = before.and_then(|before| waits.n2_late.blocks(&before, now));
@@ -229,8 +229,8 @@ impl Master {
                         });
                     }
                 }
-                Wanted::Wait(until) => commands.wait(until),
-                Wanted::Nothing => {}
+                NextNeed::Wait(until) => commands.wait(until),
+                NextNeed::Nothing => {}
             }
         }
         self.queued(&mut commands, now);

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use super::background::{Begun, Sending};
+use super::background::{ChosenTransaction, Sending};
 use super::permission::AtTurn;
 use super::waits::Waits;
 use super::{Master, Turn};
@@ -103,7 +103,7 @@ impl Master {
             command.answer(&Outcome::Offline, now);
             return None;
         }
-        let begun = self.background.insert(Begun {
+        let begun = self.background.insert(ChosenTransaction {
             sending: Sending::Command(Box::new(command)),
             admission,
             sent: false,

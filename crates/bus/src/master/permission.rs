@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 use super::Master;
 use crate::command_run::CommandRun;
 use crate::drive::{DriveIndex, PerDrive};
-use crate::drive_state::{DriveState, Wanted};
+use crate::drive_state::{DriveState, NextNeed};
 use crate::order::{Outcome, Urgency};
-use crate::permit::{Ask, Facts, LastWritten, Seen, Stage, Verdict};
+use crate::permit::{Ask, DriveFacts, Facts, LastWritten, Stage, Verdict};
 use crate::plant::BusHandle;
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
@@ -35,10 +35,10 @@ impl AtTurn {
 }
 
 impl Facts for AtTurn {
-    fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>> {
+    fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.images.get(drive.place())?.reading(self.now, RANGE_AGE);
         let written = self.written.get(drive).copied();
-        Some(Seen { reading, written })
+        Some(DriveFacts { reading, written })
     }
 }
 
@@ -56,7 +56,7 @@ pub(super) fn may_write(
     let Some(origin) = run.origins().next() else {
         return Verdict::Go;
     };
-    let seen = Seen {
+    let seen = DriveFacts {
         reading: image.reading(now, RANGE_AGE),
         written: Some(written),
     };
@@ -76,19 +76,19 @@ pub(super) fn next_need(
     bus: &BusHandle,
     index: DriveIndex,
     (drive, image): (&mut DriveState, &DriveImage),
-    want: impl Fn(&mut DriveState) -> Wanted,
+    want: impl Fn(&mut DriveState) -> NextNeed,
     now: Instant,
-) -> Wanted {
+) -> NextNeed {
     loop {
         let wanted = want(drive);
-        let Wanted::Step(slot @ Urgency::Command, _) = wanted else {
+        let NextNeed::Step(slot @ Urgency::Command, _) = wanted else {
             return wanted;
         };
         let written = drive.written;
         let Some(run) = drive.run(slot) else { return wanted };
         match may_write(bus, index, image, (run, written), now) {
             Verdict::Go | Verdict::LookFirst => return wanted,
-            Verdict::Wait(until) => return Wanted::Wait(until),
+            Verdict::Wait(until) => return NextNeed::Wait(until),
             Verdict::Refuse(outcome) => deny(bus, index, run, outcome),
         }
     }

@@ -7,7 +7,7 @@ use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_run::{Step, StepPurpose};
 use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex};
-use crate::n2_late_replies::Asked;
+use crate::n2_late_replies::LateRequest;
 use crate::n2_session::Progress;
 use crate::news::News;
 use crate::order::{Command, Outcome, Pace, Urgency, is_range_end, written};
@@ -131,7 +131,7 @@ impl Master {
             return;
         };
         let window = self.n2_window();
-        let asked = Asked {
+        let asked = LateRequest {
             address,
             pdu: &turn.pdu,
             device: self.waits.sessions.device(turn.drive),

@@ -199,7 +199,7 @@ impl<'p> Drive<'p> {
         self.word(setting.place.unwrap_or(self.control.at))
     }
 
-    pub(super) fn reset_stands(&self) -> bool {
+    pub(super) fn reset_is_set(&self) -> bool {
         let reset = self.control.fault_reset;
         reset.is_some_and(|reset| !reset.setting.once && reset.setting.holds(self.word_of(&reset.setting)))
     }

@@ -165,7 +165,7 @@ impl Report {
 
     pub(super) fn restarted(&self, index: DriveIndex) {
         let Some(drive) = self.drive(index) else { return };
-        drive.update(Snapshot::outlive);
+        drive.update(Snapshot::expire_slow_values);
         self.drive_event(index, EventKind::Restarted, None, |name| {
             format!("drive {name} has restarted; it is read again and accepts only commands sent from now on")
         });

@@ -18,7 +18,7 @@ impl Report {
         at: Instant,
     ) -> Vec<(DriveIndex, PointIndex, Instant)> {
         let findings = self.selections.read(index, read, &drive.reading(at, RECENT));
-        let wanted = findings.wanted.iter().map(|(point, at)| (index, *point, *at));
+        let wanted = findings.reads.iter().map(|(point, at)| (index, *point, *at));
         let wanted = wanted.collect();
         self.selection_found(drive, index, &findings);
         wanted

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::{Schedule, Turn};
+use super::{PollReason, Schedule};
 use crate::order::Pace;
 
 /// Time that the shares have earned and not used, in seconds of wire time; negative after a transaction that took
@@ -62,7 +62,7 @@ impl Schedule {
             return Admission::InIdleTime(cost);
         }
         // Reads for commands and probes are few, and slow polls on credit pay for themselves.
-        let instead_of_process_data = idle || self.turn == Turn::Due;
+        let instead_of_process_data = idle || self.turn == PollReason::Due;
         let missing = share.missing(pace, cost.as_secs_f64() * (1.0 - 1e-9));
         if missing.is_zero() && instead_of_process_data {
             return Admission::InShare;

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::drives::{DriveSchedule, Item, Presence};
-use super::{FIRST_SHARE, Poll, RoundStart, Schedule, Turn};
+use super::{FIRST_SHARE, Poll, PollReason, RoundStart, Schedule};
 use crate::drive::{DriveIndex, PlannedRead, PollClass};
 
 impl Schedule {
@@ -43,8 +43,8 @@ impl Schedule {
                 .iter()
                 .filter(|i| i.read.class == PollClass::Fast && i.due <= now)
                 .filter(|i| {
-                    mute += usize::from(i.mute);
-                    !i.mute || mute == 1
+                    mute += usize::from(i.never_answers);
+                    !i.never_answers || mute == 1
                 });
             reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
         }
@@ -76,7 +76,7 @@ impl Schedule {
     }
 
     pub(super) fn due_poll(&mut self, now: Instant) -> Option<Poll> {
-        self.turn = Turn::Due;
+        self.turn = PollReason::Due;
         // Many offline drives must not delay the others: a probe without success is followed by a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
@@ -89,7 +89,7 @@ impl Schedule {
         let on_credit =
             |(due, _, cost): &(Instant, Poll, Duration)| !yields && self.slow_credit >= *cost && left_out(*due);
         if let Some((_, poll, _)) = slow.filter(on_credit) {
-            self.turn = Turn::OnCredit;
+            self.turn = PollReason::OnCredit;
             return Some(poll);
         }
         if let Some(&(drive, read)) = self.round.front() {
@@ -132,7 +132,8 @@ impl Schedule {
         let online = self.drives.enumerate();
         let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted && !d.is_quiet(now));
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
-        let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
+        let due =
+            asked.filter_map(|(drive, item)| Some((item.changed_at.filter(|since| *since <= now)?, drive, item.read)));
         let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;
         Some(Poll {
             drive,
@@ -183,7 +184,7 @@ impl Schedule {
                 Presence::Online => {
                     let slow = drive.items.iter().filter(|i| i.is_slow() && !drive.waits_for_fast());
                     let slow = slow.map(|i| drive.due(i));
-                    let asked = drive.items.iter().filter_map(|i| i.asked);
+                    let asked = drive.items.iter().filter_map(|i| i.changed_at);
                     slow.chain(asked).filter(|due| is_ahead(*due, now)).min()
                 }
             };

@@ -53,19 +53,19 @@ pub(super) struct Item {
     pub(super) cost: Duration,
     pub(super) refused: bool,
     /// Whether the drive answers other reads but not this one, which does not make the drive offline.
-    pub(super) mute: bool,
+    pub(super) never_answers: bool,
     /// Number of consecutive refusals.
     pub(super) refusals: u32,
     pub(super) failures: u32,
     /// Time of the last failed poll of this item.
     pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one for a fault, that is still to be done.
-    pub(super) wanted: bool,
+    pub(super) is_pending: bool,
     /// Whether the read was never answered so far.
     pub(super) unread: bool,
     /// When a command changed the registers of this item; it is then read before the round, so that the command is
     /// confirmed soon.
-    pub(super) asked: Option<Instant>,
+    pub(super) changed_at: Option<Instant>,
     /// When the parts of a refused block may be joined again, since it may have been refused by mistake.
     pub(super) whole_again: Option<Instant>,
 }
@@ -96,7 +96,7 @@ pub(super) struct DriveSchedule {
     /// Whether the last request got no answer.
     pub(super) unanswered: bool,
     /// The unanswered read after which the drive counted as away, and the probes since.
-    pub(super) away_by: Option<PlannedRead>,
+    pub(super) failed_read: Option<PlannedRead>,
     pub(super) probes: usize,
     /// The last failed poll of process data.
     pub(super) troubled: Option<Instant>,
@@ -189,26 +189,26 @@ impl Item {
             postponed: false,
             cost,
             refused: false,
-            mute: false,
+            never_answers: false,
             refusals: 0,
             failures: 0,
             failed_at: None,
-            wanted: read.class != PollClass::Fault,
+            is_pending: read.class != PollClass::Fault,
             unread: !matches!(read.class, PollClass::Fault | PollClass::Monitor),
-            asked: None,
+            changed_at: None,
             whole_again: None,
         }
     }
 
     /// Whether the item is read in every round and is not known to stay unanswered.
     pub(super) fn is_process_data(&self) -> bool {
-        self.read.class == PollClass::Fast && !self.mute
+        self.read.class == PollClass::Fast && !self.never_answers
     }
 
     pub(super) fn is_slow(&self) -> bool {
         match self.read.class {
             PollClass::Slow => true,
-            PollClass::Once | PollClass::Fault | PollClass::Monitor => self.wanted,
+            PollClass::Once | PollClass::Fault | PollClass::Monitor => self.is_pending,
             PollClass::Fast | PollClass::Never => false,
         }
     }
@@ -233,7 +233,7 @@ impl DriveSchedule {
             failures: 0,
             garbled: 0,
             unanswered: false,
-            away_by: None,
+            failed_read: None,
             probes: 0,
             troubled: None,
             items,
@@ -281,7 +281,7 @@ impl DriveSchedule {
     /// The drive does not answer; the last request occupied the line for `took`. Sets the time of the next probe:
     /// the first probes follow soon, then the interval doubles, and the probes do not exceed their share of the
     /// line.
-    pub(super) fn is_away(&mut self, now: Instant, took: Duration) {
+    pub(super) fn probe_failed(&mut self, now: Instant, took: Duration) {
         let pause = match self.presence {
             Presence::Online => Duration::ZERO,
             Presence::Away(_, pause) => pause,
@@ -335,14 +335,14 @@ impl DriveSchedule {
         };
         match self.items.iter().any(Item::is_process_data) {
             true => item.is_process_data(),
-            false => !item.mute || self.items.iter().all(|item| item.mute),
+            false => !item.never_answers || self.items.iter().all(|item| item.never_answers),
         }
     }
 
     /// The read that probes whether the drive answers: the first one not known to be unanswered, for which the
     /// reply to the previous probe also counts; every third time another one, including parts of that read.
     pub(super) fn probe(&self) -> Option<PlannedRead> {
-        let (known, mute): (Vec<&Item>, Vec<&Item>) = self.items.iter().partition(|item| !item.mute);
+        let (known, mute): (Vec<&Item>, Vec<&Item>) = self.items.iter().partition(|item| !item.never_answers);
         let mut all = known.into_iter().chain(mute).map(|item| item.read);
         let first = all.next()?;
         let mut others: Vec<PlannedRead> = all
@@ -363,7 +363,7 @@ impl DriveSchedule {
     /// growing pauses. `took` is the time of the request on the line.
     pub(super) fn in_vain(&mut self, read: PlannedRead, took: Duration, now: Instant) {
         self.divide(read, now);
-        for item in self.items.iter_mut().filter(|item| item.mute) {
+        for item in self.items.iter_mut().filter(|item| item.never_answers) {
             let times = if item.failures > self.retries {
                 KNOWN_PAUSE
             } else {
@@ -381,13 +381,13 @@ impl DriveSchedule {
                 .items
                 .iter_mut()
                 .filter(|item| read.covers(item.read.table, item.read.start));
-            parts.for_each(|part| part.mute = true);
+            parts.for_each(|part| part.never_answers = true);
             return;
         };
         let Some(item) = self.items.get_mut(index) else {
             return;
         };
-        item.mute = true;
+        item.never_answers = true;
         item.failures = item.failures.max(retries + 1);
         let vain = item.failures.saturating_sub(retries + 1);
         item.due = now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1);
@@ -412,7 +412,7 @@ impl DriveSchedule {
         let (origin, cost) = (item.origin, item.cost);
         // The whole block was tried often enough, so each half is tried only once.
         let halves = [low, high].map(|half| Item {
-            mute: true,
+            never_answers: true,
             failures: self.retries,
             whole_again: Some(now + REFUSED_PAUSE.1),
             ..Item::new(half, origin, cost, now)
@@ -440,7 +440,7 @@ impl DriveSchedule {
         }
         let vain = |item: &&Item| {
             let often = item.failures > self.retries + TRIED_AGAIN;
-            item.mute && often && Plan::halves(item.read).is_none()
+            item.never_answers && often && Plan::halves(item.read).is_none()
         };
         self.items.iter().filter(vain).map(|item| item.read).collect()
     }
@@ -469,7 +469,7 @@ impl DriveSchedule {
                 false => Change::Unavailable(read, exception),
             };
             item.refused = true;
-            item.wanted = !matches!(item.read.class, PollClass::Fault | PollClass::Monitor);
+            item.is_pending = !matches!(item.read.class, PollClass::Fault | PollClass::Monitor);
             item.due = now + (REFUSED_PAUSE.0 * (1 << item.refusals.min(5))).min(REFUSED_PAUSE.1);
             item.refusals = item.refusals.saturating_add(1);
             let origin = item.origin;
@@ -479,7 +479,7 @@ impl DriveSchedule {
         let (origin, cost) = (item.origin, item.cost);
         let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
         for half in &mut halves {
-            half.wanted = true;
+            half.is_pending = true;
             half.whole_again = Some(now + REFUSED_PAUSE.1);
         }
         self.items.splice(index..=index, halves);
@@ -494,12 +494,12 @@ impl DriveSchedule {
                 Some(last)
                     if item.origin == origin
                         && last.origin == origin
-                        && !(item.refused || item.mute)
-                        && !(last.refused || last.mute)
+                        && !(item.refused || item.never_answers)
+                        && !(last.refused || last.never_answers)
                         && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
                 {
                     last.read.append(&item.read);
-                    last.wanted = true;
+                    last.is_pending = true;
                     last.due = last.due.min(now);
                     last.whole_again = None;
                 }

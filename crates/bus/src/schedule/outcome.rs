@@ -27,7 +27,7 @@ impl Schedule {
             drive.early.answers_again(now);
             drive.probes = 0;
             // The drive answers again, but not the read whose failure made it offline.
-            if let Some(vain) = drive.away_by.take().filter(|vain| *vain != poll.read) {
+            if let Some(vain) = drive.failed_read.take().filter(|vain| *vain != poll.read) {
                 drive.in_vain(vain, Duration::ZERO, now);
                 drive.set_apart(poll.read, now);
             }
@@ -35,9 +35,9 @@ impl Schedule {
                 self.round_due = self.round_due.min(now);
             }
             for item in &mut drive.items {
-                item.wanted = item.read.class != PollClass::Fault;
+                item.is_pending = item.read.class != PollClass::Fault;
                 item.due = now;
-                if !item.mute {
+                if !item.never_answers {
                     item.failures = 0;
                 }
             }
@@ -49,12 +49,12 @@ impl Schedule {
             item.failures = 0;
             item.unread = false;
             item.refusals = 0;
-            let was_in_vain = [&mut item.refused, &mut item.mute].map(std::mem::take);
+            let was_in_vain = [&mut item.refused, &mut item.never_answers].map(std::mem::take);
             if was_in_vain.contains(&true) {
                 // The bad point is readable again, so it is read together with its neighbours.
                 item.whole_again = Some(now);
             }
-            item.wanted = matches!(item.read.class, PollClass::Fast | PollClass::Slow);
+            item.is_pending = matches!(item.read.class, PollClass::Fast | PollClass::Slow);
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
                 // A slow read made early for a command is due a whole cycle later.
@@ -85,9 +85,9 @@ impl Schedule {
             let first = !drive.tried;
             drive.tried = true;
             if first {
-                (drive.away_by, drive.probes) = (Some(poll.read), 0);
+                (drive.failed_read, drive.probes) = (Some(poll.read), 0);
             }
-            drive.is_away(now, took);
+            drive.probe_failed(now, took);
             return if first { Change::Offline } else { Change::None };
         }
         drive.unanswered = true;
@@ -116,8 +116,8 @@ impl Schedule {
             }
             return Change::None;
         }
-        drive.is_away(now, took);
-        (drive.away_by, drive.probes) = (Some(poll.read), 0);
+        drive.probe_failed(now, took);
+        (drive.failed_read, drive.probes) = (Some(poll.read), 0);
         drive.failures = 0;
         drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);

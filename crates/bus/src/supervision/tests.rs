@@ -8,7 +8,7 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_run::{CommandRun, Next, Step};
 use crate::drive::profile::Profiles;
 use crate::drive::{Derived, DriveIndex, Profile, Source};
-use crate::drive_state::{DriveState, Wanted};
+use crate::drive_state::{DriveState, NextNeed};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
 use crate::order::{
@@ -197,7 +197,7 @@ impl SupervisedDrive {
 
     /// Sends the next step of the started command.
     fn send(&mut self) -> (Urgency, Step) {
-        let Wanted::Step(urgency, step) = self.drive.next_need(&self.image(), &N2LateReplies::default(), self.now)
+        let NextNeed::Step(urgency, step) = self.drive.next_need(&self.image(), &N2LateReplies::default(), self.now)
         else {
             panic!("nothing to send")
         };

@@ -104,21 +104,21 @@ impl InPhase {
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Contrast {
     /// Transactions under each condition.
-    pub asked: [f32; 2],
+    pub transactions: [f32; 2],
     /// Transactions that failed under each condition.
     pub failed: [f32; 2],
 }
 
 impl Contrast {
     pub(super) fn add(&mut self, condition: usize, asked: f32, failed: f32) {
-        if let (Some(a), Some(f)) = (self.asked.get_mut(condition), self.failed.get_mut(condition)) {
+        if let (Some(a), Some(f)) = (self.transactions.get_mut(condition), self.failed.get_mut(condition)) {
             *a += asked;
             *f += failed;
         }
     }
 
     pub(super) fn fade(&mut self) {
-        self.asked
+        self.transactions
             .iter_mut()
             .chain(&mut self.failed)
             .for_each(|count| *count *= FADE);

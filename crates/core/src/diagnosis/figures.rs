@@ -125,7 +125,7 @@ impl Figures {
             run_paused: [0; 2],
             silent_at: None,
             mains: InPhase::default(),
-            in_vain: Some(0),
+            unanswered: Some(0),
         };
         Figures {
             line,
@@ -178,7 +178,7 @@ impl Figures {
     }
 
     /// Notes that a reply was too early for the configured baud rate and is possible at `baud`.
-    pub fn beats(&mut self, baud: u32) {
+    pub fn note_too_early(&mut self, baud: u32) {
         self.early.add(BAUDS.partition_point(|usual| *usual < baud), 1);
     }
 
@@ -262,7 +262,7 @@ impl Figures {
             End::Silent => {
                 drive.add(Sign::Tried);
                 drive.run = drive.run.saturating_add(1);
-                drive.in_vain = drive.in_vain.map(|asked| asked.saturating_add(1));
+                drive.unanswered = drive.unanswered.map(|asked| asked.saturating_add(1));
                 if let Some(count) = condition.and_then(|condition| drive.run_paused.get_mut(condition)) {
                     *count = count.saturating_add(1);
                 }
@@ -370,7 +370,7 @@ impl Figures {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };
-        drive.in_vain = None;
+        drive.unanswered = None;
         let (run, paused) = (std::mem::take(&mut drive.run), std::mem::take(&mut drive.run_paused));
         if run == 0 || run > ABSENCE {
             return;

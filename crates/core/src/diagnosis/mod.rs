@@ -14,8 +14,8 @@
 
 pub mod counters;
 pub mod debounce;
+mod failure_rates;
 pub mod figures;
-mod known;
 pub mod own_timeout;
 pub mod rules;
 pub mod signature;

@@ -5,8 +5,8 @@ mod timing;
 use std::time::{Duration, Instant};
 
 use super::counters::{Contrast, MAINS, STEPS};
+use super::failure_rates::{ENOUGH, FEW, FailureRates, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::figures::{Figures, Sign};
-use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::{Cause, Certainty, Finding};
 use crate::drive::DriveIndex;
 
@@ -25,7 +25,7 @@ pub struct Rules<'f> {
     figures: &'f Figures,
     names: &'f [String],
     now: Instant,
-    known: Vec<Known>,
+    known: Vec<FailureRates>,
     /// Failures of other drives that are explained by a drive that replies to requests for others.
     disturbed: u32,
     /// Drives that are neither known nor absent.
@@ -35,10 +35,10 @@ pub struct Rules<'f> {
 
 /// The findings at `now`, most significant first; `names` are the names of the drives.
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
-    let known: Vec<Known> = figures
+    let known: Vec<FailureRates> = figures
         .drives
         .enumerate()
-        .filter_map(|(place, drive)| Known::of(place, drive))
+        .filter_map(|(place, drive)| FailureRates::of(place, drive))
         .collect();
     let heard = [Sign::Answered, Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Led];
     let is_absent = |drive: &&super::Drive| drive.steps(&heard) == 0 && drive.sum(Sign::Tried) > 1;
@@ -210,7 +210,7 @@ impl Rules<'_> {
 
     /// Whether transactions fail under the second condition and not under the first.
     fn contrast(contrast: &Contrast) -> bool {
-        let [asked, others] = contrast.asked;
+        let [asked, others] = contrast.transactions;
         let [failed, of_others] = contrast.failed;
         if asked < 100.0 || others < 40.0 || of_others < 10.0 {
             return false;
@@ -227,7 +227,7 @@ impl Rules<'_> {
             return;
         }
         let [standing, runs] = running.failed.map(f32::round);
-        let [of_standing, of_runs] = running.asked.map(f32::round);
+        let [of_standing, of_runs] = running.transactions.map(f32::round);
         let evidence = format!(
             "recently, {runs} of {of_runs} transactions failed while a drive ran, {standing} of {of_standing} while \
              all were stopped"
@@ -270,7 +270,7 @@ impl Rules<'_> {
             return;
         }
         self.answers_late();
-        let mut known: Vec<Known> = self
+        let mut known: Vec<FailureRates> = self
             .known
             .iter()
             .filter(|one| !self.is_reported(one.place))
@@ -286,15 +286,16 @@ impl Rules<'_> {
         let (bad, good) = known.split_at(count);
         // Whether one drive or several are bad is decided only after all bad drives have been bad for some time and
         // every other drive had enough requests to show the same failures.
-        let least = bad.iter().map(Known::share).fold(1.0, f64::min);
-        let is_good =
-            |one: &Known| f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least);
+        let least = bad.iter().map(FailureRates::share).fold(1.0, f64::min);
+        let is_good = |one: &FailureRates| {
+            f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least)
+        };
         if !bad.iter().all(|one| one.lasting) || !good.iter().all(is_good) {
             return;
         }
         let (failed, asked) = sums(good);
         let mut bad = bad.to_vec();
-        let address = |one: &Known| self.figures.drives.get(one.place).map(|drive| drive.address);
+        let address = |one: &FailureRates| self.figures.drives.get(one.place).map(|drive| drive.address);
         bad.sort_by_key(address);
         let is_tail = good.iter().map(address).max() < bad.first().map(address);
         if bad.len() > 1 && is_tail {
@@ -340,7 +341,7 @@ impl Rules<'_> {
         }
     }
 
-    fn one_drive(&mut self, bad: &Known, (failed, asked): (u32, u32)) {
+    fn one_drive(&mut self, bad: &FailureRates, (failed, asked): (u32, u32)) {
         let slow = self.sum(bad.place, Sign::Slow);
         let tail = if slow >= FEW && bad.silent > bad.damaged {
             let slowest = self.figures.drives.get(bad.place).map_or(0.0, super::Drive::slowest_ms);
@@ -366,7 +367,7 @@ impl Rules<'_> {
         self.add(Cause::OneDrive, Some(bad.place), certainty, evidence);
     }
 
-    fn bad_tail(&mut self, bad: &[Known], (failed, asked): (u32, u32)) {
+    fn bad_tail(&mut self, bad: &[FailureRates], (failed, asked): (u32, u32)) {
         let (of_bad, asked_bad) = sums(bad);
         let Some(first) = bad.first() else { return };
         let address = self.figures.drives.get(first.place).map_or(0, |drive| drive.address);
@@ -386,10 +387,10 @@ impl Rules<'_> {
 
     /// Whether errors appeared about when a drive started, so that they may be caused by running drives.
     fn may_be_of_running(&self) -> bool {
-        let Contrast { asked, failed } = *self.figures.while_running();
+        let Contrast { transactions, failed } = *self.figures.while_running();
         let (now, of) = self.exchanges();
         let [usual, _] = failed;
-        let [standing, running] = asked;
+        let [standing, running] = transactions;
         self.figures.runs()
             && standing >= 100.0
             && running < 100.0
@@ -397,7 +398,7 @@ impl Rules<'_> {
     }
 
     /// Known drives whose errors no verdict explains.
-    fn unexplained(&self) -> Vec<Known> {
+    fn unexplained(&self) -> Vec<FailureRates> {
         if self.may_be_of_running() {
             return Vec::new();
         }
@@ -410,7 +411,7 @@ impl Rules<'_> {
         if of_line.iter().any(|cause| self.has(*cause)) {
             return Vec::new();
         }
-        let rest: Vec<Known> = self
+        let rest: Vec<FailureRates> = self
             .known
             .iter()
             .filter(|one| !self.is_reported(one.place))
@@ -424,10 +425,10 @@ impl Rules<'_> {
     }
 
     /// Whether errors are lasting, frequent, and of more than one drive: of half of those that should show some.
-    fn is_of_line(&self, rest: &[Known]) -> bool {
+    fn is_of_line(&self, rest: &[FailureRates]) -> bool {
         let (failed, asked) = sums(rest);
         let rate = share(failed, asked);
-        let expected_some = |one: &&Known| f64::from(one.asked) * rate >= 3.0;
+        let expected_some = |one: &&FailureRates| f64::from(one.asked) * rate >= 3.0;
         let (some, with) = (
             rest.iter().filter(expected_some).count(),
             rest.iter().filter(expected_some).filter(|one| one.failed > 0).count(),

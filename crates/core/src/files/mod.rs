@@ -6,17 +6,17 @@
 //! - [`names`]: the names of the gateway's files.
 //! - [`read`]: the content of one of them. [`replace`]: writes new content completely or not at all.
 
+mod disk_timeout;
 mod keeper;
 pub mod names;
-mod patience;
 pub mod rotated;
 
 use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
+pub use disk_timeout::{DISK, Patience, late};
 pub use keeper::Keeper;
-pub use patience::{DISK, Patience, late};
 pub use rotated::Rotated;
 
 /// Ending of a file that is not completely written.

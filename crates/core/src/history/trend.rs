@@ -188,12 +188,12 @@ struct PointTrend {
     /// Whether the point is derived from points that are read elsewhere, too.
     derived: bool,
     /// The trend's values; `None` before the first one.
-    kept: Option<Kept>,
+    kept: Option<KeptValues>,
 }
 
 /// The kept values of a point's trend.
 #[derive(Debug)]
-struct Kept {
+struct KeptValues {
     ranges: [Buckets<Bucket>; RANGES.len()],
     /// The last value and when it was read; `None` once the drive went offline.
     last: Option<(Duration, f32)>,
@@ -260,7 +260,7 @@ impl DriveTrend {
                 continue;
             }
             let since = read.at.saturating_duration_since(self.epoch);
-            let kept = point.kept.get_or_insert_with(|| Kept::new(self.reach));
+            let kept = point.kept.get_or_insert_with(|| KeptValues::new(self.reach));
             kept.add(since, value.as_f64() as f32, || known.good_for(point.index));
         }
     }
@@ -315,9 +315,9 @@ impl DriveTrend {
     }
 }
 
-impl Kept {
-    fn new(reach: Reach) -> Kept {
-        Kept {
+impl KeptValues {
+    fn new(reach: Reach) -> KeptValues {
+        KeptValues {
             ranges: reach.ranges().map(|range| Buckets::new(range.buckets())),
             last: None,
         }

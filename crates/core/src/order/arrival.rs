@@ -9,10 +9,10 @@ use crate::stalls::Stall;
 /// A connection through which orders arrive: a TCP connection, a UDP socket, a pseudo-terminal, a connection to a
 /// broker. Clones represent the same connection.
 #[derive(Debug, Clone)]
-pub struct Connection(Arc<Way>);
+pub struct Connection(Arc<ConnectionData>);
 
 #[derive(Debug)]
-struct Way {
+struct ConnectionData {
     opened: Instant,
     gone: AtomicBool,
 }
@@ -20,7 +20,7 @@ struct Way {
 impl Connection {
     /// A connection that was opened at this time.
     pub fn opened(at: Instant) -> Connection {
-        Connection(Arc::new(Way {
+        Connection(Arc::new(ConnectionData {
             opened: at,
             gone: AtomicBool::new(false),
         }))

@@ -92,7 +92,7 @@ pub struct SlotWrite {
     /// The new entry; `None` releases the slot.
     pub entry: Option<Entry>,
     /// Slots that this write also releases: the commands of their owners were refused when they became effective.
-    pub also: Vec<(Commanded, u8)>,
+    pub released_too: Vec<(Commanded, u8)>,
     /// The entry that is planned to govern as a result.
     pub(crate) heir: Option<u64>,
 }
@@ -105,13 +105,13 @@ impl SlotWrite {
             what,
             priority,
             entry,
-            also: Vec::new(),
+            released_too: Vec::new(),
             heir: None,
         }
     }
 
     /// Plans the write; `entry` is the entry that governs afterwards.
-    pub fn in_favour_of(mut self, entry: &Entry) -> SlotWrite {
+    pub fn governed_by(mut self, entry: &Entry) -> SlotWrite {
         self.heir = Some(entry.number);
         self
     }

@@ -20,6 +20,6 @@ pub use journal::{Journal, JournalFile, NO_IDENTIFICATION, Owner, Phase};
 pub use names::{Names, cells};
 pub use plan::{Handling, NOT_KNOWN, Need, ParameterWrite, Plan, Risk, Wishes, plan};
 pub use reading::{Next, Reading};
-pub use restoration::{End, Restoration, Then, Wanted};
-pub use store::{Kept, Store, read};
+pub use restoration::{End, Restoration, RestoreNeed, Then};
+pub use store::{Store, StoredFile, read};
 pub use vault::{Prepared, RestoreStage, RestoreStatus, Status, Vault};

@@ -27,7 +27,7 @@ const MOST_SAVES: u32 = 3;
 
 /// What the restore needs next.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Wanted {
+pub enum RestoreNeed {
     /// The present state of the journal must be on disk before anything else.
     Record,
     /// This order must be given to the bus.
@@ -124,28 +124,28 @@ impl Restoration {
     }
 
     /// What the restore needs next.
-    pub fn wanted(&self) -> Wanted {
+    pub fn wanted(&self) -> RestoreNeed {
         match &self.state {
-            State::Recording(_) => Wanted::Record,
+            State::Recording(_) => RestoreNeed::Record,
             State::Setting(place) => match self.writes.get(*place) {
-                Some(write) => Wanted::Set(ParameterOrder {
+                Some(write) => RestoreNeed::Set(ParameterOrder {
                     id: write.id.name().to_string(),
                     address: write.address,
                     from: Some(write.from),
                     to: write.to,
                 }),
                 None => match self.journal.plan.handling.save {
-                    Some((address, value)) => Wanted::Set(ParameterOrder {
+                    Some((address, value)) => RestoreNeed::Set(ParameterOrder {
                         id: "save".to_string(),
                         address,
                         from: None,
                         to: RawValue::Word(value),
                     }),
-                    None => Wanted::Nothing,
+                    None => RestoreNeed::Nothing,
                 },
             },
-            State::Removing(_) => Wanted::Remove,
-            State::Over(_) => Wanted::Nothing,
+            State::Removing(_) => RestoreNeed::Remove,
+            State::Over(_) => RestoreNeed::Nothing,
         }
     }
 
@@ -369,11 +369,11 @@ mod tests {
         let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));
         loop {
             match restoration.wanted() {
-                Wanted::Record => {
+                RestoreNeed::Record => {
                     all.push(format!("record {}", restoration.journal().phase.name()));
                     restoration.recorded(Ok(()), now);
                 }
-                Wanted::Set(order) => {
+                RestoreNeed::Set(order) => {
                     let new = order.from.is_none() || has.insert(order.address);
                     if new {
                         all.push(order.what());
@@ -383,11 +383,11 @@ mod tests {
                     }
                     assert_eq!(restoration.answered(if new { &TAKEN } else { &seen }, now), Then::Go);
                 }
-                Wanted::Remove => {
+                RestoreNeed::Remove => {
                     all.push("remove".to_string());
                     restoration.removed(Ok(()));
                 }
-                Wanted::Nothing => return all,
+                RestoreNeed::Nothing => return all,
             }
         }
     }
@@ -452,7 +452,7 @@ mod tests {
         let now = Instant::now();
         let mut restoration = begun(2, false, now);
         restoration.recorded(Err("no space left".to_string()), now);
-        assert_eq!(restoration.wanted(), Wanted::Remove);
+        assert_eq!(restoration.wanted(), RestoreNeed::Remove);
         restoration.removed(Ok(()));
         assert!(matches!(restoration.end(), Some(End::NothingWritten(why)) if why.contains("no space left")));
     }
@@ -464,7 +464,7 @@ mod tests {
         restoration.recorded(Ok(()), now);
         restoration.answered(&TAKEN, now);
         restoration.answered(&Outcome::NotTaken("it shows 7".to_string()), now);
-        assert_eq!(restoration.wanted(), Wanted::Nothing);
+        assert_eq!(restoration.wanted(), RestoreNeed::Nothing);
         assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.starts_with("102: 1 → 2: ")));
         assert_eq!(restoration.progress(), (1, 3));
     }
@@ -482,7 +482,7 @@ mod tests {
         restoration.answered(&TAKEN, now);
         assert!(matches!(restoration.answered(&runs, now), Then::Pause(..)));
         assert!(matches!(restoration.answered(&Outcome::Offline, now), Then::Pause(..)));
-        assert!(matches!(restoration.wanted(), Wanted::Set(order) if order.id == "102"));
+        assert!(matches!(restoration.wanted(), RestoreNeed::Set(order) if order.id == "102"));
         restoration.answered(&runs, now + MOST_WAIT + PAUSE);
         assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.contains("60 minutes")));
     }

@@ -22,7 +22,7 @@ pub struct Store {
 
 /// A parameter reading on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Kept {
+pub struct StoredFile {
     /// Name of the drive.
     pub drive: String,
     /// Path of the file.
@@ -98,7 +98,7 @@ impl Store {
     ///
     /// # Errors
     /// If the directory of readings cannot be read.
-    pub fn list(&self) -> io::Result<Vec<Kept>> {
+    pub fn list(&self) -> io::Result<Vec<StoredFile>> {
         let entries = match fs::read_dir(&self.dir) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             entries => entries?,
@@ -114,7 +114,7 @@ impl Store {
         let mut all = Vec::new();
         for drive in drives {
             let paths = self.of(&drive)?;
-            all.extend(paths.into_iter().map(|path| Kept {
+            all.extend(paths.into_iter().map(|path| StoredFile {
                 drive: drive.clone(),
                 path,
             }));

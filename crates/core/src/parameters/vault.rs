@@ -74,7 +74,7 @@ pub struct RestoreStatus {
 
 impl RestoreStatus {
     /// Whether the drive is read or written.
-    pub fn goes_on(&self) -> bool {
+    pub fn is_in_progress(&self) -> bool {
         matches!(self.stage, RestoreStage::Reading | RestoreStage::Working)
     }
 }
@@ -242,7 +242,7 @@ impl Vault {
     /// If another restore of the drive is in progress.
     pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
         let mut state = self.lock();
-        if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {
+        if state.restores.get(drive).is_some_and(RestoreStatus::is_in_progress) {
             return Err(format!("a restore of the parameters of `{name}` is already running"));
         }
         state.numbered += 1;

@@ -47,7 +47,7 @@ impl Verdict {
 
 /// State of a drive when an order to it is judged.
 #[derive(Debug)]
-pub struct Seen<'a> {
+pub struct DriveFacts<'a> {
     /// Process image of the drive.
     pub reading: Reading<'a>,
     /// When reference and frequency range of the drive were last written; set only if the order is about to be sent.
@@ -57,12 +57,12 @@ pub struct Seen<'a> {
 /// Access to the state of the drives of a bus.
 pub trait Facts {
     /// State of the drive with this index; `None` if the bus has no such drive.
-    fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>>;
+    fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>>;
 }
 
 /// Facts of no drives, so that no rule that needs a reading refuses an order.
 impl Facts for () {
-    fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
+    fn seen(&self, _: DriveIndex) -> Option<DriveFacts<'_>> {
         None
     }
 }
@@ -81,7 +81,7 @@ pub struct Ask<'a> {
     /// Origin of the order.
     pub origin: &'a Origin,
     /// State of the drive; `None` if unknown.
-    pub seen: Option<&'a Seen<'a>>,
+    pub seen: Option<&'a DriveFacts<'a>>,
 }
 
 impl Ask<'_> {

@@ -27,7 +27,7 @@ pub use gate::{DrillLock, Gate, Unheld};
 pub use holder::{
     Claim, Denial, HoldChange, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Verb, What,
 };
-pub use judge::{Ask, Facts, Seen, Stage, Verdict};
+pub use judge::{Ask, DriveFacts, Facts, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
 pub use rules::access::{access, client_access};

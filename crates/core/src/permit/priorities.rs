@@ -259,7 +259,7 @@ impl Priorities {
         if let Some(slot) = self.slot_mut(write.what, write.priority) {
             slot.asked.push((write.id, write.entry.clone()));
         }
-        for (what, priority) in &write.also {
+        for (what, priority) in &write.released_too {
             if let Some(slot) = self.slot_mut(*what, *priority) {
                 slot.asked.push((write.id, None));
             }

@@ -239,7 +239,7 @@ impl Plant {
             };
             let mut queue = drive.bus.queue.lock();
             let rules = queue.gate.rules().cloned();
-            let goes_on = rules.and_then(|rules| one.goes_on(&rules, now, time));
+            let goes_on = rules.and_then(|rules| one.continues_after_start(&rules, now, time));
             if let Some((who, until)) = goes_on {
                 queue.gate.reserve(drive.index, who, until);
             }

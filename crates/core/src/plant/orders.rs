@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::meaning::Meant;
+use super::earlier_meanings::FormerMachine;
 use super::{BusHandle, DriveHandle, Placed};
 use crate::codec::{RequestPdu, Table, describe};
 use crate::drive::parameters::RawValue;
@@ -15,7 +15,7 @@ use crate::order::{
     Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
     Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
 };
-use crate::permit::{Facts, Seen, Stage, Verdict, admit, meant_another};
+use crate::permit::{DriveFacts, Facts, Stage, Verdict, admit, meant_another};
 use crate::process_image::{BusImage, Reading};
 
 /// An order as an interface gives it to a drive.
@@ -112,9 +112,9 @@ struct AtAccept<'a> {
 }
 
 impl Facts for AtAccept<'_> {
-    fn seen(&self, drive: DriveIndex) -> Option<Seen<'_>> {
+    fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.image.drives.get(drive)?.reading(self.now, self.stale_after);
-        Some(Seen { reading, written: None })
+        Some(DriveFacts { reading, written: None })
     }
 }
 
@@ -252,7 +252,7 @@ impl DriveHandle {
         };
         let refusal = meant_another();
         let what = self.describe(&request.order);
-        if let Meant::There(there) = &meant
+        if let FormerMachine::There(there) = &meant
             && let Some(stop) = there.stop_meant(&request.order, self)
         {
             let order = OrderRequest { order: stop, ..request };

@@ -201,7 +201,7 @@ impl Snapshot {
     }
 
     /// Slow values may have changed while the drive was offline: they are stale until they are read again.
-    pub fn outlive(&mut self) {
+    pub fn expire_slow_values(&mut self) {
         let seldom = self.spans.iter_mut().filter(|span| span.class != PollClass::Fast);
         for cell in seldom.flat_map(|span| &mut Arc::make_mut(span).cells) {
             cell.outlived = true;

@@ -11,11 +11,11 @@ use crate::order::{Command, Effects, Outcome, Touched, Work};
 /// The queue that serves a drive now, and the index of the drive there, for all queues that served it before: after
 /// any number of reloads the first queue finds the present one, even if those in between no longer exist.
 #[derive(Debug, Clone)]
-pub(super) struct Heir(Arc<Mutex<(Weak<CommandQueue>, DriveIndex)>>);
+pub(super) struct PresentQueue(Arc<Mutex<(Weak<CommandQueue>, DriveIndex)>>);
 
-impl Heir {
-    fn new(queue: &Arc<CommandQueue>, place: DriveIndex) -> Heir {
-        Heir(Arc::new(Mutex::new((Arc::downgrade(queue), place))))
+impl PresentQueue {
+    fn new(queue: &Arc<CommandQueue>, place: DriveIndex) -> PresentQueue {
+        PresentQueue(Arc::new(Mutex::new((Arc::downgrade(queue), place))))
     }
 
     fn set(&self, queue: &Arc<CommandQueue>, place: DriveIndex) {
@@ -92,7 +92,7 @@ impl CommandQueue {
         pending.closed = Some(outcome);
         pending.ending = true;
         let hurried = pending.waiting.iter_mut().filter(|c| last.contains(&c.intent.drive));
-        hurried.for_each(Command::hurry);
+        hurried.for_each(Command::end_delay);
         pending.last = last;
         drop(pending);
         self.wake();
@@ -122,7 +122,7 @@ impl CommandQueue {
         }
         drop(of_heir);
         let found_by = pending.found_by.remove(&drive);
-        let served_by = found_by.unwrap_or_else(|| Heir::new(heir, place));
+        let served_by = found_by.unwrap_or_else(|| PresentQueue::new(heir, place));
         served_by.set(heir, place);
         heir.lock().found_by.insert(place, served_by.clone());
         pending.heirs.insert(drive, served_by);

@@ -10,7 +10,7 @@ mod shared;
 mod stops;
 
 pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background};
-use handover::Heir;
+use handover::PresentQueue;
 pub use shared::CommandQueue;
 pub use stops::{NotStopped, Stopping};
 
@@ -52,9 +52,9 @@ pub struct Pending {
     /// Drives whose stop was taken for sending, until the bus reports its end.
     begun_stops: Vec<DriveIndex>,
     /// The drives whose stops another queue took over.
-    heirs: BTreeMap<DriveIndex, Heir>,
+    heirs: BTreeMap<DriveIndex, PresentQueue>,
     /// For each drive that was taken over from an earlier queue: how that queue finds the drive.
-    found_by: BTreeMap<DriveIndex, Heir>,
+    found_by: BTreeMap<DriveIndex, PresentQueue>,
     /// The stops that the gateway requires before it ends, until the bus takes them.
     stopping: Option<Stopping>,
     /// Commands that were refused when their turn came, and are not reported yet.
@@ -119,7 +119,8 @@ impl Pending {
     /// If the gate refuses the command, its refusal; the command is answered by then.
     pub fn push(&mut self, mut command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
         let is_stop = command.is_stop();
-        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive).and_then(Heir::served_by) {
+        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive).and_then(PresentQueue::served_by)
+        {
             command.move_to(place);
             return queue.submit(command, facts, now);
         }

@@ -118,7 +118,7 @@ impl CommandQueue {
         self.background().close(&Outcome::ShuttingDown, now);
         let mut pending = self.lock();
         pending.remove(now, &Outcome::ShuttingDown, |c| !c.is_stop());
-        pending.waiting.iter_mut().for_each(Command::hurry);
+        pending.waiting.iter_mut().for_each(Command::end_delay);
         pending.stops_only = true;
         pending.stopping = Some(Stopping { deadline, report });
         drop(pending);

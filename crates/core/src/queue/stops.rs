@@ -88,7 +88,7 @@ impl Pending {
         // A second stop waits for nothing, nor does the first one any more.
         if !stop.is_delayed_stop() {
             let of_drive = self.waiting.iter_mut().filter(|c| c.intent.drive == drive);
-            of_drive.for_each(Command::hurry);
+            of_drive.for_each(Command::end_delay);
         }
         let bare = stop.is_bare_stop();
         let alike = |c: &Command| c.intent.drive == drive && c.is_stop() && c.is_bare_stop() == bare;
@@ -162,7 +162,7 @@ impl Command {
     }
 
     /// Ends the delay of a stop.
-    pub(super) fn hurry(&mut self) {
+    pub(super) fn end_delay(&mut self) {
         if let Work::Stop(stop) = &mut self.work
             && stop.haste == Haste::Delayed
         {

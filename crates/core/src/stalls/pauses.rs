@@ -111,7 +111,7 @@ impl Pauses {
     }
 
     /// Whether a thread that reads orders is stalled now: no orders or heartbeats are received over its connections.
-    pub fn is_deaf(&self, now: Instant) -> bool {
+    pub fn readers_are_blocked(&self, now: Instant) -> bool {
         let state = self.state();
         let mut readers = state.readers.iter().filter_map(Weak::upgrade);
         readers.any(|beat| now.saturating_duration_since(beat.last()) > UNNOTICED)
@@ -139,13 +139,13 @@ mod tests {
     #[test]
     fn a_reader_that_does_not_run_hears_nobody() {
         let (pauses, now) = (Pauses::default(), Instant::now());
-        assert!(!pauses.is_deaf(now + SECOND), "there is none");
+        assert!(!pauses.readers_are_blocked(now + SECOND), "there is none");
         let (one, other) = (pauses.reader(now), pauses.reader(now));
-        assert!(!pauses.is_deaf(now + UNNOTICED));
+        assert!(!pauses.readers_are_blocked(now + UNNOTICED));
         one.note_run(now + SECOND);
         assert_eq!(one.last(), now + SECOND);
-        assert!(pauses.is_deaf(now + SECOND), "the other one does not run");
+        assert!(pauses.readers_are_blocked(now + SECOND), "the other one does not run");
         drop(other);
-        assert!(!pauses.is_deaf(now + SECOND), "it has ended");
+        assert!(!pauses.readers_are_blocked(now + SECOND), "it has ended");
     }
 }

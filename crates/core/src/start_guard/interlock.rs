@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Instant;
 
 use super::Interlock;
-use super::around::{Around, Watched};
+use super::drives_by_name::{DrivesByName, Watched};
 use crate::drive::{PointIndex, Quality, Value};
 
 /// An interlock that does not hold.
@@ -26,14 +26,14 @@ impl fmt::Display for Unmet {
 
 impl Interlock {
     /// The interlock if it forbids a start. Only a good sample satisfies an interlock.
-    pub(super) fn unmet(&self, around: &Around, now: Instant) -> Option<Unmet> {
+    pub(super) fn unmet(&self, around: &DrivesByName, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| self.differs(watched, index, around, now))
     }
 
     /// The interlock if it requires a running motor to stop. A drive whose bus was restarted keeps its earlier
     /// state until it is read. `stood` is the end of the last pause of the bus: a value that was satisfied and has
     /// only become too old then waits for a first reading.
-    pub(super) fn trips(&self, around: &Around, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
+    pub(super) fn trips(&self, around: &DrivesByName, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| {
             let is_only_old = stood.is_some_and(|until| self.met_before(watched, index, around, (until, now)));
             match is_only_old {
@@ -48,7 +48,7 @@ impl Interlock {
         &self,
         watched: &Watched,
         index: PointIndex,
-        around: &Around,
+        around: &DrivesByName,
         (until, now): (Instant, Instant),
     ) -> bool {
         let sample = watched.image.reading(now, around.stale_after).sample(index);
@@ -56,7 +56,7 @@ impl Interlock {
         met && sample.quality == Quality::Stale && sample.at.is_some_and(|at| at <= until)
     }
 
-    fn of(&self, around: &Around, differs: impl Fn(&Watched, PointIndex) -> Option<String>) -> Option<Unmet> {
+    fn of(&self, around: &DrivesByName, differs: impl Fn(&Watched, PointIndex) -> Option<String>) -> Option<Unmet> {
         let but = match around.drive(&self.drive) {
             None => Some("there is no such drive".to_string()),
             Some(watched) => match watched.image.spec.profile.point_index(&self.point) {
@@ -77,7 +77,7 @@ impl Interlock {
         &self,
         watched: &Watched,
         index: PointIndex,
-        around: &Around,
+        around: &DrivesByName,
         (at, now): (Instant, Instant),
     ) -> Option<String> {
         let Some(anew) = watched.anew(now) else {
@@ -94,7 +94,7 @@ impl Interlock {
     }
 
     /// The state of the point if it does not satisfy the interlock.
-    fn differs(&self, watched: &Watched, index: PointIndex, around: &Around, now: Instant) -> Option<String> {
+    fn differs(&self, watched: &Watched, index: PointIndex, around: &DrivesByName, now: Instant) -> Option<String> {
         let reading = watched.image.reading(now, around.stale_after);
         let sample = reading.sample(index);
         let age = || {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
-use super::around::Around;
+use super::drives_by_name::DrivesByName;
 use super::file::Saved;
 use super::motor::{HOUR, Motor, Reserved};
 use super::{Guard, Guarded, Reason, shown};
@@ -21,7 +21,7 @@ pub(super) const DISK: Duration = Duration::from_secs(1);
 pub struct Guards {
     ledger: Mutex<Ledger>,
     changed: Condvar,
-    around: ArcSwap<Around>,
+    around: ArcSwap<DrivesByName>,
 }
 
 #[derive(Debug, Default)]
@@ -60,7 +60,7 @@ enum Disk {
 
 /// Whether a cleared start is on disk.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Kept {
+pub(super) enum SaveProgress {
     Yes,
     NotYet,
     Failed(String),
@@ -71,7 +71,7 @@ impl Guards {
         self.ledger.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn around(&self) -> arc_swap::Guard<Arc<Around>> {
+    pub(super) fn around(&self) -> arc_swap::Guard<Arc<DrivesByName>> {
         self.around.load()
     }
 
@@ -256,22 +256,22 @@ impl Ledger {
     }
 
     /// Whether a start that is decided is on disk.
-    pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> Kept {
+    pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> SaveProgress {
         match &self.disk {
-            Disk::None => Kept::Yes,
-            Disk::Unread(path) if now >= reserved.at + DISK => Kept::Failed(format!(
+            Disk::None => SaveProgress::Yes,
+            Disk::Unread(path) if now >= reserved.at + DISK => SaveProgress::Failed(format!(
                 "{}: it is not read yet: the disk does not answer",
                 path.display()
             )),
-            Disk::File { written, .. } if *written >= reserved.generation => Kept::Yes,
+            Disk::File { written, .. } if *written >= reserved.generation => SaveProgress::Yes,
             Disk::File {
                 failed: Some((generation, why)),
                 ..
-            } if *generation >= reserved.generation => Kept::Failed(why.clone()),
+            } if *generation >= reserved.generation => SaveProgress::Failed(why.clone()),
             Disk::File { .. } if now >= reserved.at + DISK => {
-                Kept::Failed(format!("the disk did not take them within {}", shown(DISK)))
+                SaveProgress::Failed(format!("the disk did not take them within {}", shown(DISK)))
             }
-            Disk::Unread(_) | Disk::File { .. } => Kept::NotYet,
+            Disk::Unread(_) | Disk::File { .. } => SaveProgress::NotYet,
         }
     }
 
@@ -283,7 +283,7 @@ impl Ledger {
     }
 
     /// A motor was read. Whether that changed what belongs on disk.
-    pub(super) fn seen(&mut self, machine: &Machine, seen: super::Seen) -> bool {
+    pub(super) fn seen(&mut self, machine: &Machine, seen: super::MotorReading) -> bool {
         let changed = self.with(machine, |motor| motor.seen(seen)) == Some(true);
         self.generation += u64::from(changed);
         changed

@@ -12,13 +12,13 @@
 //!   these points. `view`: the results of the guards of one bus.
 //! - `file`: the file format. `keeper`: the thread that writes the file; the only part with I/O and a clock.
 
-mod around;
+mod drives_by_name;
 mod file;
 mod interlock;
 mod keeper;
 mod ledger;
 mod motor;
-mod passage;
+mod start_attempt;
 mod view;
 
 use std::time::Duration;
@@ -27,9 +27,9 @@ pub use self::file::Saved;
 pub use self::interlock::Unmet;
 pub use self::keeper::keep;
 pub use self::ledger::Guards;
-pub use self::motor::Seen;
-pub use self::passage::ByRun;
-pub use self::passage::Unable;
+pub use self::motor::MotorReading;
+pub use self::start_attempt::ByRun;
+pub use self::start_attempt::Unable;
 pub use self::view::{BusGuards, Clearance};
 pub use crate::order::{Guarded, Reason};
 pub use crate::spec::{Guard, Interlock, MOST_STARTS};

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::passage::{Besides, ByRun, Passage, Progress, SETTLES, Shown};
+use super::start_attempt::{ByRun, MotorFacts, Progress, SETTLES, StartAttempt, StartEffect};
 use super::{Guard, Guarded, MOST_STARTS, Reason, Unable, shown};
 
 /// The time window of `starts_per_hour`.
@@ -17,7 +17,7 @@ const UNREAD: Duration = Duration::from_secs(2);
 
 /// The motor's state in a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Seen {
+pub struct MotorReading {
     /// Whether the motor runs, without a fault.
     pub running: bool,
     /// Run command as the drive has it, and when that was read.
@@ -57,7 +57,7 @@ pub(super) struct Motor {
     starts: VecDeque<Instant>,
     pub(super) reserved: Option<Reserved>,
     /// The last start by an order.
-    passage: Option<Passage>,
+    passage: Option<StartAttempt>,
     /// Whether the motor runs, and when that was read; `None` if unknown.
     running: Option<(bool, Instant)>,
     /// Whether the motor ran when its state was last known.
@@ -93,8 +93,8 @@ impl Motor {
         passage.map_or(ByRun::Starts, |passage| passage.by_run(self.besides()))
     }
 
-    fn besides(&self) -> Besides {
-        Besides {
+    fn besides(&self) -> MotorFacts {
+        MotorFacts {
             stop: self.stop_written,
             commanded: self.commanded,
         }
@@ -216,7 +216,7 @@ impl Motor {
         }
         self.count(now);
         let same = self.passage.take().filter(|_| !is_next);
-        self.passage = Some(Passage {
+        self.passage = Some(StartAttempt {
             number,
             client: client.clone(),
             progress: Progress::Awaited,
@@ -262,8 +262,8 @@ impl Motor {
     }
 
     /// Processes a reading of the motor. Returns whether it changed which starts count, or from when.
-    pub(super) fn seen(&mut self, seen: Seen) -> bool {
-        let Seen {
+    pub(super) fn seen(&mut self, seen: MotorReading) -> bool {
+        let MotorReading {
             running, stands, at, ..
         } = seen;
         self.commanded = seen.commanded.or(self.commanded);
@@ -298,19 +298,19 @@ impl Motor {
             return came && self.counts_seen(None, at);
         };
         match passage.is_seen_running(came, besides, at) {
-            Shown::Nothing => false,
-            Shown::Started => {
+            StartEffect::Nothing => false,
+            StartEffect::Started => {
                 let by = Some(passage.client.clone());
                 self.started.get_or_insert(Started { at, by });
                 false
             }
-            Shown::StartedLate => {
+            StartEffect::StartedLate => {
                 let counted = std::mem::replace(&mut passage.counted, at);
                 let by = Some(passage.client.clone());
                 self.discount(counted);
                 self.counts_seen(by, at)
             }
-            Shown::Another(by) => self.counts_seen(by, at),
+            StartEffect::Another(by) => self.counts_seen(by, at),
         }
     }
 
@@ -321,7 +321,7 @@ impl Motor {
     }
 
     /// The motor does not run. Whether a start does not count any more.
-    fn is_seen_not_running(&mut self, seen: &Seen) -> bool {
+    fn is_seen_not_running(&mut self, seen: &MotorReading) -> bool {
         let besides = self.besides();
         let Some(passage) = self.passage.as_mut() else {
             return false;
@@ -342,7 +342,7 @@ impl Motor {
     }
 
     /// Notes that the drive is offline: its motor may run and stop again unseen.
-    pub(super) fn away(&mut self) {
+    pub(super) fn note_offline(&mut self) {
         (self.running, self.unable, self.stands_since) = (None, false, None);
         if let Some(passage) = &mut self.passage {
             passage.away = true;

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::ledger::{Guards, Kept};
+use super::ledger::{Guards, SaveProgress};
 use super::motor::Motor;
-use super::passage::ByRun;
-use super::{Guard, Guarded, Interlock, Reason, Seen, Unable, Unmet, shown};
+use super::start_attempt::ByRun;
+use super::{Guard, Guarded, Interlock, MotorReading, Reason, Unable, Unmet, shown};
 use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 use crate::order::{Effects, Refusal};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading, Standstill};
@@ -241,9 +241,9 @@ impl BusGuards {
                 continue;
             };
             match ledger.kept(&reserved, now) {
-                Kept::Yes => {}
-                Kept::NotYet => clearance = Clearance::Wait(now + LOOK),
-                Kept::Failed(why) => {
+                SaveProgress::Yes => {}
+                SaveProgress::NotYet => clearance = Clearance::Wait(now + LOOK),
+                SaveProgress::Failed(why) => {
                     started.iter().for_each(|of| ledger.withdraw(&of.machine));
                     return Clearance::Refused(Guarded {
                         reason: Reason::StateFile,
@@ -310,7 +310,7 @@ impl BusGuards {
             Some(seen) => ledger.seen(&of.machine, seen),
             None => {
                 ledger.with(&of.machine, |motor| match is_away {
-                    true => motor.away(),
+                    true => motor.note_offline(),
                     false if !of.tells_running => motor.begin_unreported(reading.now),
                     false => motor.unseen(),
                 });
@@ -348,7 +348,7 @@ impl BusGuards {
 }
 
 /// The motor's state from a reading; `None` if the reading does not show whether the motor runs.
-fn seen(reading: &Reading<'_>) -> Option<Seen> {
+fn seen(reading: &Reading<'_>) -> Option<MotorReading> {
     let sample = reading.model(ModelPoint::Running);
     let running = sample.good()?.as_bool();
     // The running bit of a faulted drive may be from before the fault; the motor does not run by its run command then.
@@ -362,7 +362,7 @@ fn seen(reading: &Reading<'_>) -> Option<Seen> {
     };
     let fault = told(ModelPoint::Fault, true).map(|at| (Unable::Fault, at));
     let not_ready = || told(ModelPoint::Ready, false).map(|at| (Unable::NotReady, at));
-    Some(Seen {
+    Some(MotorReading {
         running: runs,
         commanded: commanded.good().map(Value::as_bool).zip(commanded.at),
         stands: !running && !turns(),

@@ -16,7 +16,7 @@ const BUS_FILES: usize = 8;
 /// Raises the limit of open files as far as `settings` require and the system permits. If that is not enough, the settings
 /// allow fewer connections.
 pub(super) fn fit(mut settings: Settings) -> Settings {
-    let wanted = Wanted::of(&settings);
+    let wanted = FileDemand::of(&settings);
     let limit = raise(wanted.files());
     if limit >= wanted.files() {
         return settings;
@@ -54,7 +54,7 @@ fn raise(wanted: usize) -> usize {
 
 /// Everything that needs open files.
 #[derive(Debug, Clone)]
-struct Wanted {
+struct FileDemand {
     buses: usize,
     /// Connections of the tool slots and BACnet.
     slots: usize,
@@ -62,9 +62,9 @@ struct Wanted {
     http: Option<http::Options>,
 }
 
-impl Wanted {
-    fn of(settings: &Settings) -> Wanted {
-        Wanted {
+impl FileDemand {
+    fn of(settings: &Settings) -> FileDemand {
+        FileDemand {
             buses: settings.buses.len(),
             slots: settings.slots.as_ref().map_or(0, slot::Options::files)
                 + settings.bacnet.as_ref().map_or(0, bacnet::Options::files),
@@ -85,7 +85,7 @@ impl Wanted {
     }
 
     /// Reduces the connections until `limit` files are enough; each server keeps [`LEAST_CONNECTIONS`].
-    fn within(&self, limit: usize) -> Wanted {
+    fn within(&self, limit: usize) -> FileDemand {
         let (mut fewest, mut most) = (0, 1000);
         while fewest + 1 < most {
             let middle = (fewest + most) / 2;
@@ -98,7 +98,7 @@ impl Wanted {
     }
 
     /// All servers with this fraction of their connections, in thousandths.
-    fn scaled(&self, thousandths: usize) -> Wanted {
+    fn scaled(&self, thousandths: usize) -> FileDemand {
         let scale = |connections: usize| (connections * thousandths / 1000).max(LEAST_CONNECTIONS.min(connections));
         let mut scaled = self.clone();
         if let Some(options) = &mut scaled.modbus_tcp {
@@ -117,8 +117,8 @@ mod tests {
 
     use super::*;
 
-    fn wanted(buses: usize, modbus_tcp: usize, http: usize) -> Wanted {
-        Wanted {
+    fn wanted(buses: usize, modbus_tcp: usize, http: usize) -> FileDemand {
+        FileDemand {
             buses,
             slots: 0,
             modbus_tcp: Some(modbus_tcp::Options {

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::bus::master::Carried;
+use crate::bus::master::CarriedState;
 use crate::config::BusSettings;
 use crate::drive::control::Control;
 use crate::event::{Event, EventKind};
@@ -21,14 +21,14 @@ const MOST_BUSES: usize = 64;
 /// The leases and states of buses stopped by a reload, until another bus continues them.
 #[derive(Debug, Default)]
 pub(super) struct Leases {
-    left: BTreeMap<Machine, Left>,
-    parted: BTreeMap<Machine, (Instant, Carried)>,
+    left: BTreeMap<Machine, LeftLease>,
+    parted: BTreeMap<Machine, (Instant, CarriedState)>,
 }
 
 /// A lease, with the name of the drive that had it.
 #[derive(Debug)]
-struct Left {
-    carried: Carried,
+struct LeftLease {
+    carried: CarriedState,
     /// The control by which the drive was commanded.
     control: Option<Control>,
     bus: String,
@@ -37,15 +37,15 @@ struct Left {
 
 /// State of drives that reloads have removed. Clones share the state.
 #[derive(Debug, Default, Clone)]
-pub(super) struct Parted(Arc<Mutex<Kept>>);
+pub(super) struct RemovedDrives(Arc<Mutex<KeptLeases>>);
 
 #[derive(Debug, Default)]
-struct Kept {
-    leases: BTreeMap<Machine, (Instant, Carried)>,
+struct KeptLeases {
+    leases: BTreeMap<Machine, (Instant, CarriedState)>,
     buses: Vec<(Instant, BusHandle)>,
 }
 
-impl Kept {
+impl KeptLeases {
     /// Drops the leases that are too old to continue.
     fn forget(&mut self, now: Instant) {
         let is_kept = |at: &Instant| now.saturating_duration_since(*at) <= RETURN;
@@ -54,8 +54,8 @@ impl Kept {
     }
 }
 
-impl Parted {
-    fn lock(&self) -> MutexGuard<'_, Kept> {
+impl RemovedDrives {
+    fn lock(&self) -> MutexGuard<'_, KeptLeases> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -102,12 +102,12 @@ impl Parted {
 impl Leases {
     /// Takes the leases of a stopped bus; `leases` are those of its drives, in order. A drive that could not have a
     /// lease has left none.
-    pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<Carried>) {
+    pub(super) fn left(&mut self, bus: &BusSettings, leases: Vec<CarriedState>) {
         let all = bus.drives.iter().zip(leases);
         for (drive, carried) in all
             .filter(|(drive, carried)| is_commanded(drive) && (drive.supervision.is_some() || carried.stops.is_any()))
         {
-            let left = Left {
+            let left = LeftLease {
                 carried,
                 control: drive.profile.control.clone(),
                 bus: bus.spec.name.clone(),
@@ -122,7 +122,7 @@ impl Leases {
     /// The leases with which the drives of a new bus continue at `now`, in order. A drive that is no longer
     /// controlled has none. The clock of a lease stands still while its drive is removed, as while a drive is
     /// offline.
-    pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<Carried> {
+    pub(super) fn of(&mut self, bus: &BusSettings, now: Instant) -> Vec<CarriedState> {
         let mut lease = |drive: &DriveSpec| {
             let machine = bus.spec.machine(drive);
             if !is_commanded(drive) {
@@ -134,9 +134,9 @@ impl Leases {
                 // The time of the lease does not run until a configuration supervises the drive again.
                 self.parted
                     .extend(left.map(|left| (machine, (now, left.carried.alone()))));
-                return stops.map(|stops| Carried {
+                return stops.map(|stops| CarriedState {
                     stops,
-                    ..Carried::default()
+                    ..CarriedState::default()
                 });
             }
             // A refresh continues only where the drive is commanded as before.
@@ -144,7 +144,7 @@ impl Leases {
                 true => left.carried,
                 false => left.carried.alone(),
             });
-            let back = |(at, carried): (Instant, Carried)| carried.after(now.saturating_duration_since(at));
+            let back = |(at, carried): (Instant, CarriedState)| carried.after(now.saturating_duration_since(at));
             left.or_else(|| self.parted.remove(&machine).map(back))
         };
         bus.drives

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// The beats of all bus threads that run.
 #[derive(Debug, Clone, Default)]
-pub struct Pulse(Arc<Mutex<Vec<Watched>>>);
+pub struct BusHeartbeats(Arc<Mutex<Vec<Watched>>>);
 
 #[derive(Debug)]
 struct Watched {
@@ -15,7 +15,7 @@ struct Watched {
     before: Option<u64>,
 }
 
-impl Pulse {
+impl BusHeartbeats {
     fn watched(&self) -> MutexGuard<'_, Vec<Watched>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -47,7 +47,7 @@ mod tests {
     #[test]
     fn one_thread_that_stands_still_is_seen_and_one_that_ended_is_not() {
         let beats: [Arc<AtomicU64>; 2] = Default::default();
-        let pulse = Pulse::default();
+        let pulse = BusHeartbeats::default();
         let all = || ["a", "b"].map(str::to_string).into_iter().zip(beats.clone());
         pulse.watch(all());
         assert!(pulse.is_moving());

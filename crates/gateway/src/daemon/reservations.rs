@@ -21,7 +21,7 @@ const LONGEST: u64 = 1 << 20;
 pub(super) type ReservationsFile = Arc<Mutex<Option<PathBuf>>>;
 
 /// The saved reservations, as far as a change of them changes the file.
-type Seen = Vec<(Instant, String, u8)>;
+type SavedReservations = Vec<(Instant, String, u8)>;
 
 /// Saves the reservations in this state directory from now on.
 pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
@@ -59,13 +59,13 @@ fn load(path: &Path) -> Result<Vec<KeptReservation>, String> {
 /// Writes the reservations whenever they change.
 pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
-        let mut seen = Seen::new();
+        let mut seen = SavedReservations::new();
         let mut told = false;
         loop {
             let has_authority = plant.load().has_authority();
             tokio::time::sleep(if has_authority { CHECK } else { CHECK_AUTHORITY }).await;
             let kept = plant.load().reservations(Instant::now(), SystemTime::now());
-            let now: Seen = kept
+            let now: SavedReservations = kept
                 .iter()
                 .map(|(until, one)| (*until, one.machine.port.clone(), one.machine.address))
                 .collect();

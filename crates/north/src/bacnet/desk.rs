@@ -11,7 +11,7 @@ use drivegate_bacnet::{Application as _, Options as ServerOptions, Server};
 use super::Options;
 use super::rights::HostRights;
 use super::view::View;
-use super::writes::{self, Begun, Waiting};
+use super::writes::{self, JobProgress, Waiting};
 use crate::order::{Arrival, Connection, Outcome};
 use crate::permit::Settled;
 use crate::plant::{Plant, SharedPlant};
@@ -150,10 +150,10 @@ impl Desk {
     pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
         self.view.set_time(now);
         while let Some(job) = self.server.take_job() {
-            let arrival = self.arrival(job.asked);
+            let arrival = self.arrival(job.requested_at);
             match writes::begin(&self.view, &job, arrival, now) {
-                Begun::Answered(result) => self.server.written(job.token, result, &self.view, now),
-                Begun::Waits(waiting) => return Some((job.token, *waiting)),
+                JobProgress::Answered(result) => self.server.written(job.token, result, &self.view, now),
+                JobProgress::Waits(waiting) => return Some((job.token, *waiting)),
             }
         }
         None

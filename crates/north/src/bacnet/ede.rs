@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 
 use drivegate_bacnet::{Access, Kind, Object};
 
-use super::objects::Shown;
+use super::objects::ListedDevice;
 use super::units;
 
 /// The three files of an EDE export.
@@ -36,7 +36,7 @@ fn states(object: &Object) -> Option<Vec<String>> {
 }
 
 /// The tables of these devices; `project` names the configuration.
-pub fn tables(project: &str, devices: &[Shown]) -> Ede {
+pub fn tables(project: &str, devices: &[ListedDevice]) -> Ede {
     let mut references: BTreeMap<Vec<String>, usize> = BTreeMap::new();
     let mut ordered: Vec<Vec<String>> = Vec::new();
     let mut rows = String::new();

@@ -2,7 +2,7 @@
 
 use drivegate_bacnet::{Access, Kind, Object};
 
-use super::objects::{self, Flat, Shown};
+use super::objects::{self, Flat, ListedDevice};
 use super::{Options, units};
 use crate::process_image::{BusSpec, DriveSpec};
 
@@ -46,7 +46,7 @@ pub fn devices<'s>(
     gateway: &str,
     options: &Options,
     buses: impl Iterator<Item = (&'s BusSpec, &'s [DriveSpec])> + Clone,
-) -> Vec<Shown> {
+) -> Vec<ListedDevice> {
     let own = (gateway, options.device);
     let served = buses.clone().filter(|(bus, _)| options.serves(&bus.name));
     let drives = served
@@ -59,16 +59,16 @@ pub fn devices<'s>(
             .chain(drives.map(|(.., shown)| shown))
             .collect();
     }
-    let mut drives: Vec<(String, u8, Shown)> = drives.collect();
+    let mut drives: Vec<(String, u8, ListedDevice)> = drives.collect();
     drives.sort_by_key(|(_, unit, _)| *unit);
     let Flat { device, places } = objects::flat(own, gateway_device, drives.into_iter());
     let meanings = places.into_iter().map(|(_, meaning)| meaning).collect();
-    vec![Shown { device, meanings }]
+    vec![ListedDevice { device, meanings }]
 }
 
 /// All objects of these devices.
-pub fn lines(devices: &[Shown]) -> Vec<Line> {
-    let of_device = |shown: &Shown| {
+pub fn lines(devices: &[ListedDevice]) -> Vec<Line> {
+    let of_device = |shown: &ListedDevice| {
         let device = shown.device.clone();
         let objects: Vec<Line> = device
             .objects()

@@ -56,7 +56,7 @@ pub enum Meaning {
 
 /// A device and, in the order of its objects, the meaning of each object.
 #[derive(Debug, Clone)]
-pub struct Shown {
+pub struct ListedDevice {
     /// The device as shown to BACnet clients.
     pub device: Arc<Device>,
     /// The meaning of each object.
@@ -81,7 +81,7 @@ impl Objects {
 }
 
 /// The device of a drive, whose instance is that of the gateway and its unit.
-pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> Shown {
+pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> ListedDevice {
     let mut all = Objects::default();
     model(spec, &mut all);
     if spec.access == Access::Control {
@@ -97,14 +97,14 @@ pub fn of_drive(spec: &DriveSpec, gateway: (&str, u32)) -> Shown {
         (spec.profile.name.clone(), spec.profile.described().into_owned()),
         objects,
     );
-    Shown {
+    ListedDevice {
         device: Arc::new(device),
         meanings,
     }
 }
 
 /// The device of the gateway.
-pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item = &'b BusSpec>) -> Shown {
+pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item = &'b BusSpec>) -> ListedDevice {
     let mut all = Objects::default();
     for (place, (number, bus)) in (1..).zip(buses).enumerate() {
         let (up, load) = (format!("{}.up", bus.name), format!("{}.load", bus.name));
@@ -133,7 +133,7 @@ pub fn of_gateway<'b>((name, instance): (&str, u32), buses: impl Iterator<Item =
     }
     let (objects, meanings) = all.0.into_iter().unzip();
     let about = ("drivegate".to_string(), "gateway to drives".to_string());
-    Shown {
+    ListedDevice {
         device: Arc::new(Device::new(instance, None, name.to_string(), about, objects)),
         meanings,
     }
@@ -154,7 +154,11 @@ pub struct Flat {
 
 /// All objects of these devices as objects of one device, those of the gateway first: numbers are unit * 1000 + n,
 /// names `drive.point`.
-pub fn flat((name, instance): (&str, u32), gateway: Shown, drives: impl Iterator<Item = (String, u8, Shown)>) -> Flat {
+pub fn flat(
+    (name, instance): (&str, u32),
+    gateway: ListedDevice,
+    drives: impl Iterator<Item = (String, u8, ListedDevice)>,
+) -> Flat {
     let mut objects = gateway.device.objects().to_vec();
     let mut places: Vec<(Option<u8>, Meaning)> = gateway.meanings.iter().map(|meaning| (None, *meaning)).collect();
     for (drive, unit, shown) in drives {

@@ -5,7 +5,7 @@ use drivegate_bacnet::{Application as _, Data, Datum, Error, Job, ObjectId, Obje
 use drivegate_testkit::{STALE_AFTER, bus, bus_spec, controlled, image, profile, read_all, take_next};
 
 use super::view::View;
-use super::writes::{Begun, Waiting};
+use super::writes::{JobProgress, Waiting};
 use super::*;
 use crate::codec::{Reply, Table};
 use crate::drive::{ModelPoint, PointIndex, Value};
@@ -90,7 +90,7 @@ impl ControlledDrive {
             .unwrap()
     }
 
-    fn begin(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Begun {
+    fn begin(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> JobProgress {
         let job = Job {
             token: 1,
             from: format!("{client}:47808").parse().unwrap(),
@@ -99,7 +99,7 @@ impl ControlledDrive {
             object,
             value,
             priority: Some(priority),
-            asked: self.now,
+            requested_at: self.now,
             since: self.now,
         };
         writes::begin(&self.view, &job, Arrival::now(self.now), self.now)
@@ -108,8 +108,8 @@ impl ControlledDrive {
     /// The immediate result of a write: the write is refused or done.
     fn at_once(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>) -> Result<(), Error> {
         match self.begin(client, object, priority, value) {
-            Begun::Answered(result) => result,
-            Begun::Waits(mut waiting) => {
+            JobProgress::Answered(result) => result,
+            JobProgress::Waits(mut waiting) => {
                 let answer = waiting.placed.answer().expect("it waits for the drive");
                 self.settle(&waiting, &answer.outcome);
                 writes::error(&answer.outcome)
@@ -119,7 +119,7 @@ impl ControlledDrive {
 
     /// The order that results from a write, with its outcome: point, value and client.
     fn order(&self, client: &str, object: ObjectId, priority: u8, value: Option<Datum>, outcome: Outcome) -> String {
-        let Begun::Waits(mut waiting) = self.begin(client, object, priority, value) else {
+        let JobProgress::Waits(mut waiting) = self.begin(client, object, priority, value) else {
             panic!("no order");
         };
         let ordered = self.carry_out(outcome);

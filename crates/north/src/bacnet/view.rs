@@ -13,7 +13,7 @@ use drivegate_bacnet::{
 };
 use subtle::ConstantTimeEq as _;
 
-use super::objects::{self, Flat, Meaning, Shown};
+use super::objects::{self, Flat, ListedDevice, Meaning};
 use super::rights::HostRights;
 use super::{Options, WhenOffline};
 use crate::codec::Table;
@@ -29,7 +29,7 @@ const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
 #[derive(Debug)]
 pub(super) struct ShownDrive {
     pub(super) handle: DriveHandle,
-    pub(super) shown: Shown,
+    pub(super) shown: ListedDevice,
 }
 
 /// The plant, and how it appears to BACnet clients.
@@ -38,7 +38,7 @@ pub(super) struct View {
     pub(super) plant: Arc<Plant>,
     pub(super) options: Arc<Options>,
     pub(super) rights: HostRights,
-    gateway: Shown,
+    gateway: ListedDevice,
     /// All objects of the plant in a single device.
     flat: Option<Flat>,
     /// Drives by the gateway's instance number plus the unit id; this is also the instance of the drive's device,

@@ -23,7 +23,7 @@ const LOWEST: u8 = 16;
 
 /// The progress of a job.
 #[derive(Debug)]
-pub(super) enum Begun {
+pub(super) enum JobProgress {
     Answered(Result<(), Error>),
     /// The write waits for its drive.
     Waits(Box<Waiting>),
@@ -50,16 +50,16 @@ pub(super) fn origin(rights: &HostRights, from: &Address, priority: Option<u8>) 
 }
 
 /// Starts a write whose request arrived at this time.
-pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> Begun {
+pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> JobProgress {
     let Some((handle, meaning)) = view.of_drive(job.device, job.place) else {
-        return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+        return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
     };
     let origin = origin(&view.rights, &job.from, job.priority);
     let expiry = expiry(job);
     // A reload may have happened since the request was received, or between two of its writes.
     if let Err(refusal) = client_access(Stage::Accept, false, &origin, &handle.image.spec.bus) {
         handle.refuse(&described(job), refusal, origin, now);
-        return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+        return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
     }
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
@@ -76,12 +76,12 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
                     None,
                 )
             }
-            None => Begun::Answered(Err(Error::INVALID_DATA_TYPE)),
+            None => JobProgress::Answered(Err(Error::INVALID_DATA_TYPE)),
         },
         (Meaning::Reset(_) | Meaning::Slot(..), _) if job.priority == Some(MINIMUM_TIMES) => {
             let text = "priority 6 belongs to minimum on and off times";
             handle.refuse(&described(job), Refusal::NotAllowed(text.to_string()), origin, now);
-            Begun::Answered(Err(Error::WRITE_ACCESS_DENIED))
+            JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED))
         }
         (Meaning::Reset(index), Some(Datum::Bool(true))) => {
             let order = Order::Points(vec![(index, Value::Bool(true))]);
@@ -96,20 +96,20 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> B
                 None,
             )
         }
-        (Meaning::Reset(_), _) => Begun::Answered(Ok(())),
+        (Meaning::Reset(_), _) => JobProgress::Answered(Ok(())),
         (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, (arrival, now)),
-        _ => Begun::Answered(Err(Error::WRITE_ACCESS_DENIED)),
+        _ => JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
 }
 
 /// Time after the request within which a write may be sent. A write that waited for another one of the same request
 /// gets more time.
 fn expiry(job: &Job) -> Duration {
-    DEFAULT_EXPIRY + job.since.saturating_duration_since(job.asked)
+    DEFAULT_EXPIRY + job.since.saturating_duration_since(job.requested_at)
 }
 
-fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> Begun {
-    Begun::Waits(Box::new(Waiting {
+fn waits(handle: &DriveHandle, placed: Placed, slot: Option<u64>) -> JobProgress {
+    JobProgress::Waits(Box::new(Waiting {
         machine: handle.machine(),
         placed,
         slot,
@@ -141,7 +141,7 @@ fn slot(
     job: &Job,
     origin: Origin,
     (arrival, now): (Arrival, Instant),
-) -> Begun {
+) -> JobProgress {
     let priority = job.priority.unwrap_or(16);
     let value = job.value.as_ref().and_then(value_of);
     if let Some(value) = value
@@ -149,7 +149,7 @@ fn slot(
     {
         let error = of_refusal(&refusal);
         handle.refuse(&described(job), refusal, origin, now);
-        return Begun::Answered(Err(error));
+        return JobProgress::Answered(Err(error));
     }
     let entry = value.map(|value| Entry::new(value, origin.clone(), now));
     let mut write = SlotWrite::new(what, priority, entry);
@@ -162,7 +162,7 @@ fn slot(
             },
             Follows::Stop => {
                 let Some(run) = handle.image.spec.profile.model_index(Commanded::Run.point()) else {
-                    return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+                    return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
                 };
                 let order = Order::Points(vec![(run, Value::Bool(false))]);
                 let id = write.id;
@@ -172,7 +172,7 @@ fn slot(
             }
             Follows::Order(of, entry) => {
                 let Some(point) = handle.image.spec.profile.model_index(of.point()) else {
-                    return Begun::Answered(Err(Error::WRITE_ACCESS_DENIED));
+                    return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
                 };
                 let order = Order::Points(vec![(point, entry.value)]);
                 let own = write.entry.is_some();
@@ -182,14 +182,14 @@ fn slot(
                 if !own {
                     (came.asked, expires) = (now, DEFAULT_EXPIRY);
                 }
-                let as_planned = write.clone().in_favour_of(&entry);
+                let as_planned = write.clone().governed_by(&entry);
                 let request = OrderRequest::new(order, entry.origin, Authority::Write).within(expires);
                 let mut placed = handle.place(request.arrived(came).by_slot(as_planned), now);
                 let refused = matches!(placed.answer().map(|answer| answer.outcome), Some(Outcome::Refused(_)));
                 let next = handle.priorities(|all| all.successor(&write));
                 match next.filter(|_| refused && !own) {
                     // The order of the slot's owner is refused, so the slot is released as well.
-                    Some(next) if !write.also.contains(&next) => write.also.push(next),
+                    Some(next) if !write.released_too.contains(&next) => write.released_too.push(next),
                     _ => return waits(handle, placed, Some(write.id)),
                 }
             }
@@ -199,7 +199,7 @@ fn slot(
 
 /// Handles a write that leads to no order: the write is in force at once. The lease of the drive belongs to the
 /// client whose slot governs.
-fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Option<Begun> {
+fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant) -> Option<JobProgress> {
     let governs = handle.priorities(|all| {
         if all.plan(write) != Follows::Nothing {
             return None;
@@ -224,7 +224,7 @@ fn stands(handle: &DriveHandle, write: &SlotWrite, origin: &Origin, now: Instant
         target: "drivegate::bacnet", drive, priority, client = %origin.who,
         "{} = {value} is in its slot; nothing is sent", write.what.point().name()
     );
-    Some(Begun::Answered(Ok(())))
+    Some(JobProgress::Answered(Ok(())))
 }
 
 /// Whether the drive can accept this value at all; anything unknown at this time is checked when the write becomes

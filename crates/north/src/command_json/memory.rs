@@ -40,7 +40,7 @@ pub(crate) struct Memory<R> {
     /// Commands by a fingerprint of topic, `id` and payload. Trees are used because entries are added and removed
     /// all day: a hash table would double when removals have used up its free places, and keep the size that a
     /// flood required.
-    known: BTreeMap<u64, Known>,
+    known: BTreeMap<u64, RememberedCommand>,
     /// The remembered commands by the time until which they are remembered.
     ends: BTreeMap<(Instant, u64), u64>,
     /// The last command by topic and `id`.
@@ -100,7 +100,7 @@ struct Recent<R> {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Known {
+struct RememberedCommand {
     number: u64,
     stops: u64,
     /// Hash of topic and `id`.
@@ -159,7 +159,7 @@ impl<R: Clone> Memory<R> {
             .and_then(|(_, content)| self.known.get(&content).copied());
         let by_mark = || {
             let recent = self.recent.iter().rev().find(marked)?;
-            Some(Known {
+            Some(RememberedCommand {
                 number: recent.number,
                 stops: recent.stops,
                 identity: 0,
@@ -223,7 +223,7 @@ impl<R: Clone> Memory<R> {
         if let Some((identity, content)) = print.identity {
             let expiry = Duration::from_secs(taken.expiry.unwrap_or_default().into());
             let until = now + expiry.clamp(REMEMBERED, LONGEST);
-            let known = Known {
+            let known = RememberedCommand {
                 number,
                 stops,
                 identity,

@@ -81,7 +81,7 @@ pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
 
 /// The parsed content of a command.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Asked {
+pub(crate) struct ParsedCommand {
     pub(crate) points: Points,
     pub(crate) expiry: Duration,
     /// Why everything except a stop is refused; `points` then holds the points of the stop.
@@ -90,7 +90,7 @@ pub(crate) struct Asked {
     pub(crate) wait: bool,
 }
 
-impl Asked {
+impl ParsedCommand {
     /// A command with `points`, where `refused` is the error of the part that is not understood.
     ///
     /// # Errors
@@ -100,12 +100,12 @@ impl Asked {
         expiry: Duration,
         refused: Option<Refusal>,
         profile: &Profile,
-    ) -> Result<Asked, Refusal> {
+    ) -> Result<ParsedCommand, Refusal> {
         let points = match &refused {
             None => points,
             Some(refusal) => stop_of(&points, profile).ok_or_else(|| refusal.clone())?,
         };
-        Ok(Asked {
+        Ok(ParsedCommand {
             points,
             expiry,
             refused,
@@ -155,7 +155,7 @@ impl Asked {
 ///
 /// # Errors
 /// If nothing of the command may be executed; contains the refusal.
-pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal> {
+pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<ParsedCommand, Refusal> {
     let (fields, refused) = object(payload)?;
     points_of(fields, refused, profile)
 }
@@ -174,7 +174,7 @@ pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
 }
 
 /// Reads the points; `refused` is an error of the whole, which a stop ignores.
-fn points_of(fields: Fields, refused: Option<Refusal>, profile: &Profile) -> Result<Asked, Refusal> {
+fn points_of(fields: Fields, refused: Option<Refusal>, profile: &Profile) -> Result<ParsedCommand, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
     let mut wait = false;
@@ -192,8 +192,8 @@ fn points_of(fields: Fields, refused: Option<Refusal>, profile: &Profile) -> Res
         };
         refused = refused.or(understood.err());
     }
-    let asked = Asked::new(points, expiry, refused, profile)?;
-    Ok(Asked { wait, ..asked })
+    let asked = ParsedCommand::new(points, expiry, refused, profile)?;
+    Ok(ParsedCommand { wait, ..asked })
 }
 
 fn request_wait(value: &Json) -> Result<bool, Refusal> {

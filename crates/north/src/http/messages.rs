@@ -10,7 +10,7 @@ pub use crate::command_json::StopBody;
 use crate::drill::Kind;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
-use crate::parameters::{Kept, ParameterFile, Plan, RestoreStage, RestoreStatus, Status, read};
+use crate::parameters::{ParameterFile, Plan, RestoreStage, RestoreStatus, Status, StoredFile, read};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// An error reply.
@@ -222,7 +222,7 @@ pub struct StoredReading {
 
 impl StoredReading {
     /// Reads the file of a stored reading; `file` is the path that the list shows.
-    pub fn of(kept: &Kept, file: String) -> StoredReading {
+    pub fn of(kept: &StoredFile, file: String) -> StoredReading {
         let (reading, error) = match read(&kept.path) {
             Ok(reading) => (Some(reading), None),
             Err(why) => (None, Some(why)),

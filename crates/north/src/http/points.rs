@@ -40,7 +40,7 @@ pub(super) async fn points(
 }
 
 /// Reads the points; those that are not polled are read from the drive as `origin`.
-async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) -> Vec<PointValue> {
+async fn read(drive: &DriveHandle, wanted: Vec<RequestedValue>, origin: Option<Origin>) -> Vec<PointValue> {
     let profile = &drive.image.spec.profile;
     let now = Instant::now();
     // A single snapshot of the image, so that all values of one poll belong together.
@@ -48,11 +48,11 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
     let mut points = Vec::with_capacity(wanted.len());
     for one in wanted {
         let index = match one {
-            Wanted::Word(word) => {
+            RequestedValue::Word(word) => {
                 points.push(PointValue::word(word, word_of(word, drive, &reading)));
                 continue;
             }
-            Wanted::Point(index) => index,
+            RequestedValue::Point(index) => index,
         };
         let Some(point) = profile.points.get(index) else {
             continue;
@@ -68,7 +68,7 @@ async fn read(drive: &DriveHandle, wanted: Vec<Wanted>, origin: Option<Origin>) 
 
 /// The value that a name in the query stands for.
 #[derive(Debug, Clone, Copy)]
-enum Wanted {
+enum RequestedValue {
     /// A point, by its index in the profile.
     Point(PointIndex),
     Word(Word),
@@ -99,7 +99,7 @@ fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<Str
     }
 }
 
-fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
+fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<RequestedValue>, String> {
     if names.len() > MAX_POINTS {
         return Err(format!(
             "{} points are requested; at most {MAX_POINTS} are allowed",
@@ -108,13 +108,13 @@ fn wanted(profile: &Profile, names: &[&str]) -> Result<Vec<Wanted>, String> {
     }
     if names.is_empty() {
         let all = public_points(profile).into_iter();
-        return Ok(all.map(|(index, _)| Wanted::Point(index)).collect());
+        return Ok(all.map(|(index, _)| RequestedValue::Point(index)).collect());
     }
     let of = |name: &&str| {
         let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
-        let word = || Word::of(name).filter(has).map(Wanted::Word);
+        let word = || Word::of(name).filter(has).map(RequestedValue::Word);
         let shown = |index: &PointIndex| profile.points.get(*index).is_some_and(|point| !point.hidden);
-        let point = profile.point_index(name).filter(shown).map(Wanted::Point);
+        let point = profile.point_index(name).filter(shown).map(RequestedValue::Point);
         point
             .or_else(word)
             .ok_or_else(|| format!("profile `{}` has no point `{name}`", profile.name))

@@ -111,15 +111,17 @@ fn described() -> Api {
         )
         .get(
             "/api/v1/drives/{name}/trend",
-            Doc::object::<trend::Kept<'_>>("Trend of values, a list for several; without `point`, which ones are kept")
-                .or::<trend::Shown<'_>>()
-                .or_list::<trend::Shown<'_>>()
-                .query(&[
-                    ("point", POINT),
-                    ("from", TIME),
-                    ("to", TIME),
-                    ("format", "json or csv"),
-                ]),
+            Doc::object::<trend::DriveTrends<'_>>(
+                "Trend of values, a list for several; without `point`, which ones are kept",
+            )
+            .or::<trend::Shown<'_>>()
+            .or_list::<trend::Shown<'_>>()
+            .query(&[
+                ("point", POINT),
+                ("from", TIME),
+                ("to", TIME),
+                ("format", "json or csv"),
+            ]),
             trend::trend,
         )
         .post(

@@ -22,7 +22,7 @@ const SHOWN: Duration = Duration::from_secs(600);
 
 /// The trend requested by a client.
 #[derive(Debug, PartialEq)]
-struct Wanted {
+struct RequestedTrend {
     /// Names of the points; empty if the request only asks which points exist.
     points: Vec<String>,
     from: SystemTime,
@@ -30,8 +30,8 @@ struct Wanted {
     csv: bool,
 }
 
-impl Wanted {
-    fn of(query: Option<&str>, now: SystemTime) -> Result<Wanted, QueryError> {
+impl RequestedTrend {
+    fn of(query: Option<&str>, now: SystemTime) -> Result<RequestedTrend, QueryError> {
         let [point, from, to, format] = query::parameters(query, &["point", "from", "to", "format"])?;
         let time = |name, value: Option<String>, otherwise| {
             value.map_or(Ok(otherwise), |value| query::time(name, &value, now))
@@ -67,7 +67,7 @@ impl Wanted {
                 points.push(point.to_string());
             }
         }
-        Ok(Wanted { points, from, to, csv })
+        Ok(RequestedTrend { points, from, to, csv })
     }
 }
 
@@ -81,7 +81,7 @@ pub(super) async fn trend(
     let plant = app.plant.load();
     let drive = plant.drive(&name).ok_or_else(|| no_drive(&plant, &name))?;
     let clock = Clock::read();
-    let wanted = Wanted::of(query.as_deref(), clock.wall)?;
+    let wanted = RequestedTrend::of(query.as_deref(), clock.wall)?;
     let _turn = app.turn().await;
     let history = app.north.history.drive(&name);
     let profile = &drive.image.spec.profile;
@@ -116,7 +116,7 @@ pub(super) async fn trend(
         return Ok((csv, text(&parts)).into_response());
     }
     Ok(match (&parts[..], &wanted.points[..]) {
-        (_, []) => Json(Kept::new(&name, history.as_deref(), &known)).into_response(),
+        (_, []) => Json(DriveTrends::new(&name, history.as_deref(), &known)).into_response(),
         ([part], [_]) => Json(Shown::new(&name, part)).into_response(),
         _ => {
             let all: Vec<_> = parts.iter().map(|part| Shown::new(&name, part)).collect();
@@ -127,7 +127,7 @@ pub(super) async fn trend(
 
 /// The trends that a drive has.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-pub(super) struct Kept<'d> {
+pub(super) struct DriveTrends<'d> {
     drive: &'d str,
     ranges: Vec<KeptRange>,
     points: Vec<KeptPoint>,
@@ -147,8 +147,8 @@ struct KeptPoint {
     bytes: usize,
 }
 
-impl<'d> Kept<'d> {
-    fn new(drive: &'d str, history: Option<&DriveHistory>, known: &[ModelPoint]) -> Kept<'d> {
+impl<'d> DriveTrends<'d> {
+    fn new(drive: &'d str, history: Option<&DriveHistory>, known: &[ModelPoint]) -> DriveTrends<'d> {
         let bytes: Vec<_> = history.map_or_else(Vec::new, |history| history.trend().points().collect());
         let ranges = history.map_or(RANGES, |history| history.trend().ranges());
         let of = |point: ModelPoint| bytes.iter().find(|(known, _)| *known == point).map_or(0, |(_, b)| *b);
@@ -161,7 +161,7 @@ impl<'d> Kept<'d> {
             unit: point.unit(),
             bytes: of(*point),
         };
-        Kept {
+        DriveTrends {
             drive,
             ranges: ranges.into_iter().map(range).collect(),
             points: known.iter().map(point).collect(),

@@ -18,7 +18,7 @@ use super::reached::Reached;
 use super::replies::{Replied, find_bus, no_drive, not_found, refused};
 use super::{api, page, query};
 use crate::local::control;
-use crate::parameters::{Kept, ParameterFile, Store};
+use crate::parameters::{ParameterFile, Store, StoredFile};
 use crate::{metrics, readiness};
 
 pub(super) async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
@@ -182,7 +182,7 @@ pub(super) async fn all_params(State(app): State<Arc<AppState>>, RawQuery(query)
             .iter()
             .filter(|kept| drive.as_ref().is_none_or(|drive| kept.drive == *drive));
         // A client elsewhere cannot open the path.
-        let file = |kept: &Kept| kept.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let file = |kept: &StoredFile| kept.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         Ok(wanted
             .map(|kept| StoredReading::of(kept, file(kept)))
             .collect::<Vec<_>>())

@@ -210,7 +210,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             Some(answered) = waiting.next() => Ok(Event::Answer(answered)),
             count = self.stream.read(space), if reads => Ok(Event::Input(count?)),
             () = expired(half_frame_since) => Err(End::HalfFrame),
-            timeout = Idle::over(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
+            timeout = Idle::wait_until_idle(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
         }
     }
 
@@ -301,7 +301,7 @@ impl Idle {
     }
 
     /// Waits until the client was idle for the whole timeout; forever without one.
-    async fn over(idle: Option<&mut Idle>) -> Duration {
+    async fn wait_until_idle(idle: Option<&mut Idle>) -> Duration {
         let Some(idle) = idle else {
             return std::future::pending().await;
         };

@@ -69,7 +69,7 @@ pub(super) struct MessageLog {
     pub(super) counted: u64,
     /// Number up to which no messages are kept, because the buffer was full. Messages up to this number that were
     /// taken and not acknowledged are lost.
-    pub(super) gone: u64,
+    pub(super) lost_up_to: u64,
     /// The files were deleted since the last call of [`Journal::take_wiped`].
     wiped: bool,
 }
@@ -103,7 +103,7 @@ impl MessageLog {
             unsynced: false,
             lost: 0,
             counted: 0,
-            gone: 0,
+            lost_up_to: 0,
             wiped: false,
         }
     }
@@ -454,7 +454,7 @@ impl MessageLog {
         };
         if let Some((_, last)) = oldest.numbers {
             self.pass_all(last);
-            self.gone = self.gone.max(last);
+            self.lost_up_to = self.lost_up_to.max(last);
         }
         fs::remove_file(&oldest.path)?;
         Ok(true)

@@ -6,7 +6,7 @@ use std::time::Duration;
 use rumqttc::Publish;
 use serde_json::Value as Json;
 
-use crate::command_json::{self, Asked, Id, MAX_PAYLOAD, Taken, check_size, excerpt, find_id, resolve};
+use crate::command_json::{self, Id, MAX_PAYLOAD, ParsedCommand, Taken, check_size, excerpt, find_id, resolve};
 use crate::drive::Profile;
 use crate::order::{Arrival, DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
 
@@ -97,7 +97,7 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
 ///
 /// # Errors
 /// If the gateway executes nothing of the message; contains the reason.
-pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
+pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<ParsedCommand, Refusal> {
     if incoming.retain {
         return Err(Refusal::NotAllowed(
             "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
@@ -108,7 +108,7 @@ pub(super) fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile)
         Some(name) => {
             let value = text_of(&incoming.payload, name, profile).map_or_else(|| bare(&incoming.payload), Ok)?;
             let points = vec![resolve(profile, name, &value)?];
-            Asked::new(points, DEFAULT_EXPIRY, None, profile)?
+            ParsedCommand::new(points, DEFAULT_EXPIRY, None, profile)?
         }
         None => command_json::order(&incoming.payload, profile)?,
     };
@@ -164,7 +164,7 @@ mod tests {
     struct SetRequest {
         /// The id, present even if the rest is refused.
         id: Option<Id>,
-        order: Result<Asked, Refusal>,
+        order: Result<ParsedCommand, Refusal>,
     }
 
     fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> SetRequest {
@@ -197,7 +197,7 @@ mod tests {
     fn an_object_is_one_order() {
         let request = set(r#"{"id": "a-1", "run": true, "speed_reference": 50.5, "expires_ms": 500}"#);
         assert_eq!(request.id.as_ref().map(Id::text), Some("\"a-1\""));
-        let Asked { points, expiry, .. } = request.order.unwrap();
+        let ParsedCommand { points, expiry, .. } = request.order.unwrap();
         let index = |name| profile().point_index(name).unwrap();
         let expected = [
             (index("run"), Value::Bool(true)),
@@ -205,7 +205,7 @@ mod tests {
         ];
         assert_eq!(points, expected);
         assert_eq!(expiry, Duration::from_millis(500));
-        let Asked { points, expiry, .. } = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
+        let ParsedCommand { points, expiry, .. } = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
         assert_eq!((points[0].1, expiry), (Value::Bool(false), DEFAULT_EXPIRY));
         assert_eq!(set("{}").order.unwrap().points, [], "refused as an empty command later");
     }

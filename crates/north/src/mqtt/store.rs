@@ -400,7 +400,7 @@ impl Thread {
             self.write_topics();
         }
         self.shared.lost(self.journal.take_lost());
-        let (gone, missing) = (self.number(self.journal.gone), self.journal.counted);
+        let (gone, missing) = (self.number(self.journal.lost_up_to), self.journal.counted);
         self.shared.gone.store(gone, Ordering::Relaxed);
         self.shared.missing.store(missing, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {

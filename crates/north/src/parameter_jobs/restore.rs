@@ -15,7 +15,7 @@ use crate::drive::plan::WireTime;
 use crate::order::{Authority, Order, Origin, Pace, ParameterOrder, written};
 use crate::parameters::{
     End, Journal, JournalFile, NO_IDENTIFICATION, NOT_KNOWN, Owner, ParameterFile, Phase, Plan, Prepared, Reading,
-    Restoration, RestoreStage, Then, Vault, Wanted, Wishes, plan,
+    Restoration, RestoreNeed, RestoreStage, Then, Vault, Wishes, plan,
 };
 use crate::permit::{limits_passed, may_restore};
 use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
@@ -234,7 +234,7 @@ pub async fn release(
 ) -> Result<(), String> {
     let spec = &drive.image.spec;
     let machine = drive.machine();
-    if vault.restore(&machine).is_some_and(|restore| restore.goes_on()) {
+    if vault.restore(&machine).is_some_and(|restore| restore.is_in_progress()) {
         vault.update_restore(&machine, |restore| restore.is_unwanted = true);
         return Ok(());
     }
@@ -252,7 +252,10 @@ pub async fn release(
         )),
         Ok(None) => {
             drive.image.restore_lock.set(None);
-            RestoreStage::Ended(format!("`{}` accepts commands again; the journal is gone", spec.name))
+            RestoreStage::Ended(format!(
+                "`{}` accepts commands again; the journal no longer exists",
+                spec.name
+            ))
         }
         Ok(Some(aside)) => {
             drive.image.restore_lock.set(None);
@@ -366,19 +369,19 @@ impl Run {
                 self.restoration.give_up("it is to be released".to_string());
             }
             match self.restoration.wanted() {
-                Wanted::Record => {
+                RestoreNeed::Record => {
                     let journal = self.restoration.journal();
                     let (text, of) = (journal.text(&self.profile), journal.of.clone());
                     let done = self.with_journal(move |file| file.write(&of, &text)).await;
                     self.restoration.recorded(done, Instant::now());
                 }
-                Wanted::Set(order) => self.set(order).await,
-                Wanted::Remove => {
+                RestoreNeed::Set(order) => self.set(order).await,
+                RestoreNeed::Remove => {
                     let of = self.restoration.journal().of.clone();
                     let done = self.with_journal(move |file| file.remove(&of)).await;
                     self.restoration.removed(done);
                 }
-                Wanted::Nothing => break,
+                RestoreNeed::Nothing => break,
             }
         }
         self.over();

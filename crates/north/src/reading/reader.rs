@@ -33,7 +33,7 @@ impl Reader {
     /// The reader of a connection that was opened at `opened`, on the runtime observed by this watch.
     pub(crate) fn new(watch: Arc<Watch>, opened: Instant) -> Reader {
         let dated = Dated {
-            asked: opened,
+            earliest: opened,
             stall: None,
             pause: None,
         };
@@ -57,7 +57,7 @@ impl Reader {
 
     /// The reader of a connection that this one accepted last.
     pub(crate) fn accepted(&self) -> Reader {
-        Reader::new(self.watch.clone(), self.state().last.asked)
+        Reader::new(self.watch.clone(), self.state().last.earliest)
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -89,7 +89,7 @@ impl Reader {
         let dated = match self.watch.turn(now, boot) {
             true => self.watch.date(state.floor, state.waited, now),
             false => Dated {
-                asked: if state.waited { now } else { state.floor.min(now) },
+                earliest: if state.waited { now } else { state.floor.min(now) },
                 stall: None,
                 pause: None,
             },
@@ -97,7 +97,7 @@ impl Reader {
         if dated.stall.is_some() && has_gone() {
             self.connection.hang_up();
         }
-        state.floor = if all { now } else { state.floor.max(dated.asked) };
+        state.floor = if all { now } else { state.floor.max(dated.earliest) };
         state.waited = false;
         state.last = dated;
         if std::mem::take(&mut state.fresh) {
@@ -122,7 +122,7 @@ impl Reader {
 
     fn arrival(&self, dated: Dated) -> Arrival {
         Arrival {
-            asked: dated.asked,
+            asked: dated.earliest,
             connection: self.connection.clone(),
             stall: dated.stall,
             pause: dated.pause,

@@ -282,7 +282,7 @@ mod tests {
                 }
                 assert!(turn(&watch, now + MS));
                 let dated = watch.date(start - MS, true, now + MS);
-                assert_eq!(dated.asked, start, "{single}, {task_first}");
+                assert_eq!(dated.earliest, start, "{single}, {task_first}");
                 assert!(dated.stall.is_some() && watch.just_stalled(now + MS));
                 for later in [100, 200, 251] {
                     let at = now + later * MS;
@@ -311,7 +311,7 @@ mod tests {
         let now = start + 2 * MS;
         assert!(watch.turn(now, Some(boot(&watch, now) + Duration::from_secs(60))));
         let dated = watch.date(start, true, now);
-        assert!(dated.asked < start && dated.pause.is_some());
+        assert!(dated.earliest < start && dated.pause.is_some());
     }
 
     #[test]
@@ -326,7 +326,7 @@ mod tests {
         }
         assert!(turn(&watch, now));
         let dated = watch.date(start - MS, true, now);
-        assert_eq!((dated.asked, dated.pause.is_some()), (start, true));
+        assert_eq!((dated.earliest, dated.pause.is_some()), (start, true));
         WORKER_RAN.set(0);
         assert!(turn(&watch, now + MS));
     }

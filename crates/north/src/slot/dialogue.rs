@@ -20,7 +20,7 @@ pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
 /// Time that a byte of a tool takes at least: no line of 460,800 baud brings more, so a tool that floods costs little.
 const BYTE_TIME: Duration = Duration::from_micros(20);
 /// Minimum interval between two requests to the bus, stops excepted, for a tool that sends again before it is answered.
-const IMPATIENT: Duration = Duration::from_millis(20);
+const MIN_REQUEST_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A request that waits for its answer.
 #[derive(Debug)]
@@ -162,11 +162,14 @@ impl Dialogue {
     }
 
     fn asked_for(&mut self, request: ToolRequest, arrival: Arrival, now: Instant) {
-        let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + IMPATIENT);
+        let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + MIN_REQUEST_INTERVAL);
         self.give_up(SlotOutcome::Abandoned);
         let deadline = now + ANSWER_WITHIN;
         let pace = self.tool.pace(&request, now);
-        let haste = impatient.then_some(self.asked).flatten().map(|at| at + IMPATIENT);
+        let haste = impatient
+            .then_some(self.asked)
+            .flatten()
+            .map(|at| at + MIN_REQUEST_INTERVAL);
         let until = if pace.is_stop {
             now
         } else {

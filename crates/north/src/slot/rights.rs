@@ -12,7 +12,7 @@ use crate::order::{Grants, Proof, Right};
 
 /// The kind of connection by which a tool is connected.
 #[derive(Debug, Clone)]
-enum Way {
+enum ToolConnection {
     Address(IpAddr),
     Pty(PathBuf),
     /// Without a connection: a test that uses no sockets.
@@ -24,7 +24,7 @@ enum Way {
 pub(super) struct ToolRights {
     current: Arc<ArcSwap<Options>>,
     bus: Arc<str>,
-    way: Way,
+    way: ToolConnection,
 }
 
 impl ToolRights {
@@ -33,9 +33,9 @@ impl ToolRights {
             current: current.clone(),
             bus: bus.into(),
             way: match proof {
-                Proof::Address(address) => Way::Address(*address),
-                Proof::Pty(path) => Way::Pty(PathBuf::from(&**path)),
-                _ => Way::Within,
+                Proof::Address(address) => ToolConnection::Address(*address),
+                Proof::Pty(path) => ToolConnection::Pty(PathBuf::from(&**path)),
+                _ => ToolConnection::Within,
             },
         }
     }
@@ -59,11 +59,11 @@ impl Grants for ToolRight {
     fn may_write(&self, bus: &str) -> bool {
         let ToolRights { current, bus: own, way } = &self.rights;
         let serves = |slot: &Slot| match way {
-            Way::Address(address) => {
+            ToolConnection::Address(address) => {
                 slot.addresses().next().is_some() && slot.allow.iter().any(|network| network.contains(address))
             }
-            Way::Pty(path) => slot.pty.as_ref() == Some(path),
-            Way::Within => true,
+            ToolConnection::Pty(path) => slot.pty.as_ref() == Some(path),
+            ToolConnection::Within => true,
         };
         let current = current.load();
         let mut slots = current.slots.iter();

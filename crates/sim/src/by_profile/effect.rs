@@ -1,6 +1,6 @@
 //! How a drive without hand-written words reacts to the words written to it, according to `[control]` of its profile.
 
-use super::reactions::{Known, MotorEffect, WordEffect};
+use super::reactions::{KnownState, MotorEffect, WordEffect};
 use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
 
 fn place_of(setting: &Setting, control: &Control) -> ControlItem {
@@ -8,7 +8,7 @@ fn place_of(setting: &Setting, control: &Control) -> ControlItem {
 }
 
 /// The effect of a word that is written to one of the addresses of the profile's commands.
-pub(super) fn effect_of(control: &Control, known: &Known<'_>, place: ControlItem, word: u16) -> WordEffect {
+pub(super) fn effect_of(control: &Control, known: &KnownState<'_>, place: ControlItem, word: u16) -> WordEffect {
     let own = place == control.at;
     let here = |setting: &Setting| place_of(setting, control) == place;
     let holds = |setting: &Setting| match place_of(setting, control) {

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::super::SimTime;
 use super::super::model::{Model, unsigned};
+use super::state_bits::{Bits, Key, Wish, fulfilled};
 use super::status::Shows;
-use super::wishes::{Bits, Key, Wish, fulfilled};
 use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
 use crate::codec::Table;
 use crate::drive::control::{Control, Mask, OwnWord, Run, Until};

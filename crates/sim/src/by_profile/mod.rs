@@ -6,16 +6,16 @@ mod effect;
 mod figures;
 mod reactions;
 mod registers;
+mod state_bits;
 mod status;
 #[cfg(test)]
 mod tests;
-mod wishes;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use self::reactions::{FAMILIES, Family, Known, MotorEffect, WordEffect};
+use self::reactions::{FAMILIES, Family, KnownState, MotorEffect, WordEffect};
 use self::registers::Registers;
 use super::SimTime;
 use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD};
@@ -179,7 +179,7 @@ impl ProfileDrive {
             return;
         }
         let registers = &self.registers;
-        let known = Known {
+        let known = KnownState {
             before: self.word,
             position: self.shown_position(now),
             faulted: self.body.latch.fault() != 0,
@@ -224,7 +224,7 @@ impl ProfileDrive {
             MotorEffect::Nothing => {}
             MotorEffect::Prepares(position) => {
                 self.halt();
-                self.come_to(if faulted { 0 } else { position }, now);
+                self.enter_position(if faulted { 0 } else { position }, now);
             }
             MotorEffect::Runs { .. } if faulted && once => {}
             MotorEffect::Runs { reverse } => {
@@ -250,7 +250,7 @@ impl ProfileDrive {
     }
 
     /// Moves the drive to another state of the start sequence; staying in the same state takes no time.
-    fn come_to(&mut self, position: usize, now: SimTime) {
+    fn enter_position(&mut self, position: usize, now: SimTime) {
         if self.position < position {
             let step = position.saturating_sub(1);
             let time = match self.control.as_ref().map(|control| &control.run) {
@@ -281,7 +281,7 @@ impl ProfileDrive {
 
     /// Stops the motor by another source than the bus: the drive no longer runs by the previous word, although the
     /// word still reads back.
-    fn stand(&mut self) {
+    fn stop_motor(&mut self) {
         self.halt();
         self.word = 0;
     }
@@ -312,7 +312,7 @@ impl ProfileDrive {
     fn give_to_bus(&mut self, on: bool) {
         if self.remote != on {
             (self.remote, self.position) = (on, 0);
-            self.stand();
+            self.stop_motor();
         }
     }
 }
@@ -416,7 +416,7 @@ impl Model for ProfileDrive {
                 (self.run, self.reverse, self.coasts) = (Some(command.reverse), command.reverse, false);
                 self.position = self.steps().saturating_sub(1);
             }
-            false => self.stand(),
+            false => self.stop_motor(),
         }
         let percent = f64::from(command.reference) / 100.0;
         self.set_reference(percent);

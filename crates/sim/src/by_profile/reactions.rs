@@ -34,7 +34,7 @@ pub(super) struct WordEffect {
 
 /// State of the drive that determines the effect of a word.
 #[derive(Clone, Copy)]
-pub(super) struct Known<'d> {
+pub(super) struct KnownState<'d> {
     /// The word that was in force before.
     pub(super) before: u16,
     /// How many words of the start sequence the drive has received.
@@ -52,7 +52,7 @@ pub(super) struct Family {
     /// Name of the profile.
     pub(super) name: &'static str,
     /// Effect of the control word.
-    pub(super) word: fn(&Known<'_>, u16) -> WordEffect,
+    pub(super) word: fn(&KnownState<'_>, u16) -> WordEffect,
     /// Effect of another register or coil.
     pub(super) other: fn(Table, u16, u16) -> Option<WordEffect>,
     /// Whether words act once, when they are written, and do not stay as a command.
@@ -63,7 +63,11 @@ pub(super) struct Family {
     pub(super) status: fn(&Shows) -> Words,
 }
 
-const fn family(name: &'static str, word: fn(&Known<'_>, u16) -> WordEffect, status: fn(&Shows) -> Words) -> Family {
+const fn family(
+    name: &'static str,
+    word: fn(&KnownState<'_>, u16) -> WordEffect,
+    status: fn(&Shows) -> Words,
+) -> Family {
     Family {
         name,
         word,
@@ -129,7 +133,7 @@ fn effect(does: MotorEffect, resets: bool, word: u16) -> WordEffect {
     WordEffect { does, resets, word }
 }
 
-fn rises(known: &Known<'_>, word: u16, bit: u16) -> bool {
+fn rises(known: &KnownState<'_>, word: u16, bit: u16) -> bool {
     any(word & !known.before, bit)
 }
 
@@ -148,7 +152,7 @@ fn pair(bits: u16) -> MotorEffect {
 
 /// OFF1 to OFF3 are bits 0 to 2, also without bit 10, without which all else counts for nothing; a run command needs bits 0 to 6,
 /// and bit 0 must have been off before.
-fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> WordEffect {
+fn off_words(known: &KnownState<'_>, word: u16, reverse: bool) -> WordEffect {
     let valid = is(word, 0x0400);
     let word = if valid { word } else { known.before & (word | !0x0007) };
     let does = match word {
@@ -161,16 +165,16 @@ fn off_words(known: &Known<'_>, word: u16, reverse: bool) -> WordEffect {
     effect(does, rises(known, word, 0x0080), word)
 }
 
-fn abb(known: &Known<'_>, word: u16) -> WordEffect {
+fn abb(known: &KnownState<'_>, word: u16) -> WordEffect {
     off_words(known, word, false)
 }
 
-fn profidrive(known: &Known<'_>, word: u16) -> WordEffect {
+fn profidrive(known: &KnownState<'_>, word: u16) -> WordEffect {
     off_words(known, word, is(word, 0x0800))
 }
 
 /// Danfoss: without bit 10 a word is ignored; bits 2 to 5 at 0 brake, coast, stop quickly and freeze.
-fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
+fn danfoss(known: &KnownState<'_>, word: u16) -> WordEffect {
     if !is(word, 0x0400) {
         return effect(MotorEffect::Nothing, false, known.before);
     }
@@ -185,7 +189,7 @@ fn danfoss(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// CiA 402: 6 is shutdown, 7 switch on, 15 enable operation, each accepted only from the previous state.
-fn cia402(known: &Known<'_>, word: u16) -> WordEffect {
+fn cia402(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word & 0x000F {
         _ if known.faulted => MotorEffect::Coasts,
         low if !is(low, 0x0002) => MotorEffect::Coasts,
@@ -199,7 +203,7 @@ fn cia402(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// Bit 2 is an external fault; a reset counts only without a run command.
-fn yaskawa(known: &Known<'_>, word: u16) -> WordEffect {
+fn yaskawa(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = if is(word, 0x0004) {
         MotorEffect::Trips
     } else {
@@ -209,7 +213,7 @@ fn yaskawa(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// Delta: bits 1 and 0 run (10) or stop (01), bits 5 and 4 set the direction; 0 does nothing.
-fn delta(known: &Known<'_>, word: u16) -> WordEffect {
+fn delta(known: &KnownState<'_>, word: u16) -> WordEffect {
     let reverse = match word >> 4 & 3 {
         1 => false,
         2 => true,
@@ -234,7 +238,7 @@ fn delta_reset(table: Table, address: u16, word: u16) -> Option<WordEffect> {
 }
 
 /// The codes act when they are written; jogs are not simulated.
-fn invt(_: &Known<'_>, word: u16) -> WordEffect {
+fn invt(_: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         1 | 2 => pair(word),
         5 => MotorEffect::Stops,
@@ -244,7 +248,7 @@ fn invt(_: &Known<'_>, word: u16) -> WordEffect {
     effect(does, word == 7, word)
 }
 
-fn mitsubishi(_: &Known<'_>, word: u16) -> WordEffect {
+fn mitsubishi(_: &KnownState<'_>, word: u16) -> WordEffect {
     effect(pair(word >> 1 & 3), false, word)
 }
 
@@ -254,7 +258,7 @@ fn mitsubishi_restart(table: Table, address: u16, word: u16) -> Option<WordEffec
 }
 
 /// Bit 3 coasts, bit 1 stops by the second ramp; both go before bit 0.
-fn invertek(known: &Known<'_>, word: u16) -> WordEffect {
+fn invertek(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if is(word, 0x0008) => MotorEffect::Coasts,
         _ if is(word, 0x0002) => MotorEffect::Stops,
@@ -265,7 +269,7 @@ fn invertek(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// Bits 0 and 1 both, bit 2 forward; without bit 4 the panel commands.
-fn weg(known: &Known<'_>, word: u16) -> WordEffect {
+fn weg(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if !is(word, 0x0010) => MotorEffect::Nothing,
         _ if !is(word, 0x0002) => MotorEffect::Coasts,
@@ -276,7 +280,7 @@ fn weg(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// The rising edge of bit 15 resets the drive; a run command that is in effect then starts the motor.
-fn fuji(known: &Known<'_>, word: u16) -> WordEffect {
+fn fuji(known: &KnownState<'_>, word: u16) -> WordEffect {
     effect(pair(word & 3), rises(known, word, 0x8000), word)
 }
 
@@ -286,7 +290,7 @@ fn fuji_reset(table: Table, address: u16, word: u16) -> Option<WordEffect> {
 }
 
 /// Bits 15 and 10 run; bit 9 reverse, bit 11 coasts, bit 12 emergency off, bit 13 resets.
-fn toshiba(known: &Known<'_>, word: u16) -> WordEffect {
+fn toshiba(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if is(word, 0x1000) => MotorEffect::Trips,
         _ if !is(word, 0x8000) => MotorEffect::Nothing,
@@ -298,7 +302,7 @@ fn toshiba(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// Bit 0 stops, bits 1 and 2 run, bit 3 resets, bit 4 is the emergency stop; 0 does nothing.
-fn ls(known: &Known<'_>, word: u16) -> WordEffect {
+fn ls(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word & 0x07 {
         _ if is(word, 0x0010) => MotorEffect::Coasts,
         1 => MotorEffect::Stops,
@@ -310,7 +314,7 @@ fn ls(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// TECO: bit 2 of the word is an external fault.
-fn teco(known: &Known<'_>, word: u16) -> WordEffect {
+fn teco(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         _ if is(word, 0x0004) => MotorEffect::Trips,
         _ if is(word, 0x0001) => runs(is(word, 0x0002)),
@@ -320,7 +324,7 @@ fn teco(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// The run command that stands starts the motor after a reset.
-fn vacon(known: &Known<'_>, word: u16) -> WordEffect {
+fn vacon(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = if is(word, 1) {
         runs(is(word, 2))
     } else {
@@ -330,7 +334,7 @@ fn vacon(known: &Known<'_>, word: u16) -> WordEffect {
 }
 
 /// Coil 0 runs, coil 1 = 1 is reverse.
-fn hitachi(known: &Known<'_>, word: u16) -> WordEffect {
+fn hitachi(known: &KnownState<'_>, word: u16) -> WordEffect {
     let does = match word {
         0 => MotorEffect::Stops,
         _ => runs((known.at)(Table::Coil, 1) != 0),

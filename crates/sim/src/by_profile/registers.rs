@@ -6,7 +6,7 @@ use super::super::SimTime;
 use super::super::model::Model;
 use super::ProfileDrive;
 use super::effect;
-use super::wishes::Key;
+use super::state_bits::Key;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::control::{Control, ControlItem, OwnWord};
 use crate::drive::identify::{PRODUCT, VENDOR};

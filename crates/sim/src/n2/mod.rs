@@ -21,7 +21,7 @@ use crate::codec::n2::{Answer, Command, Object, Region};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Time without a poll after which a drive considers itself disconnected (reference/drives.md 6.5).
-pub(crate) const ALONE: Duration = Duration::from_secs(600);
+pub(crate) const MASTER_TIMEOUT: Duration = Duration::from_secs(600);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BoardOptions {
@@ -111,7 +111,7 @@ impl Board {
     /// Appends the answer to a command to `out`; `Err` is the error code of an invalid frame. Nothing is appended
     /// if the drive stays silent.
     pub fn answer(&mut self, command: &Result<Command, u8>, now: SimTime, model: Model<'_>, out: &mut Vec<u8>) {
-        if self.map.stands_alone && now.saturating_sub(self.polled) > ALONE {
+        if self.map.stands_alone && now.saturating_sub(self.polled) > MASTER_TIMEOUT {
             self.overridden.clear();
             self.polled = now;
         }

@@ -146,7 +146,7 @@ fn overridden_inputs_fool_the_bus_only() {
     assert_eq!(rig.ask("01730202"), "A");
     assert_eq!(rig.ask("01120202"), "A0060");
     rig.ask("0172020201");
-    rig.later(ALONE + Duration::from_secs(1));
+    rig.later(MASTER_TIMEOUT + Duration::from_secs(1));
     assert_eq!(rig.ask("01120202"), "A0060", "alone for 10 minutes");
     assert_eq!(rig.ask("017206010007"), "A");
     assert_eq!(rig.ask("01160102"), "A0007C7");

@@ -7,7 +7,7 @@ use hyper::{StatusCode, header};
 use tokio::time::timeout;
 
 use super::exchange::Opened;
-use super::{Asked, Client, ClientError};
+use super::{Client, ClientError, GatewayRequest};
 
 /// A stream that is silent for this long is dead: the gateway sends a comment every 10 s.
 const SILENCE: Duration = Duration::from_secs(35);
@@ -36,7 +36,7 @@ impl EventStream {
     /// # Errors
     /// When the gateway cannot be reached, refuses, or is not a gateway.
     pub(crate) async fn open(client: &Client, path: &str) -> Result<EventStream, ClientError> {
-        let asked = Asked::view(path);
+        let asked = GatewayRequest::view(path);
         let opened = client.open(&asked).await?;
         let kind = opened.headers.get(header::CONTENT_TYPE);
         let is_stream = kind.is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"));

@@ -28,7 +28,7 @@ const DONE_WITHIN: Duration = Duration::from_secs(40);
 
 /// A request to a gateway.
 #[derive(Debug, Clone)]
-pub(crate) struct Asked {
+pub(crate) struct GatewayRequest {
     method: Method,
     /// Path of the request, beginning with a slash.
     path: String,
@@ -40,17 +40,17 @@ pub(crate) struct Asked {
     refused: &'static str,
 }
 
-impl Asked {
+impl GatewayRequest {
     /// A GET of values that the gateway already has: it is answered at once, so the time limit is short.
-    pub(crate) fn view(path: impl Into<String>) -> Asked {
-        Asked {
+    pub(crate) fn view(path: impl Into<String>) -> GatewayRequest {
+        GatewayRequest {
             within: SHOWN_WITHIN,
-            ..Asked::get(path)
+            ..GatewayRequest::get(path)
         }
     }
 
-    pub(crate) fn get(path: impl Into<String>) -> Asked {
-        Asked {
+    pub(crate) fn get(path: impl Into<String>) -> GatewayRequest {
+        GatewayRequest {
             method: Method::GET,
             path: path.into(),
             body: String::new(),
@@ -60,30 +60,30 @@ impl Asked {
         }
     }
 
-    pub(crate) fn post(path: impl Into<String>, body: &impl Serialize) -> Asked {
-        Asked {
+    pub(crate) fn post(path: impl Into<String>, body: &impl Serialize) -> GatewayRequest {
+        GatewayRequest {
             method: Method::POST,
             // Strings, figures and JSON: this cannot fail.
             body: serde_json::to_string(body).unwrap_or_default(),
-            ..Asked::get(path)
+            ..GatewayRequest::get(path)
         }
     }
 
-    pub(crate) fn delete(path: impl Into<String>) -> Asked {
-        Asked {
+    pub(crate) fn delete(path: impl Into<String>) -> GatewayRequest {
+        GatewayRequest {
             method: Method::DELETE,
-            ..Asked::get(path)
+            ..GatewayRequest::get(path)
         }
     }
 
     /// The remedy if the reply is lost.
-    pub(crate) fn if_lost(self, lost: &'static str) -> Asked {
-        Asked { lost, ..self }
+    pub(crate) fn if_lost(self, lost: &'static str) -> GatewayRequest {
+        GatewayRequest { lost, ..self }
     }
 
     /// Sets the remedy if the request is refused, unless the status already gives one.
-    pub(crate) fn if_refused(self, refused: &'static str) -> Asked {
-        Asked { refused, ..self }
+    pub(crate) fn if_refused(self, refused: &'static str) -> GatewayRequest {
+        GatewayRequest { refused, ..self }
     }
 
     /// Whether the request may be sent again without doing anything twice.
@@ -119,7 +119,7 @@ impl Opened {
         door: &Door,
         authorization: Option<&str>,
         expected: Option<&Expected>,
-        asked: &Asked,
+        asked: &GatewayRequest,
     ) -> hyper::Result<Opened> {
         let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await?;
         let mut wire = Wire(Some(Box::pin(connection)));
@@ -175,7 +175,7 @@ impl Opened {
     ///
     /// # Errors
     /// If the reply does not arrive completely.
-    pub(super) async fn whole(mut self, asked: &Asked) -> Result<Reply, ClientError> {
+    pub(super) async fn whole(mut self, asked: &GatewayRequest) -> Result<Reply, ClientError> {
         let place = self.place.clone();
         let whole = async {
             let mut text = Vec::new();
@@ -200,7 +200,7 @@ impl Opened {
     }
 }
 
-impl Asked {
+impl GatewayRequest {
     pub(super) fn late(&self, place: &str) -> ClientError {
         self.lost(place, &format!("no reply within {} s", self.within.as_secs()))
     }
@@ -224,7 +224,7 @@ impl Reply {
     ///
     /// # Errors
     /// If the gateway refuses the request, or the server is not a gateway.
-    pub(crate) fn accepted<T: DeserializeOwned>(self, asked: &Asked) -> Result<T, ClientError> {
+    pub(crate) fn accepted<T: DeserializeOwned>(self, asked: &GatewayRequest) -> Result<T, ClientError> {
         match self.status.is_success() {
             true => self.document(),
             false => Err(self.refusal(asked)),
@@ -262,7 +262,7 @@ impl Reply {
     }
 
     /// The error that a reply reports.
-    pub(crate) fn refusal(&self, asked: &Asked) -> ClientError {
+    pub(crate) fn refusal(&self, asked: &GatewayRequest) -> ClientError {
         let Some(ErrorReply { error, known }) = self.parsed() else {
             return match self.status {
                 StatusCode::METHOD_NOT_ALLOWED if !asked.only_reads() => ClientError::Refused(format!(

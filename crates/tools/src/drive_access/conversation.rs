@@ -1,8 +1,8 @@
 //! Several requests about one drive, all through one connection.
 
 use super::direct::{Direct, Needs};
-use super::{Target, Way};
-use crate::client::{Asked, Client, ClientError, Reply};
+use super::{RequestRoute, Target};
+use crate::client::{Client, ClientError, GatewayRequest, Reply};
 use crate::config::{LogFormat, LogSettings};
 
 /// Requests about one drive, to the gateway or to the bus of this process.
@@ -18,7 +18,7 @@ impl Conversation {
     /// If no connection is possible; contains the reason as a message.
     pub(super) async fn begin(
         target: &Target,
-        asked: &Asked,
+        asked: &GatewayRequest,
         needs: Needs<'_>,
     ) -> Result<(Conversation, Reply), String> {
         let client = target.client.clone();
@@ -50,17 +50,17 @@ impl Conversation {
     ///
     /// # Errors
     /// If there is no reply; contains the reason as a message.
-    pub(super) async fn ask(&self, asked: &Asked) -> Result<Reply, String> {
+    pub(super) async fn ask(&self, asked: &GatewayRequest) -> Result<Reply, String> {
         self.client.ask(asked).await.map_err(|error| match error {
             ClientError::NotFound(_) => "the gateway is gone; the local socket; start it and try again".to_string(),
             error => error.to_string(),
         })
     }
 
-    pub(super) fn way(&self) -> Way {
+    pub(super) fn way(&self) -> RequestRoute {
         match self.direct {
-            None => Way::Gateway,
-            Some(_) => Way::Direct,
+            None => RequestRoute::Gateway,
+            Some(_) => RequestRoute::Direct,
         }
     }
 

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use super::{Conversation, Needs, Target};
-use crate::client::Asked;
+use crate::client::GatewayRequest;
 use crate::north::http::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, Stage};
 
 /// Time between two looks at the progress.
@@ -30,7 +30,7 @@ impl Target {
     ) -> Result<String, String> {
         let remedy = "parameters can be read from drives whose profile lists them, on lines that the gateway owns";
         let path = self.path("params/reading");
-        let (begin, look) = (Asked::post(&path, &how), Asked::get(&path));
+        let (begin, look) = (GatewayRequest::post(&path, &how), GatewayRequest::get(&path));
         let [begin, look] = [begin, look].map(|asked| asked.if_refused(remedy).if_lost("try again"));
         let (conversation, mut reply) = Conversation::begin(self, &begin, Needs::Identification).await?;
         let text = loop {
@@ -79,8 +79,8 @@ impl Target {
         let path = self.path("params/restore");
         let request = |act: Option<RestoreAct>| {
             let asked = match act {
-                Some(act) => Asked::post(&path, &act),
-                None => Asked::get(&path),
+                Some(act) => GatewayRequest::post(&path, &act),
+                None => GatewayRequest::get(&path),
             };
             asked.if_lost("a started restore continues in the gateway: see `drivegate params restore --look DRIVE`")
         };

@@ -9,11 +9,11 @@ use crate::failure::{Failure, Outcome};
 use crate::files;
 use crate::north::bacnet::ede::{self, Ede};
 use crate::north::bacnet::listing::{self, COLUMNS, Line};
-use crate::north::bacnet::objects::Shown;
+use crate::north::bacnet::objects::ListedDevice;
 use crate::report;
 
 /// The devices that the configuration shows; none without `[bacnet]`.
-pub(crate) fn devices(settings: &Settings) -> Option<Vec<Shown>> {
+pub(crate) fn devices(settings: &Settings) -> Option<Vec<ListedDevice>> {
     let buses = settings.buses.iter().map(|bus| (&bus.spec, bus.drives.as_slice()));
     let options = settings.bacnet.as_ref()?;
     Some(listing::devices(&settings.gateway, options, buses))

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::ExitCode;
 
-use super::super::client::{Asked, Client, Gateway, encoded};
+use super::super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::super::failure::{Failure, Outcome};
 use super::super::{printable, report, settings};
 use super::{built_in, names, read_written};
@@ -54,7 +54,7 @@ pub(super) fn list(gateway: &Gateway, drive: Option<&str>, json: bool) -> Outcom
 /// The readings listed by a gateway.
 fn listed_by(client: &Client, drive: Option<&str>) -> Result<Vec<StoredReading>, Failure> {
     let query = drive.map(|drive| format!("?drive={}", encoded(drive)));
-    let asked = Asked::get(format!("/api/v1/params{}", query.unwrap_or_default()));
+    let asked = GatewayRequest::get(format!("/api/v1/params{}", query.unwrap_or_default()));
     Ok(client.ask_now(&asked)?.accepted(&asked)?)
 }
 
@@ -73,7 +73,7 @@ fn listed_here(config: &Path, drive: Option<&str>) -> Result<(Vec<StoredReading>
 /// The last reading of a drive that a gateway has.
 fn last_of(client: &Client, drive: &str) -> Result<ParameterFile, Failure> {
     let path = format!("/api/v1/drives/{}/params?format=file", encoded(drive));
-    let asked = Asked::get(path).if_refused("read it with `drivegate params read`");
+    let asked = GatewayRequest::get(path).if_refused("read it with `drivegate params read`");
     let reply = client.ask_now(&asked)?;
     if !reply.status.is_success() {
         return Err(reply.refusal(&asked).into());

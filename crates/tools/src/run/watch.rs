@@ -7,7 +7,7 @@ use sd_notify::NotifyState;
 use tokio::time::Interval;
 
 use super::notify;
-use crate::daemon::{Daemon, Pulse};
+use crate::daemon::{BusHeartbeats, Daemon};
 use crate::event::{Event, EventKind};
 use crate::log::LogHandle;
 use crate::north::NorthState;
@@ -22,7 +22,7 @@ const LONGEST_STATUS: usize = 300;
 #[derive(Debug)]
 pub(super) struct Watch<'l> {
     log: &'l LogHandle,
-    pulse: Pulse,
+    pulse: BusHeartbeats,
     plant: SharedPlant,
     stats: Arc<NorthState>,
     is_watched: bool,

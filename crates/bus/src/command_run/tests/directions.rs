@@ -31,7 +31,7 @@ fn writes(bench: &mut ObedientDrive, points: &[(&str, f64)], urgency: Urgency) -
                 Reply::Written
             }
         };
-        bench.words.come_to(bench.now);
+        bench.words.advance_to(bench.now);
         if command.answered(&step, reply, &mut bench.words).is_some() {
             break;
         }

@@ -280,7 +280,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
             let mut turned = None;
             while let Some(action) = next.pop_front() {
                 let Action::Word(word) = action else { continue };
-                let known = Known {
+                let known = RequestContext {
                     check: Check::InVain,
                     blind: true,
                     names_run: true,

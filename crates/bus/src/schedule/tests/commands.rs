@@ -56,7 +56,7 @@ fn flooded(again: Option<Urgency>) -> ([Duration; 4], Duration) {
                 rig.now += took;
                 let kind = match (poll.read.class, rig.schedule.turn) {
                     (PollClass::Fast, _) => 0,
-                    (_, Turn::Asked) => 2,
+                    (_, PollReason::Asked) => 2,
                     _ => 1,
                 };
                 taken[kind] += took;

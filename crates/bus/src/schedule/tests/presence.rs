@@ -295,7 +295,7 @@ fn a_command_in_vain_is_as_good_as_a_probe() {
 fn probes(drive: &mut DriveSchedule, away: Instant, took: Duration, until: Duration) -> Vec<Duration> {
     let (mut now, mut times) = (away, Vec::new());
     while now < away + until {
-        drive.is_away(now, took);
+        drive.probe_failed(now, took);
         let Presence::Away(at, _) = drive.presence else {
             panic!("it is there")
         };

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::codec::Table;
-use crate::n2_late_replies::{Asked, N2LateReplies};
+use crate::n2_late_replies::{LateRequest, N2LateReplies};
 
 const WINDOW: Duration = Duration::from_millis(750);
 
@@ -16,7 +16,7 @@ fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
     let mut frame = Vec::new();
     Protocol::N2.encode(&request, &mut frame);
     let mut late = N2LateReplies::default();
-    let asked = Asked {
+    let asked = LateRequest {
         address: 2,
         pdu: &state(3),
         device: 0x10,

@@ -58,7 +58,7 @@ pub struct Drive {
     pub(super) silent_at: Option<Instant>,
     pub(super) mains: InPhase,
     /// Number of requests to a drive that has never replied; `None` if the drive has replied.
-    pub(super) in_vain: Option<u16>,
+    pub(super) unanswered: Option<u16>,
 }
 
 impl Drive {
@@ -101,7 +101,7 @@ impl Drive {
 
     /// Requests to a drive that has never replied.
     pub fn in_vain(&self) -> Option<u16> {
-        self.in_vain
+        self.unanswered
     }
 
     pub(super) fn was_silent(&self, at: Instant) -> bool {

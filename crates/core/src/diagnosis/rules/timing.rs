@@ -2,8 +2,8 @@
 
 use super::{FEW_OF_LINE, Rules, damaged_replies};
 use crate::diagnosis::counters::Contrast;
+use crate::diagnosis::failure_rates::{FEW, LASTING, share, sums};
 use crate::diagnosis::figures::{BAUDS, Sign};
-use crate::diagnosis::known::{FEW, LASTING, share, sums};
 use crate::diagnosis::{Cause, Certainty};
 
 /// Longest `response_timeout` that a verdict proposes, ms.
@@ -38,16 +38,16 @@ impl Rules<'_> {
     pub(super) fn silence_too_short(&mut self) {
         let [close, paused] = [0, 1].map(|place: usize| {
             let of = |counts: [f32; 2]| counts.get(place).copied().unwrap_or_default();
-            (of(self.figures.pause.failed), of(self.figures.pause.asked))
+            (of(self.figures.pause.failed), of(self.figures.pause.transactions))
         });
         let turned = Contrast {
-            asked: [paused.1, close.1],
+            transactions: [paused.1, close.1],
             failed: [paused.0, close.0],
         };
         let silent = self.figures.sum(Sign::Silent);
         let mut few = turned;
         // Pauses are rare on a busy line. Most of them follow a request without a reply.
-        few.asked[0] = few.asked[0].max(if few.asked[0] >= 15.0 { 100.0 } else { 0.0 });
+        few.transactions[0] = few.transactions[0].max(if few.transactions[0] >= 15.0 { 100.0 } else { 0.0 });
         let rate = close.0 / close.1.max(1.0);
         let chance = (1.0 - rate).max(0.0).powf(paused.1);
         if !Self::contrast(&few) || paused.0 > 0.2 * rate * paused.1 || chance > 1e-4 || silent < FEW_OF_LINE {

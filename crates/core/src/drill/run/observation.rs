@@ -18,7 +18,7 @@ use crate::stop_all::OneStop;
 const AT_ONCE: Duration = Duration::from_millis(500);
 
 /// What a test of a drill has shown.
-enum Seen {
+enum Observation {
     Nothing,
     Stood { took: Duration, upper_bound: bool },
     Ended(DrillState, String),
@@ -40,9 +40,9 @@ impl Run {
         let seen = match &mut how {
             Cause::Order(placed) => self.seen_of_order(cause, placed, reading, now),
             Cause::Client { stopped } => match self.seen_since(cause, cause, reading, now) {
-                Seen::Stood { .. } if !*stopped => {
+                Observation::Stood { .. } if !*stopped => {
                     let why = "the motor stopped before its supervision acted".to_string();
-                    Seen::Ended(DrillState::NotProven, why)
+                    Observation::Ended(DrillState::NotProven, why)
                 }
                 seen => seen,
             },
@@ -53,8 +53,8 @@ impl Run {
         };
         let kind = step.kind;
         match seen {
-            Seen::Nothing => self.step = Step::Caused(cause, how),
-            Seen::Stood { took, upper_bound } => {
+            Observation::Nothing => self.step = Step::Caused(cause, how),
+            Observation::Stood { took, upper_bound } => {
                 step.state = DrillState::Passed;
                 step.took_ms = Some(u64::try_from(took.as_millis()).unwrap_or(u64::MAX));
                 step.upper_bound = upper_bound;
@@ -73,13 +73,13 @@ impl Run {
                 }
             }
             // The stop that the drill should have given or observed may be late for this reason.
-            Seen::Ended(DrillState::Failed, why) if by_the_gateway && self.paused.is_some() => {
+            Observation::Ended(DrillState::Failed, why) if by_the_gateway && self.paused.is_some() => {
                 let seconds = self.paused.unwrap_or_default().as_secs_f64();
                 let why = format!("the gateway paused for {seconds:.1} s meanwhile; {why}");
                 self.end(DrillState::NotProven, why, now);
             }
-            Seen::Ended(DrillState::Failed, why) => self.failed(kind, why, (now, time)),
-            Seen::Ended(state, why) => self.end(state, why, now),
+            Observation::Ended(DrillState::Failed, why) => self.failed(kind, why, (now, time)),
+            Observation::Ended(state, why) => self.end(state, why, now),
         }
     }
 
@@ -88,60 +88,66 @@ impl Run {
         self.end(DrillState::Failed, why, now);
     }
 
-    fn seen_of_order(&mut self, cause: Instant, placed: &mut Placed, reading: &Reading<'_>, now: Instant) -> Seen {
+    fn seen_of_order(
+        &mut self,
+        cause: Instant,
+        placed: &mut Placed,
+        reading: &Reading<'_>,
+        now: Instant,
+    ) -> Observation {
         let accepted = placed.accepted();
         let why = match placed.answer() {
             Some(answer) if answer.outcome.is_ok() => {
                 return self.seen_since(cause, accepted + answer.latency, reading, now);
             }
             Some(answer) if matches!(answer.outcome, Outcome::Exception(_) | Outcome::Refused(_)) => {
-                return Seen::Ended(DrillState::Failed, format!("the stop failed: {}", answer.outcome));
+                return Observation::Ended(DrillState::Failed, format!("the stop failed: {}", answer.outcome));
             }
             Some(answer) => format!("the stop was not acknowledged: {}", answer.outcome),
-            None if now <= cause + self.options.limit => return Seen::Nothing,
+            None if now <= cause + self.options.limit => return Observation::Nothing,
             None => "the stop was not acknowledged in time".to_string(),
         };
         match self.seen_since(cause, cause, reading, now) {
-            Seen::Stood { .. } => Seen::Ended(DrillState::NotProven, why),
-            Seen::Ended(state, seen) => Seen::Ended(state, format!("{why}; {seen}")),
-            Seen::Nothing => Seen::Nothing,
+            Observation::Stood { .. } => Observation::Ended(DrillState::NotProven, why),
+            Observation::Ended(state, seen) => Observation::Ended(state, format!("{why}; {seen}")),
+            Observation::Nothing => Observation::Nothing,
         }
     }
 
     /// Whether reads after `since` show that the motor had stopped within the limit.
-    fn seen_since(&self, cause: Instant, since: Instant, reading: &Reading<'_>, now: Instant) -> Seen {
+    fn seen_since(&self, cause: Instant, since: Instant, reading: &Reading<'_>, now: Instant) -> Observation {
         let (limit, due) = (self.options.limit.as_secs_f64(), cause + self.options.limit);
         let passed = now.saturating_duration_since(cause);
         match reading.standstill_read(Some(since)) {
-            (Standstill::Stands, _) if now <= due => Seen::Stood {
+            (Standstill::Stands, _) if now <= due => Observation::Stood {
                 took: passed,
                 upper_bound: false,
             },
             (Standstill::Stands, _) => {
                 let seconds = passed.as_secs_f64();
                 let why = format!("standstill was seen first after {seconds:.1} s; the limit is {limit} s");
-                Seen::Ended(DrillState::NotProven, why)
+                Observation::Ended(DrillState::NotProven, why)
             }
             (Standstill::Turns(what), Some(at)) if at > due => {
                 let why = format!("after {limit} s the motor still turns: {what}");
-                Seen::Ended(DrillState::Failed, why)
+                Observation::Ended(DrillState::Failed, why)
             }
-            _ if now <= due + READ => Seen::Nothing,
+            _ if now <= due + READ => Observation::Nothing,
             (Standstill::Unknown(why), _) => not_observed(&why),
             _ => not_observed("it has not been read since"),
         }
     }
 
     /// Whether the first reads after the silence show the motor at standstill.
-    fn seen_after(&self, cause: Instant, until: Instant, reading: &Reading<'_>, now: Instant) -> Seen {
+    fn seen_after(&self, cause: Instant, until: Instant, reading: &Reading<'_>, now: Instant) -> Observation {
         if now < until {
-            return Seen::Nothing;
+            return Observation::Nothing;
         }
         let limit = self.options.limit.as_secs_f64();
         match reading.standstill(Some(until)) {
             // The cause of the standstill may be the switch to local control, so the drill proves nothing.
-            Standstill::Stands if is_local(reading) => Seen::Ended(DrillState::Aborted, LOCAL.to_string()),
-            Standstill::Stands if now <= until + AT_ONCE => Seen::Stood {
+            Standstill::Stands if is_local(reading) => Observation::Ended(DrillState::Aborted, LOCAL.to_string()),
+            Standstill::Stands if now <= until + AT_ONCE => Observation::Stood {
                 took: now.saturating_duration_since(cause),
                 upper_bound: true,
             },
@@ -151,18 +157,18 @@ impl Run {
                     "the motor stands, but was read only {late:.1} s after the silence of {limit} s: replies were lost, the line was \
                      busy, or the gateway paused"
                 );
-                Seen::Ended(DrillState::NotProven, why)
+                Observation::Ended(DrillState::NotProven, why)
             }
             Standstill::Turns(what) => {
                 let why = format!("after a silence of {limit} s the motor still turns: {what}");
-                Seen::Ended(DrillState::Failed, why)
+                Observation::Ended(DrillState::Failed, why)
             }
-            Standstill::Unknown(_) if now < until + READ => Seen::Nothing,
+            Standstill::Unknown(_) if now < until + READ => Observation::Nothing,
             Standstill::Unknown(why) => not_observed(&why),
         }
     }
 }
 
-fn not_observed(why: &str) -> Seen {
-    Seen::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
+fn not_observed(why: &str) -> Observation {
+    Observation::Ended(DrillState::NotProven, format!("standstill was not observed: {why}"))
 }

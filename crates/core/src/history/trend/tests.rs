@@ -44,7 +44,7 @@ impl Rig {
         let trend = self.trend.points.iter_mut().find(of).unwrap();
         trend
             .kept
-            .get_or_insert_with(|| Kept::new(reach))
+            .get_or_insert_with(|| KeptValues::new(reach))
             .add(since, value, || good_for);
         self.fed.push((self.clock.now, value, good_for));
     }

@@ -7,13 +7,13 @@
 
 mod denial;
 mod holding;
-mod kept;
 mod principal;
+mod saved_reservation;
 
 pub use denial::Denial;
 pub use holding::{HoldChange, HoldState, HoldView, Holding, Verb, What};
-pub use kept::KeptReservation;
 pub use principal::{Claim, Mode, Principal, Rules};
+pub use saved_reservation::KeptReservation;
 
 #[cfg(test)]
 mod tests;

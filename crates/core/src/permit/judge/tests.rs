@@ -46,9 +46,9 @@ struct Rig {
 }
 
 impl Facts for Rig {
-    fn seen(&self, _: DriveIndex) -> Option<Seen<'_>> {
+    fn seen(&self, _: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.image.reading(self.now, 10 * SECOND);
-        Some(Seen { reading, written: None })
+        Some(DriveFacts { reading, written: None })
     }
 }
 

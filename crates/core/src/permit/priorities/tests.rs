@@ -358,7 +358,7 @@ fn an_order_that_was_planned_follows_only_from_what_still_stands() {
     let Follows::Order(_, entry) = all.plan(&null) else {
         panic!()
     };
-    let null = null.in_favour_of(&entry);
+    let null = null.governed_by(&entry);
     assert!(all.still_follows(&null));
     let mut stopped = all.clone();
     assert!(elsewhere(&mut stopped, SourceKind::Mqtt, effect(Some(false), false)));

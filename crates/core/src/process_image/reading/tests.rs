@@ -97,7 +97,7 @@ fn parameters_from_before_a_drive_went_away_are_not_believed() {
         s.store(Table::Input, 17, &[1], now);
     });
     assert_eq!(seen(), (Quality::Good, Quality::Good, Some((0.0, 50.0))));
-    image.update(Snapshot::outlive);
+    image.update(Snapshot::expire_slow_values);
     assert_eq!(seen(), (Quality::Stale, Quality::Stale, None));
     image.update(|s| s.store(Table::Holding, 101, &[100], now));
     assert_eq!(seen(), (Quality::Good, Quality::Stale, Some((0.0, 100.0))));

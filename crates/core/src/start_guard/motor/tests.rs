@@ -50,7 +50,7 @@ impl Play {
             ["runs", "turns", "stands", "fault", "unready"].contains(&state),
             "{what}"
         );
-        self.motor.seen(Seen {
+        self.motor.seen(MotorReading {
             running: state == "runs",
             commanded,
             stands: !["runs", "turns"].contains(&state),
@@ -66,7 +66,7 @@ impl Play {
             let now = self.at(seconds.parse().unwrap());
             match what {
                 "stop" => self.motor.stop_written(now),
-                "away" => self.motor.away(),
+                "away" => self.motor.note_offline(),
                 "unseen" => self.motor.unseen(),
                 _ => match what.strip_prefix("run:") {
                     Some(expected) => {

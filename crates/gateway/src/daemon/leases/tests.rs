@@ -5,10 +5,10 @@ use crate::bus::supervision::Lease;
 use crate::config::Settings;
 
 /// A lease that has been running since then.
-fn held(since: Instant) -> Carried {
-    Carried {
+fn held(since: Instant) -> CarriedState {
+    CarriedState {
         lease: Lease::held(since),
-        ..Carried::default()
+        ..CarriedState::default()
     }
 }
 
@@ -36,7 +36,7 @@ fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
 /// the second had none.
 fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String>) {
     let mut leases = Leases::default();
-    leases.left(before, vec![held(Instant::now()), Carried::default()]);
+    leases.left(before, vec![held(Instant::now()), CarriedState::default()]);
     let of = leases
         .of(after, Instant::now())
         .into_iter()
@@ -89,7 +89,7 @@ fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
 /// Reloads from the first bus to the last, each `pause` after the previous; returns how long ago the lease of
 /// `pump-1` was renewed by then.
 fn over(buses: &[&BusSettings], pause: Duration) -> Option<Duration> {
-    let (parted, mut now) = (Parted::default(), Instant::now());
+    let (parted, mut now) = (RemovedDrives::default(), Instant::now());
     let mut held = vec![self::held(now); buses[0].drives.len()];
     for pair in buses.windows(2) {
         now += pause;

@@ -1,14 +1,14 @@
 //! Raw values: address, format and conversion to engineering units.
 
+mod contents;
 mod form;
-mod standing;
 
 use super::super::model::{Kind, Text, Value, tidy, tidy_product};
 use crate::codec::Table;
 use crate::drive::PointIndex;
 
+pub use contents::Part;
 pub use form::{Form, Order};
-pub use standing::Part;
 
 /// Whole numbers up to here are exact as a number with a fraction.
 const EXACT: u64 = 1 << 53;

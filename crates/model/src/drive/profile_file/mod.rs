@@ -5,9 +5,8 @@ mod base;
 mod commissioning;
 mod control;
 mod derived;
-mod doubts;
 mod identify;
-mod meaning;
+mod interpretation;
 mod n2;
 mod parameter_rules;
 mod parameters;
@@ -17,6 +16,7 @@ mod ranges;
 mod reference;
 mod reset;
 mod states;
+mod whole_profile;
 
 use crate::drive::{PerPoint, PointIndex};
 use std::borrow::Cow;
@@ -373,7 +373,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         profile.control = profile.control_of_bits();
     }
     check_sums(&tables, &profile);
-    doubts::check(reader, &profile);
+    whole_profile::check(reader, &profile);
     if profile.broadcast_stop && (profile.protocols.contains(&Protocol::N2) || profile.broadcast_stop().is_none()) {
         reader.problem(
             "broadcast_stop",

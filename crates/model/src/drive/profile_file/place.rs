@@ -3,7 +3,7 @@
 
 use super::super::control::ControlItem;
 use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};
-use super::meaning;
+use super::interpretation;
 use super::ranges::{Offsets, read_table};
 use crate::codec::Table;
 use crate::document::{Finding, Reader};
@@ -79,7 +79,7 @@ pub(super) fn read_raw(
     let address = offsets.applied(reader, "at", table, address)?;
     let invert = reader.or("invert", false);
     let form = read_form(reader, table, bits, invert)?;
-    let raw = meaning::apply(
+    let raw = interpretation::apply(
         reader,
         names,
         Raw {

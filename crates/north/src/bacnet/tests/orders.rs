@@ -190,7 +190,7 @@ fn a_stop_between_plan_and_acceptance_keeps_the_next_slot_from_starting() {
     rig.carry_out(done());
     let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
     let order = Order::Points(vec![(run, entry.value)]);
-    let null = null.in_favour_of(&entry);
+    let null = null.governed_by(&entry);
     let mut placed = drive.place(
         crate::plant::OrderRequest::new(order, entry.origin, Authority::Write)
             .within(Duration::from_secs(2))

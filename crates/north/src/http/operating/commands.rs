@@ -95,9 +95,9 @@ fn status(outcome: &Outcome) -> StatusCode {
 
 /// When the head of a request arrived, and the reader of its body; comparing the password and waiting for the body
 /// happen later.
-pub(in crate::http) struct Asked(Arrival, Option<Arc<Reader>>);
+pub(in crate::http) struct RequestArrival(Arrival, Option<Arc<Reader>>);
 
-impl Asked {
+impl RequestArrival {
     /// The arrival of the request, after its body was read.
     fn complete(self) -> Arrival {
         match self.1 {
@@ -107,19 +107,19 @@ impl Asked {
     }
 }
 
-impl<S: Sync> FromRequestParts<S> for Asked {
+impl<S: Sync> FromRequestParts<S> for RequestArrival {
     type Rejection = Infallible;
 
-    async fn from_request_parts(head: &mut request::Parts, _: &S) -> Result<Asked, Infallible> {
+    async fn from_request_parts(head: &mut request::Parts, _: &S) -> Result<RequestArrival, Infallible> {
         let arrival = head.extensions.get().cloned();
         let arrival = arrival.unwrap_or_else(|| Arrival::now(Instant::now()));
-        Ok(Asked(arrival, head.extensions.get().cloned()))
+        Ok(RequestArrival(arrival, head.extensions.get().cloned()))
     }
 }
 
 /// `POST /api/v1/drives/{name}/commands`
 pub(in crate::http) async fn command(
-    asked: Asked,
+    asked: RequestArrival,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     // The right is checked again when the command is placed, so that a refusal is audited.
@@ -241,13 +241,13 @@ impl Operating {
         if asked.does_more(profile) {
             match self.remember(&drive, operator, payload, id.as_ref(), now) {
                 Ok(remembered) => shared = Some(remembered),
-                Err(Known::Reply(reply)) if !asked.stops(profile) => return Progress::Repeated(reply),
-                Err(Known::Reply(_)) => {
+                Err(SkippedCommand::Reply(reply)) if !asked.stops(profile) => return Progress::Repeated(reply),
+                Err(SkippedCommand::Reply(_)) => {
                     let why = "it repeats an earlier command, so only its stop is executed again; send it with \
                                another `id`";
                     asked.refused = Some(Refusal::NotAllowed(why.to_string()));
                 }
-                Err(Known::Refused(why)) => asked.refused = Some(Refusal::NotAllowed(why)),
+                Err(SkippedCommand::Refused(why)) => asked.refused = Some(Refusal::NotAllowed(why)),
             }
         }
         let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
@@ -274,8 +274,8 @@ impl Operating {
         payload: &[u8],
         id: Option<&Id>,
         now: Instant,
-    ) -> Result<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit), Known> {
-        let refused = |why: &str| Known::Refused(format!("{why}; nothing was written"));
+    ) -> Result<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit), SkippedCommand> {
+        let refused = |why: &str| SkippedCommand::Refused(format!("{why}; nothing was written"));
         let busy = || refused("too many commands are waiting for their results");
         let permit = self.in_progress.clone().try_acquire_owned().map_err(|_| busy())?;
         let (sender, reply) = watch::channel(None);
@@ -292,12 +292,12 @@ impl Operating {
         let (print, stops) = (memory.fingerprint(&taken, Some(id.text())), drive.stops());
         match memory.repeated(&taken, print, stops, now) {
             None => {}
-            Some(Repetition::Answered(reply)) => return Err(Known::Reply(reply)),
+            Some(Repetition::Answered(reply)) => return Err(SkippedCommand::Reply(reply)),
             // A reply is shared from the start, so this state cannot occur.
             Some(Repetition::Pending) => return Err(busy()),
             Some(Repetition::Outdated(why)) => {
                 let why = format!("it repeats an earlier command, {why}; send it with another `id`");
-                return Err(Known::Refused(why));
+                return Err(SkippedCommand::Refused(why));
             }
         }
         if !memory.has_room(now) {
@@ -310,7 +310,7 @@ impl Operating {
 }
 
 /// A command that is not executed, and why.
-enum Known {
+enum SkippedCommand {
     /// The command was executed before, with this reply.
     Reply(SharedReply),
     Refused(String),

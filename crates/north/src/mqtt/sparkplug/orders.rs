@@ -13,7 +13,7 @@ use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
-use crate::command_json::{Asked, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
+use crate::command_json::{ParsedCommand, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
 use crate::drive::{ModelPoint, Profile};
 use crate::order::{Answer, Arrival, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
 use crate::plant::{Placed, Plant};
@@ -259,7 +259,7 @@ impl Request {
         profile: &Profile,
         (session, device): (&Session, usize),
         expiry: Duration,
-    ) -> Result<Asked, Refusal> {
+    ) -> Result<ParsedCommand, Refusal> {
         let alias = |metric| session.alias(device, metric);
         let name = |metric| session.definition(device, metric).map(|d| d.name.clone());
         let point = |(metric, place): &(Metric, Option<usize>)| {
@@ -310,7 +310,7 @@ impl Request {
                 Err(refusal) => refused = refused.or(Some(refusal)),
             }
         }
-        Asked::new(points, expiry, refused, profile)
+        ParsedCommand::new(points, expiry, refused, profile)
     }
 }
 

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::Seen;
+use super::MotorReading;
 
 /// If a motor is seen to start later than this after its word, the start counts from then, not from the word.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);
@@ -51,7 +51,7 @@ pub(super) enum Progress {
 
 /// A start by an order, counted from the last word of the order.
 #[derive(Debug, Clone)]
-pub(super) struct Passage {
+pub(super) struct StartAttempt {
     /// Number of the start's command.
     pub(super) number: u64,
     pub(super) client: Arc<str>,
@@ -72,7 +72,7 @@ pub(super) struct Passage {
 
 /// Effect of a reading of the running motor on the starts that count.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Shown {
+pub(super) enum StartEffect {
     /// The reading changes nothing.
     Nothing,
     /// The expected start happened.
@@ -85,18 +85,18 @@ pub(super) enum Shown {
 
 /// Other facts about the motor: its last stop, and the run command as the drive last reported it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Besides {
+pub(super) struct MotorFacts {
     pub(super) stop: Option<Instant>,
     pub(super) commanded: Option<(bool, Instant)>,
 }
 
-impl Passage {
-    fn is_stopped(&self, besides: Besides) -> bool {
+impl StartAttempt {
+    fn is_stopped(&self, besides: MotorFacts) -> bool {
         besides.stop.is_some_and(|stop| stop > self.last)
     }
 
     /// Effect of a run command on a motor that may be standing.
-    pub(super) fn by_run(&self, besides: Besides) -> ByRun {
+    pub(super) fn by_run(&self, besides: MotorFacts) -> ByRun {
         // The run command was taken away since, at the drive itself or by another source.
         let is_off = besides.commanded.is_some_and(|(on, at)| !on && at > self.last);
         match self.progress {
@@ -109,29 +109,33 @@ impl Passage {
     }
 
     /// Notes that the motor is seen to run; with `came`, the previous reading showed it not running.
-    pub(super) fn is_seen_running(&mut self, came: bool, besides: Besides, at: Instant) -> Shown {
+    pub(super) fn is_seen_running(&mut self, came: bool, besides: MotorFacts, at: Instant) -> StartEffect {
         if self.progress == Progress::Over {
-            return if came { Shown::Another(None) } else { Shown::Nothing };
+            return if came {
+                StartEffect::Another(None)
+            } else {
+                StartEffect::Nothing
+            };
         }
         let before = std::mem::replace(&mut self.progress, Progress::Ran);
         match before {
-            Progress::Vain => return Shown::Another(Some(self.client.clone())),
+            Progress::Vain => return StartEffect::Another(Some(self.client.clone())),
             Progress::Awaited | Progress::Turns if came => {}
-            _ => return Shown::Nothing,
+            _ => return StartEffect::Nothing,
         }
         let may_be_of_others = self.away || self.is_stopped(besides);
         if may_be_of_others && at > self.last + STARTS_WITHIN {
-            return Shown::Another(None);
+            return StartEffect::Another(None);
         }
         // The run command was on all the time, so the expected start happened.
         match at > self.counted + STARTS_WITHIN {
-            true => Shown::StartedLate,
-            false => Shown::Started,
+            true => StartEffect::StartedLate,
+            false => StartEffect::Started,
         }
     }
 
     /// Notes that the motor does not run. Returns whether this start failed, from this reading on.
-    pub(super) fn is_seen_not_running(&mut self, seen: &Seen, besides: Besides) -> bool {
+    pub(super) fn is_seen_not_running(&mut self, seen: &MotorReading, besides: MotorFacts) -> bool {
         let before = self.progress;
         self.unable &= seen.unable.is_some();
         let has_fault = seen.unable.is_some_and(|(why, _)| why == Unable::Fault);
@@ -146,7 +150,7 @@ impl Passage {
         before != Progress::Vain && self.progress == Progress::Vain
     }
 
-    fn awaited(&self, seen: &Seen, besides: Besides) -> Progress {
+    fn awaited(&self, seen: &MotorReading, besides: MotorFacts) -> Progress {
         let is_on = besides.commanded.is_some_and(|(on, at)| on && at > self.written);
         let shown = |is_shown: bool| if is_shown { Progress::Vain } else { Progress::Awaited };
         match seen.unable {

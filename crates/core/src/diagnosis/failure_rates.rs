@@ -20,7 +20,7 @@ const TIMES: f64 = 5.0;
 
 /// The known failure rates of one drive.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Known {
+pub(super) struct FailureRates {
     pub(super) place: DriveIndex,
     pub(super) asked: u32,
     pub(super) failed: u32,
@@ -29,7 +29,7 @@ pub(super) struct Known {
     pub(super) lasting: bool,
 }
 
-impl Known {
+impl FailureRates {
     pub(super) fn share(&self) -> f64 {
         share(self.failed, self.asked)
     }
@@ -43,7 +43,7 @@ pub(super) fn share(part: u32, of: u32) -> f64 {
     f64::from(part) / f64::from(of.max(1))
 }
 
-pub(super) fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32) {
+pub(super) fn sums<'k>(drives: impl IntoIterator<Item = &'k FailureRates>) -> (u32, u32) {
     drives
         .into_iter()
         .fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
@@ -56,25 +56,25 @@ pub(super) fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
 }
 
 /// Whether the first `count` of these drives, sorted from the worst, are all bad and much worse than the others.
-pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
+pub(super) fn stand_out(known: &[FailureRates], count: usize) -> bool {
     let Some((bad, good)) = known.split_at_checked(count) else {
         return false;
     };
     let (failed, asked) = sums(good);
     let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
     let stands_out =
-        |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
+        |one: &FailureRates| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
     good.len() >= 2 && asked >= 60 && bad.iter().all(stands_out)
 }
 
-impl Known {
+impl FailureRates {
     /// The known failure rates of the drive at this index, if it was polled often enough.
-    pub(super) fn of(place: DriveIndex, drive: &Drive) -> Option<Known> {
+    pub(super) fn of(place: DriveIndex, drive: &Drive) -> Option<FailureRates> {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
         let asked = others + silent + damaged;
         // A bad drive is polled less often over time, so a few failures are enough.
-        (asked >= KNOWN || silent + damaged >= FEW).then(|| Known {
+        (asked >= KNOWN || silent + damaged >= FEW).then(|| FailureRates {
             place,
             asked,
             failed: silent + damaged,

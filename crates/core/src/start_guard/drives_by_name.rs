@@ -11,7 +11,7 @@ const FIRST_READ: Duration = Duration::from_secs(10);
 
 /// The drives of all buses, by name.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Around {
+pub(super) struct DrivesByName {
     drives: BTreeMap<String, Watched>,
     pub(super) stale_after: Duration,
 }
@@ -21,46 +21,46 @@ pub(super) struct Around {
 pub(super) struct Watched {
     machine: Machine,
     pub(super) image: Arc<DriveImage>,
-    anew: Option<Anew>,
+    anew: Option<BusRestart>,
 }
 
 /// The last restart of the drive's bus.
 #[derive(Debug, Clone)]
-pub(super) struct Anew {
+pub(super) struct BusRestart {
     /// When the previous bus had ended.
     pub(super) since: Instant,
     /// The previous state of the machine; `None` if it was not configured before.
     pub(super) before: Option<Arc<Watched>>,
 }
 
-impl Around {
+impl DrivesByName {
     /// The state after a change to these drives.
     pub(super) fn follow(
         &self,
         drives: impl IntoIterator<Item = (Machine, Arc<DriveImage>)>,
         stale_after: Duration,
         now: Instant,
-    ) -> Around {
+    ) -> DrivesByName {
         let watched = |(machine, image): (Machine, Arc<DriveImage>)| {
             let before = self.drives.values().find(|before| before.machine == machine);
             let anew = match before {
                 Some(before) if Arc::ptr_eq(&before.image, &image) => before.anew.clone(),
                 Some(before) => Some(before.expected().cloned().unwrap_or_else(|| before.left(now))),
-                None => Some(Anew {
+                None => Some(BusRestart {
                     since: now,
                     before: None,
                 }),
             };
             (image.spec.name.clone(), Watched { machine, image, anew })
         };
-        Around {
+        DrivesByName {
             drives: drives.into_iter().map(watched).collect(),
             stale_after,
         }
     }
 
     /// The state while the buses of these drives are restarted.
-    pub(super) fn expecting(&self, drives: &[Arc<DriveImage>], now: Instant) -> Around {
+    pub(super) fn expecting(&self, drives: &[Arc<DriveImage>], now: Instant) -> DrivesByName {
         let mut next = self.clone();
         let is_meant = |watched: &&mut Watched| drives.iter().any(|image| Arc::ptr_eq(image, &watched.image));
         for watched in next.drives.values_mut().filter(is_meant) {
@@ -76,17 +76,17 @@ impl Around {
 
 impl Watched {
     /// The state that a bus leaves to the bus that replaces it.
-    fn left(&self, now: Instant) -> Anew {
+    fn left(&self, now: Instant) -> BusRestart {
         let anew = self.anew.clone().filter(|anew| anew.is_recent(now));
         let before = Watched { anew, ..self.clone() };
-        Anew {
+        BusRestart {
             since: now,
             before: Some(Arc::new(before)),
         }
     }
 
     /// The announced end of the drive's bus, if another bus will replace it.
-    fn expected(&self) -> Option<&Anew> {
+    fn expected(&self) -> Option<&BusRestart> {
         let is_same = |before: &Arc<Watched>| Arc::ptr_eq(&before.image, &self.image);
         self.anew
             .as_ref()
@@ -99,12 +99,12 @@ impl Watched {
     }
 
     /// The last restart of its bus, while the first reading after it may still be expected.
-    pub(super) fn anew(&self, now: Instant) -> Option<&Anew> {
+    pub(super) fn anew(&self, now: Instant) -> Option<&BusRestart> {
         self.anew.as_ref().filter(|anew| anew.is_recent(now))
     }
 }
 
-impl Anew {
+impl BusRestart {
     fn is_recent(&self, now: Instant) -> bool {
         now < self.since + FIRST_READ
     }

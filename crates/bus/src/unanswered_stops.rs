@@ -39,10 +39,10 @@ impl VainStops {
             self.count = (self.count - paid).max(0.0);
         }
         self.count += 1.0;
-        self.until = Some(now + if self.goes_in_turn() { took } else { pause });
+        self.until = Some(now + if self.keeps_its_turn() { took } else { pause });
     }
 
-    fn goes_in_turn(&self) -> bool {
+    fn keeps_its_turn(&self) -> bool {
         self.count <= IN_TURN
     }
 

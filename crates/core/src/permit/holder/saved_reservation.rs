@@ -49,7 +49,7 @@ impl KeptReservation {
     /// The client of the reservation and the time until which it continues after a start at `now`, which is `time`
     /// on the calendar; `None` if it has ended or its rank no longer exists. If the clock shows a time before the
     /// stop, the full time is left.
-    pub fn goes_on(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
+    pub fn continues_after_start(&self, rules: &Rules, now: Instant, time: SystemTime) -> Option<(Claim, Instant)> {
         let rank = rules.ranks.iter().position(|rank| **rank == *self.rank)?;
         let passed = milliseconds(time).saturating_sub(self.stopped_ms);
         let left = Duration::from_millis(self.lease_ms.checked_sub(passed)?).min(rules.lease);

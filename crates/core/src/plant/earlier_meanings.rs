@@ -48,13 +48,13 @@ impl By {
 struct Served {
     image: Weak<BusImage>,
     queue: Weak<CommandQueue>,
-    formerly: Weak<Formerly>,
+    formerly: Weak<EarlierMeanings>,
     place: DriveIndex,
 }
 
 /// An earlier meaning: until `until` the name or unit id meant another machine, or none.
 #[derive(Debug, Clone)]
-struct Former {
+struct EarlierMeaning {
     by: By,
     until: Instant,
     /// The machine that was meant, if a bus still serves it.
@@ -63,7 +63,7 @@ struct Former {
 
 /// The machine that an order meant, if its name means another machine now.
 #[derive(Debug)]
-pub(super) enum Meant {
+pub(super) enum FormerMachine {
     /// The machine is served under another name.
     There(Box<DriveHandle>),
     /// No bus serves that machine any more, or there was none.
@@ -72,15 +72,15 @@ pub(super) enum Meant {
 
 /// Earlier meanings of the names and units of the drives of a bus.
 #[derive(Debug, Default)]
-pub struct Formerly(Mutex<BTreeMap<DriveIndex, Vec<Former>>>);
+pub struct EarlierMeanings(Mutex<BTreeMap<DriveIndex, Vec<EarlierMeaning>>>);
 
-impl Formerly {
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<DriveIndex, Vec<Former>>> {
+impl EarlierMeanings {
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<DriveIndex, Vec<EarlierMeaning>>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What the name or unit id of the drive meant at `asked`: the record of the first change after that time.
-    fn meaning_at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<Former> {
+    fn meaning_at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<EarlierMeaning> {
         let all = self.lock();
         let mut of_drive = all.get(&drive)?.iter();
         of_drive
@@ -89,7 +89,7 @@ impl Formerly {
     }
 
     /// Adds this change, and removes those that no longer matter at `now`.
-    fn add(&self, drive: DriveIndex, former: Former, now: Instant) {
+    fn add(&self, drive: DriveIndex, former: EarlierMeaning, now: Instant) {
         let mut all = self.lock();
         let of_drive = all.entry(drive).or_default();
         of_drive.retain(|former| now < former.until + REMEMBERED);
@@ -100,7 +100,7 @@ impl Formerly {
     }
 
     /// Takes over the earlier meanings of a machine from the previous bus.
-    pub(super) fn take_over(&self, drive: DriveIndex, before: &Formerly, place: DriveIndex) {
+    pub(super) fn take_over(&self, drive: DriveIndex, before: &EarlierMeanings, place: DriveIndex) {
         if let Some(of_drive) = before.lock().get(&place) {
             self.lock().insert(drive, of_drive.clone());
         }
@@ -140,7 +140,7 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
                         place,
                     })
                 };
-                let former = Former {
+                let former = EarlierMeaning {
                     by,
                     until: now,
                     machine: after.iter().find_map(serves),
@@ -155,7 +155,7 @@ pub fn follow_names(before: &[BusHandle], after: &[BusHandle], now: Instant) {
 
 impl DriveHandle {
     /// The machine that an order of this kind meant when it arrived, if its name means another machine now.
-    pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<Meant> {
+    pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<FormerMachine> {
         let former = self.bus.formerly.meaning_at(self.index, By::of(kind)?, arrival.asked)?;
         let there = former.machine.and_then(|served| {
             let bus = BusHandle {
@@ -172,7 +172,7 @@ impl DriveHandle {
                 ..self.clone()
             })
         });
-        Some(there.map_or(Meant::Gone, |there| Meant::There(Box::new(there))))
+        Some(there.map_or(FormerMachine::Gone, |there| FormerMachine::There(Box::new(there))))
     }
 
     /// The stop for this machine in an order that was parsed for the drive that has its name now; `None` if the
