@@ -68,7 +68,7 @@ pub(super) async fn one(Path(wanted): Path<String>, uri: Uri) -> Response {
 mod tests {
     use super::*;
 
-    /// Those for developers are with the sources.
+    /// Documents for developers are with the sources.
     #[test]
     fn every_document_for_operators_is_served() {
         let (summary, _) = include_str!("../../../../docs/SUMMARY.md")

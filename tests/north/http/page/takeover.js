@@ -23,7 +23,7 @@ async function take(page) {
   await page.until(runs);
   // Asked and answered at once: a question ends when the state of the drive changes.
   await page.until(() => {
-    const said = document.querySelector(".operate-result").textContent;
+    const said = document.querySelector(".operate .operate-result").textContent;
     if (!said.startsWith("Take over: sent") && said !== "Take over: done") {
       for (const label of ["pump-1: Take over …", "Take over now: pump-1"]) document.querySelector(`button[aria-label='${label}']`)?.click();
     }
