@@ -169,7 +169,8 @@ impl Master {
             .enumerate_mut()
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
-        match state.next_need(image, &waits.n2_late, now) {
+        let want = |state: &mut DriveState| state.next_need(image, &waits.n2_late, now);
+        match next_need(bus, drive, (state, image), want, now) {
             NextNeed::Step(Urgency::Command, step)
                 if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
@@ -392,7 +393,7 @@ impl Master {
             return false;
         };
         let is_action = run.is_of_supervision() && run.is_owed();
-        !(is_action && self.client_is_back(turn.drive))
+        !(is_action && self.client_is_back(turn.drive, now))
     }
 
     /// The command in progress, unless it expired while the bus waited for silence on the line.
@@ -401,10 +402,12 @@ impl Master {
         run.filter(|run| !run.is_late(now))
     }
 
-    /// Whether a client came back while the bus waited for silence, which suspends the action of the lease.
-    fn client_is_back(&self, drive: DriveIndex) -> bool {
+    /// Whether a client came back while the line went silent, which suspends the action of its lease. An order that waits
+    /// longer than its time, as a stop may, holds no lease: supervision would choose its action again without end.
+    fn client_is_back(&self, drive: DriveIndex, now: Instant) -> bool {
         let image = self.bus.image.drives.get(drive);
-        image.is_some_and(|image| image.has_heartbeat()) || self.bus.queue.lock().client_waits_until(drive).is_some()
+        let until = self.bus.queue.lock().client_waits_until(drive);
+        image.is_some_and(|image| image.has_heartbeat()) || until.is_some_and(|until| until > now)
     }
 
     /// Whether the gateway stops: the line belongs to the stops then.

@@ -17,6 +17,7 @@ use crate::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Su
 use crate::transaction::MAY_BE_LATE;
 
 mod background;
+mod chosen;
 mod drill;
 mod family_drive;
 mod holder;
@@ -222,40 +223,43 @@ impl Rig {
                 assert!(until > self.now, "idle into the past");
                 self.now = until;
             }
-            Ok(turn) => {
-                self.master.sending(&turn, self.now);
-                let began = self.now;
-                let ended = match self.master.stranger(&turn) {
-                    Some(0) => {
-                        let heard = self.drives.iter_mut().filter(|drive| !drive.silent && !self.deaf);
-                        for drive in heard {
-                            drive.answer(turn.pdu());
-                        }
-                        Ended::Silent
-                    }
-                    _ => self.drives[turn.drive.place()].answer(turn.pdu()),
-                };
-                let took = if ended == Ended::Silent { TIMEOUT } else { COST };
-                self.now += took;
-                let mangled = false;
-                let end = TurnEnd {
-                    ended,
-                    began,
-                    at: self.now,
-                    stood: false,
-                    took,
-                    mangled,
-                    doubted: false,
-                    frame: Vec::new(),
-                };
-                self.master.done(&turn, end, self.now, &mut news);
-                self.wire.push((began, turn));
-            }
+            Ok(turn) => self.carry_out(turn, &mut news),
         }
         for one in &news {
             self.apply(one);
         }
         self.news.append(&mut news);
+    }
+
+    /// The chosen request goes out, and its exchange ends.
+    fn carry_out(&mut self, turn: Turn, news: &mut Vec<News>) {
+        self.master.sending(&turn, self.now);
+        let began = self.now;
+        let ended = match self.master.stranger(&turn) {
+            Some(0) => {
+                let heard = self.drives.iter_mut().filter(|drive| !drive.silent && !self.deaf);
+                for drive in heard {
+                    drive.answer(turn.pdu());
+                }
+                Ended::Silent
+            }
+            _ => self.drives[turn.drive.place()].answer(turn.pdu()),
+        };
+        let took = if ended == Ended::Silent { TIMEOUT } else { COST };
+        self.now += took;
+        let mangled = false;
+        let end = TurnEnd {
+            ended,
+            began,
+            at: self.now,
+            stood: false,
+            took,
+            mangled,
+            doubted: false,
+            frame: Vec::new(),
+        };
+        self.master.done(&turn, end, self.now, news);
+        self.wire.push((began, turn));
     }
 
     /// Stores a read in the process image.
