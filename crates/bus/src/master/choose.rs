@@ -151,7 +151,7 @@ impl Master {
             Decision::Idle(until) => {
                 let turn = self.refresh(true, now).ok_or(());
                 Some(turn.or_else(|()| self.background(true, now)).map_err(|again| {
-                    let wake = commands.wake_at.into_iter().chain(again).chain(self.next_refresh());
+                    let wake = commands.wake_at.into_iter().chain(again).chain(self.next_refresh(now));
                     wake.fold(until, Instant::min)
                 }))
             }

@@ -61,26 +61,29 @@ impl Master {
         self.refresh_step(index, now)
     }
 
-    /// The first step of the refresh round that is overdue longest. Polls get the line for as long as refreshes had
-    /// it, unless it is `idle`.
+    /// The first step of the round that is due longest, of those that may go now. Polls get the line for as long as refreshes
+    /// had it, unless it is `idle`.
     pub(super) fn refresh(&mut self, idle: bool, now: Instant) -> Option<Turn> {
         if !self.refresh_debt.is_zero() && !idle {
             return None;
         }
-        let (_, index) = self.due_refreshes().filter(|(due, _)| *due <= now).min()?;
-        match self.may_refresh(index, Stage::Turn, now) {
-            May::Yes => self.refresh_step(index, now),
-            May::NotNow => None,
-            May::No(why) => {
-                self.end_refresh(index, why);
-                None
-            }
-        }
+        let mut due: Vec<(Instant, DriveIndex)> = self.due_refreshes().filter(|(due, _)| *due <= now).collect();
+        due.sort_unstable();
+        due.into_iter()
+            .find_map(|(_, index)| match self.may_refresh(index, Stage::Turn, now) {
+                May::Yes => self.refresh_step(index, now),
+                May::NotNow => None,
+                May::No(why) => {
+                    self.end_refresh(index, why);
+                    None
+                }
+            })
     }
 
-    /// When the next refresh round is due.
-    pub(super) fn next_refresh(&self) -> Option<Instant> {
-        self.due_refreshes().map(|(due, _)| due).min()
+    /// When to look for the next round on an idle line. A round that is due and may not go is asked about again a moment later.
+    pub(super) fn next_refresh(&self, now: Instant) -> Option<Instant> {
+        let at = |due: Instant| if due > now { due } else { now + super::LOOK_ROUND };
+        self.due_refreshes().map(|(due, _)| at(due)).min()
     }
 
     /// Whether nothing may be sent to this drive because of a drill that tests the drive's own timeout.

@@ -1,5 +1,7 @@
 //! Refreshes of a drive of each kind of command word, in virtual time.
 
+mod others;
+
 use super::family_drive::FamilyDrive;
 use super::*;
 use crate::drive::Profile;
