@@ -83,6 +83,11 @@ fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
     written.chain(word).collect()
 }
 
+/// How often what was ordered is written again: never without a lease, which ends that when the client falls silent.
+fn refresh_of(spec: &DriveSpec) -> Option<Duration> {
+    spec.refresh.filter(|_| spec.supervision.is_some())
+}
+
 impl DriveState {
     /// State of a drive about which nothing is known yet; its status is read at most every `round`.
     pub(super) fn new(spec: &DriveSpec, round: Duration) -> DriveState {
@@ -94,7 +99,7 @@ impl DriveState {
             late: LateReplies::default(),
             repeated_stops: RepeatedStops::default(),
             supervision: Supervision::default(),
-            refresh: Refresh::new(profile, spec.refresh),
+            refresh: Refresh::new(profile, refresh_of(spec)),
             refresh_ended: None,
             confirmations: Confirmations::default(),
             runs: [None, None, None],

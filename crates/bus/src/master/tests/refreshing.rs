@@ -1,6 +1,7 @@
 //! Refreshes of a drive of each kind of command word, in virtual time.
 
 mod others;
+mod words;
 
 use super::family_drive::FamilyDrive;
 use super::*;
