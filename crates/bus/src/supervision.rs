@@ -248,7 +248,7 @@ impl Supervision {
         drive: DriveIndex,
     ) {
         let in_vain = self.waits_in_vain(reading);
-        let Some(running) = self.running(reading, words, in_vain, news, drive) else {
+        let Some(running) = self.running(since, (reading, words), in_vain, news, drive) else {
             return;
         };
         // A motor with its run command on may run, or start, whatever its status shows.
@@ -303,8 +303,8 @@ impl Supervision {
     /// unknown run command counts as set.
     fn running(
         &mut self,
-        reading: &Reading<'_>,
-        words: &KnownWords,
+        since: Instant,
+        (reading, words): (&Reading<'_>, &KnownWords),
         in_vain: bool,
         news: &mut Vec<News>,
         drive: DriveIndex,
@@ -318,8 +318,10 @@ impl Supervision {
         if !std::mem::replace(&mut self.blind_reported, true) {
             news.push(News::RunningUnknown(drive));
         }
-        if let Some(run) = reading.model(ModelPoint::Run).good() {
-            return Some(run.as_bool());
+        // A run command that was read before the last order says nothing about what that order did.
+        let run = reading.model(ModelPoint::Run);
+        if let Some(set) = run.good().filter(|_| run.at.is_some_and(|at| at > since)) {
+            return Some(set.as_bool());
         }
         Some(written_run(reading, words).unwrap_or(true))
     }

@@ -535,3 +535,31 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     assert!(rig.after(100, true).is_none());
     assert_eq!(rig.news, []);
 }
+
+/// The drive refuses to report whether it runs, and whether it took the run command is not known: what its command word was
+/// before says nothing.
+#[test]
+fn a_run_command_in_doubt_counts_as_set_where_the_drive_does_not_show_its_motor() {
+    for (known, acts) in [(None, true), (Some(0), false), (Some(1), true)] {
+        let mut rig = SupervisedDrive::new(LeaseAction::Stop);
+        let image = rig.image();
+        let raw = |point| image.spec.profile.model_point(point).and_then(|point| point.raw());
+        let (run, running) = (raw(ModelPoint::Run).unwrap(), raw(ModelPoint::Running).unwrap());
+        image.update(|s| {
+            s.link = Link::Online(SystemTime::now());
+            s.refuse(running.table, running.address, 1, Exception::ADDRESS);
+        });
+        rig.shows(ModelPoint::Run, Value::Bool(false));
+        rig.now += Duration::from_millis(100);
+        rig.heartbeat();
+        if let Some(word) = known {
+            rig.drive.words.learn(run.table, run.address, word);
+        }
+        let acted = (0..80).any(|_| {
+            rig.now += Duration::from_millis(100);
+            rig.supervise();
+            rig.take().is_some()
+        });
+        assert_eq!(acted, acts, "{known:?}");
+    }
+}
