@@ -228,7 +228,14 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    /// Kills and restarts the process: `guards` contains what remains of its state.
+    /// The process is gone: nothing is sent any more, and the drives go on.
+    pub fn vanish(&mut self) {
+        self.open = false;
+        self.wire.cut();
+        (self.asked, self.ended) = (None, None);
+    }
+
+    /// The process is killed and started again: of all that it knew, `guards` has what is left.
     pub fn kill(&mut self, guards: Guards, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.wire.cut();
         self.guards = Arc::new(guards);

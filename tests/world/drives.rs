@@ -30,6 +30,18 @@ pub struct Truth {
     pub ordered: HashMap<(Table, u16), u16>,
     /// The run command was written last, by an order or again.
     pub fed: Option<Instant>,
+    /// The last write that the drive's own timeout counts.
+    pub counted: Option<Instant>,
+    /// The drive tripped by its own timeout last.
+    pub timed_out: Option<Instant>,
+    /// When another master wrote the word that the drive has, unless an order changed it since.
+    pub foreign: Option<Instant>,
+    /// The last write of an order.
+    pub commanded: Option<Instant>,
+    /// Time since which the motor runs by the bus.
+    pub obeys_since: Option<Instant>,
+    /// When the drive last was not under its local control.
+    pub remote_at: Option<Instant>,
     /// When an order started the motor, if nothing has stopped it since.
     pub ran_by_order: Option<Instant>,
     /// When an order to the drive last waited.
@@ -106,6 +118,12 @@ impl Truth {
             acts: VecDeque::new(),
             ordered: HashMap::new(),
             fed: None,
+            counted: None,
+            timed_out: None,
+            foreign: None,
+            commanded: None,
+            obeys_since: None,
+            remote_at: None,
             ran_by_order: None,
             waited_until: None,
             heard: (None, None),
@@ -168,6 +186,14 @@ impl Truth {
         };
         let last = self.acts.iter().rev().find(|(_, pdu, _)| touches(pdu));
         last.is_some_and(|(_, pdu, _)| sets(pdu, unique))
+    }
+
+    /// The gateway was killed, and a new one knows of no client.
+    pub fn forget_the_gateway(&mut self, now: Instant) {
+        self.ordered.clear();
+        (self.heard, self.online_since, self.carried) = ((None, None), None, None);
+        (self.ran_by_order, self.supervised, self.action) = (None, None, None);
+        self.trouble(now + AFTERMATH);
     }
 
     pub fn trouble(&mut self, until: Instant) {

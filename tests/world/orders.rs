@@ -294,3 +294,19 @@ pub fn run_command(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
         .find(|(at, _)| table == place.table && *at == place.address)?;
     Some(!profile.is_stop(table, address, word))
 }
+
+/// Whether the own timeout of a drive of that family counts a write.
+pub fn is_counted(profile: &Profile, pdu: &RequestPdu) -> bool {
+    let (Ok(repeats), Some(control)) = (profile.repeats(), &profile.control) else {
+        return false;
+    };
+    let Some((table, items)) = written(pdu) else {
+        return false;
+    };
+    let by_reference = !repeats.word || control.refresh_with_reference;
+    table == Table::Holding
+        && items.iter().any(|(address, _)| {
+            (repeats.word && *address == control.at.address)
+                || (by_reference && profile.is_repeated_reference(*address))
+        })
+}

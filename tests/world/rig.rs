@@ -55,6 +55,7 @@ impl Counts {
 pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> Line {
     Line {
         refresh: None,
+        own_timeout: None,
         family,
         protocol,
         baud,

@@ -44,6 +44,8 @@ pub struct Line {
     pub supervision: Option<Supervision>,
     /// How often the gateway writes its orders again.
     pub refresh: Option<Duration>,
+    /// The drives' own timeout: they trip when they run and no write came that it counts.
+    pub own_timeout: Option<Duration>,
     pub on_shutdown: OnShutdown,
     /// Configured addresses without an answering drive.
     pub dead: Vec<u8>,
@@ -116,7 +118,10 @@ impl Scenario {
     pub fn of(seed: u64) -> Scenario {
         let mut dice = Random::new(seed);
         let calm = dice.chance(0.35);
-        let buses = (0..dice.within(1..=3)).map(|_| Line::of(&mut dice, calm)).collect();
+        let trips = seed.is_multiple_of(2);
+        let buses = (0..dice.within(1..=3))
+            .map(|_| Line::of(&mut dice, calm, trips))
+            .collect();
         let mut clients = vec![Habit::Plain];
         for habit in [
             Habit::Mqtt,
@@ -159,7 +164,8 @@ impl Scenario {
 }
 
 impl Line {
-    fn of(dice: &mut Random, calm: bool) -> Line {
+    /// A line; in worlds where it `trips`, drives with a lease also have a timeout of their own.
+    fn of(dice: &mut Random, calm: bool, trips: bool) -> Line {
         let (family, protocol) = FAMILIES[dice.within(0..=FAMILIES.len() as u64 - 1) as usize];
         let ms = Duration::from_millis;
         let (baud, format) = match protocol {
@@ -182,13 +188,17 @@ impl Line {
             _ => LeaseAction::SpeedReference(20.0),
         };
         let supervised = dice.chance(0.6);
-        // Chosen without random numbers, like `spec`: every second line that has a lease and registers that are not stored.
-        let repeats = supervised && protocol != Protocol::N2 && timeout.as_millis().is_multiple_of(2);
+        // Without the dice, as `spec`: lines that have a lease and registers that are not stored; every second one where the
+        // drives have no timeout of their own.
+        let can_repeat = supervised && protocol != Protocol::N2;
+        let repeats = can_repeat && (trips || timeout.as_millis().is_multiple_of(2));
         // A quarter of the line at most: a round is about a hundred characters.
         let round = Duration::from_micros(u64::from(1_100_000_000 / baud)) + 4 * turnaround;
         let every = (4 * round * u32::from(drives)).max(ms(200));
         Line {
             refresh: repeats.then_some(every),
+            // Longer than a feeding may take on a sound line, see `check_feeding`.
+            own_timeout: (repeats && trips).then_some(6 * every + ms(1_000)),
             family,
             protocol,
             baud,

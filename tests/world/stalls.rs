@@ -6,7 +6,7 @@
 //! result from an order that its client has not withdrawn.
 
 mod clients;
-mod incidents;
+mod own_timeouts;
 mod promised;
 
 use std::collections::VecDeque;
@@ -23,6 +23,7 @@ use drivegate_world::event::Events;
 use drivegate_world::north::modbus_tcp::Loopback;
 use drivegate_world::order::{Authority, Order, Origin, SourceKind, WriteStats};
 use drivegate_world::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
+use drivegate_world::process_image::{LeaseAction, Supervision};
 use drivegate_world::sim::random::Random;
 use drivegate_world::sim::simulated_drive::{Command, ModelOptions};
 use drivegate_world::stalls::{Heartbeat, TICK};
@@ -98,6 +99,7 @@ struct World {
     promised: Promised,
     history: History,
     calm: bool,
+    own: own_timeouts::Own,
 }
 
 fn families() -> Vec<String> {
@@ -119,9 +121,22 @@ impl World {
         let mut dice = Random::new(seed);
         let all = families();
         let family = all[seed as usize % all.len()].clone().leak();
+        // Each family with and without a timeout of its own.
+        let repeats = Profiles::built_in()
+            .get(family)
+            .is_some_and(|profile| profile.repeats().is_ok());
+        let trips = (seed as usize / all.len()).is_multiple_of(2) && repeats;
+        let own_timeout = trips.then_some(Duration::from_millis(2_500));
         let drives = if dice.chance(0.6) { 2 } else { dice.within(1..=3) as u8 };
         let baud = [9_600, 19_200, 38_400, 115_200][dice.within(0..=3) as usize];
         let line = Line {
+            supervision: own_timeout.map(|timeout| Supervision {
+                timeout: 2 * timeout,
+                action: LeaseAction::Stop,
+                adopt: false,
+            }),
+            refresh: own_timeout.map(|timeout| timeout / 5),
+            own_timeout,
             spec: |spec| {
                 spec.frequency_range = spec
                     .profile
@@ -168,6 +183,7 @@ impl World {
             promised: Promised::new(drives),
             history: History::default(),
             calm: false,
+            own: own_timeouts::Own::new(drives),
             bus,
             dice,
         };
@@ -272,6 +288,7 @@ impl World {
         self.run_readers();
         self.run_bus();
         self.check_motors();
+        self.own_timeouts();
         self.incidents();
         for index in 0..self.connections.len() {
             self.act(index);
@@ -328,6 +345,7 @@ impl World {
                 }
                 Action::Send => self.bus.send(now, &mut seen),
                 Action::Wait { until, commands, .. } => {
+                    assert!(until > now, "idle until a time that is past");
                     self.bus.waits(until, commands, &mut seen);
                     break;
                 }
@@ -381,6 +399,7 @@ impl World {
         if !asked.pdu.is_write() {
             return;
         }
+        self.own.wrote(&self.bus.profile, asked.acted, &asked.pdu, self.now);
         self.promised.told(asked.acted, asked.at);
     }
 

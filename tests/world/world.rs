@@ -7,6 +7,7 @@ mod heal;
 mod incidents;
 mod lines;
 mod look;
+mod own_timeouts;
 mod readers;
 mod refreshes;
 
@@ -60,6 +61,7 @@ pub struct Figures {
     pub confirmed: u64,
     pub supervised: u64,
     pub refreshed: u64,
+    pub timed_out: u64,
 }
 
 impl Figures {
@@ -71,6 +73,7 @@ impl Figures {
         self.confirmed += other.confirmed;
         self.supervised += other.supervised;
         self.refreshed += other.refreshed;
+        self.timed_out += other.timed_out;
     }
 }
 
@@ -79,8 +82,8 @@ impl fmt::Display for Figures {
         let hours = self.bus_time.as_secs_f64() / 3600.0;
         write!(
             f,
-            "{} worlds, {hours:.2} bus-hours, {} exchanges, {} orders, {} confirmed, {} leases ran out, {} refreshes",
-            self.worlds, self.exchanges, self.orders, self.confirmed, self.supervised, self.refreshed
+            "{} worlds, {hours:.2} bus-hours, {} exchanges, {} orders, {} confirmed, {} leases ran out, {} refreshes, {} own timeouts",
+            self.worlds, self.exchanges, self.orders, self.confirmed, self.supervised, self.refreshed, self.timed_out
         )
     }
 }
@@ -204,6 +207,7 @@ impl World {
             self.step();
         }
         self.heal();
+        self.try_own_timeouts();
         self.stop();
         self.figures.worlds = 1;
         self.figures.bus_time = (self.now - self.began) * self.buses.len() as u32;

@@ -120,7 +120,7 @@ impl World {
         self.drives_that_answer().filter(online).collect()
     }
 
-    fn drives_that_answer(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+    pub(super) fn drives_that_answer(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         let drives =
             |(bus, line): (usize, &WorldBus)| (0..usize::from(line.line.drives)).map(move |drive| (bus, drive));
         let all = self.buses.iter().enumerate().flat_map(drives);
@@ -130,15 +130,7 @@ impl World {
     /// Stops one drive of each line: whatever happened before, the stop is on the wire soon.
     fn stop_at_once(&mut self) -> Vec<(usize, usize, Instant)> {
         let mut stops = Vec::new();
-        let client = self.clients.len();
-        self.clients.push(Client {
-            habit: Habit::Plain,
-            next: self.now,
-            way: Way::Plain(Vec::new()),
-            open: 0,
-            silent_until: self.now,
-            burst: (0, 0, 0),
-        });
+        let client = self.new_client();
         for bus in 0..self.buses.len() {
             let drive = self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize;
             if self.is_alive(bus, drive) {
@@ -167,6 +159,19 @@ impl World {
         stops
     }
 
+    /// A client with plain orders of its own; its number.
+    pub(super) fn new_client(&mut self) -> usize {
+        self.clients.push(Client {
+            habit: Habit::Plain,
+            next: self.now,
+            way: Way::Plain(Vec::new()),
+            open: 0,
+            silent_until: self.now,
+            burst: (0, 0, 0),
+        });
+        self.clients.len() - 1
+    }
+
     fn check_stops(&self, stops: &[(usize, usize, Instant)]) {
         let since = self.healing.map_or(self.now, |healing| healing.since);
         for (bus, drive, due) in stops {
@@ -184,7 +189,7 @@ impl World {
         }
     }
 
-    fn look_until(&mut self, end: Instant, check: impl Fn(&World)) {
+    pub(super) fn look_until(&mut self, end: Instant, check: impl Fn(&World)) {
         while self.now < end {
             self.step();
             check(self);

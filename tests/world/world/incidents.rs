@@ -87,6 +87,11 @@ impl World {
                 drive.trip(1);
                 "trips"
             }
+            7 if self.buses[bus].line.refresh.is_some() => {
+                let drive = self.buses[bus].wire.slaves().drive(address).unwrap();
+                drive.advance(sim);
+                self.other_master(bus, address)
+            }
             _ => {
                 let drive = self.buses[bus].wire.slaves().drive(address).unwrap();
                 drive.advance(sim);

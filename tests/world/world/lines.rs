@@ -287,6 +287,7 @@ impl World {
             truth.run = run;
         }
         truth.act(self.now, asked.pdu.clone(), words);
+        self.note_counted(bus, drive, &asked.pdu);
         self.note_ordered(bus, drive, asked);
     }
 

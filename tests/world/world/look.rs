@@ -30,6 +30,9 @@ impl World {
                 let seen = image.reading(now, Duration::from_secs(5)).is_set(ModelPoint::Running);
                 // If the drive refuses to report whether it runs, its run command counts instead.
                 let blind = index == 0 && bus.line.refuses.is_some() && truth.run && image.snapshot().link.is_online();
+                if drive.state().remote {
+                    truth.remote_at = Some(now);
+                }
                 let running = drive.state().running && drive.answers() && (seen || blind);
                 if drive.state().running {
                     truth.turned_at = Some(now);
@@ -47,6 +50,7 @@ impl World {
         for key in self.open.keys() {
             self.truths[key.0][key.1].waited_until = Some(self.now);
         }
+        self.own_timeouts();
         self.check_answered_in_time();
         if !self.stopping {
             self.check_leases();

@@ -2,12 +2,17 @@
 
 use super::*;
 
+/// What a drive showed this long ago is no longer known: the reads right before a refresh are behind it.
+const SHOWN: Duration = Duration::from_millis(500);
+
 impl World {
     /// Checks the frame of a refresh: only values that an order wrote, only the stop word after a stop, and no run
     /// word for a motor at standstill.
     pub(super) fn check_refresh(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         self.collect();
         let now = self.now;
+        let simulated = self.buses[bus].wire.slaves().drive(drive as u8 + 1);
+        let turns = simulated.is_some_and(|drive| drive.state().running);
         let profile = self.buses[bus].profile.clone();
         let truth = &self.truths[bus][drive];
         let (table, items) = written(pdu).expect("a write that the drives have");
@@ -25,9 +30,24 @@ impl World {
             );
         }
         assert!(!self.buses[bus].ending, "a refresh goes out while the gateway ends");
-        if run_command(&profile, pdu) != Some(true) {
+        let repeats = profile.repeats().expect("a family whose orders are written again");
+        let is_over = |at: Option<Instant>| at.is_none_or(|at| now - at > SHOWN);
+        // The word that the drive has now, if another master wrote it behind the last order.
+        let foreign = truth
+            .foreign
+            .filter(|at| Some(*at) > truth.commanded && is_over(Some(*at)));
+        let reads = profile.control.as_ref().is_some_and(|control| control.is_read());
+        assert!(
+            foreign.is_none() || !repeats.word || !reads,
+            "drive {} gets its word again over that of another master",
+            drive + 1
+        );
+        let runs = run_command(&profile, pdu) == Some(true);
+        if !runs && (repeats.word || !truth.run) {
             return;
         }
+        let local = profile.model_index(ModelPoint::Remote).is_some() && is_over(truth.remote_at);
+        assert!(!local, "drive {} is fed under its local control", drive + 1);
         let open = self.open.get(&(bus, drive)).into_iter().flatten();
         let stops = |id: &&usize| {
             let record = &self.records[**id];
@@ -39,20 +59,19 @@ impl World {
             "a run command is repeated behind a stop of drive {}",
             drive + 1
         );
+        // A run command that was lost after the reads before this frame.
         assert!(
-            truth.run,
+            truth.run || !is_over(truth.lost_word),
             "drive {} gets a run command again that it does not have",
             drive + 1
         );
-        // State that the drive showed directly before.
-        let within = Duration::from_millis(500);
         assert!(
-            truth.turned_at.is_some_and(|at| now - at <= within),
+            turns || !is_over(truth.turned_at),
             "drive {} stands, and its run command is repeated",
             drive + 1
         );
         if let Some(supervision) = &self.buses[bus].line.supervision {
-            let last = truth.heard.1.unwrap_or(now);
+            let last = truth.heard.1.expect("a client whose order is written again");
             let speed = matches!(supervision.action, LeaseAction::SpeedReference(_));
             let acted = speed && truth.supervised.is_some_and(|at| at >= last);
             assert!(
@@ -68,35 +87,15 @@ impl World {
     /// Checks that the timeout of a drive that counts only writes is kept from expiring while its motor runs by an
     /// order whose client is present.
     pub(super) fn check_feeding(&self) {
-        if self.scenario.incidents.is_some() {
-            return;
-        }
         for (bus, truths) in self.buses.iter().zip(&self.truths) {
-            let (Some(every), Some(supervision)) = (bus.line.refresh, &bus.line.supervision) else {
-                continue;
-            };
-            if bus.line.is_noisy() || !bus.open || bus.line.refuses.is_some() {
-                continue;
-            }
-            // All other drives may be served before this one.
+            let Some(every) = bus.line.refresh else { continue };
+            // All other drives may have their turn before this one.
             let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
             let most = 4 * every + 3 * round + 2 * self.exchange(bus) * u32::from(bus.line.drives);
             for (drive, truth) in truths.iter().enumerate() {
-                let (Some(ordered), Some(heard)) = (truth.ran_by_order, truth.heard.0) else {
-                    continue;
-                };
-                let alive = self.now - heard < supervision.timeout / 2;
-                // After a lease expired, only an order begins a new lease; a heartbeat does not.
-                let expired = truth.supervised.is_some_and(|at| at >= ordered);
-                let waits = expired || self.open.contains_key(&(bus.index, drive)) || truth.is_troubled(ordered);
-                let runs = truth.run && truth.running_since.is_some_and(|since| self.now - since > most);
-                if !alive || waits || !runs || self.now - ordered < most {
-                    continue;
-                }
-                let free = truth.waited_until.is_none_or(|at| self.now - at > most);
                 let fed = truth.fed.is_some_and(|at| self.now - at <= most);
                 assert!(
-                    fed || !free,
+                    fed || !self.is_owed_a_feeding(bus.index, drive, most),
                     "line{} drive {} got its run command last {:?} ago, {most:?} at most",
                     bus.index,
                     drive + 1,
@@ -106,8 +105,25 @@ impl World {
         }
     }
 
-    /// Records the effects of a write that a drive carried out: the values set by an order, and what restarted the
-    /// drive's timeout.
+    /// Whether a drive must have been fed in the last `time`: it runs by an order, its client is there, and nothing has been in
+    /// the way since.
+    pub(super) fn is_owed_a_feeding(&self, bus: usize, drive: usize, time: Duration) -> bool {
+        let (line, truth, now) = (&self.buses[bus].line, &self.truths[bus][drive], self.now);
+        let sound = self.scenario.incidents.is_none() && !line.is_noisy() && self.buses[bus].open;
+        let (Some(supervision), Some(ordered), Some(heard)) = (&line.supervision, truth.ran_by_order, truth.heard.0)
+        else {
+            return false;
+        };
+        let alive = now - heard < supervision.timeout / 2;
+        // After a lease expired, only an order begins a new lease, a heartbeat does not.
+        let expired = truth.supervised.is_some_and(|at| at >= ordered);
+        let runs = truth.run && truth.running_since.is_some_and(|since| now - since > time);
+        let waits = self.open.contains_key(&(bus, drive)) || truth.waited_until.is_some_and(|at| now - at <= time);
+        let is_disturbed = expired || truth.is_troubled(ordered) || line.refuses.is_some();
+        sound && alive && runs && !waits && !is_disturbed && now - ordered >= time
+    }
+
+    /// Records the effects of a write that a drive acted upon: what an order set, and what fed the drive's timeout.
     pub(super) fn note_ordered(&mut self, bus: usize, drive: usize, asked: &Asked) {
         let (profile, now) = (self.buses[bus].profile.clone(), self.now);
         let truth = &mut self.truths[bus][drive];
@@ -115,6 +131,7 @@ impl World {
             return;
         };
         if !asked.is_refresh {
+            truth.commanded = Some(now);
             truth
                 .ordered
                 .extend(items.iter().map(|(address, word)| ((table, *address), *word)));
