@@ -276,7 +276,8 @@ impl DriveState {
                 OrderEnd::Action
             }
             outcome if outcome.is_ok() => OrderEnd::Other,
-            Outcome::Exception(_) | Outcome::Refused(_) if !run.in_doubt() => OrderEnd::Refused,
+            Outcome::Exception(_) | Outcome::Refused(_) | Outcome::Expired if !run.in_doubt() => OrderEnd::Partly,
+            Outcome::Interrupted(Interruption::Expired) if !run.in_doubt() => OrderEnd::Partly,
             _ => OrderEnd::Unknown,
         };
         let held = self.supervision.is_held();

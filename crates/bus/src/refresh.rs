@@ -68,9 +68,9 @@ pub(super) enum OrderEnd {
     Drill,
     /// The speed reference of a lease that expired was.
     Action,
-    /// The drive refused a step of the order.
-    Refused,
-    /// The part of the order that the drive accepted is unknown.
+    /// The drive refused a step of the order, or its time was over before that: which part the drive took is known.
+    Partly,
+    /// Which part of the order the drive took is unknown.
     Unknown,
     /// An order of the gateway itself was sent to the drive.
     Other,
@@ -194,9 +194,9 @@ impl Refresh {
             OrderEnd::Done => (held, Beginner::Client),
             OrderEnd::Drill => (held, Beginner::Drill),
             OrderEnd::Action => (self.by_lease, Beginner::Action),
-            // The part of the order that the drive accepted before may belong to another command than the repeated one.
-            OrderEnd::Refused if self.repeats_what_was_ordered() => return None,
-            OrderEnd::Refused | OrderEnd::Unknown => return self.end(End::Unknown),
+            // The part taken before may be another command than the repeated one.
+            OrderEnd::Partly if self.repeats_what_was_ordered() => return None,
+            OrderEnd::Partly | OrderEnd::Unknown => return self.end(End::Unknown),
             OrderEnd::Other => return self.end(End::Other),
         };
         self.by_lease = false;

@@ -161,3 +161,37 @@ fn a_refresh_that_is_not_answered_is_not_tried_again_at_once() {
         assert!(shortest.is_none_or(|time| time >= EVERY), "{name}: {writes:?}");
     }
 }
+
+/// An order to run at another reference, whose time is over when the drive has taken the reference: what the drive has is known,
+/// and the motor that runs is fed further.
+#[test]
+fn an_order_that_expires_half_done_ends_no_refresh() {
+    let mut plant = Plant::new("vacon-nx");
+    plant.starts();
+    plant.rig.run(Duration::from_secs(3));
+    let image = plant.rig.bus.image.drives[0].clone();
+    let index = |point| image.spec.profile.model_index(point).unwrap();
+    let half = (0..50u32).any(|number| {
+        let points = [
+            (
+                index(ModelPoint::SpeedReference),
+                Value::Number(20.0 + f64::from(number)),
+            ),
+            (index(ModelPoint::Run), Value::Bool(true)),
+        ];
+        let reading = image.reading(plant.rig.now, DEFAULT_EXPIRY);
+        let admitted = admit(Order::Points(points.to_vec()), &reading, Authority::Write).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, "client");
+        let now = plant.rig.now;
+        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, now, plant.rig.stats.clone());
+        let window = window(now, Duration::from_millis(2 + u64::from(number)));
+        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
+        plant.rig.bus.queue.submit(command, &(), now);
+        plant.rig.run(Duration::from_millis(330));
+        matches!(outcome(&mut answer), Some(Outcome::Interrupted(_)))
+    });
+    assert!(half, "no order was half done when its time was over");
+    let refreshes = plant.refreshes(5);
+    assert!(refreshes.len() >= 6, "{refreshes:?}");
+    assert!(plant.rig.bus.image.drives[0].is_refreshing());
+}
