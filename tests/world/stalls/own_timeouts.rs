@@ -28,10 +28,8 @@ impl Own {
     /// How long the timeout of a motor that runs was not fed.
     fn waits(&mut self, machine: u8, runs: bool, now: Instant) -> Duration {
         let fed = &mut self.fed[usize::from(machine) - 1];
-        if !runs {
-            *fed = None;
-        }
-        runs.then(|| now - *fed.get_or_insert(now)).unwrap_or_default()
+        *fed = runs.then(|| fed.unwrap_or(now));
+        fed.map_or(Duration::ZERO, |fed| now - fed)
     }
 }
 
