@@ -2,9 +2,9 @@
 
 use serde_json::{Value as Json, json};
 
-use crate::support::process::{Running, get, until, write_registers};
+use crate::support::process::{Running, free_port, get, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, USERS, controlled};
-use crate::support::tools::{feed, run};
+use crate::support::tools::{feed, python, root, run};
 
 fn program() -> &'static std::path::Path {
     std::path::Path::new(env!("CARGO_BIN_EXE_drivegate"))
@@ -239,4 +239,48 @@ fn a_gateway_killed_in_a_drill_stops_the_motor_when_it_is_back() {
     plant.others[1].ended();
     plant.others[1] = plant.site.run_ready();
     assert_eq!(plant.curl("alice", "GET", &format!("/{id}"), &Json::Null).1, drill);
+}
+
+/// A drive in Python whose own timeout counts only writes: the drill feeds it until it falls silent, then the drive stops by
+/// itself, and that proves the whole chain.
+fn passes_by_its_own_timeout(profile: &str, peer: &str) {
+    let port = free_port().to_string();
+    let drives = root().join("tests/peers/families/run.py").display().to_string();
+    let drive = Running::start(&python(), &[&drives, peer, &port, "timeout=6"]);
+    drive.until_printed("ready");
+    let bus = LINE1.replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""));
+    let supervised = "supervision = { timeout = \"1min\", action = \"stop\" }";
+    let pump = controlled("pump-1", 1, supervised).replace("vacon-nx", profile);
+    let site = Site::of(&[&bus, &pump, HTTP, "[drill]\nmax_speed = 20.0\nlimit = \"12s\"\n"]);
+    let state = site.path("state");
+    std::fs::create_dir(&state).unwrap();
+    let place = format!("[gateway]\nstate_dir = \"{state}\"\nsocket = \"{}\"\n", site.path("s"));
+    site.change("[gateway]\n", &place);
+    let _gateway = site.run_ready();
+    until("the drive is ready", || {
+        (site.point("pump-1", "running") == false && site.point("pump-1", "fault") == false).then_some(())
+    });
+    let config = site.config();
+    let arguments = ["drill", "--config", &config, "pump-1", "--gateway", "--speed", "10"];
+    let ran = feed(program(), &arguments, "pump-1\n");
+    let said = String::from_utf8(ran.stderr).unwrap();
+    let did = drive.output();
+    assert!(ran.status.success(), "{profile}: {said}\n{did}");
+    assert!(said.contains("nothing is sent"), "{profile}: {said}");
+    let count = |text: &str| did.matches(text).count();
+    assert_eq!(
+        (count("motor forward"), count("own timeout")),
+        (1, 1),
+        "{profile}: {did}"
+    );
+}
+
+#[test]
+fn a_drill_of_the_gateway_proves_a_timeout_that_counts_words() {
+    passes_by_its_own_timeout("danfoss-fc", "danfoss");
+}
+
+#[test]
+fn a_drill_of_the_gateway_proves_a_timeout_that_counts_references() {
+    passes_by_its_own_timeout("abb-acs580", "abb");
 }
