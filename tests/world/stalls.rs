@@ -6,6 +6,7 @@
 //! result from an order that its client has not withdrawn.
 
 mod clients;
+mod incidents;
 mod own_timeouts;
 mod promised;
 

@@ -11,7 +11,7 @@ fn a_drive_that_may_not_be_fed_now_holds_up_no_other() {
             let timeout = Duration::from_secs(3600);
             let supervision = Settings {
                 timeout,
-                action: LeaseAction::Hold,
+                action: LeaseAction::LeaveRunning,
                 adopt: false,
             };
             DriveSpec {

@@ -126,9 +126,11 @@ fn a_refresh_ends_with_what_is_not_an_order_of_a_client() {
             plant.rig.drives[0].silent = false;
         }),
         ("restore", |plant| {
-            plant.rig.bus.image.drives[0].hold.set(Some("restore".to_string()));
+            plant.rig.bus.image.drives[0]
+                .restore_lock
+                .set(Some("restore".to_string()));
             plant.rig.run(Duration::from_secs(2));
-            plant.rig.bus.image.drives[0].hold.set(None);
+            plant.rig.bus.image.drives[0].restore_lock.set(None);
         }),
         ("restart", |plant| plant.rig.master.drives[0].restarted()),
     ];
