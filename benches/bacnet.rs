@@ -69,7 +69,8 @@ fn measure() -> Result<(), Box<dyn Error>> {
         loop {
             let length = client.recv(&mut buffer)?;
             let value = [0x2E, 0x91, u8::from(on), 0x2F];
-            if buffer[..length].windows(4).any(|bytes| bytes == value) {
+            let received = buffer.get(..length).unwrap_or_default();
+            if received.windows(4).any(|bytes| bytes == value) {
                 break;
             }
         }
