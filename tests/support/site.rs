@@ -48,6 +48,17 @@ pub(crate) fn nx_in_ascii(name: &str) -> String {
     changed
 }
 
+const OWN_SOCKET: &str = "socket = \"own.sock\"\n";
+
+/// The configuration with a local socket of its own, unless it names another one.
+fn with_own_socket(text: &str) -> String {
+    let without = text.replacen(OWN_SOCKET, "", 1);
+    match without.contains("\nsocket = ") {
+        true => without,
+        false => without.replacen("[gateway]\n", &format!("[gateway]\n{OWN_SOCKET}"), 1),
+    }
+}
+
 pub(crate) struct Site {
     pub(crate) folder: TempDir,
     pub(crate) modbus: u16,
@@ -95,18 +106,14 @@ impl Site {
         let text = ports.iter().fold(parts.concat(), |text, (place, port)| {
             text.replace(place, &port.to_string())
         });
-        let text = match text.contains("\nsocket = ") {
-            true => text,
-            false => text.replacen("[gateway]\n", "[gateway]\nsocket = \"own.sock\"\n", 1),
-        };
-        self.write("drivegate.conf", &text);
+        self.write("drivegate.conf", &with_own_socket(&text));
     }
 
     /// Replaces a part of the configuration and writes it; returns the previous configuration.
     pub(crate) fn change(&self, from: &str, to: &str) -> String {
         let text = std::fs::read_to_string(self.config()).unwrap();
         assert!(text.contains(from), "{from} does not stand in\n{text}");
-        self.write("drivegate.conf", &text.replace(from, to));
+        self.write("drivegate.conf", &with_own_socket(&text.replace(from, to)));
         text
     }
 

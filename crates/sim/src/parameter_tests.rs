@@ -116,10 +116,11 @@ impl DriveOnLine {
 /// The families with parameters, and the addresses of the parameters in their simulated drives.
 fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
-    // Profiles of a single application are left out: they have the parameters of their base.
+    // Profiles of a single application are left out: they have the parameters of their base. Families that are simulated by their
+    // profile have no rules of their own for parameters.
     let all = all
         .iter()
-        .filter(|profile| profile.base.is_none() && !profile.parameters.is_empty());
+        .filter(|profile| profile.base.is_none() && profile.simulator.is_some() && !profile.parameters.is_empty());
     let families: Vec<_> = all
         .map(|profile| {
             let file = DriveOnLine::new(profile).read(BTreeSet::new());

@@ -30,7 +30,7 @@ pub(super) struct Args {
 
 /// The gateway's reply.
 #[derive(Debug, Deserialize)]
-struct Hold {
+struct HoldDocument {
     #[serde(default)]
     error: Option<Reason>,
     hold: String,
@@ -62,7 +62,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 /// The gateway's reply: parsed, and as it was sent.
-async fn hold(args: &Args) -> Result<(Hold, Json), String> {
+async fn hold(args: &Args) -> Result<(HoldDocument, Json), String> {
     let path = format!("/api/v1/drives/{}/hold", encoded(&args.drive));
     let asked = match &args.action {
         None => GatewayRequest::get(path),
@@ -80,8 +80,8 @@ async fn hold(args: &Args) -> Result<(Hold, Json), String> {
 }
 
 /// One line of text: holder, rank and seconds left.
-fn line(hold: &Hold) -> String {
-    let Hold {
+fn line(hold: &HoldDocument) -> String {
+    let HoldDocument {
         hold,
         holder,
         holder_rank,

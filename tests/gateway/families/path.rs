@@ -11,7 +11,7 @@ use crate::support::tools::{python, root, run_well, tool};
 /// Profile, and what `scan` prints about the drive at address 1.
 const FAMILIES: [(&str, &str); 3] = [
     // No register tells this family from others.
-    ("abb-acs580", "address 1: no known profile"),
+    ("abb-acs580", "address 1: a device whose family no read shows"),
     ("danfoss-fc", "address 1: danfoss-fc"),
     ("schneider-altivar", "address 1: schneider-altivar"),
 ];

@@ -36,4 +36,5 @@ class Drive(profidrive.Drive):
         self.holding[102] = drive.unsigned(abs(self.speed) * 5)
         self.holding[103] = 25 if self.speed else 0
         self.holding[106] = 540
-        self.holding[400] = 1 if self.faulted else 0
+        # Overcurrent; 6681 is the lost line of an ACS580.
+        self.holding[400] = 0 if not self.faulted else 0x6681 if self.timed_out else 1

@@ -57,6 +57,7 @@ class Drive:
         self.read_only = set()
         self.write_only = set()
         self.faulted = False
+        self.timed_out = False  # the fault is that of its own timeout
         self.direction = 0  # -1, 0, 1: as commanded
         self.speed = 0.0  # percent, signed
         self.target = 0.0  # percent, without the direction's sign
@@ -122,7 +123,7 @@ class Drive:
 
     def reset(self):
         if self.faulted:
-            self.faulted = False
+            self.faulted = self.timed_out = False
             self.log("reset")
 
     @property
@@ -143,6 +144,7 @@ class Drive:
         with self.lock:
             if TIMEOUT and self.running and time.monotonic() - self.fed > TIMEOUT:
                 self.log("own timeout")
+                self.timed_out = True
                 self.trip()
             aim = self.target * self.direction
             step = RAMP * seconds

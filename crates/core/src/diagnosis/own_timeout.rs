@@ -81,8 +81,8 @@ mod tests {
         assert_eq!(of("vacon-nx", 53, 3, false), said(Certainty::Likely, fieldbus));
         assert_eq!(of("vacon-nx", 1, 3, false), None, "overcurrent");
         assert_eq!(of("vacon-nx", 53, 31, false), None, "long after any write");
-        // A code without a text; a family whose timeout counts writes and that shows no code.
-        let serial = "fault 28 came 3.0 s after the last write to the drive";
+        // A family whose timeout counts writes, and one that shows no code.
+        let serial = "fault 28 (serial link lost) came 3.0 s after the last write to the drive";
         assert_eq!(of("abb-acs550", 28, 3, false), said(Certainty::Likely, serial));
         assert_eq!(of("abb-acs550", 1, 3, false), None);
         let unnamed = "a fault without a code came 3.0 s after the last write to the drive";

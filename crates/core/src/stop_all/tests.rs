@@ -110,7 +110,7 @@ fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
     assert!(
         audited
             .iter()
-            .any(|line| line.contains("bob") && line.contains("under way")),
+            .any(|line| line.contains("bob") && line.contains("already in progress")),
         "{audited:?}"
     );
     let (_, placed) = second_order(|plant, all, now| {

@@ -377,5 +377,12 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
             found.contains("`50` to `0` is not a range") && found.contains("6 fields instead of 5 or 7"),
             "{found}"
         );
+        let counts = HEAD.replace("A-3, 52, Other, s, 0.1", "A-3, 52, Other, s, 0.1, 0, 9990");
+        let found = Profile::parse("p.toml", &counts, false).unwrap_err();
+        let wanted = "9990 s is more than a register holds at a scale of 0.1; the range is in the unit";
+        assert!(
+            found.iter().any(|problem| problem.to_string().contains(wanted)),
+            "{found:?}"
+        );
     }
 }

@@ -107,6 +107,13 @@ fn read_row(row: &str) -> Result<Parameter, String> {
         return Err("the id is empty or contains # or =".to_string());
     }
     let scale: f64 = scale.parse().map_err(|_| format!("`{scale}` is not a scale"))?;
+    let fits = |range: &RangeInclusive<f64>| scale == 0.0 || (range.end() / scale).abs() <= MOST_COUNTS;
+    if let Some(range) = range.as_ref().filter(|range| !fits(range)) {
+        return Err(format!(
+            "{} {unit} is more than a register holds at a scale of {scale}; the range is in the unit",
+            range.end()
+        ));
+    }
     Ok(Parameter {
         id: id.to_string(),
         address: parse_address(address).ok_or_else(|| format!("`{address}` is not an address"))?,
@@ -118,6 +125,9 @@ fn read_row(row: &str) -> Result<Parameter, String> {
         range,
     })
 }
+
+/// Highest number in a register, with room for rounding.
+const MOST_COUNTS: f64 = 65_535.5;
 
 fn read_range(least: &str, greatest: &str) -> Result<RangeInclusive<f64>, String> {
     let number = |text: &str| text.parse().ok().filter(|value: &f64| value.is_finite());
