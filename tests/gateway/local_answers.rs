@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
-use crate::support::process::{PATIENCE, Running};
+use crate::support::process::{PATIENCE, Running, local};
 use crate::support::site::{HTTP, LINE1, Site, controlled};
 
 /// A gateway with a socket, and a drive whose simulator is stalled, so that an order to it takes some seconds.
@@ -22,7 +22,7 @@ fn site() -> (Site, Running, Running) {
 
 /// Gives an order over the socket without waiting for the answer.
 fn order(site: &Site, body: &str) -> UnixStream {
-    let mut stream = UnixStream::connect(site.path("socket")).unwrap();
+    let mut stream = local(site.path("socket"));
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let request = format!(
         "POST /api/v1/drives/pump-1/commands HTTP/1.1\r\nHost: gateway\r\nContent-Length: {}\r\n\r\n{body}",

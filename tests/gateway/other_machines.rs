@@ -9,7 +9,7 @@ use std::time::Duration;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::SimulatedBus;
 
-use crate::support::process::{PATIENCE, Running, api, until};
+use crate::support::process::{PATIENCE, Running, api, local, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
 
 const MS: Duration = Duration::from_millis(1);
@@ -112,7 +112,7 @@ fn reply(stream: &mut impl Read) -> Vec<u8> {
 
 /// The head of a command over HTTP at the local socket; the gateway waits for the body.
 fn begin_over_http(site: &Site, drive: &str, body: &str) -> UnixStream {
-    let mut stream = UnixStream::connect(site.file("socket")).unwrap();
+    let mut stream = local(site.file("socket"));
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let head = format!(
         "POST /api/v1/drives/{drive}/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\nExpect: \

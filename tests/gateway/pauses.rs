@@ -3,12 +3,11 @@
 
 use std::io::{Read, Write};
 use std::net::{TcpStream, UdpSocket};
-use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use drivegate::codec::rtu;
 
-use crate::support::process::{PATIENCE, Running, api, free_port, get, until};
+use crate::support::process::{PATIENCE, Running, api, free_port, get, local, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};
 
 const MS: Duration = Duration::from_millis(1);
@@ -117,7 +116,7 @@ impl Plant {
 
     /// A client of HTTP at the local socket, which needs no login.
     fn http(&self) -> Client {
-        let stream = UnixStream::connect(self.site.path("socket")).unwrap();
+        let stream = local(self.site.path("socket"));
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         Client {
             stream: Box::new(stream),

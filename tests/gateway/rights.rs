@@ -3,7 +3,6 @@
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
-use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use drivegate::codec::rtu;
@@ -11,7 +10,7 @@ use drivegate::north::http::basic_authorization;
 use drivegate::sim::wire::SimulatedBus;
 
 use crate::support::mqtt::client;
-use crate::support::process::{PATIENCE, Running, api, free_port, get, until, write_registers};
+use crate::support::process::{PATIENCE, Running, api, free_port, get, local, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, PASSWORD, Site, USERS, controlled, functions};
 
 /// A connection of any kind.
@@ -79,7 +78,7 @@ const OTHERS: [(&str, &str); 5] = [
 ];
 
 fn socket(site: &Site) -> Begun {
-    let stream = UnixStream::connect(site.file("socket")).unwrap();
+    let stream = local(site.file("socket"));
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     start_over_http(stream, COMMANDS, START)
 }

@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::os::linux::net::SocketAddrExt;
-use std::os::unix::net::{SocketAddr, UnixDatagram, UnixListener};
+use std::os::unix::net::{SocketAddr, UnixDatagram, UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU16, AtomicU32, Ordering};
@@ -168,6 +168,11 @@ fn keep(stream: impl Read + Send + 'static, output: &Arc<Mutex<String>>) {
             output.push('\n');
         }
     });
+}
+
+/// A connection to a local socket, which a gateway may open a moment after its HTTP server.
+pub(crate) fn local(socket: impl AsRef<Path>) -> UnixStream {
+    until("the local socket", || UnixStream::connect(&socket).ok())
 }
 
 /// Waits until `ask` returns an answer.

@@ -118,9 +118,10 @@ fn families() -> Vec<(Arc<Profile>, BTreeSet<u16>)> {
     let all = Profiles::built_in();
     // Profiles of a single application are left out: they have the parameters of their base. Families that are simulated by their
     // profile have no rules of their own for parameters.
+    let has_model = |profile: &Profile| profile.simulator.as_deref().and_then(ModelOptions::by_name).is_some();
     let all = all
         .iter()
-        .filter(|profile| profile.base.is_none() && profile.simulator.is_some() && !profile.parameters.is_empty());
+        .filter(|profile| profile.base.is_none() && has_model(profile) && !profile.parameters.is_empty());
     let families: Vec<_> = all
         .map(|profile| {
             let file = DriveOnLine::new(profile).read(BTreeSet::new());
