@@ -151,17 +151,22 @@ impl Rig {
     }
 }
 
-/// Sends a request on a separate connection; `head` is the number of bytes before the function of the reply.
+/// Sends a request on a separate connection; `head` is the number of bytes before the function of the reply. A slot serves four
+/// tools, and refuses a connection while it has not noticed the end of former ones.
 fn answer(port: u16, frame: &[u8], head: usize) -> Answer {
-    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    stream.write_all(frame).unwrap();
+    until("a reply", || answer_once(port, frame, head).ok())
+}
+
+fn answer_once(port: u16, frame: &[u8], head: usize) -> std::io::Result<Answer> {
+    let mut stream = TcpStream::connect(("127.0.0.1", port))?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.write_all(frame)?;
     let mut reply = vec![0; head + 2];
-    stream.read_exact(&mut reply).unwrap();
-    match reply[head] & 0x80 {
+    stream.read_exact(&mut reply)?;
+    Ok(match reply[head] & 0x80 {
         0 => Answer::Done,
         _ => Answer::Exception(reply[head + 1]),
-    }
+    })
 }
 
 /// The RTU frame of a request.

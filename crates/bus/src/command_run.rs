@@ -400,7 +400,7 @@ impl CommandRun {
     }
 
     /// Whether the end of the pulse is sent before the next stop, because enough stops were sent before it.
-    pub fn is_put_off(&self) -> bool {
+    pub fn is_deferred(&self) -> bool {
         !self.may_write_on() && self.overtaken >= MOST_STOPS
     }
 

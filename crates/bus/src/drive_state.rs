@@ -197,7 +197,7 @@ impl DriveState {
     /// Whether stops were sent repeatedly before the end of a pulse, and the next stop is not on the wire yet.
     fn pulse_is_put_off(&self) -> bool {
         let [stop, command, _] = &self.runs;
-        let waits = command.as_ref().is_some_and(CommandRun::is_put_off);
+        let waits = command.as_ref().is_some_and(CommandRun::is_deferred);
         waits && !stop.as_ref().is_some_and(CommandRun::reached_the_wire)
     }
 

@@ -144,7 +144,7 @@ impl Drills {
             )));
         }
         let speed = speed.unwrap_or(options.max_speed);
-        possible(drive, kinds, speed, options)?;
+        check_possible(drive, kinds, speed, options)?;
         may(drive, who, now)?;
         let run = Run::armed(drive, (kinds, speed), options, who, (now, time));
         let report = run.report().clone();
@@ -415,7 +415,7 @@ impl State {
 }
 
 /// Checks whether these ways to stop can be tested on this drive.
-fn possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptions) -> Result<(), DrillRefusal> {
+fn check_possible(drive: &DriveHandle, kinds: &[Kind], speed: f64, options: DrillOptions) -> Result<(), DrillRefusal> {
     let spec = &drive.image.spec;
     if kinds.is_empty() {
         return Err(not_possible("name at least one of order, client, gateway"));
