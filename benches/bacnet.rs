@@ -11,9 +11,9 @@ use std::net::UdpSocket;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use drivegate::drive::Value;
-use drivegate::order::{Authority, Order, Origin, SourceKind};
-use drivegate::plant::OrderRequest;
+use drivegate_core::order::{Authority, Order, Origin, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_model::drive::Value;
 
 use common::gateway::{Bus, Gateway, line, settings};
 use common::{option, quantile};

@@ -17,10 +17,10 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use drivegate::codec::{LineFormat, Request, RequestPdu, Table};
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::statistics::{Direction, Statistics};
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_proto::{LineFormat, Request, RequestPdu, Table};
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::statistics::{Direction, Statistics};
+use drivegate_sim::wire::SimulatedBus;
 
 use bus::bare_master::{self, BareOptions};
 use bus::gateway;

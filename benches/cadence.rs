@@ -10,8 +10,8 @@ use std::error::Error;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use drivegate::codec::LineFormat;
-use drivegate::sim::statistics::{Direction, Recorded, Statistics};
+use drivegate_proto::LineFormat;
+use drivegate_sim::statistics::{Direction, Recorded, Statistics};
 
 use common::gateway::{Bus, Gateway, NORTH, line, settings};
 use common::{median, option, quantile, silences};

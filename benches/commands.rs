@@ -11,10 +11,10 @@ use std::error::Error;
 use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::drive::Value;
-use drivegate::order::{Authority, Order, Origin, SourceKind};
-use drivegate::plant::OrderRequest;
-use drivegate::process_image::Direction;
+use drivegate_core::order::{Authority, Order, Origin, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_core::process_image::Direction;
+use drivegate_model::drive::Value;
 
 use common::gateway::{Bus, Gateway, line, settings};
 use common::{option, quantile};

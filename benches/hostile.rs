@@ -15,8 +15,8 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::sim::statistics::{Direction, Recorded};
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::statistics::{Direction, Recorded};
+use drivegate_sim::wire::SimulatedBus;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::task::JoinSet;

@@ -17,10 +17,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::event::{Event, EventKind};
-use drivegate::north::mqtt::{self, History, Options, Telemetry};
-use drivegate::north::{NorthState, Server as _};
-use drivegate::plant::SharedPlant;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::plant::SharedPlant;
+use drivegate_north::mqtt::{self, History, Options, Telemetry};
+use drivegate_north::{NorthState, Server as _};
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{AsyncClient, MqttOptions, Packet};
 use tokio::runtime::Runtime;

@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use drivegate::north::mqtt::{self, Options, sparkplug};
-use drivegate::north::{NorthState, Server as _};
+use drivegate_north::mqtt::{self, Options, sparkplug};
+use drivegate_north::{NorthState, Server as _};
 use tokio_util::sync::CancellationToken;
 
 use common::{option, session};

@@ -5,8 +5,8 @@
 //! operating system and pseudo-terminal leave of the wire's limit, and is therefore the reference for the rate of a
 //! bus task.
 
-use drivegate::codec::{Decoded, LineFormat, Request, rtu};
-use drivegate::line::{poll_until, sharpen_timers, wait_until};
+use drivegate_line::{poll_until, sharpen_timers, wait_until};
+use drivegate_proto::{Decoded, LineFormat, Request, rtu};
 use rustix::event::{PollFd, PollFlags};
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};

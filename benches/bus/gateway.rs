@@ -3,9 +3,9 @@
 use std::error::Error;
 use std::time::Duration;
 
-use drivegate::codec::LineFormat;
-use drivegate::sim::statistics::Statistics;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_proto::LineFormat;
+use drivegate_sim::statistics::Statistics;
+use drivegate_sim::wire::SimulatedBus;
 
 use crate::common::gateway::{Bus, Gateway, NORTH, settings};
 use crate::{DRIVES, record};

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use drivegate::line::{sharpen_timers, wait_until};
+use drivegate_line::{sharpen_timers, wait_until};
 use tokio_modbus::client::{Reader, rtu};
 use tokio_modbus::slave::{Slave, SlaveContext};
 use tokio_serial::SerialStream;

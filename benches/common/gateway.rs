@@ -4,14 +4,14 @@ use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::LineFormat;
-use drivegate::config::Settings;
-use drivegate::daemon::Daemon;
-use drivegate::plant::Plant;
-use drivegate::process_image::BusImage;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::simulated_drive::DriveOptions;
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_core::plant::Plant;
+use drivegate_core::process_image::BusImage;
+use drivegate_gateway::config::Settings;
+use drivegate_gateway::daemon::Daemon;
+use drivegate_proto::LineFormat;
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::simulated_drive::DriveOptions;
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tokio::runtime::Runtime;
 
 use super::Readers;

@@ -16,8 +16,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use drivegate::sim::SimTime;
-use drivegate::sim::statistics::{Direction, Recorded};
+use drivegate_sim::SimTime;
+use drivegate_sim::statistics::{Direction, Recorded};
 
 /// The exit code of a bench, whose error is printed.
 pub fn exit(outcome: Result<(), Box<dyn Error>>) -> ExitCode {

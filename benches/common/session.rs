@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::codec::{LineFormat, Protocol, Table};
-use drivegate::drive::profile::Profiles;
-use drivegate::north::mqtt::{Broker, History, Options, Qos, Telemetry};
-use drivegate::plant::{BusHandle, Plant};
-use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
-use drivegate::queue::CommandQueue;
+use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
+use drivegate_core::queue::CommandQueue;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_north::mqtt::{Broker, History, Options, Qos, Telemetry};
+use drivegate_proto::{LineFormat, Protocol, Table};
 
 /// States and events as by default, without TLS, commands and Sparkplug.
 pub fn options(client_id: &str, host: &str, port: u16) -> Options {

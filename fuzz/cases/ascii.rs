@@ -7,11 +7,11 @@
 
 use std::time::{Duration, Instant};
 
-use drivegate::bus::transaction::{Ended, Step, Transaction};
-use drivegate::codec::ascii::{
+use drivegate_bus::transaction::{Ended, Step, Transaction};
+use drivegate_proto::ascii::{
     LONGEST, decode_reply, decode_request, encode_frame, encode_request, noise, open_frame, request_len,
 };
-use drivegate::codec::{Decoded, Protocol, Request, RequestPdu, describe};
+use drivegate_proto::{Decoded, Protocol, Request, RequestPdu, describe};
 
 const SOUND: u8 = 1;
 const OWN_ADDRESS: u8 = 2;

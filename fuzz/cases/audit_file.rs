@@ -4,7 +4,7 @@
 
 use std::time::SystemTime;
 
-use drivegate::order::chain::{Chain, Entry, Verifier, fragment, tail};
+use drivegate_core::order::chain::{Chain, Entry, Verifier, fragment, tail};
 
 fn is_whole(text: &[u8]) -> Option<Option<Chain>> {
     let mut verifier = Verifier::new(None);

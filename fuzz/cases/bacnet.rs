@@ -8,11 +8,11 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bacnet::npdu::{self, Payload};
-use drivegate::bacnet::object::{Access, Commands, Datum, Device, Kind, Object, Reliability, Sample};
-use drivegate::bacnet::services::WriteItem;
-use drivegate::bacnet::types::Error;
-use drivegate::bacnet::{Application, DateTime, Mac, ObjectId, ObjectType, Options, Server, To, bvlc};
+use drivegate_bacnet::npdu::{self, Payload};
+use drivegate_bacnet::object::{Access, Commands, Datum, Device, Kind, Object, Reliability, Sample};
+use drivegate_bacnet::services::WriteItem;
+use drivegate_bacnet::types::Error;
+use drivegate_bacnet::{Application, DateTime, Mac, ObjectId, ObjectType, Options, Server, To, bvlc};
 
 const NETWORK: u16 = 1001;
 const GATEWAY: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 47808);

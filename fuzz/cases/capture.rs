@@ -5,9 +5,9 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::listener::Decoder;
-use drivegate::codec::{LineFormat, Protocol};
-use drivegate::history::capture;
+use drivegate_bus::listener::Decoder;
+use drivegate_proto::{LineFormat, Protocol};
+use drivegate_core::history::capture;
 
 pub(crate) fn run(data: &[u8]) {
     let packets = match capture::read(data) {

@@ -2,7 +2,7 @@
 //!
 //! Input: the certificate in DER.
 
-use drivegate::north::modbus_tcp::certificate_role;
+use drivegate_north::modbus_tcp::certificate_role;
 
 pub(crate) fn run(data: &[u8]) {
     let Some(role) = certificate_role(data) else { return };

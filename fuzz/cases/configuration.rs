@@ -2,7 +2,7 @@
 //!
 //! Input: the file; bytes that are not UTF-8 are replaced.
 
-use drivegate::config::Settings;
+use drivegate_gateway::config::Settings;
 
 pub(crate) fn run(data: &[u8]) {
     let text = String::from_utf8_lossy(data);

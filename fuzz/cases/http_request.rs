@@ -5,8 +5,8 @@
 use std::sync::{Arc, LazyLock};
 
 use arc_swap::ArcSwap;
-use drivegate::north::http::Loopback;
-use drivegate::plant::Plant;
+use drivegate_north::http::Loopback;
+use drivegate_core::plant::Plant;
 
 static SERVER: LazyLock<Loopback> = LazyLock::new(|| {
     let plant = Plant {

@@ -9,13 +9,13 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::process_image::{BusImage, DriveImage, Link};
-use drivegate::codec::{Exception, Reply, RequestPdu, Table};
-use drivegate::order::{Authority, Command, Order, Outcome, Urgency};
-use drivegate::queue::{Ready, CommandQueue};
-use drivegate::config::Settings;
-use drivegate::north::modbus_tcp::{Loopback, Options, Uncached};
-use drivegate::plant::{BusHandle, Plant, SharedPlant};
+use drivegate_core::process_image::{BusImage, DriveImage, Link};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
+use drivegate_core::order::{Authority, Command, Order, Outcome, Urgency};
+use drivegate_core::queue::{Ready, CommandQueue};
+use drivegate_gateway::config::Settings;
+use drivegate_north::modbus_tcp::{Loopback, Options, Uncached};
+use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
 
 /// Unit 1 may be commanded, 2 not, 3 is offline, the bus of 4 is down.
 const CONFIGURATION: &str = r#"

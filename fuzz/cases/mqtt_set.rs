@@ -6,13 +6,13 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Reply, Table};
-use drivegate::order::{Order, Outcome, Urgency};
-use drivegate::queue::{Ready, CommandQueue};
-use drivegate::config::Settings;
-use drivegate::north::mqtt::{Incoming, Loopback};
-use drivegate::plant::{BusHandle, Plant, SharedPlant};
-use drivegate::process_image::{BusImage, DriveImage, Link};
+use drivegate_proto::{Reply, Table};
+use drivegate_core::order::{Order, Outcome, Urgency};
+use drivegate_core::queue::{Ready, CommandQueue};
+use drivegate_gateway::config::Settings;
+use drivegate_north::mqtt::{Incoming, Loopback};
+use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
+use drivegate_core::process_image::{BusImage, DriveImage, Link};
 
 const CONFIGURATION: &str = r#"
 [gateway]
@@ -31,7 +31,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
     let settings = loaded.settings.unwrap_or_else(|| panic!("{:?}", loaded.errors));
     let now = Instant::now();
     let buses = settings.buses.iter().map(|bus| {
-        let image = |d: &drivegate::process_image::DriveSpec| Arc::new(DriveImage::new(d.clone(), bus.spec.slow_cycle));
+        let image = |d: &drivegate_core::process_image::DriveSpec| Arc::new(DriveImage::new(d.clone(), bus.spec.slow_cycle));
         let drives: Vec<Arc<DriveImage>> = bus.drives.iter().map(image).collect();
         for drive in &drives {
             drive.update(|s| {

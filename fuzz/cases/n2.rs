@@ -3,8 +3,8 @@
 //! Input: the request, options, then the bytes from the line. The last bit of the options corrects the checksum of
 //! the line, since the fuzzer would hardly find it by chance.
 
-use drivegate::codec::n2::{Command, RegionWidth, Session, command::checksum, decode_reply, encode_request, reply_chars};
-use drivegate::codec::{Decoded, Reply, Request, RequestPdu, Table};
+use drivegate_proto::n2::{Command, RegionWidth, Session, command::checksum, decode_reply, encode_request, reply_chars};
+use drivegate_proto::{Decoded, Reply, Request, RequestPdu, Table};
 
 fn asked(kind: u8, start: u16) -> RequestPdu {
     let read = |table, count| RequestPdu::Read { table, start, count };

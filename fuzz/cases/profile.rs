@@ -2,7 +2,7 @@
 //!
 //! Input: the file; bytes that are not UTF-8 are replaced.
 
-use drivegate::drive::Profile;
+use drivegate_model::drive::Profile;
 
 pub(crate) fn run(data: &[u8]) {
     let text = String::from_utf8_lossy(data);

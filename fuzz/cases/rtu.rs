@@ -3,10 +3,10 @@
 //! Input: length and bytes of a request PDU, then the bytes from the line. The last bit of the length corrects the
 //! check code of the frame, since the fuzzer would hardly find it by chance.
 
-use drivegate::codec::rtu::{
+use drivegate_proto::rtu::{
     LONGEST, decode_reply, decode_request, encode_frame, encode_request, open_frame, request_len,
 };
-use drivegate::codec::{Decoded, Request, RequestPdu};
+use drivegate_proto::{Decoded, Request, RequestPdu};
 
 pub(crate) fn run(data: &[u8]) {
     let Some((head, rest)) = data.split_first() else { return };

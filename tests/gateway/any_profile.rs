@@ -4,9 +4,9 @@
 use std::path::Path;
 use std::process::Output;
 
-use drivegate::drive::PollClass::{Fast, Once, Slow};
-use drivegate::drive::profile::Profiles;
-use drivegate::sim::simulated_drive::ModelOptions;
+use drivegate_model::drive::PollClass::{Fast, Once, Slow};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_sim::simulated_drive::ModelOptions;
 use serde_json::{Value, json};
 
 use crate::support::process::{Running, api, read_registers, until, write_registers};

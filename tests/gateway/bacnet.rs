@@ -10,8 +10,8 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use drivegate::codec::Protocol;
-use drivegate::drive::profile::Profiles;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::Protocol;
 use serde_json::{Value as Json, json};
 
 use crate::support::process::{PATIENCE, Running, api, free_port, get, mbpoll_write, until};

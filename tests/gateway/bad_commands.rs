@@ -3,8 +3,8 @@
 use std::io::{Read, Write};
 use std::net::TcpStream;
 
-use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::statistics::Direction;
+use drivegate_sim::wire::SimulatedBus;
 use drivegate_testkit::rows;
 
 use crate::support::process::{PATIENCE, Running, api, until};

@@ -123,7 +123,7 @@ fn errors_and_warnings_go_to_stderr_in_the_form_of_the_contract() {
         unknown.err,
         format!(
             "error: unknown profile `vacon-xn`; command line, NAME; did you mean `vacon-nx`? known profiles: {}\n",
-            drivegate::drive::profile::Profiles::built_in()
+            drivegate_model::drive::profile::Profiles::built_in()
                 .names()
                 .collect::<Vec<_>>()
                 .join(", ")

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use drivegate::sim::statistics::Direction;
+use drivegate_sim::statistics::Direction;
 use serde_json::{Value as Json, json};
 
 use super::bacnet::free_udp_port;

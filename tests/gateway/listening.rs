@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
-use drivegate::codec::{LineFormat, Protocol};
-use drivegate::drive::profile::Profiles;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::{LineFormat, Protocol};
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 use drivegate_testkit as testkit;
 use serde_json::Value as Json;
 use tokio_modbus::client::{Reader as _, Writer as _};

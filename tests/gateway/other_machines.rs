@@ -6,8 +6,8 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
-use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::statistics::Direction;
+use drivegate_sim::wire::SimulatedBus;
 
 use crate::support::process::{PATIENCE, Running, api, local, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};

@@ -4,7 +4,7 @@ use std::fs;
 
 use serde_json::Value;
 
-use drivegate::codec::RequestPdu;
+use drivegate_proto::RequestPdu;
 
 use crate::support::process::{drivegate, get, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};

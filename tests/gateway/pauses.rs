@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::net::{TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
-use drivegate::codec::rtu;
+use drivegate_proto::rtu;
 
 use crate::support::process::{PATIENCE, Running, api, free_port, get, local, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled};

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::wire::SimulatedBus;
 use serde_json::Value;
 
 use crate::support::process::{Running, drivegate, get, point, until};

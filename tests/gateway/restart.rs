@@ -3,9 +3,9 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::statistics::Direction;
+use drivegate_sim::wire::SimulatedBus;
 
 use crate::support::process::{Running, api, get, mbpoll_read, until, until_ready, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, functions};

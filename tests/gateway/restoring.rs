@@ -6,8 +6,8 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use drivegate::codec::{Reply, RequestPdu, Table};
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_proto::{Reply, RequestPdu, Table};
+use drivegate_sim::wire::SimulatedBus;
 
 use super::parameters::few;
 use crate::support::process::{Running, api, drivegate, get, until, write_registers};

@@ -5,9 +5,9 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::rtu;
-use drivegate::north::http::basic_authorization;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_north::http::basic_authorization;
+use drivegate_proto::rtu;
+use drivegate_sim::wire::SimulatedBus;
 
 use crate::support::mqtt::client;
 use crate::support::process::{PATIENCE, Running, api, free_port, get, local, until, write_registers};

@@ -6,7 +6,7 @@ use std::io::{Read as _, Write as _};
 use std::net::{TcpStream, UdpSocket};
 use std::time::Duration;
 
-use drivegate::codec::{Protocol, ascii, rtu};
+use drivegate_proto::{Protocol, ascii, rtu};
 use serde_json::{Value as Json, json};
 
 use crate::support::process::{PATIENCE, Running, drivegate, free_port, until};

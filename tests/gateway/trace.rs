@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::SimulatedBus;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::statistics::Direction;
+use drivegate_sim::wire::SimulatedBus;
 
 use crate::support::process::{Running, get, until};
 use crate::support::site::{HTTP, LINE1, Site, drive};

@@ -4,10 +4,10 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
-use drivegate::codec::rtu;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::event::EventKind;
-use drivegate::sim::endpoint::EndpointOptions;
+use drivegate_core::event::EventKind;
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::rtu;
+use drivegate_sim::endpoint::EndpointOptions;
 
 use super::rig::{Rig, Setup};
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use drivegate::codec::Protocol;
-use drivegate::drive::{ModelPoint, Profile, Value};
+use drivegate_model::drive::{ModelPoint, Profile, Value};
+use drivegate_proto::Protocol;
 
 use super::rig::{Rig, Setup};
 use crate::support::process::{Running, until};

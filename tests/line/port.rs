@@ -7,14 +7,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
-use drivegate::codec::LineFormat;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::event::EventKind;
-use drivegate::line::{Line, LineOptions, Rs485};
-use drivegate::order::{Interruption, Outcome};
-use drivegate::sim::endpoint::EndpointOptions;
-use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::statistics::Direction;
+use drivegate_core::event::EventKind;
+use drivegate_core::order::{Interruption, Outcome};
+use drivegate_line::{Line, LineOptions, Rs485};
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::LineFormat;
+use drivegate_sim::endpoint::EndpointOptions;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::statistics::Direction;
 
 use super::rig::{Rig, Setup, reason, with_port};
 use crate::support::process::until;

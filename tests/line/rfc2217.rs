@@ -3,10 +3,10 @@
 use std::net::TcpListener;
 use std::time::Duration;
 
-use drivegate::codec::LineFormat;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::line::{Level, Line, LineOptions, OpenError};
-use drivegate::sim::endpoint::EndpointOptions;
+use drivegate_line::{Level, Line, LineOptions, OpenError};
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::LineFormat;
+use drivegate_sim::endpoint::EndpointOptions;
 
 use super::rig::{Rig, Setup, reason, with_port};
 use crate::support::process::{Running, free_port};

@@ -3,20 +3,20 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::{BusOptions, BusTask};
-use drivegate::codec::wire::Silence;
-use drivegate::codec::{LineFormat, Protocol};
-use drivegate::drive::profile::Profile;
-use drivegate::drive::{ModelPoint, State, Value};
-use drivegate::event::Events;
-use drivegate::line::LineOptions;
-use drivegate::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate::plant::{DriveHandle, OrderRequest, Plant};
-use drivegate::process_image::{BusSpec, DriveImage, DriveSpec};
-use drivegate::sim::endpoint::EndpointOptions;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::simulated_drive::DriveOptions;
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_bus::{BusOptions, BusTask};
+use drivegate_core::event::Events;
+use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Plant};
+use drivegate_core::process_image::{BusSpec, DriveImage, DriveSpec};
+use drivegate_line::LineOptions;
+use drivegate_model::drive::profile::Profile;
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{LineFormat, Protocol};
+use drivegate_sim::endpoint::EndpointOptions;
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::simulated_drive::DriveOptions;
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 use drivegate_testkit as testkit;
 
 use crate::support::process::PATIENCE;

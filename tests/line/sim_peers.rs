@@ -1,11 +1,11 @@
 //! Independent masters on the simulated line: mbpoll (libmodbus, without Modbus ASCII) and pymodbus. Their readings
 //! prove the simulated drive, and their frames are the worked frames of the reference.
 
-use drivegate::codec::{LineFormat, Protocol};
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::nx::{NxOptions, StatusBits, UPDATE_PERIOD, status_word};
-use drivegate::sim::simulated_drive::{DriveOptions, ModelOptions};
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_proto::{LineFormat, Protocol};
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::nx::{NxOptions, StatusBits, UPDATE_PERIOD, status_word};
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 use std::path::Path;
 use std::time::Duration;
 
@@ -62,7 +62,7 @@ fn values(text: &str) -> Vec<u16> {
 }
 
 fn frames(line: &SimulatedBus) -> Vec<String> {
-    let frame = |frame: &drivegate::sim::statistics::Recorded| {
+    let frame = |frame: &drivegate_sim::statistics::Recorded| {
         frame
             .to_string()
             .split_once(' ')
@@ -161,7 +161,7 @@ fn pymodbus_commands_a_drive_in_ascii() {
     }
 }
 
-fn as_text(frame: &drivegate::sim::statistics::Recorded) -> String {
+fn as_text(frame: &drivegate_sim::statistics::Recorded) -> String {
     String::from_utf8(frame.bytes.clone()).unwrap()
 }
 

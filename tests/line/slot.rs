@@ -5,7 +5,7 @@ use std::net::TcpStream;
 use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::rtu;
+use drivegate_proto::rtu;
 
 use crate::support::process::{free_port, get, until};
 use crate::support::site::{HTTP, LINE1, Site, controlled, drive};

@@ -5,7 +5,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use drivegate::sim::broker::Broker;
+use drivegate_sim::broker::Broker;
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{
     AsyncClient, ConnectionError, DisconnectReasonCode, Event, EventLoop, MqttOptions, Packet, PublishProperties,

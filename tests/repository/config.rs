@@ -3,9 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use drivegate::config::{Loaded, Settings};
-use drivegate::drive::Profile;
-use drivegate::north::mqtt::{Password, Secret};
+use drivegate_gateway::config::{Loaded, Settings};
+use drivegate_model::drive::Profile;
+use drivegate_north::mqtt::{Password, Secret};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -223,7 +223,7 @@ fn every_profile_that_ships_is_sound() {
     }
     assert_eq!(
         count,
-        drivegate::drive::profile::Profiles::built_in().iter().count(),
+        drivegate_model::drive::profile::Profiles::built_in().iter().count(),
         "all are embedded"
     );
 }

@@ -42,7 +42,7 @@ fn every_command_has_a_manual_page_and_completions() {
     pages::write(folder.path()).unwrap();
     let written = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap();
 
-    let command = drivegate::cli::command_line();
+    let command = drivegate_tools::command_line();
     let mut wanted = Vec::new();
     names(&command, "drivegate", &mut wanted);
     assert!(wanted.len() > 15, "{wanted:?}");

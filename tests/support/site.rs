@@ -3,12 +3,12 @@
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 
-use drivegate::codec::LineFormat;
-use drivegate::sim::endpoint::EndpointOptions;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::simulated_drive::DriveOptions;
-use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_proto::LineFormat;
+use drivegate_sim::endpoint::EndpointOptions;
+use drivegate_sim::half_duplex::LineRules;
+use drivegate_sim::simulated_drive::DriveOptions;
+use drivegate_sim::statistics::Direction;
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tempfile::TempDir;
 
 use super::mqtt::client;

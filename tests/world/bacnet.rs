@@ -8,15 +8,15 @@
 use std::net::SocketAddrV4;
 use std::time::{Duration, Instant};
 
-use drivegate_world::bacnet::encoding::{Reader, Writer};
-use drivegate_world::bacnet::npdu::{self, Payload};
-use drivegate_world::bacnet::{Data, Mac, ObjectId, ObjectType, To, bvlc};
-use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate_world::north::bacnet::{Loopback, Options, WhenOffline};
-use drivegate_world::order::{Outcome, Refusal};
-use drivegate_world::plant::Placed;
-use drivegate_world::process_image::{LeaseAction, Supervision};
-use drivegate_world::sim::random::Random;
+use drivegate_bacnet::encoding::{Reader, Writer};
+use drivegate_bacnet::npdu::{self, Payload};
+use drivegate_bacnet::{Data, Mac, ObjectId, ObjectType, To, bvlc};
+use drivegate_core::order::{Outcome, Refusal};
+use drivegate_core::plant::Placed;
+use drivegate_core::process_image::{LeaseAction, Supervision};
+use drivegate_north::bacnet::{Loopback, Options, WhenOffline};
+use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
+use drivegate_sim::random::Random;
 
 use super::bus::Seen;
 use super::orders::{reference_point, run_command};
@@ -503,7 +503,7 @@ fn all_at_once(seed: u64) -> (usize, usize) {
     }
     world
         .rig
-        .set_faults(drivegate_world::sim::faults::FaultPlan::new("".parse().unwrap(), 0));
+        .set_faults(drivegate_sim::faults::FaultPlan::new("".parse().unwrap(), 0));
     world.wait(Duration::from_secs(20));
     for client in &mut world.clients {
         client.waits = false;

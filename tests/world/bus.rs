@@ -3,27 +3,27 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_world::bus::BusOptions;
-use drivegate_world::bus::core::{Action, BusCore, Closed};
-use drivegate_world::bus::master::{Handover, Purpose};
-use drivegate_world::bus::predict::predict;
-use drivegate_world::codec::wire::Silence;
-use drivegate_world::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
-use drivegate_world::drive::profile::Profiles;
-use drivegate_world::drive::{DriveIndex, PollClass, Profile};
-use drivegate_world::event::Events;
-use drivegate_world::line::LineOptions;
-use drivegate_world::order::{NO_DRIVE, WriteStats};
-use drivegate_world::plant::BusHandle;
-use drivegate_world::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
-use drivegate_world::queue::CommandQueue;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
-use drivegate_world::sim::random::Random;
-use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
-use drivegate_world::sim::slave::Slaves;
-use drivegate_world::sim::statistics::Transcript;
-use drivegate_world::start_guard::{BusGuards, Guards};
+use drivegate_bus::BusOptions;
+use drivegate_bus::core::{Action, BusCore, Closed};
+use drivegate_bus::master::{Handover, Purpose};
+use drivegate_bus::predict::predict;
+use drivegate_core::event::Events;
+use drivegate_core::order::{NO_DRIVE, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate_core::queue::CommandQueue;
+use drivegate_core::start_guard::{BusGuards, Guards};
+use drivegate_line::LineOptions;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{DriveIndex, PollClass, Profile};
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::half_duplex::{Delivery, HalfDuplex, LineRules};
+use drivegate_sim::random::Random;
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_sim::slave::Slaves;
+use drivegate_sim::statistics::Transcript;
 
 use super::scenario::Line;
 
@@ -218,7 +218,7 @@ impl WorldBus {
             handle(index, &self.line, &self.profile, format, (&self.guards, now)),
         );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
-        stopped.queue.close(drivegate_world::order::Outcome::ShuttingDown, now);
+        stopped.queue.close(drivegate_core::order::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {
@@ -269,7 +269,7 @@ impl WorldBus {
         let drive = self.wire.slaves().drive(address)?;
         if let Some(hertz) = new {
             let value = *raw
-                .encode(drivegate_world::drive::Value::Number(hertz), 0)
+                .encode(drivegate_model::drive::Value::Number(hertz), 0)
                 .ok()?
                 .first()?;
             let address = raw.address;
@@ -280,7 +280,7 @@ impl WorldBus {
             .answer(&RequestPdu::Read { table, start, count: 1 }, sim)?
             .words()?;
         Some(
-            raw.decode(&words, drivegate_world::drive::model::Kind::Number)?
+            raw.decode(&words, drivegate_model::drive::model::Kind::Number)?
                 .as_f64(),
         )
     }

@@ -5,12 +5,12 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_world::north::modbus_tcp::{self, Uncached};
-use drivegate_world::north::mqtt::Incoming;
-use drivegate_world::north::reading::Watch;
-use drivegate_world::north::{NorthState, mqtt};
-use drivegate_world::order::Authority;
-use drivegate_world::plant::{Placed, SharedPlant};
+use drivegate_core::order::Authority;
+use drivegate_core::plant::{Placed, SharedPlant};
+use drivegate_north::modbus_tcp::{self, Uncached};
+use drivegate_north::mqtt::Incoming;
+use drivegate_north::reading::Watch;
+use drivegate_north::{NorthState, mqtt};
 
 use super::scenario::Habit;
 

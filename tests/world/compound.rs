@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::{Exception, Protocol, RequestPdu};
-use drivegate_world::drive::{ModelPoint, State, Value};
-use drivegate_world::order::{Order, Outcome, Refusal};
-use drivegate_world::sim::faults::FaultPlan;
+use drivegate_core::order::{Order, Outcome, Refusal};
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::{Exception, Protocol, RequestPdu};
+use drivegate_sim::faults::FaultPlan;
 
 use super::rig::{PATIENCE, Rig, line, write};
 use super::scenario::Line;

@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use drivegate_world::bus::core::Closed;
-use drivegate_world::codec::Protocol;
-use drivegate_world::diagnosis::Cause;
-use drivegate_world::drive::{ModelPoint, State, Value};
-use drivegate_world::event::EventKind;
-use drivegate_world::order::Outcome;
+use drivegate_bus::core::Closed;
+use drivegate_core::diagnosis::Cause;
+use drivegate_core::event::EventKind;
+use drivegate_core::order::Outcome;
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::Protocol;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};

@@ -4,12 +4,12 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::drive::profile::Profiles;
-use drivegate_world::drive::{ModelPoint, State};
-use drivegate_world::order::Outcome;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::random::Random;
+use drivegate_core::order::Outcome;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{ModelPoint, State};
+use drivegate_proto::Protocol;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::random::Random;
 
 use super::rig::{Rig, line};
 use super::scenario::Line;

@@ -2,13 +2,13 @@
 
 use std::time::Duration;
 
-use drivegate_world::bus::predict::predict;
-use drivegate_world::codec::wire::Silence;
-use drivegate_world::codec::{Protocol, RequestPdu};
-use drivegate_world::drive::{ModelPoint, PollClass, Value};
-use drivegate_world::order::{Order, Urgency};
-use drivegate_world::plant::Placed;
-use drivegate_world::process_image::DriveSpec;
+use drivegate_bus::predict::predict;
+use drivegate_core::order::{Order, Urgency};
+use drivegate_core::plant::Placed;
+use drivegate_core::process_image::DriveSpec;
+use drivegate_model::drive::{ModelPoint, PollClass, Value};
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{Protocol, RequestPdu};
 
 use super::bus::{Parts, Seen};
 use super::rig::{Rig, line};

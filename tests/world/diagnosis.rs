@@ -3,10 +3,10 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::diagnosis::Cause;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::half_duplex::Delivery;
+use drivegate_core::diagnosis::Cause;
+use drivegate_proto::Protocol;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::half_duplex::Delivery;
 
 use super::bus::Parts;
 use super::number;

@@ -4,14 +4,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
-use drivegate_world::drive::ModelPoint;
-use drivegate_world::order::{Authority, Origin, Outcome, SourceKind};
-use drivegate_world::plant::OrderRequest;
-use drivegate_world::process_image::{LeaseAction, Supervision};
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::nx::Command;
+use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
+use drivegate_core::order::{Authority, Origin, Outcome, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_core::process_image::{LeaseAction, Supervision};
+use drivegate_model::drive::ModelPoint;
+use drivegate_proto::Protocol;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::nx::Command;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

@@ -3,8 +3,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use drivegate_world::codec::{RequestPdu, Table};
-use drivegate_world::order::written;
+use drivegate_core::order::written;
+use drivegate_proto::{RequestPdu, Table};
 
 use super::orders::{Unique, sets};
 

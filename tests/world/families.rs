@@ -1,10 +1,10 @@
 //! Every family of the reference, over every protocol that it supports, commanded through one sequence and read by
 //! one set of names: the differences are in the profiles, and clients need not know them.
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::drive::profile::Profiles;
-use drivegate_world::drive::{ModelPoint, State, Value};
-use drivegate_world::sim::simulated_drive::ModelOptions;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::Protocol;
+use drivegate_sim::simulated_drive::ModelOptions;
 
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;

@@ -5,19 +5,19 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_world::codec::{Protocol, Table};
-use drivegate_world::order::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
-use drivegate_world::permit::{HoldState, Mode, Principal, Rules, Verb};
-use drivegate_world::plant::{OrderRequest, Placed};
-use drivegate_world::process_image::DriveSpec;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::random::Random;
-use drivegate_world::start_guard::Guard;
+use drivegate_core::order::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_core::permit::{HoldState, Mode, Principal, Rules, Verb};
+use drivegate_core::plant::{OrderRequest, Placed};
+use drivegate_core::process_image::DriveSpec;
+use drivegate_core::start_guard::Guard;
+use drivegate_proto::{Protocol, Table};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::random::Random;
 
 use super::bus::{Parts, Seen};
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;
-use drivegate_world::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 const SECOND: Duration = Duration::from_secs(1);
 const LEASE: Duration = Duration::from_secs(3);

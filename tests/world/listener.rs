@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
-use drivegate_world::bus::listener::{Decoder, Traffic};
-use drivegate_world::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Table, ascii, n2, rtu};
+use drivegate_bus::listener::{Decoder, Traffic};
+use drivegate_proto::{LineFormat, Protocol, Reply, Request, RequestPdu, Table, ascii, n2, rtu};
 
 /// Replies that a decoder accepts from successive frames, each with a pause in ms before it: address, first
 /// register, words.

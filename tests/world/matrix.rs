@@ -8,16 +8,16 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use drivegate_world::codec::wire::Silence;
-use drivegate_world::codec::{Protocol, Table};
-use drivegate_world::drive::Point;
-use drivegate_world::drive::profile::{Profile, Profiles};
-use drivegate_world::order::{Order, Outcome};
-use drivegate_world::plant::Placed;
-use drivegate_world::sim::faults::{Fault, FaultPlan};
-use drivegate_world::sim::half_duplex::Delivery;
-use drivegate_world::sim::nx::{NxOptions, Values};
-use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_core::order::{Order, Outcome};
+use drivegate_core::plant::Placed;
+use drivegate_model::drive::Point;
+use drivegate_model::drive::profile::{Profile, Profiles};
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{Protocol, Table};
+use drivegate_sim::faults::{Fault, FaultPlan};
+use drivegate_sim::half_duplex::Delivery;
+use drivegate_sim::nx::{NxOptions, Values};
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
 
 use super::bus::{Parts, Seen};
 use super::orders::unique_reference;

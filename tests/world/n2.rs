@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use drivegate_world::codec::{Exception, Protocol, n2};
-use drivegate_world::drive::{ModelPoint, Profile, Quality, State, Value};
-use drivegate_world::event::EventKind;
-use drivegate_world::order::Outcome;
-use drivegate_world::sim::faults::FaultPlan;
+use drivegate_core::event::EventKind;
+use drivegate_core::order::Outcome;
+use drivegate_model::drive::{ModelPoint, Profile, Quality, State, Value};
+use drivegate_proto::{Exception, Protocol, n2};
+use drivegate_sim::faults::FaultPlan;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

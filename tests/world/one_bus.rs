@@ -2,16 +2,16 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::{Exception, Protocol, RequestPdu};
-use drivegate_world::drive::{ModelPoint, Quality, State, Value};
-use drivegate_world::event::EventKind;
-use drivegate_world::order::{Authority, Order, Origin, Outcome, Refusal, SourceKind};
-use drivegate_world::plant::OrderRequest;
-use drivegate_world::process_image::{Access, LeaseAction, Supervision};
-use drivegate_world::sim::faults::{Fault, FaultPlan};
-use drivegate_world::sim::nx::NxOptions;
-use drivegate_world::sim::simulated_drive::ModelOptions;
-use drivegate_world::sim::statistics::Recorded;
+use drivegate_core::event::EventKind;
+use drivegate_core::order::{Authority, Order, Origin, Outcome, Refusal, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_core::process_image::{Access, LeaseAction, Supervision};
+use drivegate_model::drive::{ModelPoint, Quality, State, Value};
+use drivegate_proto::{Exception, Protocol, RequestPdu};
+use drivegate_sim::faults::{Fault, FaultPlan};
+use drivegate_sim::nx::NxOptions;
+use drivegate_sim::simulated_drive::ModelOptions;
+use drivegate_sim::statistics::Recorded;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};

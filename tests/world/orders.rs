@@ -2,10 +2,10 @@
 
 use std::time::Instant;
 
-use drivegate_world::codec::{RequestPdu, Table};
-use drivegate_world::drive::{ModelPoint, Point, PointIndex, Profile, Value};
-use drivegate_world::order::{Order, written};
-use drivegate_world::sim::random::Random;
+use drivegate_core::order::{Order, written};
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, Profile, Value};
+use drivegate_proto::{RequestPdu, Table};
+use drivegate_sim::random::Random;
 
 /// The kind of an order in a world.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

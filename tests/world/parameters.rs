@@ -4,12 +4,12 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use drivegate_world::codec::{Protocol, RequestPdu, Table};
-use drivegate_world::drive::{DriveIndex, ModelPoint};
-use drivegate_world::order::{BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
-use drivegate_world::parameters::{Entry, Names, Next, ParameterFile, Reading, differences};
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::random::Random;
+use drivegate_core::order::{BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
+use drivegate_core::parameters::{Entry, Names, Next, ParameterFile, Reading, differences};
+use drivegate_model::drive::{DriveIndex, ModelPoint};
+use drivegate_proto::{Protocol, RequestPdu, Table};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::random::Random;
 
 use super::rig::{PATIENCE, Rig, line};
 use super::scenario::Line;

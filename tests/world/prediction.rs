@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use drivegate_world::bus::predict::predict;
-use drivegate_world::codec::Protocol;
-use drivegate_world::codec::wire::Silence;
-use drivegate_world::process_image::DriveSpec;
-use drivegate_world::sim::statistics::{Direction, Recorded};
+use drivegate_bus::predict::predict;
+use drivegate_core::process_image::DriveSpec;
+use drivegate_proto::Protocol;
+use drivegate_proto::wire::Silence;
+use drivegate_sim::statistics::{Direction, Recorded};
 
 use super::bus::Parts;
 use super::rig::{Rig, line};

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use drivegate_world::codec::{Protocol, RequestPdu, Table};
-use drivegate_world::drive::Value;
-use drivegate_world::history::{Clock, Recorder, RecorderOptions, Recording, TriggerKind, assemble::assemble};
-use drivegate_world::sim::statistics::Direction;
+use drivegate_core::history::{Clock, Recorder, RecorderOptions, Recording, TriggerKind, assemble::assemble};
+use drivegate_model::drive::Value;
+use drivegate_proto::{Protocol, RequestPdu, Table};
+use drivegate_sim::statistics::Direction;
 
 use super::rig::{Rig, line};
 
@@ -186,7 +186,7 @@ fn a_stop_waits_for_no_read_of_a_fault() {
         .position(|frame| frame.bytes[1] == stop.function())
         .unwrap();
     assert!(place <= 1, "one exchange was on the line: {place}");
-    let on_fault = |frame: &drivegate_world::sim::statistics::Recorded| frame.bytes[1..4] == [4, 0, 14];
+    let on_fault = |frame: &drivegate_sim::statistics::Recorded| frame.bytes[1..4] == [4, 0, 14];
     rig.run(30 * SECOND);
     let read = rig.requests()[before..].iter().filter(|frame| on_fault(frame)).count();
     assert!(

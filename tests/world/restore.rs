@@ -5,18 +5,18 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use drivegate_world::codec::{Protocol, Reply, RequestPdu};
-use drivegate_world::drive::ModelPoint;
-use drivegate_world::order::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
-use drivegate_world::parameters::{
+use drivegate_core::order::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
+use drivegate_core::parameters::{
     End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, RestoreNeed,
     Then, Wishes, differences, plan,
 };
-use drivegate_world::plant::{OrderRequest, Placed};
-use drivegate_world::process_image::ParamsAccess;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::nx::Command;
-use drivegate_world::sim::random::Random;
+use drivegate_core::plant::{OrderRequest, Placed};
+use drivegate_core::process_image::ParamsAccess;
+use drivegate_model::drive::ModelPoint;
+use drivegate_proto::{Protocol, Reply, RequestPdu};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::nx::Command;
+use drivegate_sim::random::Random;
 
 use super::bus::Seen;
 use super::rig::{Rig, line};
@@ -221,7 +221,7 @@ impl RestoreWorld {
                             if (*table, *start, *count) == (running.table, running.address, running.form.items()));
                     let words = asked.reply.as_ref().and_then(Reply::words).filter(|_| asks);
                     let stands = words
-                        .and_then(|words| running.decode(&words, drivegate_world::drive::model::Kind::Bool))
+                        .and_then(|words| running.decode(&words, drivegate_model::drive::model::Kind::Bool))
                         .is_some_and(|runs| !runs.as_bool());
                     self.stands = stands.then_some(asked.at);
                 }
@@ -490,7 +490,7 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
     let others: Vec<_> = others.iter().filter(|one| !written.contains(&one.id)).collect();
     assert_eq!(
         others,
-        Vec::<&drivegate_world::parameters::Difference>::new(),
+        Vec::<&drivegate_core::parameters::Difference>::new(),
         "seed {seed}"
     );
     if done {

@@ -4,16 +4,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate_world::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate_world::drive::{ModelPoint, PollClass, Sample, State, Value};
-use drivegate_world::event::Events;
-use drivegate_world::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate_world::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
-use drivegate_world::process_image::{OnShutdown, Outcome as Counted};
-use drivegate_world::sim::SimTime;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::simulated_drive::SimulatedDrive;
-use drivegate_world::sim::statistics::{Direction, Recorded};
+use drivegate_core::event::Events;
+use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
+use drivegate_core::process_image::{OnShutdown, Outcome as Counted};
+use drivegate_model::drive::{ModelPoint, PollClass, Sample, State, Value};
+use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
+use drivegate_sim::SimTime;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::simulated_drive::SimulatedDrive;
+use drivegate_sim::statistics::{Direction, Recorded};
 
 use super::bus::{Parts, Seen, WorldBus};
 use super::scenario::Line;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::drive::RawWrites;
-use drivegate_world::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
-use drivegate_world::sim::random::Random;
+use drivegate_core::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
+use drivegate_model::drive::RawWrites;
+use drivegate_proto::Protocol;
+use drivegate_sim::random::Random;
 
 /// The description of a random world.
 #[derive(Debug, Clone)]

@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::drive::{ModelPoint, State};
-use drivegate_world::event::EventKind;
-use drivegate_world::sim::faults::{Fault, FaultPlan};
+use drivegate_core::event::EventKind;
+use drivegate_model::drive::{ModelPoint, State};
+use drivegate_proto::Protocol;
+use drivegate_sim::faults::{Fault, FaultPlan};
 
 use super::rig::{PATIENCE, Rig, line};
 
@@ -33,7 +33,7 @@ fn good(rig: &Rig, point: ModelPoint) -> Option<f64> {
 
 fn differing(
     rig: &mut Rig,
-    events: &mut tokio::sync::broadcast::Receiver<std::sync::Arc<drivegate_world::event::Event>>,
+    events: &mut tokio::sync::broadcast::Receiver<std::sync::Arc<drivegate_core::event::Event>>,
 ) -> Vec<String> {
     let end = rig.now + Duration::from_secs(20);
     rig.until("time passes", PATIENCE, |rig| rig.now >= end);
@@ -121,8 +121,8 @@ fn a_monitoring_register_that_the_drive_refuses_changes_nothing() {
     let mut rig = running("vacon-nx");
     let mut events = rig.plant.events.subscribe();
     let refusing = FaultPlan::default()
-        .refusing(1, drivegate_world::codec::Table::Holding, 98)
-        .refusing(1, drivegate_world::codec::Table::Holding, TORQUE - 1);
+        .refusing(1, drivegate_proto::Table::Holding, 98)
+        .refusing(1, drivegate_proto::Table::Holding, TORQUE - 1);
     rig.set_faults(refusing);
     back_with(&mut rig, OUT_8, FAULT);
     rig.until_state(1, State::Running);

@@ -2,13 +2,13 @@
 
 use std::time::{Duration, Instant};
 
-use drivegate_world::codec::{Protocol, Reply, Table};
-use drivegate_world::drive::{ModelPoint, Value};
-use drivegate_world::order::{Order, Outcome};
-use drivegate_world::plant::Placed;
-use drivegate_world::process_image::{LeaseAction, OnShutdown, Supervision};
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::random::Random;
+use drivegate_core::order::{Order, Outcome};
+use drivegate_core::plant::Placed;
+use drivegate_core::process_image::{LeaseAction, OnShutdown, Supervision};
+use drivegate_model::drive::{ModelPoint, Value};
+use drivegate_proto::{Protocol, Reply, Table};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::random::Random;
 
 use super::bus::{Parts, Seen};
 use super::clients::{Servers, answers, write_frame};

@@ -6,14 +6,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_world::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate_world::drive::{DriveIndex, ModelPoint};
-use drivegate_world::north::slot::{Loopback, Slot, SlotAccess};
-use drivegate_world::north::{NorthState, SlotOutcome};
-use drivegate_world::order::Urgency;
-use drivegate_world::process_image::Access;
-use drivegate_world::sim::random::Random;
-use drivegate_world::sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_core::order::Urgency;
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::{DriveIndex, ModelPoint};
+use drivegate_north::slot::{Loopback, Slot, SlotAccess};
+use drivegate_north::{NorthState, SlotOutcome};
+use drivegate_proto::{LineFormat, Protocol, RequestPdu, Table};
+use drivegate_sim::random::Random;
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
 
 mod order;
 
@@ -181,7 +181,7 @@ impl ToolRig {
         let (address, pdu) = (self.asks)(&mut self.dice, &self.line);
         let mut frame = Vec::new();
         self.line.protocol.encode(
-            &drivegate_world::codec::Request {
+            &drivegate_proto::Request {
                 address,
                 pdu: pdu.clone(),
                 n2: self.rig.bus.profile.n2,
@@ -500,7 +500,7 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
     let set = |value: u16| RequestPdu::WriteRegister { address: 2000, value };
     let frame = |pdu: &RequestPdu| {
         let mut frame = Vec::new();
-        Protocol::ModbusRtu.encode(&drivegate_world::codec::Request::new(1, pdu.clone()), &mut frame);
+        Protocol::ModbusRtu.encode(&drivegate_proto::Request::new(1, pdu.clone()), &mut frame);
         frame
     };
     // A reference uses up the share of writes, so the start after it is held.

@@ -16,18 +16,18 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate_world::bus::core::Action;
-use drivegate_world::codec::Protocol;
-use drivegate_world::drive::profile::Profiles;
-use drivegate_world::drive::{ModelPoint, Value};
-use drivegate_world::event::Events;
-use drivegate_world::north::modbus_tcp::Loopback;
-use drivegate_world::order::{Authority, Order, Origin, SourceKind, WriteStats};
-use drivegate_world::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
-use drivegate_world::process_image::{LeaseAction, Supervision};
-use drivegate_world::sim::random::Random;
-use drivegate_world::sim::simulated_drive::{Command, ModelOptions};
-use drivegate_world::stalls::{Heartbeat, TICK};
+use drivegate_bus::core::Action;
+use drivegate_core::event::Events;
+use drivegate_core::order::{Authority, Order, Origin, SourceKind, WriteStats};
+use drivegate_core::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
+use drivegate_core::process_image::{LeaseAction, Supervision};
+use drivegate_core::stalls::{Heartbeat, TICK};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{ModelPoint, Value};
+use drivegate_north::modbus_tcp::Loopback;
+use drivegate_proto::Protocol;
+use drivegate_sim::random::Random;
+use drivegate_sim::simulated_drive::{Command, ModelOptions};
 
 use self::promised::{Does, Promised};
 use super::bus::{Asked, Parts, Seen, WorldBus};
@@ -105,7 +105,7 @@ struct World {
 
 fn families() -> Vec<String> {
     let built_in = Profiles::built_in();
-    let can = |profile: &&Arc<drivegate_world::drive::Profile>| {
+    let can = |profile: &&Arc<drivegate_model::drive::Profile>| {
         profile.protocols.contains(&Protocol::ModbusRtu)
             && profile.run_place().is_some()
             && ModelOptions::of_profile(profile).is_some()
@@ -376,7 +376,7 @@ impl World {
                     .handle
                     .image
                     .drives
-                    .get(drivegate_world::drive::DriveIndex::new(asked.drive));
+                    .get(drivegate_model::drive::DriveIndex::new(asked.drive));
                 let read = image
                     .zip(first_word(asked))
                     .and_then(|(image, (table, at))| image.snapshot().read_at(table, at));
@@ -504,9 +504,9 @@ impl World {
 }
 
 /// The table and the address of the first word of a read.
-fn first_word(asked: &Asked) -> Option<(drivegate_world::codec::Table, u16)> {
+fn first_word(asked: &Asked) -> Option<(drivegate_proto::Table, u16)> {
     match asked.pdu {
-        drivegate_world::codec::RequestPdu::Read { table, start, .. } => Some((table, start)),
+        drivegate_proto::RequestPdu::Read { table, start, .. } => Some((table, start)),
         _ => None,
     }
 }

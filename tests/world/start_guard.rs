@@ -6,15 +6,15 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_world::codec::{Protocol, RequestPdu, Table};
-use drivegate_world::drive::{ModelPoint, State, Value};
-use drivegate_world::order::{Authority, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
-use drivegate_world::permit::{Mode, Principal, Rules};
-use drivegate_world::plant::{OrderRequest, Placed};
-use drivegate_world::process_image::DriveSpec;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::random::Random;
-use drivegate_world::start_guard::{Guard, Guards, Interlock, Saved};
+use drivegate_core::order::{Authority, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_core::permit::{Mode, Principal, Rules};
+use drivegate_core::plant::{OrderRequest, Placed};
+use drivegate_core::process_image::DriveSpec;
+use drivegate_core::start_guard::{Guard, Guards, Interlock, Saved};
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::{Protocol, RequestPdu, Table};
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::random::Random;
 
 use super::bus::Seen;
 use super::rig::{PATIENCE, Rig, line, write};

@@ -3,12 +3,12 @@
 
 use std::time::Duration;
 
-use drivegate_world::codec::Protocol;
-use drivegate_world::order::{Origin, SourceKind};
-use drivegate_world::process_image::Access;
-use drivegate_world::sim::faults::FaultPlan;
-use drivegate_world::sim::statistics::Recorded;
-use drivegate_world::stop_all::{LOOK, Scope, StopAll, StopReport, Stopped, StoppedDrive};
+use drivegate_core::order::{Origin, SourceKind};
+use drivegate_core::process_image::Access;
+use drivegate_core::stop_all::{LOOK, Scope, StopAll, StopReport, Stopped, StoppedDrive};
+use drivegate_proto::Protocol;
+use drivegate_sim::faults::FaultPlan;
+use drivegate_sim::statistics::Recorded;
 
 use super::bus::Parts;
 use super::rig::{PATIENCE, Rig, line};
@@ -120,7 +120,7 @@ fn what_is_said_to_stand_stands_and_all_stands_in_the_end() {
             }
             start_all(&mut rig);
             rig.until("all run", PATIENCE, |rig| {
-                (1..=DRIVES).all(|address| rig.state(address) == drivegate_world::drive::State::Running)
+                (1..=DRIVES).all(|address| rig.state(address) == drivegate_model::drive::State::Running)
             });
         }
     }

@@ -18,14 +18,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate_world::codec::{Protocol, Reply, RequestPdu};
-use drivegate_world::drive::{ModelPoint, Quality, RawWrites, Value};
-use drivegate_world::event::{EventKind, Events};
-use drivegate_world::north::mqtt::Incoming;
-use drivegate_world::order::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
-use drivegate_world::plant::{Plant, SharedPlant};
-use drivegate_world::process_image::{LeaseAction, OnShutdown};
-use drivegate_world::sim::random::Random;
+use drivegate_core::event::{EventKind, Events};
+use drivegate_core::order::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_core::process_image::{LeaseAction, OnShutdown};
+use drivegate_model::drive::{ModelPoint, Quality, RawWrites, Value};
+use drivegate_north::mqtt::Incoming;
+use drivegate_proto::{Protocol, Reply, RequestPdu};
+use drivegate_sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
@@ -95,7 +95,7 @@ pub struct World {
     now: Instant,
     plant: SharedPlant,
     events: Events,
-    heard_events: broadcast::Receiver<Arc<drivegate_world::event::Event>>,
+    heard_events: broadcast::Receiver<Arc<drivegate_core::event::Event>>,
     writes: Arc<WriteStats>,
     buses: Vec<WorldBus>,
     truths: Vec<Vec<Truth>>,

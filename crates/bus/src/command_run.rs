@@ -25,12 +25,12 @@ use self::parameter::ParameterRun;
 use self::steps::{Action, Check, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
-use crate::codec::{Reply, Table};
-use crate::drive::control::Run;
-use crate::drive::{ModelPoint, Profile};
-use crate::order::{
+use drivegate_core::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
 };
+use drivegate_model::drive::control::Run;
+use drivegate_model::drive::{ModelPoint, Profile};
+use drivegate_proto::{Reply, Table};
 
 /// Maximum number of stops to a drive that are sent before the end of a pulse in progress.
 const MOST_STOPS: u32 = 8;

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, PointIndex, Profile, Value};
-use crate::order::{Order, Receipt, written};
-use crate::process_image::Reading;
+use drivegate_core::order::{Order, Receipt, written};
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, Profile, Value};
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
@@ -115,7 +115,8 @@ fn effect_of(profile: &Profile, index: PointIndex, value: Value) -> Option<Effec
 
 /// Whether the reading shows the effect, by samples read after `since`; `None` if there are no such samples.
 fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> {
-    let after = |sample: crate::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
+    let after =
+        |sample: drivegate_model::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
     let model = |point| after(reading.model(point));
     match effect {
         Effect::Runs => model(ModelPoint::Running).map(Value::as_bool),

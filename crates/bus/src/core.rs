@@ -13,13 +13,13 @@ use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
 use super::transaction::Ended;
-use crate::codec::{Exception, Reply, Request};
-use crate::drive::DriveIndex;
-use crate::event::Events;
-use crate::order::{Outcome, Urgency, WriteStats};
-use crate::plant::BusHandle;
-use crate::process_image::Taping;
-use crate::stalls::Stalls;
+use drivegate_core::event::Events;
+use drivegate_core::order::{Outcome, Urgency, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::Taping;
+use drivegate_core::stalls::Stalls;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::{Exception, Reply, Request};
 
 /// What the bus does next with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
-use crate::codec::Reply;
-use crate::diagnosis::CountedByDrive;
-use crate::drive::DriveIndex;
 use crate::line_diagnosis::LineDiagnosis;
-use crate::order::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
-use crate::plant::BusHandle;
+use drivegate_core::diagnosis::CountedByDrive;
+use drivegate_core::order::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::Reply;
 
 /// Pause between two readings of a drive.
 const PAUSE: Duration = Duration::from_secs(30);

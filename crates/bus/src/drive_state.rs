@@ -10,12 +10,12 @@ use super::refresh::{End, OrderEnd, Refresh};
 use super::repeated_stops::RepeatedStops;
 use super::supervision::Supervision;
 use super::unanswered_stops::VainStops;
-use crate::codec::{Reply, Table};
-use crate::drive::control::Control;
-use crate::drive::{ModelPoint, Point, Profile};
-use crate::order::{Command, Interruption, Order, Origin, Outcome, Receipt, Urgency};
-use crate::permit::LastWritten;
-use crate::process_image::{DriveImage, DriveSpec, Reading};
+use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Receipt, Urgency};
+use drivegate_core::permit::LastWritten;
+use drivegate_core::process_image::{DriveImage, DriveSpec, Reading};
+use drivegate_model::drive::control::Control;
+use drivegate_model::drive::{ModelPoint, Point, Profile};
+use drivegate_proto::{Reply, Table};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);

@@ -28,7 +28,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::codec::RequestPdu;
+use drivegate_proto::RequestPdu;
 
 /// Time after which a missing reply is no longer expected.
 pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);

@@ -14,7 +14,7 @@
 //! - `start_gate`: which commands to guarded drives may start them, and the stops of interlocks.
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
-//! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows the result.
+//! - `line_diagnosis`: feeds [`drivegate_core::diagnosis`] and shows the result.
 //! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
 //! - [`news`]: the results of the master; `report` applies them to the process image, to events and to the log.
 //!
@@ -50,20 +50,7 @@ mod tap;
 pub mod transaction;
 mod unanswered_stops;
 
-use drivegate_core::diagnosis;
-use drivegate_core::event;
-use drivegate_core::order;
-use drivegate_core::permit;
-use drivegate_core::plant;
-use drivegate_core::process_image;
-use drivegate_core::queue;
-use drivegate_core::stalls;
-use drivegate_core::start_guard;
 pub use drivegate_core::stop_all::stop_of_line;
-use drivegate_line as line;
-use drivegate_model::document;
-use drivegate_model::drive;
-use drivegate_proto as codec;
 
 pub use line_loop::BusTask;
 
@@ -71,10 +58,10 @@ use std::time::Duration;
 
 use ipnet::IpNet;
 
-use crate::codec::wire::Silence;
-use crate::line::LineOptions;
+use drivegate_line::LineOptions;
+use drivegate_proto::wire::Silence;
 
-/// Settings of a bus for its line, besides [`crate::process_image::BusSpec`].
+/// Settings of a bus for its line, besides [`drivegate_core::process_image::BusSpec`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusOptions {
     /// Time for the first byte of a reply; wire time is added.

@@ -7,15 +7,15 @@ use std::time::{Duration, Instant, SystemTime};
 use super::line_state::Exchanged;
 use super::listener::Exchange as Overheard;
 use super::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
-use crate::codec::{Reply, RequestPdu};
-use crate::diagnosis::debounce::{Change, Debounce};
-use crate::diagnosis::figures::Sign;
-use crate::diagnosis::{
+use drivegate_core::diagnosis::debounce::{Change, Debounce};
+use drivegate_core::diagnosis::figures::Sign;
+use drivegate_core::diagnosis::{
     Cause, Counted, CountedByDrive, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, own_timeout, rules,
     unanswered,
 };
-use crate::drive::{DriveIndex, PerDrive, PlannedRead};
-use crate::process_image::BusImage;
+use drivegate_core::process_image::BusImage;
+use drivegate_model::drive::{DriveIndex, PerDrive, PlannedRead};
+use drivegate_proto::{Reply, RequestPdu};
 
 /// Time for which a trip by a drive's own communication timeout is shown.
 const TRIP_SHOWN: Duration = Duration::from_secs(600);

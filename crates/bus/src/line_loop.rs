@@ -11,13 +11,13 @@ use super::core::{Action, BusCore, Closed};
 use super::listener::ListenCore;
 use super::master::Handover;
 use super::{BusOptions, Mode};
-use crate::codec::LineFormat;
-use crate::drive::DriveIndex;
-use crate::event::Events;
-use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
-use crate::order::{Outcome, WriteStats};
-use crate::plant::BusHandle;
-use crate::stalls::Stalls;
+use drivegate_core::event::Events;
+use drivegate_core::order::{Outcome, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::stalls::Stalls;
+use drivegate_line::{Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::LineFormat;
 
 /// First and longest pause between two attempts to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
@@ -229,7 +229,7 @@ impl Worker {
 
     /// Serves the port while it exists, and opens it again whenever it is lost, until the bus is to end.
     fn keep_open<C: Core>(&self, mut core: C) -> C {
-        line::sharpen_timers();
+        drivegate_line::sharpen_timers();
         let mut pauses = ReopenPauses::default();
         let mut names = Names::allowing(&self.options.allow);
         while !self.stopping() {
@@ -323,7 +323,7 @@ impl Worker {
         let mut came = false;
         while !self.stopping() && Instant::now() < until {
             let beat = until.min(Instant::now() + BEAT);
-            if line::wait_without_port(beat, self.handle.queue.wake_fd(), arrival) {
+            if drivegate_line::wait_without_port(beat, self.handle.queue.wake_fd(), arrival) {
                 came = true;
                 until = until.min(began + REOPEN.0);
             }
@@ -335,11 +335,11 @@ impl Worker {
     fn serve_as_master(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut break_off = None;
-        core.runs_on(Instant::now(), line::since_boot());
+        core.runs_on(Instant::now(), drivegate_line::since_boot());
         // The transaction on the line is completed first: the next user of the line would otherwise send into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
-            if core.note_run(now, line::since_boot()) {
+            if core.note_run(now, drivegate_line::since_boot()) {
                 // Bytes that arrived during the stall are a reply, although its time limit has passed.
                 let count = line.receive(&mut buffer)?;
                 core.received(buffer.get(..count).unwrap_or_default(), now);
@@ -355,7 +355,7 @@ impl Worker {
                     let now = Instant::now();
                     if count > 0 {
                         core.received(buffer.get(..count).unwrap_or_default(), now);
-                    } else if !core.note_run(now, line::since_boot()) {
+                    } else if !core.note_run(now, drivegate_line::since_boot()) {
                         line.send(core.sending(now))?;
                     }
                     continue;
@@ -386,20 +386,20 @@ impl Worker {
 
     /// Waits without a connection until a request is to be sent, or the bus is to end.
     fn wait_to_ask(&self, core: &mut BusCore) {
-        core.runs_on(Instant::now(), line::since_boot());
+        core.runs_on(Instant::now(), drivegate_line::since_boot());
         while !self.stopping() {
             let now = Instant::now();
-            core.note_run(now, line::since_boot());
+            core.note_run(now, drivegate_line::since_boot());
             match core.poll(now) {
                 Action::Send => return,
                 Action::Wait { until, commands, .. } => {
                     let until = until.min(now + BEAT);
                     if commands {
-                        line::wait_without_port(until, self.handle.queue.wake_fd(), None);
+                        drivegate_line::wait_without_port(until, self.handle.queue.wake_fd(), None);
                         self.handle.queue.clear_wake();
                         core.command_came();
                     } else {
-                        line::wait_until(until, Duration::ZERO);
+                        drivegate_line::wait_until(until, Duration::ZERO);
                     }
                 }
             }
@@ -408,19 +408,19 @@ impl Worker {
 
     fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
-        let mut stalls = Stalls::new(Instant::now(), line::since_boot());
+        let mut stalls = Stalls::new(Instant::now(), drivegate_line::since_boot());
         // Earliest time at which the bytes read next may have arrived.
         let mut since = None;
         while !self.stopping() {
             let now = Instant::now();
-            let stood = stalls.observe(now, line::since_boot());
+            let stood = stalls.observe(now, drivegate_line::since_boot());
             since = since.or(stood.map(|stall| stall.began));
             let until = core.on_time(now).min(now + BEAT);
             match line.wait(until, Some(self.handle.queue.wake_fd()))? {
                 Woken::Readable => {
                     let count = line.receive(&mut buffer)?;
                     let now = Instant::now();
-                    let stood = stalls.observe(now, line::since_boot());
+                    let stood = stalls.observe(now, drivegate_line::since_boot());
                     let came = since.take().or(stood.map(|stall| stall.began));
                     core.on_bytes(buffer.get(..count).unwrap_or_default(), came.unwrap_or(now));
                 }

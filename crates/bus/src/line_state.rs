@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use super::n2_late_replies::N2LateReplies;
 use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_its_reply};
-use crate::codec::{LineFormat, Protocol, Reply, Request};
-use crate::drive::plan::WireTime;
+use drivegate_model::drive::plan::WireTime;
+use drivegate_proto::{LineFormat, Protocol, Reply, Request};
 
 /// Time after which the bus sends even on a line that never goes silent, so that a stop can get out.
 pub const MAX_WAIT_FOR_SILENCE: Duration = Duration::from_millis(500);

@@ -42,13 +42,13 @@ use super::schedule::{Cadence, Poll, Schedule};
 use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
-use crate::codec::n2::Session;
-use crate::codec::{Protocol, RequestPdu};
-use crate::drive::plan::WireTime;
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, PlannedRead, PollClass, Value};
-use crate::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
-use crate::plant::{BusHandle, turn_away};
-use crate::process_image::{DriveImage, Timing};
+use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
+use drivegate_core::plant::{BusHandle, turn_away};
+use drivegate_core::process_image::{DriveImage, Timing};
+use drivegate_model::drive::plan::WireTime;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, Plan, PlannedRead, PollClass, Value};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Protocol, RequestPdu};
 
 /// Longest time between two checks of the bus at its drives and queue.
 const LOOK_ROUND: Duration = Duration::from_millis(100);

@@ -13,10 +13,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::codec::n2::command::Answer;
-use crate::codec::n2::{Form, form};
-use crate::codec::{Exception, RequestPdu};
-use crate::drive::{PlannedRead, PollClass};
+use drivegate_model::drive::{PlannedRead, PollClass};
+use drivegate_proto::n2::command::Answer;
+use drivegate_proto::n2::{Form, form};
+use drivegate_proto::{Exception, RequestPdu};
 
 /// Late replies remembered; beyond that the oldest is forgotten.
 const KEPT: usize = 16;
@@ -260,8 +260,8 @@ impl Late {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Table;
-    use crate::codec::n2::Session;
+    use drivegate_proto::Table;
+    use drivegate_proto::n2::Session;
 
     const WINDOW: Duration = Duration::from_millis(750);
 

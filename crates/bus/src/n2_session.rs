@@ -10,10 +10,10 @@
 use std::time::Instant;
 
 use super::transaction::Ended;
-use crate::codec::n2::{N2Options, Session};
-use crate::codec::{Exception, Reply};
-use crate::drive::{DriveIndex, PerDrive};
-use crate::order::Urgency;
+use drivegate_core::order::Urgency;
+use drivegate_model::drive::{DriveIndex, PerDrive};
+use drivegate_proto::n2::{N2Options, Session};
+use drivegate_proto::{Exception, Reply};
 
 /// Number of polls within which a drive must have reported all its changes.
 pub const MOST_POLLS: u8 = 16;

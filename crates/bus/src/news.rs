@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use super::confirm::Unconfirmed;
-use crate::codec::Exception;
-use crate::drive::{DriveIndex, PlannedRead};
-use crate::order::Refusal;
-use crate::queue::Denied;
+use drivegate_core::order::Refusal;
+use drivegate_core::queue::Denied;
+use drivegate_model::drive::{DriveIndex, PlannedRead};
+use drivegate_proto::Exception;
 
 /// A result of the master. Drives are given by their index on the bus.
 #[derive(Debug, Clone, PartialEq)]

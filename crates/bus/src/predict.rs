@@ -15,12 +15,12 @@ use std::time::Duration;
 
 use super::refresh;
 use super::schedule::{SLOW_SHARE, slow_share};
-use crate::codec::LineFormat;
-use crate::codec::wire::Silence;
-use crate::document::{Finding, format_duration};
-use crate::drive::plan::WireTime;
-use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
-use crate::process_image::{BusSpec, DriveSpec};
+use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_model::document::{Finding, format_duration};
+use drivegate_model::drive::plan::WireTime;
+use drivegate_model::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
+use drivegate_proto::LineFormat;
+use drivegate_proto::wire::Silence;
 
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use super::line_state::{Exchanged, LineState, Sending};
 use super::n2_late_replies::N2LateReplies;
 use super::transaction::Ended;
-use crate::codec::{LineFormat, Protocol, Reply, Request};
-use crate::diagnosis::signature::{self, Shape};
-use crate::line::{Line, Lost, Woken};
+use drivegate_core::diagnosis::signature::{self, Shape};
+use drivegate_line::{Line, Lost, Woken};
+use drivegate_proto::{LineFormat, Protocol, Reply, Request};
 
 /// A line with its settings, for single transactions.
 #[derive(Debug)]

@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 use self::drive::{Drive, Start};
 use self::frame::{Fate, Frame, different, in_words};
 use super::command_run::{CommandRun, KnownWords, Next, Step, StepPurpose};
-use crate::codec::{Exception, Reply, Table};
-use crate::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
-use crate::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Value};
-use crate::order::{
+use drivegate_core::order::{
     Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
 };
+use drivegate_model::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
+use drivegate_model::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Value};
+use drivegate_proto::{Exception, Reply, Table};
 
 /// Maximum number of requests of a command, including the reads of a state that it waits for; a command that sends more
 /// has no end.

@@ -15,11 +15,11 @@ pub(crate) use self::end::End;
 use self::ordered::{InForce, Ordered, in_force, reference_of};
 use self::round::Round;
 pub(super) use self::round::requests;
-use crate::codec::{RequestPdu, Table};
-use crate::drive::control::{Control, ControlItem};
-use crate::drive::{ModelPoint, Profile, Repeats};
-use crate::order::written;
-use crate::process_image::{Reading, RestoreLock};
+use drivegate_core::order::written;
+use drivegate_core::process_image::{Reading, RestoreLock};
+use drivegate_model::drive::control::{Control, ControlItem};
+use drivegate_model::drive::{ModelPoint, Profile, Repeats};
+use drivegate_proto::{RequestPdu, Table};
 
 /// Number of refresh intervals within which a drive that does not answer may return.
 const PERIODS: u32 = 3;

@@ -3,9 +3,9 @@
 
 use std::time::{Duration, Instant};
 
-use crate::codec::RequestPdu;
-use crate::drive::Profile;
-use crate::order::written;
+use drivegate_core::order::written;
+use drivegate_model::drive::Profile;
+use drivegate_proto::RequestPdu;
 
 /// Times after the stop at which the stop is written again.
 const AGAIN: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(3)];

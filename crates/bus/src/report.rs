@@ -16,15 +16,15 @@ use super::selection::{Findings, Selections};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
-use crate::codec::{Exception, Reply, Request, Table};
-use crate::diagnosis::own_timeout::Trip;
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
-use crate::event::{EventKind, Events};
-use crate::order::WriteStats;
-use crate::process_image::{
+use drivegate_core::diagnosis::own_timeout::Trip;
+use drivegate_core::event::{EventKind, Events};
+use drivegate_core::order::WriteStats;
+use drivegate_core::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Reading, Snapshot, TapedRead, Verdict,
 };
-use crate::stalls::Stall;
+use drivegate_core::stalls::Stall;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, PlannedRead, PointIndex, PollClass, Value};
+use drivegate_proto::{Exception, Reply, Request, Table};
 
 /// Time over which the load of the line is calculated.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);

@@ -4,7 +4,7 @@
 //! background transactions. Five rules modify this order: after eight commands in a row a due poll goes first;
 //! commands, and the reads that they cause, get no more of a line that is busy with polls than process data; slow
 //! polls that had less than their share of the time ([`slow_share`]) go before fast ones; background transactions
-//! have the idle time and otherwise a small share ([`crate::order::Pace`]); a drive that does not answer is probed
+//! have the idle time and otherwise a small share ([`drivegate_core::order::Pace`]); a drive that does not answer is probed
 //! so rarely that it costs at most 2 %.
 
 mod background;
@@ -21,9 +21,9 @@ use self::background::BackgroundShare;
 pub(crate) use self::drives::TRIAL_PAUSE;
 use self::drives::{DriveSchedule, Item, Presence, singles};
 use self::share::CommandShare;
-use crate::codec::Exception;
-use crate::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
-use crate::order::Urgency;
+use drivegate_core::order::Urgency;
+use drivegate_model::drive::{DriveIndex, PerDrive, Plan, PlannedRead, PollClass};
+use drivegate_proto::Exception;
 
 /// Number of consecutive commands after which a due poll is sent first.
 pub const COMMANDS_IN_A_ROW: u32 = 8;

@@ -9,8 +9,8 @@
 
 use std::time::{Duration, Instant};
 
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Raw};
-use crate::process_image::Reading;
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Raw};
 
 /// Number of consecutive comparisons that differ, all with the same selection, after which the selection counts as changed.
 const DIFFERING: u8 = 3;

@@ -11,13 +11,13 @@ use super::command_run::KnownWords;
 use super::drive_state::DriveState;
 use super::news::News;
 use super::supervision::written_run;
-use crate::codec::RequestPdu;
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
-use crate::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
-use crate::plant::{BusHandle, turn_away};
-use crate::process_image::{DriveImage, Reading};
-use crate::stalls::Stall;
-use crate::start_guard::BusGuards;
+use drivegate_core::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate_core::plant::{BusHandle, turn_away};
+use drivegate_core::process_image::{DriveImage, Reading};
+use drivegate_core::stalls::Stall;
+use drivegate_core::start_guard::BusGuards;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, Profile, Value};
+use drivegate_proto::RequestPdu;
 
 /// First and longest pause before a motor that keeps running after an interlock's stop is stopped again.
 const AGAIN: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));

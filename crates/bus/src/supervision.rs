@@ -14,13 +14,13 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
-use crate::drive::control::ControlItem;
-use crate::drive::{
+use drivegate_core::order::{Answer, Outcome, Refusal};
+use drivegate_core::process_image::{LeaseAction, Reading, Unavailable};
+use drivegate_model::drive::control::ControlItem;
+use drivegate_model::drive::{
     COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, DriveIndex, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass,
     Quality, Value,
 };
-use crate::order::{Answer, Outcome, Refusal};
-use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// Time after which an action that was not acknowledged is written again.
 const AGAIN: Duration = Duration::from_secs(1);

@@ -7,10 +7,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::transaction::{CONNECTION_CLOSED, Ended};
-use crate::codec::describe::{self, Kind, Part};
-use crate::codec::{LineFormat, Reply, Request};
-use crate::drive::DriveIndex;
-use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
+use drivegate_core::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::describe::{self, Kind, Part};
+use drivegate_proto::{LineFormat, Reply, Request};
 
 /// Bytes kept of one transaction; of a longer one the start is shown.
 const KEPT: usize = 2048;

@@ -12,8 +12,8 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use super::n2_late_replies::{N2LateReplies, Taken};
-use crate::codec::n2::Session;
-use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
 /// Maximum number of bytes considered in one transaction: further bytes are noise.
 const MOST_BYTES: usize = 1024;

@@ -18,9 +18,6 @@ pub mod start_guard;
 pub mod stop_all;
 pub mod version;
 
-use drivegate_model::drive;
-use drivegate_proto as codec;
-
 /// Hand-made plants for tests; the source file is shared with the package `testkit`, which depends on this one.
 #[cfg(test)]
 #[path = "../../testkit/src/lib.rs"]

@@ -14,13 +14,13 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 
-use crate::drive::DriveIndex;
-use crate::drive::why::Explanation;
 use crate::event::{Event, Events};
 use crate::order::{Answer, Origin, Outcome, Refusal, WriteStats};
 use crate::permit::Priorities;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 use crate::queue::CommandQueue;
+use drivegate_model::drive::DriveIndex;
+use drivegate_model::drive::why::Explanation;
 
 pub use self::earlier_meanings::{EarlierMeanings, follow_names};
 pub use self::exchange::{Exchange, Question, Target};

@@ -428,8 +428,8 @@ mod tests {
     use std::io::Write;
 
     use super::*;
-    use crate::codec::LineFormat;
     use crate::{Line, LineOptions};
+    use drivegate_proto::LineFormat;
 
     fn loopback() -> Vec<IpNet> {
         vec!["127.0.0.0/8".parse().unwrap()]

@@ -1,7 +1,7 @@
 //! Recognises by its first bytes which kind of server is at the other end of a connection that should be a raw serial port.
 
 use super::rfc2217::is_greeting;
-use crate::codec::checksum::crc16;
+use drivegate_proto::checksum::crc16;
 
 /// Number of bytes that decide: the length of an exception of Modbus TCP.
 const ENOUGH: usize = 9;
@@ -112,7 +112,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::codec::rtu;
+    use drivegate_proto::rtu;
 
     fn frame(address: u8, pdu: &[u8]) -> Vec<u8> {
         let mut out = Vec::new();

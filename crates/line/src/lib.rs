@@ -20,8 +20,6 @@ mod rfc2217;
 mod rs485;
 mod sys;
 
-use drivegate_proto as codec;
-
 pub use arrival::Arrival;
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, since_boot, wait_until};
@@ -48,7 +46,7 @@ use rustix::event::{PollFd, PollFlags};
 use rustix::termios::{ControlModes, tcgetattr};
 use tokio_serial::{DataBits, FlowControl, Parity as SerialParity, StopBits};
 
-use crate::codec::{LineFormat, Parity};
+use drivegate_proto::{LineFormat, Parity};
 
 /// Time to reach a device server at one address.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);

@@ -9,7 +9,7 @@ use std::net::TcpStream;
 use std::os::fd::{AsFd, BorrowedFd};
 
 use super::{Lost, read, write_all};
-use crate::codec::rtu;
+use drivegate_proto::rtu;
 
 /// Transaction id, protocol and length, before the unit id.
 const HEADER: usize = 6;

@@ -4,7 +4,7 @@ use std::os::fd::BorrowedFd;
 use std::time::Instant;
 
 use super::{Level, Line, LineOptions, Lost, Names, OpenError, Rs485, Spin, Woken};
-use crate::codec::LineFormat;
+use drivegate_proto::LineFormat;
 
 /// Settings of such a port: the kernel switches no direction, and RTS, which enables the driver of many adapters,
 /// is lowered. Linux raises RTS and DTR when a port is opened; they stay raised until these settings are applied.

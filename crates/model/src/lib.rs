@@ -2,5 +2,3 @@
 
 pub mod document;
 pub mod drive;
-
-use drivegate_proto as codec;

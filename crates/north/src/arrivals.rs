@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use crate::order::Arrival;
+use drivegate_core::order::Arrival;
 
 /// Maximum number of chunks whose arrival times are kept separately; later chunks get the time of the last one.
 const MOST_PIECES: usize = 64;
@@ -54,8 +54,8 @@ mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
-    use crate::order::Connection;
-    use crate::stalls::Stall;
+    use drivegate_core::order::Connection;
+    use drivegate_core::stalls::Stall;
 
     fn over(connection: &Connection, asked: Instant) -> Arrival {
         Arrival::over(connection.clone(), asked)

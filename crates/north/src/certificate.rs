@@ -7,7 +7,7 @@ use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
 use x509_cert::der::{self, Decode, Tag, Tagged};
 use x509_cert::name::Name;
 
-use crate::hex;
+use drivegate_core::hex;
 
 /// The role of a client (Modbus/TCP Security protocol specification, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");

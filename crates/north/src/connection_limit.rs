@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::order::Authority;
+use drivegate_core::order::Authority;
 
 /// Maximum number of displaced connections that are not closed yet.
 const MAX_CLOSING: usize = 32;

@@ -29,26 +29,6 @@ mod stats;
 mod tcp_server;
 mod tls_words;
 
-use drivegate_core::diagnosis;
-use drivegate_core::drill;
-use drivegate_core::event;
-use drivegate_core::files;
-use drivegate_core::hex;
-use drivegate_core::history;
-use drivegate_core::order;
-use drivegate_core::parameters;
-use drivegate_core::permit;
-use drivegate_core::plant;
-use drivegate_core::process_image;
-use drivegate_core::stalls;
-use drivegate_core::start_guard;
-use drivegate_core::stop_all;
-use drivegate_core::version;
-use drivegate_line as line;
-use drivegate_model::document;
-use drivegate_model::drive;
-use drivegate_proto as codec;
-
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -1,7 +1,7 @@
 //! Whether the gateway is ready: every bus is open, each drive was tried, and every server listens.
 
 use super::NorthState;
-use crate::plant::Plant;
+use drivegate_core::plant::Plant;
 
 /// Why the gateway is not ready; empty if it is ready.
 pub(crate) fn reasons(plant: &Plant, stats: &NorthState) -> Vec<String> {

@@ -8,7 +8,7 @@ use std::time::Instant;
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, NoPlace};
 use super::log_throttle::LogThrottle;
 use super::{ConnectionRefusal, NorthState, ServerKind};
-use crate::order::Authority;
+use drivegate_core::order::Authority;
 
 /// Counts the refused connections of one server.
 #[derive(Debug)]

@@ -10,11 +10,11 @@ mod gateway;
 pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
-use crate::codec::Exception;
-use crate::drive::tidy;
-use crate::drive::{ModelPoint, State, Value};
-use crate::permit::{HoldState, HoldView};
-use crate::process_image::Reading;
+use drivegate_core::permit::{HoldState, HoldView};
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::tidy;
+use drivegate_model::drive::{ModelPoint, State, Value};
+use drivegate_proto::Exception;
 
 /// First address that does not belong to the drive.
 pub const FIRST: u16 = 0x8000;

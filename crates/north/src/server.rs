@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio_util::sync::CancellationToken;
 
 use super::{NorthState, ServerError};
-use crate::plant::SharedPlant;
+use drivegate_core::plant::SharedPlant;
 
 /// Time limit for a server to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);

@@ -8,11 +8,11 @@ use super::http::SharedReply;
 use super::listener::ListenerStates;
 use super::mqtt::{BrokerRights, Handover};
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
-use crate::drill::Drills;
-use crate::files::Patience;
-use crate::history::{History, Recordings};
-use crate::parameters::Vault;
-use crate::stop_all::StopAll;
+use drivegate_core::drill::Drills;
+use drivegate_core::files::Patience;
+use drivegate_core::history::{History, Recordings};
+use drivegate_core::parameters::Vault;
+use drivegate_core::stop_all::StopAll;
 
 /// State that the servers share and that survives a reload, which replaces servers: counters, recent commands, and
 /// recordings.

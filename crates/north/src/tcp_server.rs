@@ -11,7 +11,7 @@ use tokio_util::task::TaskTracker;
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::server::{Reconfigure, Server};
 use super::{NorthState, ServerError, ServerKind};
-use crate::plant::SharedPlant;
+use drivegate_core::plant::SharedPlant;
 
 /// Differences of one TCP server from the others.
 pub(crate) trait TcpService<Options>: Debug + Sized {

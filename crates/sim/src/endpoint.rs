@@ -1,7 +1,7 @@
 //! The endpoint by which a master reaches the simulated line: a pseudo-terminal, a real serial port, or a network port.
 
-use crate::codec::{LineFormat, Parity};
-use crate::line::Pty;
+use drivegate_line::Pty;
+use drivegate_proto::{LineFormat, Parity};
 use rustix::event::{PollFd, PollFlags};
 use rustix::fs::{FlockOperation, flock};
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr, tcsetattr};

@@ -5,8 +5,8 @@ mod shape;
 pub use shape::{Burst, Kind};
 
 use super::random::Random;
-use crate::codec::{RequestPdu, Table};
-use crate::document::{Finding, parse_duration};
+use drivegate_model::document::{Finding, parse_duration};
+use drivegate_proto::{RequestPdu, Table};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
@@ -306,7 +306,7 @@ impl FaultPlan {
 mod tests {
     use super::shape::foreign;
     use super::*;
-    use crate::codec::{Decoded, Protocol, Request, RequestPdu, Table, rtu};
+    use drivegate_proto::{Decoded, Protocol, Request, RequestPdu, Table, rtu};
 
     const RTU: Protocol = Protocol::ModbusRtu;
 

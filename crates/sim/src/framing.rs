@@ -9,7 +9,7 @@
 
 use std::time::Duration;
 
-use crate::codec::{Protocol, ascii, rtu};
+use drivegate_proto::{Protocol, ascii, rtu};
 
 /// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1), also used for N2.
 pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);

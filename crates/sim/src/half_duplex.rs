@@ -13,7 +13,7 @@ use super::faults::{Burst, Fault, FaultPlan, Kind};
 use super::framing;
 use super::slave::{FrameMeaning, ReceivedRequest, Slaves, refuse};
 use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
-use crate::codec::{Exception, LineFormat, Protocol, rtu};
+use drivegate_proto::{Exception, LineFormat, Protocol, rtu};
 use std::collections::BTreeMap;
 use std::time::Duration;
 

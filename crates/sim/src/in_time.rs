@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::SimTime;
 use super::model::Model;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// A drive together with its clock.
 pub(crate) struct InTime<D> {

@@ -44,14 +44,5 @@ pub mod statistics;
 pub(crate) mod teco;
 pub mod wire;
 
-#[cfg(test)]
-use drivegate_core::order;
-#[cfg(test)]
-use drivegate_core::parameters;
-use drivegate_line as line;
-use drivegate_model::document;
-use drivegate_model::drive;
-use drivegate_proto as codec;
-
 /// Time since the simulated line was switched on.
 pub type SimTime = Duration;

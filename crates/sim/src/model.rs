@@ -4,7 +4,7 @@ use super::SimTime;
 use super::motor::{Load, Motor};
 use super::parameter_set::Writes;
 use super::random::Random;
-use crate::codec::{Exception, Reply, RequestPdu};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;

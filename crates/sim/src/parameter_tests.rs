@@ -8,13 +8,15 @@ use super::random::Random;
 use super::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive, Writes};
 use super::slave::{FrameMeaning, Slaves};
 use super::*;
-use crate::codec::n2::Session;
-use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
-use crate::drive::Profile;
-use crate::drive::parameters::RawValue;
-use crate::drive::profile::Profiles;
-use crate::order::Outcome;
-use crate::parameters::{Names, Next, ParameterFile, ParameterWrite, Plan, Reading, Wishes, differences, plan};
+use drivegate_core::order::Outcome;
+use drivegate_core::parameters::{
+    Names, Next, ParameterFile, ParameterWrite, Plan, Reading, Wishes, differences, plan,
+};
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
 const ADDRESS: u8 = 1;
 const SEEDS: u64 = 6;
@@ -281,7 +283,7 @@ fn a_locked_drive_refuses_what_the_plan_says_it_will() {
         for write in &plan.writes {
             let is_locked = lock
                 .as_ref()
-                .is_some_and(|lock| crate::drive::parameters::has(&lock.of, write.address));
+                .is_some_and(|lock| drivegate_model::drive::parameters::has(&lock.of, write.address));
             let reply = rig.write(write);
             match (is_locked, code) {
                 (true, Some(code)) => assert_eq!(reply, Reply::Exception(code), "{}", write.line),
@@ -313,12 +315,12 @@ fn a_write_while_the_motor_is_fed_is_recorded() {
                 .rules
                 .lock
                 .as_ref()
-                .is_some_and(|lock| crate::drive::parameters::has(&lock.of, address))
+                .is_some_and(|lock| drivegate_model::drive::parameters::has(&lock.of, address))
         };
         let free: Vec<(u16, RawValue)> = free.filter(|(address, _)| !locked(*address)).collect();
         let (address, value) = free[random.within(0..=free.len() as u64 - 1) as usize];
         let write = ParameterWrite {
-            id: crate::parameters::Id::new("any"),
+            id: drivegate_core::parameters::Id::new("any"),
             address,
             from: value,
             to: value,

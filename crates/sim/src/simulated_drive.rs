@@ -9,8 +9,8 @@ use super::model::{DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
 use super::random::Random;
 use super::teco::{TecoDrive, TecoOptions};
-use crate::codec::{Exception, Reply, RequestPdu};
-use crate::drive::Profile;
+use drivegate_model::drive::Profile;
+use drivegate_proto::{Exception, Reply, RequestPdu};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
@@ -337,7 +337,7 @@ mod properties;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Table;
+    use drivegate_proto::Table;
 
     #[test]
     fn a_write_takes_the_drive_from_its_autopilot() {

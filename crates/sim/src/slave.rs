@@ -8,9 +8,9 @@ use super::SimTime;
 use super::framing;
 use super::n2::{Board, BoardOptions, code_of, maps};
 use super::simulated_drive::{DriveOptions, SimulatedDrive};
-use crate::codec::modbus::encode_exception;
-use crate::codec::n2::{Answer, Command};
-use crate::codec::{Exception, Protocol, RequestPdu};
+use drivegate_proto::modbus::encode_exception;
+use drivegate_proto::n2::{Answer, Command};
+use drivegate_proto::{Exception, Protocol, RequestPdu};
 use std::collections::BTreeMap;
 
 /// Address of a broadcast.
@@ -240,7 +240,7 @@ mod tests {
     use super::super::simulated_drive::ModelOptions;
     use super::super::teco::TecoOptions;
     use super::*;
-    use crate::codec::{ascii, rtu};
+    use drivegate_proto::{ascii, rtu};
     use std::time::Duration;
 
     const RTU: Protocol = Protocol::ModbusRtu;

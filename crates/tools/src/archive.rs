@@ -9,7 +9,7 @@ use ring::digest::{Context, SHA256};
 use serde::{Deserialize, Serialize};
 use tar::{Archive, Builder, EntryType, Header};
 
-use crate::hex;
+use drivegate_core::hex;
 
 /// Version of the form; one that is greater cannot be read.
 pub(super) const FORMAT: u32 = 1;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::failure::{Outcome, negative};
 use super::report;
-use crate::order::chain::{Hash, Verifier, seq};
+use drivegate_core::order::chain::{Hash, Verifier, seq};
 
 /// Longest line that is read, bytes; any entry is far shorter.
 const LONGEST_LINE: u64 = 16 << 20;

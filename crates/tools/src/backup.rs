@@ -11,8 +11,8 @@ use super::archive::{Content, FORMAT, Hashed, LeftOut, Manifest, Member, Root, w
 use super::failure::Outcome;
 use super::restore::UNPACKED;
 use super::{ConfigFile, report};
-use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
-use crate::history::store;
+use drivegate_core::history::store;
+use drivegate_gateway::config::{FileKind, NamedFile, Settings, environment, named_files};
 
 /// Endings of files in the state directory that a backup does not need: locks, and partially written files.
 const TRANSIENT: [&str; 2] = ["lock", "partial"];

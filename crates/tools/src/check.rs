@@ -13,20 +13,20 @@ use serde::Serialize;
 
 use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, NamedConfig, report};
-use crate::bus::predict::{PredictedRequest, Prediction};
-use crate::bus::proof;
-use crate::config::memory::{BusMemory, Memory};
-use crate::config::{BusSettings, Loaded, Settings, environment};
-use crate::daemon::drills::load as kept_drills;
-use crate::document::format_duration;
-use crate::document::{Finding, Problem};
-use crate::drill::{Kind, ways};
-use crate::drive::raw_writes;
-use crate::files::names::DRILLS;
-use crate::history::trend::Reach;
-use crate::north::parameter_jobs::orphans;
-use crate::north::slot::Slot;
-use crate::process_image::{Access, DriveSpec};
+use drivegate_bus::predict::{PredictedRequest, Prediction};
+use drivegate_bus::proof;
+use drivegate_core::drill::{Kind, ways};
+use drivegate_core::files::names::DRILLS;
+use drivegate_core::history::trend::Reach;
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_gateway::config::memory::{BusMemory, Memory};
+use drivegate_gateway::config::{BusSettings, Loaded, Settings, environment};
+use drivegate_gateway::daemon::drills::load as kept_drills;
+use drivegate_model::document::format_duration;
+use drivegate_model::document::{Finding, Problem};
+use drivegate_model::drive::raw_writes;
+use drivegate_north::parameter_jobs::orphans;
+use drivegate_north::slot::Slot;
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///

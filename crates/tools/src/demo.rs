@@ -16,15 +16,15 @@ use self::written::Written;
 use super::failure::Outcome;
 use super::report;
 use super::simulate::Speed;
-use crate::codec::{LineFormat, Protocol};
-use crate::config::{LogFormat, LogSettings, Settings};
-use crate::daemon::Daemon;
-use crate::drive::profile::Profiles;
-use crate::sim::broker::Broker;
-use crate::sim::endpoint::EndpointOptions;
-use crate::sim::half_duplex::{LineRules, Wire};
-use crate::sim::simulated_drive::{DriveOptions, ModelOptions};
-use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate_gateway::config::{LogFormat, LogSettings, Settings};
+use drivegate_gateway::daemon::Daemon;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::{LineFormat, Protocol};
+use drivegate_sim::broker::Broker;
+use drivegate_sim::endpoint::EndpointOptions;
+use drivegate_sim::half_duplex::{LineRules, Wire};
+use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions};
+use drivegate_sim::wire::{SimulatedBus, SimulatedBusOptions};
 
 /// Shows the whole product with simulated drives: no hardware, nothing to install
 #[derive(Debug, clap::Args)]
@@ -39,7 +39,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "DIR")]
     pub write_config: Option<PathBuf>,
     /// Log level: off, error, warn, info, debug, trace, also for each target
-    #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
+    #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = drivegate_gateway::config::parse_level)]
     pub log: String,
 }
 

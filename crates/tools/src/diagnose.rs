@@ -8,7 +8,7 @@ use super::client::{Gateway, encoded};
 use super::failure::Outcome;
 use super::port_users::{self, BusAt, PortUser};
 use super::{printable, report};
-use crate::diagnosis::{Counted, Verdict};
+use drivegate_core::diagnosis::{Counted, Verdict};
 
 /// Shows what is wrong with a line: each verdict with evidence, certainty and remedy.
 #[derive(Debug, clap::Args)]
@@ -166,7 +166,7 @@ fn text(diagnosis: &Diagnosis) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnosis::{Cause, Certainty};
+    use drivegate_core::diagnosis::{Cause, Certainty};
 
     #[test]
     fn a_verdict_is_told_with_evidence_and_remedy() {

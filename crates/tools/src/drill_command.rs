@@ -11,8 +11,8 @@ use serde_json::json;
 use super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
-use crate::drill::{DrillReport, DrillState, Kind};
-use crate::north::http::messages::DrillWish;
+use drivegate_core::drill::{DrillReport, DrillState, Kind};
+use drivegate_north::http::messages::DrillWish;
 
 /// Time between two looks at a running drill.
 const LOOK: Duration = Duration::from_millis(500);

@@ -15,12 +15,12 @@ pub(super) use self::direct::Needs;
 use super::client::{Client, ClientError, Door, Gateway, GatewayRequest, NotFound, Reply, encoded};
 use super::failure::Failure;
 use super::report;
-use crate::config::{BusSettings, Settings};
-use crate::document::{candidates, nearest};
-use crate::drive::{PointIndex, Profile};
-use crate::north::http::messages::{Expected, ExpectedDrive};
-use crate::north::local::SocketPath;
-use crate::process_image::DriveSpec;
+use drivegate_core::process_image::DriveSpec;
+use drivegate_gateway::config::{BusSettings, Settings};
+use drivegate_model::document::{candidates, nearest};
+use drivegate_model::drive::{PointIndex, Profile};
+use drivegate_north::http::messages::{Expected, ExpectedDrive};
+use drivegate_north::local::SocketPath;
 
 // The options that select the drive of a command.
 #[derive(Debug, clap::Args)]

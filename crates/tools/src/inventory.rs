@@ -8,8 +8,8 @@ use toml::{Table, Value};
 
 use super::failure::{Failure, Outcome};
 use super::{NamedConfig, report};
-use crate::config::{Settings, environment};
-use crate::document::{self, Finding, Problem};
+use drivegate_gateway::config::{Settings, environment};
+use drivegate_model::document::{self, Finding, Problem};
 
 /// The group of all gateways, and the variable with the configuration of one.
 const GROUP: &str = "drivegate";
@@ -103,7 +103,7 @@ mod tests {
             }
         }
         let mut found = Vec::new();
-        secrets(&crate::config::schema(), "", &mut found);
+        secrets(&drivegate_gateway::config::schema(), "", &mut found);
         assert_eq!(found, SECRETS.map(|(key, _)| format!(".{}", key.join("."))));
     }
 

@@ -51,29 +51,6 @@ mod watch;
 mod why;
 mod write;
 
-use drivegate_bus as bus;
-use drivegate_core::diagnosis;
-use drivegate_core::drill;
-use drivegate_core::event;
-use drivegate_core::files;
-use drivegate_core::hex;
-use drivegate_core::history;
-use drivegate_core::order;
-use drivegate_core::parameters;
-use drivegate_core::plant;
-use drivegate_core::process_image;
-use drivegate_core::queue;
-use drivegate_core::stop_all;
-use drivegate_core::version;
-use drivegate_gateway::config;
-use drivegate_gateway::daemon;
-use drivegate_line as line;
-use drivegate_model::document;
-use drivegate_model::drive;
-use drivegate_north as north;
-use drivegate_proto as codec;
-use drivegate_sim as sim;
-
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::LazyLock;
@@ -81,8 +58,8 @@ use std::sync::LazyLock;
 use clap::Parser;
 
 use self::failure::{Failure, Outcome};
-use crate::config::{Settings, environment};
-use crate::drive::profile::Profiles;
+use drivegate_gateway::config::{Settings, environment};
+use drivegate_model::drive::profile::Profiles;
 
 /// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
@@ -93,7 +70,7 @@ pub const EXIT_DATA: u8 = 65;
 /// Exit code of a bad configuration (sysexits EX_CONFIG).
 pub const EXIT_CONFIG: u8 = 78;
 /// Default path of the configuration.
-pub const DEFAULT_CONFIG: &str = crate::config::DEFAULT_FILE;
+pub const DEFAULT_CONFIG: &str = drivegate_gateway::config::DEFAULT_FILE;
 
 /// The variable that names the configuration where `--config` is missing.
 const CONFIG_VARIABLE: &str = "DRIVEGATE_CONFIG";
@@ -113,9 +90,9 @@ fn default_config() -> &'static Path {
 }
 
 /// Version and commit of the build.
-static VERSION: LazyLock<String> = LazyLock::new(|| match version::commit() {
-    Some(commit) => format!("{} (commit {commit})", version::VERSION),
-    None => version::VERSION.to_string(),
+static VERSION: LazyLock<String> = LazyLock::new(|| match drivegate_core::version::commit() {
+    Some(commit) => format!("{} (commit {commit})", drivegate_core::version::VERSION),
+    None => drivegate_core::version::VERSION.to_string(),
 });
 
 /// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
@@ -232,7 +209,7 @@ fn runtime() -> Result<tokio::runtime::Runtime, String> {
 
 /// Runs `command` on a new runtime.
 fn block_on(command: impl Future<Output = Outcome>) -> Outcome {
-    let runtime = north::reading::watched_runtime();
+    let runtime = drivegate_north::reading::watched_runtime();
     runtime.map_err(cannot_start)?.block_on(command)
 }
 

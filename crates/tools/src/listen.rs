@@ -11,14 +11,14 @@ use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome};
 use super::report;
 use super::scan::{self, Found, Setting, Snippet, absolute};
-use crate::bus::Mode;
-use crate::bus::listener::guess::Guess;
-use crate::bus::listener::n2_survey::N2Survey;
-use crate::bus::listener::survey::Survey;
-use crate::bus::listener::{Decoder, Traffic};
-use crate::codec::{LineFormat, Protocol};
-use crate::drive::profile::Profiles;
-use crate::line::{Lost, Receiver, Woken};
+use drivegate_bus::Mode;
+use drivegate_bus::listener::guess::Guess;
+use drivegate_bus::listener::n2_survey::N2Survey;
+use drivegate_bus::listener::survey::Survey;
+use drivegate_bus::listener::{Decoder, Traffic};
+use drivegate_line::{Lost, Receiver, Woken};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::{LineFormat, Protocol};
 
 /// Time for each setting while the right one is looked for.
 const DWELL: Duration = Duration::from_secs(3);

@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 
-use crate::config::{self, Loaded, Settings};
+use drivegate_gateway::config::{self, Loaded, Settings};
 
 /// Time limit for reading the files of a reload.
 const TIMEOUT: Duration = Duration::from_secs(10);

@@ -18,8 +18,8 @@ use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 use self::journald::Journald;
 pub(super) use self::journald::reads_stderr;
 use self::line::{Form, LogLine};
-use crate::config::{LogFormat, LogSettings};
-use crate::order::SENT;
+use drivegate_core::order::SENT;
+use drivegate_gateway::config::{LogFormat, LogSettings};
 
 /// Log target of commands (`command::AuditRecord`), and the level of their lines.
 const AUDIT: &str = "audit";

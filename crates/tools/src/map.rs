@@ -13,11 +13,11 @@ use std::sync::Arc;
 use self::rows::{Row, gateway_rows};
 use super::failure::{Failure, Outcome};
 use super::{default_config, report};
-use crate::config::{BusSettings, Settings};
-use crate::north::modbus_tcp::{Role, View};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::{BusImage, DriveImage, DriveSpec};
-use crate::queue::CommandQueue;
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::process_image::{BusImage, DriveImage, DriveSpec};
+use drivegate_core::queue::CommandQueue;
+use drivegate_gateway::config::{BusSettings, Settings};
+use drivegate_north::modbus_tcp::{Role, View};
 
 /// Prints the Modbus TCP register map of a configuration, or its BACnet objects, for the SCADA engineer.
 #[derive(Debug, clap::Args)]

@@ -12,9 +12,9 @@ use super::client::Gateway;
 use super::drive_access::target;
 use super::failure::{Failure, Outcome, documented, negative};
 use super::report;
-use crate::files;
-use crate::north::http::messages::{ParameterReading, ReadParameters};
-use crate::parameters::{Names, ParameterFile, differences, read as read_file};
+use drivegate_core::files;
+use drivegate_core::parameters::{Names, ParameterFile, differences, read as read_file};
+use drivegate_north::http::messages::{ParameterReading, ReadParameters};
 
 /// Reads, compares, restores and shows the parameters of drives.
 ///
@@ -171,7 +171,7 @@ impl ReadArgs {
     }
 }
 
-type Found = (ParameterFile, std::sync::Arc<crate::drive::Profile>);
+type Found = (ParameterFile, std::sync::Arc<drivegate_model::drive::Profile>);
 
 fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Result<Found, Failure> {
     let target = target(gateway, drive)?;
@@ -197,8 +197,10 @@ fn read_from_drive(gateway: &Gateway, drive: &str, how: ReadParameters) -> Resul
     Ok((file, profile))
 }
 
-fn built_in(family: &str) -> Result<std::sync::Arc<crate::drive::Profile>, Failure> {
-    let profile = crate::drive::profile::Profiles::built_in().get(family).cloned();
+fn built_in(family: &str) -> Result<std::sync::Arc<drivegate_model::drive::Profile>, Failure> {
+    let profile = drivegate_model::drive::profile::Profiles::built_in()
+        .get(family)
+        .cloned();
     Ok(profile.ok_or_else(|| format!("profile `{family}` is not built in; --names; name the list in [params]"))?)
 }
 

@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::client::{Client, ClientError, Door, GatewayRequest};
-use crate::config::{Settings, environment};
-use crate::line::TAKEN;
-use crate::north::http::messages::Expected;
-use crate::north::local::{RuntimeDirectories, SocketPath};
+use drivegate_gateway::config::{Settings, environment};
+use drivegate_line::TAKEN;
+use drivegate_north::http::messages::Expected;
+use drivegate_north::local::{RuntimeDirectories, SocketPath};
 
 /// The name of a gateway's process.
 const GATEWAY: &str = "drivegate";

@@ -15,13 +15,13 @@ use serde_json::{Value as Json, json};
 
 use super::failure::{Failure, Outcome};
 use super::{printable, report};
-use crate::codec::Protocol;
-use crate::codec::n2::ASSUMPTIONS;
-use crate::config::unknown_profile;
-use crate::document::{Finding, Problem, format_duration};
-use crate::drive::control::Mask;
-use crate::drive::profile::{AddressRange, Form, Profiles};
-use crate::drive::{Bound, Derived, Point, PointIndex, Profile, Source, Step};
+use drivegate_gateway::config::unknown_profile;
+use drivegate_model::document::{Finding, Problem, format_duration};
+use drivegate_model::drive::control::Mask;
+use drivegate_model::drive::profile::{AddressRange, Form, Profiles};
+use drivegate_model::drive::{Bound, Derived, Point, PointIndex, Profile, Source, Step};
+use drivegate_proto::Protocol;
+use drivegate_proto::n2::ASSUMPTIONS;
 
 /// Mark of a point, fault text or address that no manual confirms.
 const NOT_VERIFIED: &str = "not verified";

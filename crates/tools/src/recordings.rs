@@ -9,8 +9,8 @@ use std::process::ExitCode;
 use super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::failure::{Failure, Outcome};
 use super::report;
-use crate::document::nearest;
-use crate::history::{Entry, Recording, export, pcapng, recording, store};
+use drivegate_core::history::{Entry, Recording, export, pcapng, recording, store};
+use drivegate_model::document::nearest;
 
 /// Lists, shows and exports recordings.
 ///

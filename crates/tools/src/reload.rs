@@ -7,9 +7,9 @@ use hyper::StatusCode;
 use super::client::{Client, GatewayRequest};
 use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
-use crate::config::{Settings, environment};
-use crate::north::http::messages::ReloadOutcome;
-use crate::north::local::SocketPath;
+use drivegate_gateway::config::{Settings, environment};
+use drivegate_north::http::messages::ReloadOutcome;
+use drivegate_north::local::SocketPath;
 
 /// Makes the running gateway reload its configuration, and waits for the result.
 ///

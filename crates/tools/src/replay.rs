@@ -9,14 +9,14 @@ use tokio::sync::broadcast;
 
 use super::failure::{self, Failure};
 use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, report};
-use crate::bus::listener::ListenCore;
-use crate::config::{BusSettings, Settings, environment};
-use crate::event::{Event, Events};
-use crate::history::capture::{self, Packet};
-use crate::order::WriteStats;
-use crate::plant::BusHandle;
-use crate::process_image::{BusImage, DriveImage, Outcome, public_points, value_or_null};
-use crate::queue::CommandQueue;
+use drivegate_bus::listener::ListenCore;
+use drivegate_core::event::{Event, Events};
+use drivegate_core::history::capture::{self, Packet};
+use drivegate_core::order::WriteStats;
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{BusImage, DriveImage, Outcome, public_points, value_or_null};
+use drivegate_core::queue::CommandQueue;
+use drivegate_gateway::config::{BusSettings, Settings, environment};
 
 /// Largest capture that is read.
 const MOST_BYTES: u64 = 1 << 30;

@@ -8,8 +8,8 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, pres
 use serde::Serialize;
 
 use super::{EXIT_FAILED, log, printable};
-use crate::config::Loaded;
-use crate::document::{Finding, Problem, parse_duration};
+use drivegate_gateway::config::Loaded;
+use drivegate_model::document::{Finding, Problem, parse_duration};
 
 /// Prints the lines of `text`, harmless for a terminal, to stdout.
 pub(super) fn print(text: &str) -> ExitCode {

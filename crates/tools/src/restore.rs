@@ -13,7 +13,7 @@ use super::archive::{self, Manifest, Root};
 use super::client::{Client, GatewayRequest};
 use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
-use crate::config::{Loaded, Settings, environment};
+use drivegate_gateway::config::{Loaded, Settings, environment};
 
 /// Sets a gateway up again from a file that `backup` wrote.
 ///

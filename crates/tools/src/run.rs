@@ -18,10 +18,10 @@ use super::failure::Outcome;
 use super::loading::Loading;
 use super::log::LogHandle;
 use super::{EXIT_CONFIG, VERSION, report};
-use crate::config::{Loaded, Settings};
-use crate::daemon::Daemon;
-use crate::north::local::Control;
-use crate::north::reading::watched_runtime;
+use drivegate_gateway::config::{Loaded, Settings};
+use drivegate_gateway::daemon::Daemon;
+use drivegate_north::local::Control;
+use drivegate_north::reading::watched_runtime;
 
 /// Time for files that are being written when the gateway has stopped.
 const LAST_WRITES: Duration = Duration::from_secs(1);

@@ -24,9 +24,9 @@ pub(super) use self::wishes::can_be;
 use super::adapters::persistent_name;
 use super::failure::{Failure, Outcome, documented, negative};
 use super::{port_users, report};
-use crate::bus::Mode;
-use crate::codec::LineFormat;
-use crate::drive::profile::Profiles;
+use drivegate_bus::Mode;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::LineFormat;
 
 /// Finds the drives on a line and prints a configuration for them; only reads.
 #[derive(Debug, clap::Args)]

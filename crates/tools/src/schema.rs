@@ -2,7 +2,7 @@
 
 use super::failure::Outcome;
 use super::report;
-use crate::config::schema;
+use drivegate_gateway::config::schema;
 
 /// Prints the JSON Schema (draft 2020-12) of the configuration, for editors and tools.
 #[derive(Debug, clap::Args)]

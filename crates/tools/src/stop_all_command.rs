@@ -3,8 +3,8 @@
 use super::client::{Gateway, GatewayRequest};
 use super::failure::{Outcome, documented, negative};
 use super::{printable, report};
-use crate::north::http::messages::StopBody;
-use crate::stop_all::{StopReport, Stopped};
+use drivegate_core::stop_all::{StopReport, Stopped};
+use drivegate_north::http::messages::StopBody;
 
 /// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stop.
 ///
@@ -65,7 +65,7 @@ fn shown(stopped: &StopReport) -> String {
         .drives
         .iter()
         .partition(|drive| drive.outcome == Stopped::Standing);
-    let line = |drive: &&crate::stop_all::StoppedDrive| {
+    let line = |drive: &&drivegate_core::stop_all::StoppedDrive| {
         let name = printable::line(&drive.drive);
         let reason = drive.reason.as_deref().unwrap_or_default();
         match drive.outcome {

@@ -15,7 +15,7 @@ use self::pcap::Capture;
 use super::client::{EventStream, Gateway, encoded};
 use super::failure::Outcome;
 use super::printable;
-use crate::process_image::Direction;
+use drivegate_core::process_image::Direction;
 
 /// Interval at which the capture is flushed.
 const FLUSH: Duration = Duration::from_secs(1);

@@ -6,8 +6,8 @@ use std::time::SystemTime;
 use super::drive_access::{OneDrive, Target};
 use super::failure::Outcome;
 use super::{printable, profiles, read, report};
-use crate::drive::{ModelPoint, Profile};
-use crate::north::http::messages::PointValue;
+use drivegate_model::drive::{ModelPoint, Profile};
+use drivegate_north::http::messages::PointValue;
 
 /// Prints a form for confirming a drive's profile on hardware: what the gateway reads, next to what the panel shows.
 #[derive(Debug, clap::Args)]
@@ -94,7 +94,7 @@ fn text(profile: &Profile, rows: &[PointValue], time: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
 
     #[test]
     fn the_form_has_every_reading_and_the_commands_of_the_family() {

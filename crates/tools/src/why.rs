@@ -7,7 +7,7 @@ use super::client::GatewayRequest;
 use super::drive_access::{Needs, OneDrive, Target};
 use super::failure::Outcome;
 use super::{printable, report};
-use crate::north::http::messages::Why;
+use drivegate_north::http::messages::Why;
 
 /// Shows why a drive does not run: each cause with evidence, age and remedy.
 #[derive(Debug, clap::Args)]
@@ -83,7 +83,7 @@ fn seconds(age: Duration) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::why::{Cause, Explanation};
+    use drivegate_model::drive::why::{Cause, Explanation};
 
     #[test]
     fn each_cause_has_its_evidence_its_age_and_a_remedy() {

@@ -7,9 +7,9 @@ use super::client::GatewayRequest;
 use super::drive_access::{Needs, OneDrive, RequestRoute, Target, point};
 use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
-use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
-use crate::process_image::value_or_null;
+use drivegate_core::process_image::value_or_null;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, Value};
 
 /// Commands a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]

@@ -17,9 +17,9 @@ const SHELLS: [Shell; 3] = [Shell::Bash, Shell::Zsh, Shell::Fish];
 pub(crate) fn write(folder: &Path) -> io::Result<()> {
     let pages = folder.join("man1");
     fs::create_dir_all(&pages)?;
-    clap_mangen::generate_to(drivegate::cli::command_line(), &pages)?;
+    clap_mangen::generate_to(drivegate_tools::command_line(), &pages)?;
     for shell in SHELLS {
-        let mut command = drivegate::cli::command_line();
+        let mut command = drivegate_tools::command_line();
         clap_complete::generate_to(shell, &mut command, "drivegate", folder)?;
     }
     Ok(())

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use drivegate::drive::profile::Profiles;
+use drivegate_model::drive::profile::Profiles;
 
 use super::Rig;
 use super::cases::{Case, cases};

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::net::TcpStream;
 use std::time::Duration;
 
-use drivegate::drive::profile::Profiles;
+use drivegate_model::drive::profile::Profiles;
 use drivegate_testkit::Order::{Pair, Word};
 use drivegate_testkit::number;
 
@@ -70,7 +70,7 @@ impl Rig {
 /// The register of the reference, if one write can set it together with the control word.
 fn beside(case: &Case, address: u16) -> Option<u16> {
     let profile = Profiles::built_in().get(case.profile).unwrap().clone();
-    let range = profile.range(drivegate::codec::Table::Holding, address)?;
+    let range = profile.range(drivegate_proto::Table::Holding, address)?;
     let other = case.reference_register()?;
     (range.write >= 2 && range.addresses.contains(&other) && address.abs_diff(other) == 1).then_some(other)
 }

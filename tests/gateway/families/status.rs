@@ -4,8 +4,8 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{RequestPdu, Table};
-use drivegate::drive::profile::{Profiles, WriteFunctions};
+use drivegate_model::drive::profile::{Profiles, WriteFunctions};
+use drivegate_proto::{RequestPdu, Table};
 use drivegate_sim::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
 use drivegate_testkit::Order::Word;
 use drivegate_testkit::{families, number, rows};

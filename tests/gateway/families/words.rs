@@ -1,8 +1,8 @@
 //! The effect of every word, worked out by hand from the figures of the manuals, compared with the profiles.
 
-use drivegate::codec::Table;
-use drivegate::drive::control::ControlItem;
-use drivegate::drive::profile::Profiles;
+use drivegate_model::drive::control::ControlItem;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::Table;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Does {

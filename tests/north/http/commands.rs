@@ -3,11 +3,11 @@
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use drivegate::drive::Value;
-use drivegate::north::http::{Options, Scope, Token, Tokens, User, Users};
-use drivegate::order::{Authority, Order, Origin, Outcome, SourceKind};
-use drivegate::plant::OrderRequest;
-use drivegate::process_image::{Access, LeaseAction, Supervision};
+use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_core::process_image::{Access, LeaseAction, Supervision};
+use drivegate_model::drive::Value;
+use drivegate_north::http::{Options, Scope, Token, Tokens, User, Users};
 use drivegate_testkit::{image, monitored};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
@@ -51,7 +51,7 @@ impl Rig {
     }
 
     async fn with(options: Options) -> Rig {
-        let pump = drivegate::process_image::DriveSpec {
+        let pump = drivegate_core::process_image::DriveSpec {
             access: Access::Control,
             supervision: Some(Supervision {
                 timeout: Duration::from_secs(5),

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::Exception;
-use drivegate::north::Server as _;
-use drivegate::north::http::{self, Options};
-use drivegate::process_image::Link;
+use drivegate_core::process_image::Link;
+use drivegate_north::Server as _;
+use drivegate_north::http::{self, Options};
+use drivegate_proto::Exception;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -169,7 +169,10 @@ async fn a_good_drive() {
         })
     );
     let names: Vec<&String> = points.as_object().unwrap().keys().collect();
-    assert_eq!(names.len(), drivegate::process_image::public_points(&plant::nx()).len());
+    assert_eq!(
+        names.len(),
+        drivegate_core::process_image::public_points(&plant::nx()).len()
+    );
     assert!(
         !names.contains(&&"process_data_in_1".to_string()),
         "what is never read is left out"

@@ -2,8 +2,8 @@
 
 use std::net::SocketAddr;
 
-use drivegate::north::http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Options};
-use drivegate::north::{ConnectionRefusal, ServerKind};
+use drivegate_north::http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Options};
+use drivegate_north::{ConnectionRefusal, ServerKind};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::time::timeout;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::plant::{self as hand_made, Server, event};
 use crate::support::tools::{root, tool};
 
-use drivegate::event::EventKind;
+use drivegate_core::event::EventKind;
 
 use self::lively::Lively;
 

@@ -3,8 +3,8 @@
 use std::fs;
 use std::time::Duration;
 
-use drivegate::drive::parameters::RawValue;
-use drivegate::parameters::{Entry, Id, ParameterFile, Store};
+use drivegate_core::parameters::{Entry, Id, ParameterFile, Store};
+use drivegate_model::drive::parameters::RawValue;
 use serde_json::{Value, json};
 
 use super::client::get;

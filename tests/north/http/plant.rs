@@ -7,17 +7,17 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Exception, Table};
-use drivegate::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
-use drivegate::drive::model::Kind;
-use drivegate::drive::{ModelPoint, Profile};
-use drivegate::event::{Event, EventKind};
-use drivegate::north::http::{self, Http, Options};
-use drivegate::north::{NorthState, SlotOutcome};
-use drivegate::north::{Reconfigure as _, Server as _};
-use drivegate::order;
-use drivegate::plant::{BusHandle, Plant, SharedPlant};
-use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
+use drivegate_core::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::order;
+use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
+use drivegate_core::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{ModelPoint, Profile};
+use drivegate_north::http::{self, Http, Options};
+use drivegate_north::{NorthState, SlotOutcome};
+use drivegate_north::{Reconfigure as _, Server as _};
+use drivegate_proto::{Exception, Table};
 use drivegate_testkit::{bus_spec, image, monitored, profile, read_all, ticket};
 use tokio_util::sync::CancellationToken;
 

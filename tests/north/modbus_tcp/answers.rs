@@ -4,10 +4,10 @@
 use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
 
-use drivegate::codec::Exception;
-use drivegate::north::modbus_tcp::Uncached;
-use drivegate::order::Outcome;
-use drivegate::process_image::{Access, Link};
+use drivegate_core::order::Outcome;
+use drivegate_core::process_image::{Access, Link};
+use drivegate_north::modbus_tcp::Uncached;
+use drivegate_proto::Exception;
 
 use drivegate_testkit::{number, rows};
 

@@ -1,14 +1,14 @@
 //! Writes: what reaches the bus, and when they are answered.
 
-use drivegate::drive::PointIndex;
+use drivegate_model::drive::PointIndex;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use drivegate::codec::Table;
-use drivegate::drive::Value;
-use drivegate::event::EventKind;
-use drivegate::order::{CAPACITY, Order, Outcome, SourceKind};
+use drivegate_core::event::EventKind;
+use drivegate_core::order::{CAPACITY, Order, Outcome, SourceKind};
+use drivegate_model::drive::Value;
+use drivegate_proto::Table;
 
 use super::rig::{Rig, acknowledge, frame, registers, until, words, write};
 
@@ -169,7 +169,7 @@ async fn pipelined_writes_reach_the_bus_in_their_order() {
     let written: Vec<Order> = rig.buses[0].orders();
     let wanted = values
         .iter()
-        .map(|v| Order::Write(drivegate::codec::RequestPdu::write_register(2003, *v)));
+        .map(|v| Order::Write(drivegate_proto::RequestPdu::write_register(2003, *v)));
     assert!(written.into_iter().eq(wanted));
     rig.end().await;
 }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use drivegate::north::Server as _;
-use drivegate::north::modbus_tcp::{self, Uncached};
+use drivegate_north::Server as _;
+use drivegate_north::modbus_tcp::{self, Uncached};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use drivegate::codec::Table;
-use drivegate::north::{ConnectionRefusal, ServerKind};
+use drivegate_north::{ConnectionRefusal, ServerKind};
+use drivegate_proto::Table;
 use rand_free::Dice;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

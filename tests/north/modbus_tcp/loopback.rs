@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{RequestPdu, Table};
-use drivegate::north::modbus_tcp::Loopback;
-use drivegate::order::{Authority, Command, Order};
-use drivegate::plant::{Plant, SharedPlant};
+use drivegate_core::order::{Authority, Command, Order};
+use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_north::modbus_tcp::Loopback;
+use drivegate_proto::{RequestPdu, Table};
 use drivegate_testkit::take_next;
 
 use super::rig::{acknowledge, frame, n2_plant, options, plant, registers, words};

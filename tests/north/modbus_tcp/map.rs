@@ -5,10 +5,10 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::config::Settings;
-use drivegate::drive::profile::Profiles;
-use drivegate::plant::Plant;
-use drivegate::process_image::DriveImage;
+use drivegate_core::plant::Plant;
+use drivegate_core::process_image::DriveImage;
+use drivegate_gateway::config::Settings;
+use drivegate_model::drive::profile::Profiles;
 use drivegate_testkit as testkit;
 use serde_json::Value;
 

@@ -3,7 +3,7 @@
 
 use std::process::Command;
 
-use drivegate::order::Order;
+use drivegate_core::order::Order;
 use serde::Deserialize;
 use tokio_modbus::client::{Reader, Writer};
 use tokio_modbus::slave::{Slave, SlaveContext};

@@ -2,10 +2,10 @@
 
 use std::time::SystemTime;
 
-use drivegate::codec::{Exception, RequestPdu, Table};
-use drivegate::north::modbus_tcp::Uncached;
-use drivegate::order::{Order, Outcome};
-use drivegate::process_image::Link;
+use drivegate_core::order::{Order, Outcome};
+use drivegate_core::process_image::Link;
+use drivegate_north::modbus_tcp::Uncached;
+use drivegate_proto::{Exception, RequestPdu, Table};
 
 use super::rig::{Client, Rig, n2_plant, options, registers, words, write};
 
@@ -150,10 +150,10 @@ async fn what_the_drive_refuses() {
         (Outcome::Purged, 6),
         // The reply does not answer the request.
         (
-            Outcome::Acknowledged(drivegate::codec::Reply::Registers(vec![1, 2, 3])),
+            Outcome::Acknowledged(drivegate_proto::Reply::Registers(vec![1, 2, 3])),
             4,
         ),
-        (Outcome::Acknowledged(drivegate::codec::Reply::Bits(vec![true])), 4),
+        (Outcome::Acknowledged(drivegate_proto::Reply::Bits(vec![true])), 4),
     ];
     for (outcome, code) in table {
         let answer = outcome.clone();

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, SystemTime};
 
-use drivegate::north::Reconfigure as _;
-use drivegate::north::modbus_tcp::{Identity, Options, Role};
+use drivegate_north::Reconfigure as _;
+use drivegate_north::modbus_tcp::{Identity, Options, Role};
 use rustls::version::{TLS12, TLS13};
 
 use super::rig::{Rig, registers, until, words};

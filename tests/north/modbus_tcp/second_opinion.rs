@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use arc_swap::ArcSwap;
-use drivegate::codec::RequestPdu;
-use drivegate::codec::Table;
-use drivegate::north::modbus_tcp::{Loopback, Uncached};
-use drivegate::order::Authority;
+use drivegate_core::order::Authority;
+use drivegate_north::modbus_tcp::{Loopback, Uncached};
+use drivegate_proto::RequestPdu;
+use drivegate_proto::Table;
 use proptest::prelude::*;
 use tokio_modbus::{Request, Response};
 

@@ -8,9 +8,9 @@ use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::north::modbus_tcp::{Identity, Options, Role, Tls};
-use drivegate::north::{ConnectionRefusal, ServerKind};
-use drivegate::order::SourceKind;
+use drivegate_core::order::SourceKind;
+use drivegate_north::modbus_tcp::{Identity, Options, Role, Tls};
+use drivegate_north::{ConnectionRefusal, ServerKind};
 use rustls::version::{TLS12, TLS13};
 use rustls::{ClientConfig, RootCertStore, SupportedProtocolVersion};
 use rustls_pki_types::pem::PemObject;

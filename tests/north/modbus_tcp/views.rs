@@ -1,10 +1,10 @@
 //! Other views of a listener: a drive at units 0 and 255, the common model at 0, only the drive's registers; and
 //! function 23, which writes and reads.
 
-use drivegate::codec::RequestPdu;
-use drivegate::drive::Value;
-use drivegate::north::modbus_tcp::{Options, Registers, View};
-use drivegate::order::{Order, Outcome};
+use drivegate_core::order::{Order, Outcome};
+use drivegate_model::drive::Value;
+use drivegate_north::modbus_tcp::{Options, Registers, View};
+use drivegate_proto::RequestPdu;
 
 use super::rig::{Rig, listener, options, registers, words, write};
 
@@ -154,7 +154,7 @@ async fn registers_of_the_drive_alone_are_there_up_to_the_last() {
     assert_eq!(
         rig.buses[0].orders(),
         [Order::Read(RequestPdu::read(
-            drivegate::codec::Table::Holding,
+            drivegate_proto::Table::Holding,
             0xFA00,
             2
         ))]

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use drivegate::drive::Value;
-use drivegate::event::EventKind;
+use drivegate_core::event::EventKind;
+use drivegate_model::drive::Value;
 use drivegate_testkit::rows;
 
 use super::bench::*;

@@ -2,8 +2,8 @@
 
 use std::time::{Duration, SystemTime};
 
-use drivegate::event::EventKind;
-use drivegate::north::mqtt::{Buffer, History};
+use drivegate_core::event::EventKind;
+use drivegate_north::mqtt::{Buffer, History};
 use tempfile::TempDir;
 
 use super::bench::*;

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use drivegate::north::mqtt::{self, Options, sparkplug};
+use drivegate_north::mqtt::{self, Options, sparkplug};
 use serde_json::json;
 use tempfile::TempDir;
 

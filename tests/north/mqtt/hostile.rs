@@ -5,7 +5,7 @@ use std::io::Write;
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 
-use drivegate::event::EventKind;
+use drivegate_core::event::EventKind;
 use drivegate_testkit::mqtt as packets;
 
 use super::bench::*;
@@ -318,7 +318,7 @@ fn odd_brokers_are_served() {
     for (name, manners) in cases {
         let broker = Hostile::start(manners);
         let mut options = options(broker.port);
-        options.telemetry_qos = drivegate::north::mqtt::Qos::AtLeastOnce;
+        options.telemetry_qos = drivegate_north::mqtt::Qos::AtLeastOnce;
         let gateway = Gateway::start(options, plant(&["p1"]));
         serves(&broker, &gateway, 40);
         for value in 0..10 {

@@ -7,9 +7,9 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use drivegate::drive::Value;
-use drivegate::north::mqtt::{self, sparkplug};
-use drivegate::process_image::Link;
+use drivegate_core::process_image::Link;
+use drivegate_model::drive::Value;
+use drivegate_north::mqtt::{self, sparkplug};
 use serde_json::{Value as Json, json};
 
 use super::bench::{Broker, CutLine, Gateway, Watcher, plant, wait_for};

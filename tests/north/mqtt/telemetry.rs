@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use drivegate::event::{Event, EventKind};
-use drivegate::north::mqtt::{Buffer, Qos};
-use drivegate::process_image::Link;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::process_image::Link;
+use drivegate_north::mqtt::{Buffer, Qos};
 use tempfile::TempDir;
 
 use super::bench::*;
@@ -64,7 +64,7 @@ fn all_topics_are_there_retained() {
 #[test]
 fn nothing_is_retained_where_that_is_not_wanted() {
     let broker = Broker::start();
-    let options = drivegate::north::mqtt::Options {
+    let options = drivegate_north::mqtt::Options {
         retain: false,
         ..options(broker.port)
     };

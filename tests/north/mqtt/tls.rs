@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use drivegate::event::EventKind;
-use drivegate::north::mqtt::{Password, Secret};
+use drivegate_core::event::EventKind;
+use drivegate_north::mqtt::{Password, Secret};
 use tempfile::TempDir;
 
 use super::bench::*;

@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 
-use drivegate::drive::Step;
-use drivegate::drive::profile::{Profile, Profiles};
+use drivegate_model::drive::Step;
+use drivegate_model::drive::profile::{Profile, Profiles};
 
 /// Each family that is not based on another, with the one that it is compared with.
 const FAMILIES: [(&str, Option<&str>); 8] = [

@@ -6,7 +6,7 @@ use clap::{Arg, ArgAction, Command};
 
 pub(crate) fn table() -> String {
     let mut text = String::from("\n|command|does|\n|---|---|\n");
-    let root = drivegate::cli::command_line();
+    let root = drivegate_tools::command_line();
     for command in root.get_subcommands().filter(|command| !command.is_hide_set()) {
         rows(&mut text, "drivegate", command);
     }

@@ -2,9 +2,9 @@
 
 use std::fmt::Write;
 
-use drivegate::codec::{N2Options, Protocol, Table, n2};
-use drivegate::drive::profile::{Form, Profile, Profiles};
-use drivegate::drive::{Bound, Derived, ModelPoint, Point, PointIndex, PollClass, Source, Value};
+use drivegate_model::drive::profile::{Form, Profile, Profiles};
+use drivegate_model::drive::{Bound, Derived, ModelPoint, Point, PointIndex, PollClass, Source, Value};
+use drivegate_proto::{N2Options, Protocol, Table, n2};
 
 /// The Modbus families.
 const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];

@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 
-use drivegate::drive::Step;
-use drivegate::drive::profile::Profiles;
+use drivegate_model::drive::Step;
+use drivegate_model::drive::profile::Profiles;
 
 /// Text of a profile whose timeout counts unknown requests, which the page states only once.
 const UNKNOWN: &str = "; which requests count is not known";

@@ -1,9 +1,9 @@
 //! A broadcast of a tool is an order to every drive of the bus, and is ordered among their other orders.
 
-use drivegate_world::drive::RawWrites;
-use drivegate_world::event::{Event, EventKind};
-use drivegate_world::order::Outcome;
-use drivegate_world::process_image::{LeaseAction, Supervision};
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::order::Outcome;
+use drivegate_core::process_image::{LeaseAction, Supervision};
+use drivegate_model::drive::RawWrites;
 
 use super::*;
 

@@ -1,7 +1,7 @@
 //! Drives with a timeout of their own, which counts only writes: it stops their motor, with a fault or without one.
 
-use drivegate_world::codec::RequestPdu;
-use drivegate_world::drive::Profile;
+use drivegate_model::drive::Profile;
+use drivegate_proto::RequestPdu;
 
 use super::*;
 use crate::orders::is_counted;

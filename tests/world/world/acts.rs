@@ -1,8 +1,8 @@
 //! The actions of the clients in a world.
 
 use super::*;
-use drivegate_world::drive::PointIndex;
-use drivegate_world::plant::OrderRequest;
+use drivegate_core::plant::OrderRequest;
+use drivegate_model::drive::PointIndex;
 
 /// Additional time that a client waits after an order that was answered at once.
 const TURNED_AWAY: Duration = Duration::from_millis(40);

@@ -1,6 +1,6 @@
 //! The end of the gateway in a world.
 
-use drivegate_world::queue::NotStopped;
+use drivegate_core::queue::NotStopped;
 
 use super::*;
 
@@ -38,7 +38,7 @@ impl World {
             });
         }
         for (index, bus) in self.buses.iter_mut().enumerate() {
-            let on_shutdown = bus.line.on_shutdown == drivegate_world::process_image::OnShutdown::Stop;
+            let on_shutdown = bus.line.on_shutdown == drivegate_core::process_image::OnShutdown::Stop;
             let Some(missing) = missing.get(&index).filter(|_| on_shutdown) else {
                 continue;
             };

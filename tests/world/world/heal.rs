@@ -1,8 +1,8 @@
 //! The second half of a world: every fault ends, and after a computed time all is as good as in a world that never had one.
 
-use drivegate_world::bus::master::Remains;
-use drivegate_world::codec::Table;
-use drivegate_world::drive::PollClass;
+use drivegate_bus::master::Remains;
+use drivegate_model::drive::PollClass;
+use drivegate_proto::Table;
 
 use super::*;
 use crate::bus::Parts;
@@ -296,8 +296,8 @@ impl World {
     }
 }
 
-fn ages_of(handle: &drivegate_world::plant::BusHandle) -> Ages {
-    let reads = |image: &Arc<drivegate_world::process_image::DriveImage>| {
+fn ages_of(handle: &drivegate_core::plant::BusHandle) -> Ages {
+    let reads = |image: &Arc<drivegate_core::process_image::DriveImage>| {
         let reads = image.plan.reads.iter().map(|read| (read.table, read.start, read.class));
         let polled = reads.filter(|(.., class)| matches!(class, PollClass::Fast | PollClass::Slow));
         polled.map(|read| (read, Some(Duration::ZERO))).collect()
@@ -306,7 +306,7 @@ fn ages_of(handle: &drivegate_world::plant::BusHandle) -> Ages {
 }
 
 /// Records the age of each value; a value that was never read has no age.
-fn note_ages(ages: &mut Ages, handle: &drivegate_world::plant::BusHandle, now: Instant) {
+fn note_ages(ages: &mut Ages, handle: &drivegate_core::plant::BusHandle, now: Instant) {
     for (ages, image) in ages.iter_mut().zip(&handle.image.drives) {
         let snapshot = image.snapshot();
         for ((table, start, _), oldest) in ages {

@@ -62,7 +62,7 @@ impl World {
         self.read_by_http();
     }
 
-    pub(super) fn on_event(&mut self, event: &drivegate_world::event::Event) {
+    pub(super) fn on_event(&mut self, event: &drivegate_core::event::Event) {
         let text = format!("event {}: {}", event.kind.name(), event.text);
         self.note(move || text);
         let Some(name) = &event.drive else { return };
@@ -192,7 +192,7 @@ impl World {
             let bad = |point: ModelPoint| {
                 profile.model_index(point).is_some() && reading.model(point).quality != Quality::Good
             };
-            use drivegate_world::drive::State;
+            use drivegate_model::drive::State;
             match reading.state() {
                 Some(State::Running) => assert!(!bad(ModelPoint::Running), "running though nobody knows"),
                 Some(State::Ready | State::NotReady) => {

@@ -1,7 +1,7 @@
 //! Drives that trip by a timeout of their own, which counts only writes of what the family says, and a gateway that is gone.
 
-use drivegate_world::sim::simulated_drive::Command;
-use drivegate_world::start_guard::Guards;
+use drivegate_core::start_guard::Guards;
+use drivegate_sim::simulated_drive::Command;
 
 use super::*;
 use crate::orders::is_counted;

@@ -3,10 +3,10 @@
 
 use std::time::SystemTime;
 
-use drivegate_world::drive::{Point, PointIndex, PollClass, Profile, Source};
-use drivegate_world::north::metrics::{self, Format};
-use drivegate_world::north::{NorthState, http};
-use drivegate_world::plant::DriveHandle;
+use drivegate_core::plant::DriveHandle;
+use drivegate_model::drive::{Point, PointIndex, PollClass, Profile, Source};
+use drivegate_north::metrics::{self, Format};
+use drivegate_north::{NorthState, http};
 use serde_json::Value as Json;
 
 use super::*;

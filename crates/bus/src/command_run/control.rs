@@ -9,11 +9,11 @@ use std::time::{Duration, Instant};
 use super::known_words::KnownWords;
 use super::standstill::{KnownRun, Motor, Verdict, Wants, depends_on_motor, judge};
 use super::steps::{Action, Check, RequestContext, Step, StepPurpose};
-use crate::codec::{Reply, RequestPdu, Table};
-use crate::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
-use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, PointIndex, Profile, Raw, Value};
-use crate::order::Refusal;
+use drivegate_core::order::Refusal;
+use drivegate_model::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Raw, Value};
+use drivegate_proto::{Reply, RequestPdu, Table};
 
 /// Pause between two looks at a state for which a sequence waits.
 pub(super) const LOOK_PAUSE: Duration = Duration::from_millis(20);

@@ -5,9 +5,9 @@ use std::time::Instant;
 use super::control::Word;
 use super::steps::{Action, Check};
 use super::{CommandRun, Phase};
-use crate::codec::Exception;
 use crate::confirm::Effect;
-use crate::order::{Interruption, Outcome, Receipt, Refusal};
+use drivegate_core::order::{Interruption, Outcome, Receipt, Refusal};
+use drivegate_proto::Exception;
 
 impl CommandRun {
     /// Ends the command with this outcome; if it started a motor, that is stopped.

@@ -1,8 +1,8 @@
 //! Function codes that a drive accepts for a write of one item: those of its profile, until the drive itself shows
 //! otherwise. Pure.
 
-use crate::codec::{Protocol, RequestPdu};
-use crate::drive::Profile;
+use drivegate_model::drive::Profile;
+use drivegate_proto::{Protocol, RequestPdu};
 
 /// The functions that a drive has shown to accept, if any.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

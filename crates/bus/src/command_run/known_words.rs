@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use super::functions::TakenFunctions;
-use crate::codec::{RequestPdu, Table};
-use crate::drive::Profile;
-use crate::drive::control::Control;
-use crate::order::written;
+use drivegate_core::order::written;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::control::Control;
+use drivegate_proto::{RequestPdu, Table};
 
 /// The registers and coils of a drive whose bits are commanded, as the drive has them.
 ///

@@ -6,9 +6,9 @@ use super::control::{self, Made, Word};
 use super::functions::other_function;
 use super::steps::{Action, Step, step_of};
 use super::{CommandRun, KnownWords, Next, Phase};
-use crate::codec::Exception;
-use crate::drive::Profile;
-use crate::order::{Interruption, Outcome};
+use drivegate_core::order::{Interruption, Outcome};
+use drivegate_model::drive::Profile;
+use drivegate_proto::Exception;
 
 /// Result of evaluating a command's first action.
 enum First {

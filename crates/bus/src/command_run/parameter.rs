@@ -4,11 +4,11 @@
 
 use super::state_read::StateRead;
 use super::steps::{Step, StepPurpose};
-use crate::codec::n2::Session;
-use crate::codec::{Reply, RequestPdu, Table};
-use crate::drive::Profile;
-use crate::drive::parameters::RawValue;
-use crate::order::{Outcome, ParameterOrder, Refusal};
+use drivegate_core::order::{Outcome, ParameterOrder, Refusal};
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Reply, RequestPdu, Table};
 
 /// Reads of a value that was acknowledged until it counts as not taken.
 const LOOKS: u32 = 3;

@@ -7,8 +7,8 @@ use super::functions::other_function;
 use super::parameter::Then;
 use super::steps::{Action, Check};
 use super::{CommandRun, Doubt, KnownWords, Phase, Step, StepPurpose};
-use crate::codec::{Exception, Reply, RequestPdu};
-use crate::order::{Outcome, Urgency};
+use drivegate_core::order::{Outcome, Urgency};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 
 /// Pause before a parameter is read back once more.
 const LOOK_AGAIN: Duration = Duration::from_millis(100);

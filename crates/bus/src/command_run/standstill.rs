@@ -4,7 +4,7 @@
 //! A drive that restarted, or was stopped at its panel, has lost its run command: the remembered word would
 //! start its motor.
 
-use crate::order::Refusal;
+use drivegate_core::order::Refusal;
 
 /// State of the motor as the drive reported it during this command, right before the write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

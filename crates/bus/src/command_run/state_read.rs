@@ -7,10 +7,10 @@ use super::control::Word;
 use super::standstill::{self, Motor};
 use super::steps::Action;
 use super::{CommandRun, KnownWords, Step, StepPurpose};
-use crate::codec::{Protocol, Reply, RequestPdu, Table};
-use crate::drive::model::Kind;
-use crate::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
-use crate::order::Outcome;
+use drivegate_core::order::Outcome;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
+use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
 
 /// A state of the drive with the registers or bits that show it, as one bit, a masked register or a derived value.
 #[derive(Debug, Clone, PartialEq)]
@@ -258,7 +258,7 @@ fn read_with(reads: &mut Vec<RequestPdu>, profile: &Profile, raw: &Raw) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
 
     fn look(name: &str) -> StateRead {
         StateRead::at_motor(Profiles::built_in().get(name).unwrap()).unwrap()

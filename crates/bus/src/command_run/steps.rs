@@ -7,12 +7,12 @@ use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
 use super::standstill::Motor;
-use crate::codec::n2::Session;
-use crate::codec::{RequestPdu, Table};
-use crate::drive::control::Setting;
-use crate::drive::profile::Form;
-use crate::drive::{Point, PointIndex, Profile, Raw, Value};
-use crate::order::{Refusal, written};
+use drivegate_core::order::{Refusal, written};
+use drivegate_model::drive::control::Setting;
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{Point, PointIndex, Profile, Raw, Value};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{RequestPdu, Table};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Action {

@@ -6,10 +6,10 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::codec::{Exception, RequestPdu, Table};
-use crate::drive::profile::Profiles;
-use crate::drive::{DriveIndex, Value};
-use crate::order::{Admitted, Answer, Origin, SourceKind, WriteStats};
+use drivegate_core::order::{Admitted, Answer, Origin, SourceKind, WriteStats};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{DriveIndex, Value};
+use drivegate_proto::{Exception, RequestPdu, Table};
 
 mod directions;
 mod elsewhere;

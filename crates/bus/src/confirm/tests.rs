@@ -4,10 +4,10 @@ use std::sync::Arc;
 use proptest::prelude::*;
 
 use super::*;
-use crate::codec::{Reply, RequestPdu, Table};
-use crate::drive::profile::Profiles;
-use crate::order::{Outcome, WriteStats};
-use crate::process_image::{DriveImage, DriveSpec};
+use drivegate_core::order::{Outcome, WriteStats};
+use drivegate_core::process_image::{DriveImage, DriveSpec};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::{Reply, RequestPdu, Table};
 
 struct CommandedDrive {
     drive: DriveImage,

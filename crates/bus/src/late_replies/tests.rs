@@ -1,5 +1,5 @@
 use super::*;
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 const DEADLINE: Duration = Duration::from_millis(105);
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::codec::{RequestPdu, Table, rtu};
+use drivegate_proto::{RequestPdu, Table, rtu};
 
 /// A line at 9600 baud on which every reply may be a duplicate of the previous one.
 struct DoublingLine {

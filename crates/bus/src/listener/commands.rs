@@ -5,12 +5,12 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
-use crate::drive::ModelPoint;
-use crate::drive::model::Kind;
-use crate::order::{Change, Outcome, written};
-use crate::process_image::DriveSpec;
 use crate::transaction::Ended;
+use drivegate_core::order::{Change, Outcome, written};
+use drivegate_core::process_image::DriveSpec;
+use drivegate_model::drive::ModelPoint;
+use drivegate_model::drive::model::Kind;
+use drivegate_proto::{Protocol, Reply, RequestPdu, Table, describe};
 
 /// Shortest time between two reported references of a drive.
 const PAUSE: Duration = Duration::from_secs(1);

@@ -8,16 +8,16 @@ use std::time::{Duration, Instant};
 use super::commands::{Commanded, Commands};
 use super::decoder::{Decoder, Exchange, Traffic};
 use crate::BusOptions;
-use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
 use crate::core::Closed;
-use crate::drive::{DriveIndex, PerDrive, Profile};
-use crate::event::{EventKind, Events};
 use crate::news::News;
-use crate::order::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
-use crate::plant::BusHandle;
-use crate::process_image::{Cadence, Outcome as Counted};
 use crate::report::Report;
 use crate::transaction::Ended;
+use drivegate_core::event::{EventKind, Events};
+use drivegate_core::order::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{Cadence, Outcome as Counted};
+use drivegate_model::drive::{DriveIndex, PerDrive, Profile};
+use drivegate_proto::{Exception, Protocol, Reply, RequestPdu, Table};
 
 /// Time without a reply after which a drive is offline, or three of its usual pauses if that is longer.
 const SILENT: Duration = Duration::from_secs(5);
@@ -66,7 +66,7 @@ impl ListenCore {
         writes: Arc<WriteStats>,
         now: Instant,
     ) -> ListenCore {
-        let known = |drive: &Arc<crate::process_image::DriveImage>| {
+        let known = |drive: &Arc<drivegate_core::process_image::DriveImage>| {
             drive.update(|snapshot| snapshot.heard = Some(Cadence::default()));
             DriveRecord {
                 address: drive.spec.address,
@@ -124,7 +124,7 @@ impl ListenCore {
         self.report.bus_down(why, now);
     }
 
-    /// Answers commands that entered the queue although [`crate::permit::admit`] prevents it, and a gateway that is
+    /// Answers commands that entered the queue although [`drivegate_core::permit::admit`] prevents it, and a gateway that is
     /// about to end: there is nothing to stop.
     pub(crate) fn refuse_all(&mut self, now: Instant) {
         let name = &self.bus.image.spec.name;

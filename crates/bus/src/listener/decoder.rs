@@ -18,12 +18,12 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use crate::codec::frames::{ADAPTER_DELAY, Cut, Frames, GLITCH, Piece, are_sound, may_be_request};
-use crate::codec::n2::{self, N2Options};
-use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu};
 use crate::late_replies::{FORGOTTEN_AFTER, LateReplies};
 use crate::n2_late_replies::{LateRequest, N2LateReplies, Taken};
 use crate::transaction::{Ended, MAY_BE_LATE};
+use drivegate_proto::frames::{ADAPTER_DELAY, Cut, Frames, GLITCH, Piece, are_sound, may_be_request};
+use drivegate_proto::n2::{self, N2Options};
+use drivegate_proto::{LineFormat, Protocol, Reply, Request, RequestPdu};
 
 /// Time after which a request without a reply has ended, unless the next request comes first: the longest
 /// `response_timeout`.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use super::decoder::{Decoder, Exchange, Traffic};
-use crate::codec::{LineFormat, Parity, Protocol};
+use drivegate_proto::{LineFormat, Parity, Protocol};
 
 /// Number of requests that decide the guess.
 const ENOUGH: u64 = 3;

@@ -7,7 +7,7 @@
 //! - [`n2_survey`]: what confirms or contradicts the assumptions about N2. Pure.
 //! - [`guess`]: protocol and format of a line from what is received with a setting. Pure.
 //!
-//! No code here can send: the thread ([`crate::BusTask`]) has a [`crate::line::Receiver`], which offers no way to send.
+//! No code here can send: the thread ([`crate::BusTask`]) has a [`drivegate_line::Receiver`], which offers no way to send.
 
 pub mod commands;
 pub mod core;

@@ -1,4 +1,4 @@
-//! Evidence from a real trunk for or against the assumptions about N2 ([`ASSUMPTIONS`](crate::codec::n2::ASSUMPTIONS)).
+//! Evidence from a real trunk for or against the assumptions about N2 ([`ASSUMPTIONS`](drivegate_proto::n2::ASSUMPTIONS)).
 //! Pure.
 
 use std::collections::BTreeMap;
@@ -6,8 +6,8 @@ use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
 use super::decoder::{Exchange, Traffic};
-use crate::codec::n2::command::checksum;
-use crate::codec::n2::{Answer, Command, Object, Region};
+use drivegate_proto::n2::command::checksum;
+use drivegate_proto::n2::{Answer, Command, Object, Region};
 
 /// Different values of one kind that are counted apart.
 const MOST_VALUES: usize = 16;

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use super::decoder::{Exchange, Traffic};
-use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
-use crate::drive::Profile;
-use crate::drive::profile::Profiles;
 use crate::transaction::Ended;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::{Protocol, Reply, RequestPdu, Table, describe};
 
 /// Different requests to one address that are counted apart.
 const MOST_REQUESTS: usize = 256;

@@ -4,21 +4,21 @@ use std::time::{Duration, Instant};
 
 use super::permission::AtTurn;
 use super::{Master, Purpose, Turn, TurnEnd};
-use crate::codec::rtu::LONGEST;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::plan::WireTime;
-use crate::drive::{DriveIndex, PlannedRead, PollClass};
 use crate::n2_session::Progress;
 use crate::news::News;
-use crate::order::{
-    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
-    Urgency, Work, written,
-};
-use crate::permit::{Stage, Verdict, client_access};
 use crate::schedule::Admission;
 use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
+use drivegate_core::order::{
+    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
+    Urgency, Work, written,
+};
+use drivegate_core::permit::{Stage, Verdict, client_access};
+use drivegate_model::drive::plan::WireTime;
+use drivegate_model::drive::{DriveIndex, PlannedRead, PollClass};
+use drivegate_proto::rtu::LONGEST;
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Time of a transaction whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);

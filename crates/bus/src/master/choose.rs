@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 use super::passed_on::{drop_unwanted, is_ready};
 use super::permission::{AtTurn, next_need};
 use super::{Before, Master, Purpose, Turn};
-use crate::codec::RequestPdu;
 use crate::command_run::{CommandRun, Step};
-use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, NextNeed};
-use crate::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEnd, Urgency, Work};
-use crate::queue::{Chosen, Ready};
 use crate::schedule::{Decision, Poll};
+use drivegate_core::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEnd, Urgency, Work};
+use drivegate_core::queue::{Chosen, Ready};
+use drivegate_model::drive::{DriveIndex, PerDrive};
+use drivegate_proto::RequestPdu;
 
 /// Maximum number of transactions of one rank in a row while a lower rank waits; then the lower one is served.
 const IN_A_ROW: u32 = 8;

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::DriveState;
-use crate::order::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
-use crate::plant::BusHandle;
-use crate::process_image::{DriveImage, Reading};
 use crate::supervision::written_run;
+use drivegate_core::order::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{DriveImage, Reading};
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
 
 /// Reports to the queue whose commands were executed, and whether the drive is under local control.
 pub(super) fn report_control(

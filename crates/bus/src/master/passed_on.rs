@@ -6,11 +6,11 @@ use super::background::{ChosenTransaction, Sending};
 use super::permission::AtTurn;
 use super::waits::Waits;
 use super::{Master, Turn};
-use crate::drive::PerDrive;
 use crate::drive_state::DriveState;
-use crate::order::{Command, NO_DRIVE, Order, Outcome, Pace, PassedOn};
-use crate::queue::{Choice, Pending, Ready};
 use crate::schedule::Admission;
+use drivegate_core::order::{Command, NO_DRIVE, Order, Outcome, Pace, PassedOn};
+use drivegate_core::queue::{Choice, Pending, Ready};
+use drivegate_model::drive::PerDrive;
 
 /// Ends passed-on requests whose tool has disconnected, or has sent another one.
 pub(super) fn drop_unwanted(pending: &mut Pending, now: Instant) {

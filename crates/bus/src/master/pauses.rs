@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::Master;
-use crate::order::Urgency;
-use crate::stalls::Stall;
+use drivegate_core::order::Urgency;
+use drivegate_core::stalls::Stall;
 
 impl Master {
     /// The thread did not run until `now`. Waiting commands are judged by that when they are chosen again. A command of

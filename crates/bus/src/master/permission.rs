@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 
 use super::Master;
 use crate::command_run::CommandRun;
-use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::{DriveState, NextNeed};
-use crate::order::{Outcome, Urgency};
-use crate::permit::{Ask, DriveFacts, Facts, LastWritten, Stage, Verdict};
-use crate::plant::BusHandle;
-use crate::process_image::DriveImage;
-use crate::queue::Denied;
+use drivegate_core::order::{Outcome, Urgency};
+use drivegate_core::permit::{Ask, DriveFacts, Facts, LastWritten, Stage, Verdict};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::DriveImage;
+use drivegate_core::queue::Denied;
+use drivegate_model::drive::{DriveIndex, PerDrive};
 
 /// Maximum age of the frequency range on which a command depends when it is about to be sent. Whether the range was
 /// too old for the command was decided when the command was accepted.

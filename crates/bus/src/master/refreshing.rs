@@ -4,14 +4,14 @@ use std::time::{Duration, Instant};
 
 use super::permission::AtTurn;
 use super::{Master, Purpose, Turn, TurnEnd};
-use crate::codec::{Reply, RequestPdu, Table};
-use crate::drive::{DriveIndex, PlannedRead, PollClass};
 use crate::drive_state::DriveState;
 use crate::news::News;
-use crate::order::{Arrival, Effect, Effects, Intent, Order, Origin, Outcome, SourceKind, Touched, Window};
-use crate::permit::{Ask, Facts, Stage, Verdict};
 use crate::refresh::{Around, End};
 use crate::transaction::Ended;
+use drivegate_core::order::{Arrival, Effect, Effects, Intent, Order, Origin, Outcome, SourceKind, Touched, Window};
+use drivegate_core::permit::{Ask, Facts, Stage, Verdict};
+use drivegate_model::drive::{DriveIndex, PlannedRead, PollClass};
+use drivegate_proto::{Reply, RequestPdu, Table};
 
 /// Limit for the time of refreshes that polls get back.
 const MOST_DEBT: Duration = Duration::from_secs(2);

@@ -3,17 +3,17 @@
 use std::time::{Duration, Instant};
 
 use super::{Before, Master, Purpose, Turn, TurnEnd};
-use crate::codec::n2::Session;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_run::{Step, StepPurpose};
-use crate::drive::{DriveIndex, PlannedRead, Point, PointIndex};
 use crate::n2_late_replies::LateRequest;
 use crate::n2_session::Progress;
 use crate::news::News;
-use crate::order::{Command, Outcome, Pace, Urgency, is_range_end, written};
-use crate::permit::is_reference;
 use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
+use drivegate_core::order::{Command, Outcome, Pace, Urgency, is_range_end, written};
+use drivegate_core::permit::is_reference;
+use drivegate_model::drive::{DriveIndex, PlannedRead, Point, PointIndex};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 impl Master {
     /// Applies the effects of a turn's transaction that has ended.

@@ -8,13 +8,13 @@ use tokio::sync::oneshot::Receiver;
 use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
-use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::drive_state::FRESH;
-use crate::order::{Answer, Origin, Outcome, SourceKind, WriteStats};
-use crate::plant::{BusHandle, Exchange, Question};
-use crate::process_image::{Access, DriveImage, OnShutdown};
-use crate::queue::{NotStopped, Stopping};
 use crate::stop_of_line::stop_of_line;
+use drivegate_core::order::{Answer, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::plant::{BusHandle, Exchange, Question};
+use drivegate_core::process_image::{Access, DriveImage, OnShutdown};
+use drivegate_core::queue::{NotStopped, Stopping};
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
 
 /// How long the stops wait for the broadcast before them: for a transaction on the line, the broadcast, and the
 /// time that the drives need to carry it out.

@@ -7,14 +7,14 @@ use drivegate_testkit::{bus, bus_spec, controlled, image, window};
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::codec::wire::Silence;
-use crate::codec::{Exception, Reply, Table};
-use crate::drive::{DriveIndex, ModelPoint, PollClass, Value};
-use crate::line::LineOptions;
-use crate::order::{Answer, Authority, Command, NO_DRIVE, Order, Ticket};
-use crate::permit::admit;
-use crate::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use crate::transaction::MAY_BE_LATE;
+use drivegate_core::order::{Answer, Authority, Command, NO_DRIVE, Order, Ticket};
+use drivegate_core::permit::admit;
+use drivegate_core::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
+use drivegate_line::LineOptions;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PollClass, Value};
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{Exception, Reply, Table};
 
 mod background;
 mod chosen;

@@ -3,15 +3,15 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use crate::codec::RequestPdu;
-use crate::drive::{DriveIndex, PerDrive};
 use crate::drive_state::DriveState;
 use crate::late_replies::LateReplies;
 use crate::n2_late_replies::N2LateReplies;
 use crate::n2_session::N2Sessions;
-use crate::order::{BackgroundRequest, Command, Order, PassedOn, Urgency};
-use crate::queue::Ready;
 use crate::start_gate::StartGate;
+use drivegate_core::order::{BackgroundRequest, Command, Order, PassedOn, Urgency};
+use drivegate_core::queue::Ready;
+use drivegate_model::drive::{DriveIndex, PerDrive};
+use drivegate_proto::RequestPdu;
 
 /// Conditions that a transaction may have to wait for.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 use std::time::Duration;
 
 use super::*;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 const IDENTIFY: Session = Session::Identify;
 const POLL: Session = Session::Poll { again: false };

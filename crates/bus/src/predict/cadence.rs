@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use super::faster::with_faster_points;
 use super::predict;
-use crate::codec::wire::Silence;
-use crate::process_image::{BusSpec, DriveSpec};
+use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_proto::wire::Silence;
 
 /// Cadences to choose from, in ms.
 const STEPS: [u64; 17] = [
@@ -41,7 +41,7 @@ pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
+    use drivegate_proto::{LineFormat, Protocol};
     use drivegate_testkit::{bus_spec, monitored};
 
     fn carried_by(protocol: Protocol, baud: u32, profiles: &[&str]) -> Option<(u128, u128)> {

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use super::predict;
-use crate::codec::wire::Silence;
-use crate::drive::Profile;
-use crate::process_image::{BusSpec, DriveSpec};
+use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_model::drive::Profile;
+use drivegate_proto::wire::Silence;
 
 /// The drives of a bus with the points `fast_if_carried` of their profiles in the fast class, if the line carries
 /// that with a fifth to spare; applied to all drives of the bus or to none. `None` also if there are no such
@@ -37,9 +37,9 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::codec::LineFormat;
-    use crate::drive::plan::Plan;
-    use crate::drive::{ModelPoint, PollClass};
+    use drivegate_model::drive::plan::Plan;
+    use drivegate_model::drive::{ModelPoint, PollClass};
+    use drivegate_proto::LineFormat;
     use drivegate_testkit as testkit;
 
     fn line(cycle: u64, profiles: &[&str]) -> Option<Vec<DriveSpec>> {

@@ -5,7 +5,7 @@ use drivegate_testkit::{bus_spec, monitored};
 
 use super::super::schedule::{Cadence, Decision, Polled, Schedule};
 use super::*;
-use crate::drive::{DriveIndex, Profile};
+use drivegate_model::drive::{DriveIndex, Profile};
 
 /// A family whose drives are read by one fast request of 11 registers, and by slow ones of 10 each.
 fn profile(bauds: &str, slow: usize) -> Arc<Profile> {
@@ -180,7 +180,7 @@ fn nothing_to_read_is_no_load() {
 
 #[test]
 fn the_built_in_family_reads_as_planned() {
-    let profiles = crate::drive::profile::Profiles::built_in();
+    let profiles = drivegate_model::drive::profile::Profiles::built_in();
     let drives = drives(profiles.get("vacon-nx").unwrap(), 2);
     let p = predict(&spec(9600, 100, 1000), Silence::Spec, &drives);
     let of_first: Vec<_> = p
@@ -314,7 +314,7 @@ fn the_schedule_does_what_is_predicted() {
     ] {
         as_scheduled(&spec(baud, cycle, slow_cycle), &drives(&profile("[]", slow), count));
     }
-    let profiles = crate::drive::profile::Profiles::built_in();
+    let profiles = drivegate_model::drive::profile::Profiles::built_in();
     let family = profiles.get("vacon-nx").unwrap();
     for (baud, cycle, count) in [
         (9600, 10, 1),

@@ -3,10 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use crate::codec::{Reply, RequestPdu};
-use crate::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
-use crate::drive::{PointIndex, Profile};
-use crate::order::written;
+use drivegate_core::order::written;
+use drivegate_model::drive::control::{Control, ControlItem, Run, Setting, Step, Until};
+use drivegate_model::drive::{PointIndex, Profile};
+use drivegate_proto::{Reply, RequestPdu};
 
 /// The state in which a proof begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use crate::codec::{Exception, RequestPdu};
-use crate::order::written;
+use drivegate_core::order::written;
+use drivegate_proto::{Exception, RequestPdu};
 
 /// What happens to a request of the proof.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,6 +1,6 @@
 use super::*;
-use crate::document::Problem;
-use crate::drive::profile::Profiles;
+use drivegate_model::document::Problem;
+use drivegate_model::drive::profile::Profiles;
 
 mod mutated;
 

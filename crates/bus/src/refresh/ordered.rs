@@ -2,9 +2,9 @@
 
 use std::time::Instant;
 
-use crate::codec::Table;
-use crate::drive::control::{Control, ControlItem};
-use crate::process_image::Reading;
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::control::{Control, ControlItem};
+use drivegate_proto::Table;
 
 /// Maximum number of registers of a reference.
 const LONGEST: usize = 2;

@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use super::ordered::{Ordered, Reference, reference_of};
 use super::{End, InForce, Refresh};
-use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_run::{Motor, StateRead};
-use crate::drive::Profile;
-use crate::drive::control::Control;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::control::Control;
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// A step of a refresh round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -4,10 +4,10 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::Report;
-use crate::drive::{DriveIndex, ModelPoint, Value};
-use crate::event::{Event, EventKind};
-use crate::order::Origin;
-use crate::process_image::Reading;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::order::Origin;
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
 
 /// Time from a command to the poll that shows the motor running, ramps and slow polls included.
 const STARTS_WITHIN: Duration = Duration::from_secs(30);

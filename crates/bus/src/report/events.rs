@@ -4,12 +4,12 @@ use std::time::{Instant, SystemTime};
 
 use super::{RECENT, Report, goes_offline};
 use crate::confirm::Unconfirmed;
-use crate::drive::DriveIndex;
-use crate::event::{Event, EventKind, RefusedCommand};
 use crate::news::Adopted;
-use crate::plant::explain;
-use crate::process_image::{LeaseAction, Snapshot};
-use crate::queue::Denied;
+use drivegate_core::event::{Event, EventKind, RefusedCommand};
+use drivegate_core::plant::explain;
+use drivegate_core::process_image::{LeaseAction, Snapshot};
+use drivegate_core::queue::Denied;
+use drivegate_model::drive::DriveIndex;
 
 impl Report {
     /// Publishes an event of a drive; `text` makes the message from the drive's name.

@@ -4,10 +4,10 @@
 use std::time::Instant;
 
 use super::{Findings, RECENT, Report};
-use crate::codec::Exception;
-use crate::drive::{DriveIndex, PlannedRead, PointIndex};
-use crate::event::EventKind;
-use crate::process_image::DriveImage;
+use drivegate_core::event::EventKind;
+use drivegate_core::process_image::DriveImage;
+use drivegate_model::drive::{DriveIndex, PlannedRead, PointIndex};
+use drivegate_proto::Exception;
 
 impl Report {
     /// Compares the values that were just read. Returns the monitoring points to read: drive, point and time.

@@ -4,8 +4,8 @@ use drivegate_testkit::{bus_spec, monitored, nx};
 
 use super::*;
 use crate::confirm::Unconfirmed;
-use crate::drive::DriveIndex;
-use crate::process_image::{DriveSpec, LeaseAction};
+use drivegate_core::process_image::{DriveSpec, LeaseAction};
+use drivegate_model::drive::DriveIndex;
 
 fn image(drives: u8) -> Arc<BusImage> {
     let profile = nx();
@@ -150,7 +150,7 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
     let mut image = image(1);
     let drive = &image.drives[0];
     let spec = DriveSpec {
-        supervision: Some(crate::process_image::Supervision {
+        supervision: Some(drivegate_core::process_image::Supervision {
             timeout: Duration::from_secs(5),
             action: LeaseAction::Stop,
             adopt: false,
@@ -206,7 +206,7 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
 /// A motor that starts and stops: the words of the status register, and the client reported as the cause.
 #[test]
 fn an_event_tells_who_started_and_stopped_a_motor() {
-    use crate::order::{Origin, Outcome, SourceKind, Ticket};
+    use drivegate_core::order::{Origin, Outcome, SourceKind, Ticket};
     const SECOND: Duration = Duration::from_secs(1);
     let image = image(1);
     let (events, writes) = (Events::default(), Arc::<WriteStats>::default());
@@ -223,7 +223,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     let order = |run: bool, outcome: Outcome, now: Instant| {
         let origin = Origin::new(SourceKind::Mqtt, "operator");
         let (ticket, _) = Ticket::new(origin, "d1", "run".to_string(), true, now, writes.clone());
-        let change = crate::order::Change {
+        let change = drivegate_core::order::Change {
             point: "run".to_string(),
             old: None,
             new: Value::Bool(run),

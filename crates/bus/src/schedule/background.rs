@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::{PollReason, Schedule};
-use crate::order::Pace;
+use drivegate_core::order::Pace;
 
 /// Time that the shares have earned and not used, in seconds of wire time; negative after a transaction that took
 /// longer than it had earned.

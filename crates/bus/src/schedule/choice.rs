@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::drives::{DriveSchedule, Item, Presence};
 use super::{FIRST_SHARE, Poll, PollReason, RoundStart, Schedule};
-use crate::drive::{DriveIndex, PlannedRead, PollClass};
+use drivegate_model::drive::{DriveIndex, PlannedRead, PollClass};
 
 impl Schedule {
     /// Slow polls earn their share of all time, including idle time: on a nearly full line, idle moments too short

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use super::Change;
-use crate::codec::Exception;
-use crate::drive::{Plan, PlannedRead, PollClass};
+use drivegate_model::drive::{Plan, PlannedRead, PollClass};
+use drivegate_proto::Exception;
 
 /// Share of the line that probes of a drive which does not answer take. The promise is 2 %; three such drives among ten
 /// were measured to cost 6.5 % with just that.

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::drives::{MUTE_PAUSE, Presence};
 use super::{Change, Poll, Polled, Schedule};
-use crate::drive::{DriveIndex, PollClass};
+use drivegate_model::drive::{DriveIndex, PollClass};
 
 /// Garbled answers in a row after which a drive counts as offline: something is present but cannot be read.
 const MOST_GARBLED: u32 = 8;

@@ -7,7 +7,7 @@
 use std::time::Duration;
 
 use super::COMMANDS_IN_A_ROW;
-use crate::order::Urgency;
+use drivegate_core::order::Urgency;
 
 /// Time of the line that was used in advance, before the others have paid for it.
 #[derive(Debug, Default)]

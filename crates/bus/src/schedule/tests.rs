@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use super::*;
-use crate::codec::Table;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::Table;
 
 mod chance;
 mod commands;

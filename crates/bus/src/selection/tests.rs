@@ -3,10 +3,10 @@
 use drivegate_testkit::nx;
 
 use super::*;
-use crate::drive::profile::Profiles;
-use crate::drive::{PointIndex, PollClass};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{PointIndex, PollClass};
 
-fn pair<'p>(profile: &'p crate::drive::Profile, name: &str) -> (&'p Point, &'p Point) {
+fn pair<'p>(profile: &'p drivegate_model::drive::Profile, name: &str) -> (&'p Point, &'p Point) {
     let point = profile.points.iter().find(|point| point.name == name).unwrap();
     (point, profile.points.get(point.monitor.unwrap()).unwrap())
 }
@@ -78,7 +78,7 @@ fn every_monitoring_register_is_in_a_request_of_its_own_class() {
     for name in ["vacon-nx", "eaton-svx", "eaton-hvx"] {
         let profiles = Profiles::built_in();
         let profile = profiles.get(name).unwrap();
-        let plan = crate::drive::Plan::of(profile);
+        let plan = drivegate_model::drive::Plan::of(profile);
         for point in profile.points.iter().filter(|point| point.monitor.is_some()) {
             let raw = profile.points.get(point.monitor.unwrap()).unwrap().raw().unwrap();
             let in_plan = plan.monitors.iter().filter(|read| covers(read, raw));

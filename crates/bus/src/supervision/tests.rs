@@ -3,21 +3,21 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
-use crate::codec::n2::Session;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_run::{CommandRun, Next, Step};
-use crate::drive::profile::Profiles;
-use crate::drive::{Derived, DriveIndex, Profile, Source};
 use crate::drive_state::{DriveState, NextNeed};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
-use crate::order::{
+use drivegate_core::order::{
     Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats,
     written,
 };
-use crate::permit::admit;
-use crate::plant::BusHandle;
-use crate::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
+use drivegate_core::permit::admit;
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{Derived, DriveIndex, Profile, Source};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 mod begins;
 mod chance;

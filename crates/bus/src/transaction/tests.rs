@@ -1,7 +1,7 @@
 //! Transactions in Modbus RTU; tests of Modbus ASCII, and random ones of both, are in separate files.
 
 use super::*;
-use crate::codec::{Table, rtu};
+use drivegate_proto::{Table, rtu};
 
 mod ascii;
 mod chance;

@@ -2,7 +2,7 @@
 
 use super::Drive;
 use super::figures::Sign;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 /// Transactions in the last minute from which on the failure rate of a drive is known.
 const KNOWN: u32 = 15;

@@ -10,9 +10,9 @@ pub use self::drive::{Drive, Sign};
 use super::STEP;
 use super::counters::{Contrast, FADE, InPhase, LATENCY, LONGEST_AGE, MAINS, Running, STEPS, Window, lock};
 use super::signature::{self, Answering, Shape};
-use crate::codec::describe::{self, Kind};
-use crate::codec::{LineFormat, Protocol, Request};
-use crate::drive::{DriveIndex, PerDrive};
+use drivegate_model::drive::{DriveIndex, PerDrive};
+use drivegate_proto::describe::{self, Kind};
+use drivegate_proto::{LineFormat, Protocol, Request};
 
 /// Maximum memory per drive; a line has at most 2 KiB in addition.
 pub const BYTES_PER_DRIVE: usize = 512;

@@ -27,8 +27,8 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
-use crate::codec::RequestPdu;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::RequestPdu;
 
 pub use figures::{Drive, End, Exchange, Figures, Line};
 

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use super::{Cause, Certainty, Finding};
-use crate::drive::{DriveIndex, Profile};
+use drivegate_model::drive::{DriveIndex, Profile};
 
 /// Longest time between the last write to a drive and a fault that is reported as a trip by the drive's own timeout.
 pub const WITHIN: Duration = Duration::from_secs(30);
@@ -61,7 +61,7 @@ pub fn finding(drive: DriveIndex, profile: &Profile, trip: Trip) -> Option<Findi
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
 
     #[test]
     fn by_the_code_by_what_the_timeout_counts_and_by_the_time() {

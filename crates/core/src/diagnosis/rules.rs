@@ -8,7 +8,7 @@ use super::counters::{Contrast, MAINS, STEPS};
 use super::failure_rates::{ENOUGH, FEW, FailureRates, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::figures::{Figures, Sign};
 use super::{Cause, Certainty, Finding};
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 /// Failures that a verdict about the whole line needs at least.
 const FEW_OF_LINE: u32 = 10;

@@ -1,6 +1,6 @@
 //! Evidence about the line in the bytes of one transaction.
 
-use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
+use drivegate_proto::{Decoded, Protocol, Reply, Request, RequestPdu};
 
 /// Stray bytes before a reply that still look like a line without bias or a late adapter.
 const MOST_STRAY: usize = 3;
@@ -162,7 +162,7 @@ pub fn answer(protocol: Protocol, bytes: &[u8]) -> Option<Answering> {
             .map(|(address, _)| Answering::Address(address)),
         Protocol::N2 => {
             let line = bytes.strip_suffix(b"\r")?;
-            crate::codec::n2::Answer::decode(line)
+            drivegate_proto::n2::Answer::decode(line)
                 .is_ok()
                 .then_some(Answering::Anybody)
         }
@@ -172,7 +172,7 @@ pub fn answer(protocol: Protocol, bytes: &[u8]) -> Option<Answering> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{Table, ascii, rtu};
+    use drivegate_proto::{Table, ascii, rtu};
 
     fn request() -> Request {
         Request::new(5, RequestPdu::read(Table::Holding, 2100, 2))

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use super::Cause;
-use crate::drive::commissioning::{Shared, gather};
-use crate::drive::{Profile, Step};
+use drivegate_model::drive::commissioning::{Shared, gather};
+use drivegate_model::drive::{Profile, Step};
 
 /// Maximum number of steps reported with a verdict.
 const MOST_STEPS: usize = 96;
@@ -151,8 +151,8 @@ pub fn step_lines<'p>(profiles: impl IntoIterator<Item = &'p Profile>, steps: &[
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Protocol;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
+    use drivegate_proto::Protocol;
 
     /// Every family with a manual has its checks for a silent drive in the text, and no check is cut off.
     #[test]

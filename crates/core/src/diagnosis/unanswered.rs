@@ -1,7 +1,7 @@
 //! Registers to which a drive never replies although it replies to others: lists them, and what to write in the profile.
 
 use super::{Cause, Certainty, Finding};
-use crate::drive::{DriveIndex, PlannedRead, Profile};
+use drivegate_model::drive::{DriveIndex, PlannedRead, Profile};
 
 /// Maximum number of registers and points that one verdict lists.
 const NAMED: usize = 6;
@@ -76,9 +76,9 @@ fn few(all: &[String]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Table;
-    use crate::drive::PollClass;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::PollClass;
+    use drivegate_model::drive::profile::Profiles;
+    use drivegate_proto::Table;
 
     fn read(start: u16, count: u16) -> PlannedRead {
         PlannedRead {

@@ -17,10 +17,10 @@ use tokio::sync::Notify;
 
 pub use self::report::{DrillReport, DrillState, DrillStep, Kind, Proof, SavedDrills, StopProof};
 use self::run::{Ended, Run};
-use crate::drive::ModelPoint;
 use crate::order::Origin;
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Access, DriveSpec, Machine};
+use drivegate_model::drive::ModelPoint;
 
 /// Time within which an armed drill must be started.
 pub const ARMED: Duration = Duration::from_secs(60);

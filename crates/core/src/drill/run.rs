@@ -9,13 +9,13 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::broadcast::Receiver;
 
 use super::{ARMED, DrillOptions, DrillReport, DrillState, DrillStep, Kind, Proof};
-use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind};
 use crate::order::{AuditRecord, Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::permit::DrillLock;
 use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 use crate::process_image::{Machine, Reading, Standstill};
 use crate::stop_all::OneStop;
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// Maximum time to write the start of a drill to disk; after that the operator no longer expects the motor to start.
 const KEEP: Duration = Duration::from_secs(5);

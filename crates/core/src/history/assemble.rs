@@ -9,8 +9,8 @@ use serde_json::Value as Json;
 use super::recorder::{Capture, Note, NoteBody, reading};
 use super::recording::{Bus, Column, CommandNote, Drive, EventNote, Frame, Further, Header, Read, Recording, VERSION};
 use super::summary;
-use crate::drive::{DriveIndex, PointIndex, Profile, Source};
 use crate::process_image::{Reading, Snapshot, TapedRead, value_or_null};
+use drivegate_model::drive::{DriveIndex, PointIndex, Profile, Source};
 
 pub fn assemble(capture: &Capture) -> Recording {
     let spec = &capture.drive.spec;
@@ -74,7 +74,7 @@ fn seconds(at: Instant, trigger: Instant) -> f64 {
 }
 
 fn columns(profile: &Profile) -> Vec<Column> {
-    let column = |point: &crate::drive::Point| Column {
+    let column = |point: &drivegate_model::drive::Point| Column {
         name: point.name.clone(),
         unit: point.unit.clone(),
     };

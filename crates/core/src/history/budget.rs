@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use super::RecorderOptions;
 use super::packed_ring::{self, packed_frame, packed_read};
-use crate::drive::plan::WireTime;
-use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::process_image::{BusSpec, DriveSpec};
+use drivegate_model::drive::plan::WireTime;
+use drivegate_model::drive::{Plan, PlannedRead, PollClass};
 
 /// Memory that the recorder takes for all buses together at most, bytes.
 pub const MOST_BYTES: usize = 20 << 20;

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::drive::{ModelPoint, Value};
 use crate::process_image::Reading;
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// The counters of a drive since it was first seen.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

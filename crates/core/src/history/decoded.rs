@@ -1,10 +1,10 @@
 //! What the frames of a recording say, in the words of `drivegate trace`. Pure.
 
 use super::recording::Frame;
-use crate::codec::describe::{self, Kind};
-use crate::codec::n2::{self, Command};
-use crate::codec::{Protocol, Request, RequestPdu};
 use crate::process_image::Verdict;
+use drivegate_proto::describe::{self, Kind};
+use drivegate_proto::n2::{self, Command};
+use drivegate_proto::{Protocol, Request, RequestPdu};
 
 /// Decodes the frames of a line in their order: a reply is read against the request before it.
 #[derive(Debug)]
@@ -66,8 +66,8 @@ fn request(protocol: Protocol, frame: &[u8]) -> Option<Request> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::RequestPdu::Read;
-    use crate::codec::Table;
+    use drivegate_proto::RequestPdu::Read;
+    use drivegate_proto::Table;
 
     fn frame(verdict: Verdict, bytes: &[u8]) -> Frame {
         Frame {

@@ -8,8 +8,8 @@ use super::Clock;
 use super::counters::{Counters, Totals};
 use super::line::LineHistory;
 use super::trend::{DriveTrend, Reach};
-use crate::drive::Profile;
 use crate::process_image::{BusImage, DriveSpec, Reading, TapedRead};
+use drivegate_model::drive::Profile;
 
 /// Maximum number of drives removed from the configuration whose counters are kept, in case they return.
 const MOST_ABSENT: usize = 4096;

@@ -6,9 +6,9 @@ use std::collections::VecDeque;
 use std::marker::PhantomData;
 use std::time::{Duration, Instant};
 
-use crate::codec::Table;
-use crate::drive::DriveIndex;
 use crate::process_image::{TapedFrame, TapedRead, Verdict};
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::Table;
 
 /// Bytes before each entry: length and time of the entry.
 const HEAD: usize = 4 + 8;

@@ -13,10 +13,10 @@ use super::ring::{Ring, Timed};
 use super::trend::Reach;
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
-use crate::drive::{DriveIndex, PerDrive, Plan};
 use crate::process_image::{
     BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
 };
+use drivegate_model::drive::{DriveIndex, PerDrive, Plan};
 
 /// Further triggers that a recording notes after the first.
 const MOST_TRIGGERS: usize = 32;

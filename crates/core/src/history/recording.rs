@@ -10,9 +10,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
 use super::trigger::TriggerKind;
-use crate::codec::Table;
-use crate::codec::checksum::crc16;
 use crate::process_image::Verdict;
+use drivegate_proto::Table;
+use drivegate_proto::checksum::crc16;
 
 /// Version of the recording format.
 pub const VERSION: u32 = 1;

@@ -5,8 +5,8 @@ use serde_json::Value as Json;
 
 use super::recording::Recording;
 use super::trigger::TriggerKind;
-use crate::drive::Profile;
 use crate::process_image::Verdict;
+use drivegate_model::drive::Profile;
 
 /// Errors on the line within this time before the trigger are mentioned in the summary, s.
 const ERRORS_BEFORE: f64 = 5.0;

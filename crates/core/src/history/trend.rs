@@ -8,9 +8,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::Clock;
 use super::buckets::Buckets;
-use crate::codec::Table;
-use crate::drive::{ModelPoint, PointIndex, Profile, Source};
 use crate::process_image::{Reading, TapedRead};
+use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Source};
+use drivegate_proto::Table;
 
 /// A span of time, and the length of the steps for it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

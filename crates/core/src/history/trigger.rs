@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::event::EventKind;
 use crate::order::AuditRecord;
 use crate::process_image::{Reading, TriggerLimit};
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
 
 /// Errors on a line within [`BURST_IN`] that are a burst.
 pub const BURST: usize = 10;

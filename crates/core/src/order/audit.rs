@@ -15,8 +15,8 @@ use arc_swap::ArcSwapOption;
 use serde::{Deserialize, Serialize, Serializer};
 use tokio::sync::broadcast;
 
-use crate::drive::Value;
 use crate::event::{FairRing, RefusalLimit, in_order};
+use drivegate_model::drive::Value;
 
 pub use file::{AuditFile, AuditFileOptions};
 

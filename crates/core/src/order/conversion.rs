@@ -1,8 +1,8 @@
 //! The value that a point takes when the register of another point is written. Pure.
 
-use crate::drive::model::Kind;
-use crate::drive::{Point, PointIndex, Source, Value};
 use crate::process_image::Reading;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{Point, PointIndex, Source, Value};
 
 /// The value that a point takes when the register of another point is written.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -2,8 +2,8 @@
 //! command is accepted. Pure.
 
 use super::{Order, Touched, Urgency, written};
-use crate::codec::Table;
-use crate::drive::{DriveIndex, ModelPoint, Profile};
+use drivegate_model::drive::{DriveIndex, ModelPoint, Profile};
+use drivegate_proto::Table;
 
 /// Rights that a command requires from the hold of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -138,7 +138,7 @@ fn raw(profile: &Profile, table: Table, items: &[(u16, u16)]) -> Effect {
     let bit = |point: ModelPoint| {
         let raw = register(point)?;
         let (_, word) = items.iter().find(|(address, _)| raw.covers(table, *address))?;
-        raw.decode(&[*word], crate::drive::model::Kind::Bool)
+        raw.decode(&[*word], drivegate_model::drive::model::Kind::Bool)
     };
     let by_control = || {
         let control = profile.control.as_ref().filter(|control| control.at.table == table)?;
@@ -204,9 +204,9 @@ impl Effects {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::RequestPdu;
-    use crate::drive::Value;
-    use crate::drive::profile::{Form, Profiles};
+    use drivegate_model::drive::Value;
+    use drivegate_model::drive::profile::{Form, Profiles};
+    use drivegate_proto::RequestPdu;
 
     #[test]
     fn points_and_registers_say_the_same() {

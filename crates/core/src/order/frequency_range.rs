@@ -4,9 +4,9 @@
 use std::time::Instant;
 
 use super::{Becomes, becomes};
-use crate::codec::Table;
-use crate::drive::{Bound, PointIndex, Profile, Source, Value};
 use crate::process_image::Reading;
+use drivegate_model::drive::{Bound, PointIndex, Profile, Source, Value};
+use drivegate_proto::Table;
 
 /// A frequency range as it was when a command was admitted.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -49,8 +49,8 @@ pub use touched::Touched;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use crate::codec::RequestPdu;
-use crate::drive::{DriveIndex, PointIndex, Profile, Value};
+use drivegate_model::drive::{DriveIndex, PointIndex, Profile, Value};
+use drivegate_proto::RequestPdu;
 
 /// Default time after which a command is no longer sent.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::audit::Reach;
 use super::{CAPACITY, Guarded};
-use crate::codec::{Exception, Reply};
+use drivegate_proto::{Exception, Reply};
 
 /// Event that interrupted a started command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

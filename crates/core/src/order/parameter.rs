@@ -1,7 +1,7 @@
 //! The order that writes one parameter.
 
-use crate::codec::{RequestPdu, Table};
-use crate::drive::parameters::RawValue;
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_proto::{RequestPdu, Table};
 
 /// A parameter to set. The bus reads the value and whether the motor runs, writes, and reads the value back; nothing
 /// else is sent between the reply that the motor is stopped and the write. A drive that already has the value is not

@@ -4,8 +4,8 @@
 use std::sync::{Arc, OnceLock};
 
 use super::{Order, Outcome, written};
-use crate::codec::{RequestPdu, Table};
-use crate::drive::{ModelPoint, PointIndex, Profile, Value};
+use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
+use drivegate_proto::{RequestPdu, Table};
 
 /// A command split into its stop and its rest.
 #[derive(Debug, Clone, PartialEq)]
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn one_answer_tells_both_parts() {
-        use crate::codec::Reply;
+        use drivegate_proto::Reply;
         let done = || Some(Outcome::Acknowledged(Reply::Written));
         assert_eq!(joined(None, done()), None);
         assert_eq!(joined(done(), None), None);

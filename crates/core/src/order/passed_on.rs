@@ -5,8 +5,8 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 
 use super::{Outcome, SourceKind, Ticket};
-use crate::codec::RequestPdu;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::RequestPdu;
 
 /// How much of a busy line background transactions may take, as shares of the wire time of process data; an idle
 /// line is theirs. All of them together take at most a fifth of a busy line.

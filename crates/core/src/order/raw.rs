@@ -1,6 +1,6 @@
 //! The registers that a raw write sets. Pure.
 
-use crate::codec::{RequestPdu, Table};
+use drivegate_proto::{RequestPdu, Table};
 
 /// The registers (or coils, as 0 and 1) that a raw write sets, as address and value.
 pub fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use super::Origin;
-use crate::drive::{ModelPoint, Value};
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// A point that is commanded by priorities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

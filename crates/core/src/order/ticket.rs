@@ -293,7 +293,7 @@ pub(super) mod tests {
     fn a_confirmation_comes_after_the_one_answer() {
         let stats = Arc::new(WriteStats::default());
         let now = Instant::now();
-        let acknowledged = Outcome::Acknowledged(crate::codec::Reply::Written);
+        let acknowledged = Outcome::Acknowledged(drivegate_proto::Reply::Written);
         let (mut ticket, mut answer) = ticket(&stats, now);
         let mut confirmation = ticket.confirmation();
         let receipt = ticket.acknowledge(acknowledged.clone(), now + Duration::from_millis(5));

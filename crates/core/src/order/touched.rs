@@ -2,8 +2,8 @@
 //! reordered. Pure.
 
 use super::{FrequencyRange, Order, written};
-use crate::codec::Table;
-use crate::drive::{PointIndex, Profile, Raw};
+use drivegate_model::drive::{PointIndex, Profile, Raw};
+use drivegate_proto::Table;
 
 /// A register or coil of a drive.
 type Item = (Table, u16);

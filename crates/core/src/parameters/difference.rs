@@ -1,7 +1,7 @@
 //! Differences between two parameter files. Pure.
 
 use super::file::{Entry, Id, ParameterFile};
-use crate::drive::parameters::RawValue;
+use drivegate_model::drive::parameters::RawValue;
 
 /// A parameter with different values in two files.
 #[derive(Debug, Clone, PartialEq)]

@@ -22,8 +22,8 @@ use std::fmt::{self, Write as _};
 
 use ring::digest::{SHA256, digest};
 
-use crate::drive::parameters::RawValue;
 use crate::hex;
+use drivegate_model::drive::parameters::RawValue;
 
 /// The first line of every file.
 const HEAD: &str = "# drivegate parameters 1";

@@ -31,8 +31,8 @@ use std::fmt::Write as _;
 
 use super::file::{self, CHECKSUM, Id};
 use super::plan::{Handling, Need, ParameterWrite, Plan};
-use crate::drive::Profile;
 use crate::process_image::Machine;
+use drivegate_model::drive::Profile;
 
 /// The first line of a journal.
 const HEAD: &str = "# drivegate restore 2";
@@ -343,8 +343,8 @@ pub(super) mod tests {
     use std::fs;
 
     use super::*;
-    use crate::drive::parameters::RawValue;
     use crate::testkit;
+    use drivegate_model::drive::parameters::RawValue;
 
     pub(crate) fn profile() -> std::sync::Arc<Profile> {
         testkit::nx()
@@ -396,7 +396,7 @@ pub(super) mod tests {
         let mut journal = journal(vec![write(102, 5000, 10_000)]);
         journal.plan.handling = Handling {
             needs: Some(Need {
-                point: crate::drive::PointIndex::new(0),
+                point: drivegate_model::drive::PointIndex::new(0),
                 value: false,
                 exception: Some(0x22),
                 remedy: "switch the operator to PRGM".to_string(),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::file::Id;
-use crate::drive::parameters::Label;
+use drivegate_model::drive::parameters::Label;
 
 /// Maximum number of rows of a list.
 const MOST_ROWS: usize = 10_000;

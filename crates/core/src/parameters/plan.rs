@@ -7,8 +7,8 @@ mod tests;
 mod text;
 
 use super::file::{Id, ParameterFile};
-use crate::drive::parameters::RawValue;
-use crate::drive::{PointIndex, Profile};
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_model::drive::{PointIndex, Profile};
 use making::Making;
 pub use making::NOT_KNOWN;
 

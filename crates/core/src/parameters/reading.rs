@@ -10,11 +10,11 @@ use std::time::Duration;
 
 use super::file::{Entry, Id, ParameterFile};
 use super::names::Names;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::diagnosis::CountedByDrive;
-use crate::drive::Profile;
-use crate::drive::parameters::{Label, Numbering, RawValue};
 use crate::order::Outcome;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::parameters::{Label, Numbering, RawValue};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Attempts of a request without a reply.
 const TRIES: u32 = 4;

@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 
 use super::journal::{Journal, Phase};
 use super::plan::ParameterWrite;
-use crate::codec::{Exception, Reply};
-use crate::drive::parameters::RawValue;
 use crate::order::{Outcome, ParameterOrder, Refusal};
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_proto::{Exception, Reply};
 
 /// Time without progress after which a restore ends.
 const MOST_WAIT: Duration = Duration::from_secs(3600);

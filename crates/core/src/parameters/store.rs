@@ -157,7 +157,7 @@ pub fn read(path: &Path) -> Result<ParameterFile, String> {
 mod tests {
     use super::super::file::{Entry, Id};
     use super::*;
-    use crate::drive::parameters::RawValue;
+    use drivegate_model::drive::parameters::RawValue;
 
     fn file(minute: u32, value: u16) -> ParameterFile {
         let entry = Entry {

@@ -5,14 +5,14 @@ mod raw_write;
 
 use self::raw_write::{raw_write, stops};
 use super::reference_limits::keeps_limits;
-use crate::codec::Table;
-use crate::drive::model::Kind;
-use crate::drive::profile::AddressRange;
-use crate::drive::{Derived, ModelPoint, Point, PointIndex, Source, Value};
 use crate::order::{
     Admitted, Authority, Becomes, FrequencyRange, Order, ParameterOrder, Refusal, Urgency, as_held, becomes, rests_on,
 };
 use crate::process_image::{Access, DriveSpec, ParamsAccess, Reading, RestoreLock};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::profile::AddressRange;
+use drivegate_model::drive::{Derived, ModelPoint, Point, PointIndex, Source, Value};
+use drivegate_proto::Table;
 
 /// Values of an enumeration that a refusal names.
 const MOST_TEXTS: usize = 12;

@@ -14,10 +14,10 @@ pub use self::holds::Unheld;
 use super::holder::{Claim, Holding, Rules};
 use super::judge::{self, Ask, Facts, Stage, Verdict};
 use super::priorities::Priorities;
-use crate::drive::DriveIndex;
 use crate::order::{Command, Connection, Effect, Intent, LastStops, Origin, Outcome, Refusal, Urgency};
 use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Clearance};
+use drivegate_model::drive::DriveIndex;
 
 /// Maximum number of clients of a drive that are remembered.
 const MOST_CLIENTS: usize = 64;

@@ -5,9 +5,9 @@ use std::time::Instant;
 use super::gate::{DriveGate, Gate};
 use super::reference_limits::LastWritten;
 use super::rules;
-use crate::drive::DriveIndex;
 use crate::order::{Asks, Effect, Intent, Order, Origin, Outcome, Refusal};
 use crate::process_image::Reading;
+use drivegate_model::drive::DriveIndex;
 
 /// A moment at which an order is judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

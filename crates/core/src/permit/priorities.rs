@@ -11,8 +11,8 @@ mod void;
 use std::sync::Arc;
 use std::time::Instant;
 
-use crate::drive::{ModelPoint, Value};
 use crate::order::{Commanded, Effect, Entry, Origin, Outcome, SlotWrite, SourceKind};
+use drivegate_model::drive::{ModelPoint, Value};
 
 pub use void::VoidSlot;
 

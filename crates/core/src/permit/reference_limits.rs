@@ -3,12 +3,12 @@
 
 use std::time::Instant;
 
-use crate::codec::Table;
-use crate::drive::model::Kind;
-use crate::drive::parameters::RawValue;
-use crate::drive::{Bound, Derived, PointIndex, Profile, Source, Value};
 use crate::order::{Order, Refusal, written};
 use crate::process_image::Reading;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_model::drive::{Bound, Derived, PointIndex, Profile, Source, Value};
+use drivegate_proto::Table;
 
 /// When reference and range of a drive were written last; values read before that are not valid.
 #[derive(Debug, Clone, Copy, Default)]

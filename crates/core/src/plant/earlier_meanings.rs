@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use super::{BusHandle, DriveHandle};
-use crate::drive::{DriveIndex, ModelPoint, Value};
 use crate::order::{Arrival, Order, Parts, SourceKind};
 use crate::process_image::BusImage;
 use crate::queue::CommandQueue;
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
 
 /// Time after a reload during which the first bytes of an order may be from before the reload: connections that are
 /// silent for longer are closed.

@@ -9,8 +9,6 @@ use tokio::sync::oneshot;
 
 use super::BusHandle;
 use super::orders::changes;
-use crate::codec::{Protocol, RequestPdu, describe};
-use crate::drive::DriveIndex;
 use crate::order::{
     Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, Pace,
     PassedOn, Ticket, Touched, Window, WriteStats, written,
@@ -18,6 +16,8 @@ use crate::order::{
 use crate::permit::{Stage, client_access};
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::{Protocol, RequestPdu, describe};
 
 /// Receiver of a request on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,13 +3,13 @@
 use std::time::{Instant, SystemTime};
 
 use super::{BusHandle, DriveHandle, Plant};
-use crate::drive::DriveIndex;
-use crate::drive::why::{Cause, Explanation};
 use crate::event::{Event, EventKind, Events};
 use crate::order::{Asks, Authority, Command, Origin, Refusal};
 use crate::permit::{
     self, Claim, HoldChange, HoldState, HoldView, KeptReservation, Rules, Stage, Unheld, Verb, What, client_access,
 };
+use drivegate_model::drive::DriveIndex;
+use drivegate_model::drive::why::{Cause, Explanation};
 
 impl BusHandle {
     /// Whether a command of that client renews the lease of a drive.

@@ -7,9 +7,6 @@ use tokio::sync::oneshot;
 
 use super::earlier_meanings::FormerMachine;
 use super::{BusHandle, DriveHandle, Placed};
-use crate::codec::{RequestPdu, Table, describe};
-use crate::drive::parameters::RawValue;
-use crate::drive::{DriveIndex, ModelPoint, PointIndex, Value};
 use crate::event::RefusedCommand;
 use crate::order::{
     Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
@@ -17,6 +14,9 @@ use crate::order::{
 };
 use crate::permit::{DriveFacts, Facts, Stage, Verdict, admit, meant_another};
 use crate::process_image::{BusImage, Reading};
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PointIndex, Value};
+use drivegate_proto::{RequestPdu, Table, describe};
 
 /// An order as an interface gives it to a drive.
 #[derive(Debug, Clone)]

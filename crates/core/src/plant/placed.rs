@@ -186,7 +186,7 @@ fn now<T>(poll: impl FnOnce(&mut Context<'_>) -> Poll<T>) -> Option<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Reply;
+    use drivegate_proto::Reply;
 
     #[test]
     fn asked_without_a_runtime_and_as_often_as_one_likes() {

@@ -65,10 +65,10 @@ mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
-    use crate::drive::Value;
     use crate::order::{Origin, Proof, Right, SourceKind};
     use crate::permit::Principal;
     use crate::testkit::{bus, bus_spec, controlled, image, monitored, profile};
+    use drivegate_model::drive::Value;
 
     const NOW: SystemTime = SystemTime::UNIX_EPOCH;
 
@@ -76,7 +76,7 @@ mod tests {
     fn left(bus: &BusHandle, events: &Events) -> (Vec<(Commanded, u8)>, usize) {
         bus.void_slots(Some(events), NOW);
         let mut queue = bus.queue.lock();
-        let all = &*queue.gate.priorities(crate::drive::DriveIndex::new(0));
+        let all = &*queue.gate.priorities(drivegate_model::drive::DriveIndex::new(0));
         let stand = |what| {
             (1..=16)
                 .filter(move |priority| all.entry(what, *priority).is_some())
@@ -89,7 +89,7 @@ mod tests {
     /// Enters three values of this client into the slots: `run` inactive, `run` active, and a reference.
     fn occupied(bus: &BusHandle, origin: &Origin) {
         let mut queue = bus.queue.lock();
-        let all = queue.gate.priorities(crate::drive::DriveIndex::new(0));
+        let all = queue.gate.priorities(drivegate_model::drive::DriveIndex::new(0));
         let mut put = |what, priority, value| {
             all.restore(what, priority, Entry::new(value, origin.clone(), Instant::now()));
         };

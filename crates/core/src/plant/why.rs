@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use crate::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 use crate::order::{AuditRecord, CONFIRMED, Guarded, Origin, Reason, SourceKind, WriteStats};
 use crate::process_image::{Access, BusImage, Link, Reading, RestoreLock};
+use drivegate_model::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 
 /// Whether the drive of `reading`, on this bus, runs, and if not, why.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {

@@ -4,7 +4,7 @@
 use std::time::Instant;
 
 use super::Reading;
-use crate::drive::{ModelPoint, PointIndex, Value};
+use drivegate_model::drive::{ModelPoint, PointIndex, Value};
 
 /// The speed points, each with the value in its unit (%, Hz, rpm) above which the motor certainly turns.
 const SPEEDS: [(ModelPoint, f64); 3] = [
@@ -70,9 +70,9 @@ mod tests {
     use std::time::{Duration, SystemTime};
 
     use super::*;
-    use crate::codec::Table;
     use crate::process_image::Link;
     use crate::testkit;
+    use drivegate_proto::Table;
 
     /// A CX that runs or not, with an output frequency read now and a motor speed read `age` before, 1 rpm and 0.01 Hz.
     fn contradicted(running: u16, hertz: u16, rpm: u16, age: Duration) -> bool {

@@ -35,7 +35,7 @@ use tokio::sync::Notify;
 
 use self::health::TURNAROUNDS;
 use crate::diagnosis::Diagnosis;
-use crate::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, Profile, Value};
+use drivegate_model::drive::{ModelPoint, PerDrive, Plan, Point, PointIndex, Profile, Value};
 
 #[derive(Debug)]
 pub struct DriveImage {

@@ -6,10 +6,12 @@ use std::time::{Duration, Instant};
 
 use super::snapshot::{Cell, Snapshot, Unavailable};
 use super::{DriveSpec, RestoreLock};
-use crate::codec::Table;
-use crate::drive::model::Kind;
-use crate::drive::profile::MOST_REGISTERS;
-use crate::drive::{Bound, ModelPoint, Point, PointIndex, PollClass, Quality, Raw, Sample, Source, State, Value};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::profile::MOST_REGISTERS;
+use drivegate_model::drive::{
+    Bound, ModelPoint, Point, PointIndex, PollClass, Quality, Raw, Sample, Source, State, Value,
+};
+use drivegate_proto::Table;
 
 /// Maximum age of a drive parameter on which a command may depend, if the line can read the parameter faster.
 const PARAMETER_AGE: Duration = Duration::from_secs(5);

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::codec::{Exception, Table};
-use crate::drive::{Plan, PointIndex, PollClass};
+use drivegate_model::drive::{Plan, PointIndex, PollClass};
+use drivegate_proto::{Exception, Table};
 
 /// Whether a drive answers, and since when.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,7 +101,7 @@ pub struct Snapshot {
     /// How often another master reads process data, where its traffic fills the snapshot.
     pub heard: Option<Cadence>,
     /// Points that take their value from their monitoring register because a selector of the drive has assigned
-    /// other content than the profile states; see [`crate::drive::Point::monitor`].
+    /// other content than the profile states; see [`drivegate_model::drive::Point::monitor`].
     pub monitored: Vec<PointIndex>,
     /// Spans of registers, shared with earlier snapshots if nothing in them changed.
     spans: Vec<Arc<Span>>,

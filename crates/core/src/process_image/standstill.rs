@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use super::{Reading, Unavailable};
-use crate::drive::{ModelPoint, Point};
+use drivegate_model::drive::{ModelPoint, Point};
 
 /// Causes (`blocks` of a point in the profile) for which a motor may turn whatever its drive does.
 const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];

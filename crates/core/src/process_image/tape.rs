@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use crate::codec::Table;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::Table;
 
 /// Maximum number of bytes of entries that wait for the recorder; further entries are counted and dropped.
 pub const TAPE_BYTES: usize = 1 << 20;

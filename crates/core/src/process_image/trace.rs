@@ -33,7 +33,7 @@ pub struct FrameRecord {
     pub drive: Option<String>,
     /// The bytes on the wire; empty if nothing arrived.
     pub bytes: Vec<u8>,
-    /// The bytes in plain words ([`crate::codec::describe`]).
+    /// The bytes in plain words ([`drivegate_proto::describe`]).
     pub decode: String,
     /// The result: empty for a request, then `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `echo`, `timeout`.
     pub verdict: String,

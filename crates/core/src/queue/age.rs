@@ -4,8 +4,8 @@
 use std::time::{Duration, Instant};
 
 use super::Pending;
-use crate::drive::DriveIndex;
 use crate::order::{Command, Outcome, Urgency};
+use drivegate_model::drive::DriveIndex;
 
 impl Pending {
     /// Ends the orders that have expired. An accepted stop is sent, however long it waits.

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Instant;
 
 use super::{CommandQueue, Pending};
-use crate::drive::DriveIndex;
 use crate::order::{Command, Effects, Outcome, Touched, Work};
+use drivegate_model::drive::DriveIndex;
 
 /// The queue that serves a drive now, and the index of the drive there, for all queues that served it before: after
 /// any number of reloads the first queue finds the present one, even if those in between no longer exist.

@@ -17,9 +17,9 @@ pub use stops::{NotStopped, Stopping};
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
 
-use crate::drive::DriveIndex;
 use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Urgency};
 use crate::permit::{Facts, Gate, Stage, Verdict};
+use drivegate_model::drive::DriveIndex;
 
 /// Maximum number of clients and drives for which the queue remembers when they were last served.
 const SERVED_KEPT: usize = 4 * CAPACITY;

@@ -4,9 +4,9 @@
 use std::time::Instant;
 
 use super::{Choice, Chosen, Pending, Ready};
-use crate::drive::DriveIndex;
 use crate::order::{Command, Outcome, Urgency};
 use crate::permit::{Facts, Verdict};
+use drivegate_model::drive::DriveIndex;
 
 impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop

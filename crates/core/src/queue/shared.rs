@@ -11,10 +11,10 @@ use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
 use super::{Background, NotStopped, Pending, Stopping};
-use crate::drive::DriveIndex;
 use crate::order::{BackgroundRequest, Command, Outcome, Refusal};
 use crate::permit::{DrillLock, Facts, Rules};
 use crate::start_guard::BusGuards;
+use drivegate_model::drive::DriveIndex;
 
 /// The queue between the north sides and one bus.
 #[derive(Debug)]

@@ -6,8 +6,8 @@ use std::time::Instant;
 use tokio::sync::oneshot;
 
 use super::Pending;
-use crate::drive::DriveIndex;
 use crate::order::{Command, Haste, Order, Origin, Outcome, Work};
+use drivegate_model::drive::DriveIndex;
 
 /// The wish of the gateway, which is about to end, that a bus stops its drives.
 #[derive(Debug)]

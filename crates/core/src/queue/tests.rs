@@ -4,10 +4,10 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::codec::Table;
-use crate::drive::{DriveIndex, PointIndex, Value};
 use crate::order::{Admitted, Answer, Arrival, SourceKind, Ticket, Touched, Window, WriteStats};
 use crate::testkit::{next_command, nx, ticket};
+use drivegate_model::drive::{DriveIndex, PointIndex, Value};
+use drivegate_proto::Table;
 
 mod age;
 mod order;

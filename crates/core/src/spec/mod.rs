@@ -11,8 +11,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::codec::{LineFormat, Protocol};
-use crate::drive::{PointIndex, Profile, RawWrites};
+use drivegate_model::drive::{PointIndex, Profile, RawWrites};
+use drivegate_proto::{LineFormat, Protocol};
 
 /// Whether a drive may be commanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

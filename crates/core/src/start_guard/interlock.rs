@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use super::Interlock;
 use super::drives_by_name::{DrivesByName, Watched};
-use crate::drive::{PointIndex, Quality, Value};
+use drivegate_model::drive::{PointIndex, Quality, Value};
 
 /// An interlock that does not hold.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -2,8 +2,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
-use crate::codec::{RequestPdu, Table};
-use crate::drive::DriveIndex;
 use crate::order::{
     Arrival, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, PassedOn, Refusal, SourceKind, Ticket,
     Touched, Window,
@@ -11,6 +9,8 @@ use crate::order::{
 use crate::permit::{Gate, Stage, Verdict};
 use crate::process_image::{BusSpec, DriveImage, DriveSpec, Link};
 use crate::testkit::{bus_spec, controlled, image, nx, profile, read};
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::{RequestPdu, Table};
 
 mod reload;
 

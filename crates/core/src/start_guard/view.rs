@@ -8,9 +8,9 @@ use super::ledger::{Guards, SaveProgress};
 use super::motor::Motor;
 use super::start_attempt::ByRun;
 use super::{Guard, Guarded, Interlock, MotorReading, Reason, Unable, Unmet, shown};
-use crate::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 use crate::order::{Effects, Refusal};
 use crate::process_image::{BusSpec, DriveSpec, Link, Machine, Reading, Standstill};
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, Plan, Value};
 
 /// Time until a start that waits for the disk is looked at again.
 const LOOK: Duration = Duration::from_millis(2);

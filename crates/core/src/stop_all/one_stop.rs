@@ -3,10 +3,10 @@
 use std::time::{Duration, Instant};
 
 use super::{Stopped, StoppedDrive};
-use crate::drive::{ModelPoint, Value};
 use crate::order::{Answer, Authority, Order, Origin, Outcome};
 use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
 use crate::process_image::{Machine, Standstill};
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// Wait before a stop that failed is placed again; twice as long each time.
 const AGAIN: Duration = Duration::from_millis(100);

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use crate::codec::{Protocol, RequestPdu};
 use crate::process_image::{Access, BusSpec, DriveSpec};
+use drivegate_proto::{Protocol, RequestPdu};
 
 /// Time that drives need to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
 pub const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
@@ -28,8 +28,8 @@ pub fn stop_of_line<'d>(bus: &BusSpec, drives: impl IntoIterator<Item = &'d Driv
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::LineFormat;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
+    use drivegate_proto::LineFormat;
 
     fn drives(profiles: &[&str], access: Access) -> Vec<DriveSpec> {
         let known = Profiles::built_in();

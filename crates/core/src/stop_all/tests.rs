@@ -1,11 +1,11 @@
 use super::*;
 use std::sync::Arc;
 
-use crate::drive::Value;
 use crate::order::{Authority, Order, SourceKind};
 use crate::plant::OrderRequest;
 use crate::process_image::{BusImage, DriveSpec};
 use crate::testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx, up};
+use drivegate_model::drive::Value;
 
 /// Buses `a` and `b`, each with a controlled drive in the group `pumps` and a monitored one in none.
 fn plant() -> Plant {
@@ -72,13 +72,16 @@ fn second_order(then: impl Fn(&Plant, &StopAll, Instant)) -> (Plant, usize) {
     let read = |at: Instant, words: &[u16]| {
         let drive = &plant.buses[0].image.drives[0];
         crate::testkit::read(drive, 2100, words, at);
-        drive.update(|snapshot| snapshot.store(crate::codec::Table::Holding, 2000, &[words[0] & 2 >> 1, 0, 0], at));
+        drive.update(|snapshot| snapshot.store(drivegate_proto::Table::Holding, 2000, &[words[0] & 2 >> 1, 0, 0], at));
     };
     read(now, &[0x03, 0, 0, 2500]);
     let order = |who: &Origin, now| all.order(&plant, &Scope::Gateway, who, WAIT, now);
     order(&origin, now).unwrap();
     let stop = crate::testkit::take_next(&plant.buses[0].queue, now).unwrap();
-    stop.answer(&crate::order::Outcome::Acknowledged(crate::codec::Reply::Written), now);
+    stop.answer(
+        &crate::order::Outcome::Acknowledged(drivegate_proto::Reply::Written),
+        now,
+    );
     assert!(all.advance(&plant, now));
     then(&plant, &all, now);
     let later = now + Duration::from_millis(900);
@@ -96,7 +99,7 @@ fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
         let image = &drive(plant).image;
         let hertz = if status & 2 == 0 { 0 } else { 2500 };
         crate::testkit::read(image, 2100, &[status, 0, 0, hertz], at);
-        image.update(|snapshot| snapshot.store(crate::codec::Table::Holding, 2000, &[command, 0, 0], at));
+        image.update(|snapshot| snapshot.store(drivegate_proto::Table::Holding, 2000, &[command, 0, 0], at));
     };
     let after = |now: Instant, millis| now + Duration::from_millis(millis);
     let (plant, placed) = second_order(|plant, _, now| read(plant, after(now, 500), 0x03, 0));

@@ -10,8 +10,8 @@ use super::bus;
 use super::keys::{AUTHORITY, PRINCIPAL};
 use super::settings::Unusable;
 use super::together::Clients;
-use crate::document::{Finding, Reader, nearest};
-use crate::permit::{Mode, Principal, Rules};
+use drivegate_core::permit::{Mode, Principal, Rules};
+use drivegate_model::document::{Finding, Reader, nearest};
 
 /// File with the users of the system.
 const PASSWD: &str = "/etc/passwd";

@@ -8,8 +8,8 @@ use super::bus::Found;
 use super::keys::{BACNET, DRIVE, Layout};
 use super::settings::Unusable;
 use super::{files, mqtt, values};
-use crate::document::{Place, Reader};
-use crate::north::bacnet::{Options, Secret};
+use drivegate_model::document::{Place, Reader};
+use drivegate_north::bacnet::{Options, Secret};
 
 /// Highest instance of a device.
 const MAX_INSTANCE: u32 = 4_194_302;

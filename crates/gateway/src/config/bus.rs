@@ -8,13 +8,13 @@ use super::drive::{self, Surroundings};
 use super::keys::{BUS, RESERVED};
 use super::settings::BusSettings;
 use super::{line, port, slot};
-use crate::bus::predict::faster_points;
-use crate::bus::{BusOptions, Mode};
-use crate::codec::wire::Silence;
-use crate::codec::{LineFormat, Protocol, n2};
-use crate::document::{Finding, Place, Reader, format_duration};
-use crate::drive::profile::Profiles;
-use crate::process_image::{Access, BusSpec, DriveSpec, is_modbus_tcp};
+use drivegate_bus::predict::faster_points;
+use drivegate_bus::{BusOptions, Mode};
+use drivegate_core::process_image::{Access, BusSpec, DriveSpec, is_modbus_tcp};
+use drivegate_model::document::{Finding, Place, Reader, format_duration};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{LineFormat, Protocol, n2};
 
 /// `response_timeout` above which a warning is given.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);

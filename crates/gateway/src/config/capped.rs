@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::key::{Form, Time};
-use crate::document::{Reader, format_duration};
+use drivegate_model::document::{Reader, format_duration};
 
 /// A duration within a range. A longer duration that earlier versions allowed counts as the longest of the range.
 pub(super) struct Capped {

@@ -1,8 +1,8 @@
 //! Reads `[drill]`: how stops are proven.
 
 use super::keys::DRILL;
-use crate::document::Reader;
-use crate::drill::DrillOptions;
+use drivegate_core::drill::DrillOptions;
+use drivegate_model::document::Reader;
 
 /// Absent when a part cannot be used, which is reported.
 pub(super) fn read(reader: &Reader<'_>) -> Option<DrillOptions> {

@@ -12,14 +12,14 @@ use super::keys::{
 };
 use super::start_guard::Guards;
 use super::{raw_writes, start_guard};
-use crate::codec::Protocol;
-use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
-use crate::drive::model::Kind;
-use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PointIndex, PollClass, Profile, Value};
-use crate::process_image::{
+use drivegate_core::process_image::{
     Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
 };
+use drivegate_model::document::{Finding, Place, Raw as Node, Reader, nearest};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{ModelPoint, Plan, PlannedRead, Point, PointIndex, PollClass, Profile, Value};
+use drivegate_proto::Protocol;
 
 /// Maximum number of points that a message names.
 const MOST_NAMED: usize = 4;

@@ -4,8 +4,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::time::SystemTime;
 
-use crate::document::{Finding, Reader};
-use crate::north::{IdentityFault, TlsFile, certificate_warnings, unreadable};
+use drivegate_model::document::{Finding, Reader};
+use drivegate_north::{IdentityFault, TlsFile, certificate_warnings, unreadable};
 
 /// Permissions of users who are neither owner nor in the group: to read, and to write.
 const OTHERS: u32 = 0o006;

@@ -6,9 +6,9 @@ use std::time::SystemTime;
 
 use super::keys::HTTP;
 use super::{files, values};
-use crate::document::{Finding, Place, Reader};
-use crate::north::http::{self, Credential, Credentials, Tokens, Users};
-use crate::north::{ServerIdentity, TlsFile};
+use drivegate_model::document::{Finding, Place, Reader};
+use drivegate_north::http::{self, Credential, Credentials, Tokens, Users};
+use drivegate_north::{ServerIdentity, TlsFile};
 
 /// An address on which a server listens, with its place in the file.
 pub(super) type Listener = (SocketAddr, Place);

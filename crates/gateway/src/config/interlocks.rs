@@ -6,10 +6,10 @@ use std::sync::Arc;
 use super::bus;
 use super::drive::Found;
 use super::settings::BusSettings;
-use crate::document::{Document, nearest};
-use crate::drive::model::Kind;
-use crate::drive::{Plan, PointIndex, Profile};
-use crate::process_image::{Access, DriveSpec};
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_model::document::{Document, nearest};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{Plan, PointIndex, Profile};
 
 /// Reports interlocks that can never be satisfied, or have no effect.
 pub(super) fn check(document: &Document, buses: &[bus::Found]) {

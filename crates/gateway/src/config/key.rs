@@ -7,12 +7,12 @@ use std::time::Duration;
 use serde_json::{Map, Value, json};
 
 use super::values::{self, NAME_LENGTH};
-use crate::codec::Protocol;
-use crate::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration, parse_size};
+use drivegate_model::document::{Document, Finding, FromNode, Place, Reader, ValueError, format_duration, parse_size};
+use drivegate_proto::Protocol;
 
-/// Pattern of a duration, a number and a unit, as [`crate::document::parse_duration`] reads it.
+/// Pattern of a duration, a number and a unit, as [`drivegate_model::document::parse_duration`] reads it.
 pub(super) const DURATION: &str = r"^\s*(\d+\.?\d*|\.\d+)\s*(us|µs|ms|s|min|m|h)\s*$";
-/// Pattern of a size, as [`crate::document::parse_size`] reads it.
+/// Pattern of a size, as [`drivegate_model::document::parse_size`] reads it.
 const SIZE: &str = r"^\s*\d+\s*(B|KiB|MiB|GiB)\s*$";
 
 /// A key whose value is a `T`.

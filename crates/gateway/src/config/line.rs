@@ -1,8 +1,8 @@
 //! The keys of `[[bus]]` that set up the port.
 
 use super::keys::BUS;
-use crate::document::{Reader, format_duration};
-use crate::line::{Level, LineOptions, Rs485};
+use drivegate_line::{Level, LineOptions, Rs485};
+use drivegate_model::document::{Reader, format_duration};
 
 /// Reads the options of a line; reports those that are invalid or have no effect.
 pub(super) fn read(reader: &Reader<'_>, port: Option<&str>) -> LineOptions {

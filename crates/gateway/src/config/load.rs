@@ -11,12 +11,12 @@ use super::together::{Clients, judge};
 use super::{
     authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings, unused_profiles,
 };
-use crate::bus::proof;
-use crate::document::{self, Document, Finding, Problem, Reader};
-use crate::drive::Profile;
-use crate::north::local::SocketPath;
-use crate::north::slot as slot_server;
-use crate::process_image::Access;
+use drivegate_bus::proof;
+use drivegate_core::process_image::Access;
+use drivegate_model::document::{self, Document, Finding, Problem, Reader};
+use drivegate_model::drive::Profile;
+use drivegate_north::local::SocketPath;
+use drivegate_north::slot as slot_server;
 
 /// The outcome of loading a configuration file.
 #[derive(Debug)]

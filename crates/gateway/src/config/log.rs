@@ -4,9 +4,9 @@ use std::path::Path;
 
 use super::keys::{AUDIT, LOG, LogFormat};
 use super::values;
-use crate::document::Reader;
-use crate::files::names;
-use crate::order::AuditFileOptions;
+use drivegate_core::files::names;
+use drivegate_core::order::AuditFileOptions;
+use drivegate_model::document::Reader;
 
 /// The settings of the log.
 #[derive(Debug, Clone, PartialEq, Eq)]

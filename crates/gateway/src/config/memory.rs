@@ -1,9 +1,9 @@
 //! Memory that the gateway takes at most, with every ring full.
 
 use super::settings::{BusSettings, Settings};
-use crate::history::budget::Budget;
-use crate::history::line;
-use crate::history::trend::Reach;
+use drivegate_core::history::budget::Budget;
+use drivegate_core::history::line;
+use drivegate_core::history::trend::Reach;
 
 /// Memory of the program, its libraries, its threads and its servers for the clients that they allow, bytes; measured.
 const PROGRAM: usize = 25 << 20;

@@ -11,9 +11,9 @@ use super::http::Listener as Address;
 use super::key::Key;
 use super::keys::{LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::{files, values};
-use crate::document::{Place, Reader};
-use crate::north::TlsFile;
-use crate::north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
+use drivegate_model::document::{Place, Reader};
+use drivegate_north::TlsFile;
+use drivegate_north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
 
 /// Default address of the short form, used if `listen` is absent.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);

@@ -9,9 +9,9 @@ use super::keys::{
     BUFFER, Broker, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, ProxyAddress, SPARKPLUG, TelemetryTopic,
 };
 use super::{files, values};
-use crate::document::{Finding, FromNode, Reader, format_duration};
-use crate::north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
-use crate::north::{ServerIdentity, TlsFile};
+use drivegate_model::document::{Finding, FromNode, Reader, format_duration};
+use drivegate_north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
+use drivegate_north::{ServerIdentity, TlsFile};
 
 /// Maximum number of brokers: with three attempts per second, all of them are tried within 10 s.
 const MOST_BROKERS: usize = 16;

@@ -7,7 +7,7 @@ use super::key::Key;
 use super::keys::{BACNET, GATEWAY, HTTP, MODBUS_TCP, MQTT, ROOT, TLS};
 use super::settings::ENVIRONMENT;
 use super::values;
-use crate::document::{self, Document, Reader};
+use drivegate_model::document::{self, Document, Reader};
 
 /// The kind of a file named in a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use super::keys::PARAMS;
 use super::values;
-use crate::document::{self, Reader};
-use crate::drive::profile::Profiles;
-use crate::files::names;
-use crate::parameters::Names;
-use crate::process_image::Machine;
+use drivegate_core::files::names;
+use drivegate_core::parameters::Names;
+use drivegate_core::process_image::Machine;
+use drivegate_model::document::{self, Reader};
+use drivegate_model::drive::profile::Profiles;
 
 /// How parameters are read and kept.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use super::keys::BUS;
 use super::{drive, values};
-use crate::bus::Mode;
-use crate::codec::Protocol;
-use crate::document::{Finding, Reader};
-use crate::line::{LONGEST_ID, split_dial_in};
-use crate::process_image::Access;
+use drivegate_bus::Mode;
+use drivegate_core::process_image::Access;
+use drivegate_line::{LONGEST_ID, split_dial_in};
+use drivegate_model::document::{Finding, Reader};
+use drivegate_proto::Protocol;
 
 /// Remedy with all kinds of ports.
 const KINDS: &str = "write the path of a serial device, or \"tcp://host:port\" (raw serial over TCP), \"rfc2217://host:port\", \

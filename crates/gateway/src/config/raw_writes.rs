@@ -3,8 +3,8 @@
 use std::ops::RangeInclusive;
 
 use super::keys::DRIVE;
-use crate::document::{Finding, Node, Raw, Reader};
-use crate::drive::{Profile, RawWrites};
+use drivegate_model::document::{Finding, Node, Raw, Reader};
+use drivegate_model::drive::{Profile, RawWrites};
 
 /// Registers that raw writes may set in addition to writable points; none if the key is absent or invalid.
 pub(super) fn read(reader: &Reader<'_>, profile: Option<&Profile>) -> RawWrites {

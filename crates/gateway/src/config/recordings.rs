@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use super::keys::RECORDINGS;
-use crate::document::Reader;
-use crate::files::names::RECORDINGS as RECORDINGS_DIR;
-use crate::history::RecorderOptions;
+use drivegate_core::files::names::RECORDINGS as RECORDINGS_DIR;
+use drivegate_core::history::RecorderOptions;
+use drivegate_model::document::Reader;
 
 pub(super) fn read(reader: &Reader<'_>, state_dir: &Path) -> RecorderOptions {
     let options = RecorderOptions {

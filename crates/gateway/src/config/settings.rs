@@ -6,19 +6,19 @@ use std::time::Duration;
 
 use super::log::LogSettings;
 use super::params::ParamsSettings;
-use crate::bus::predict::{self, Prediction};
-use crate::bus::{BusOptions, Mode};
-use crate::drill::DrillOptions;
-use crate::drive::profile::Profiles;
-use crate::history::RecorderOptions;
-use crate::north::local::SocketPath;
-use crate::north::{
+use drivegate_bus::predict::{self, Prediction};
+use drivegate_bus::{BusOptions, Mode};
+use drivegate_core::drill::DrillOptions;
+use drivegate_core::history::RecorderOptions;
+use drivegate_core::order::AuditFileOptions;
+use drivegate_core::permit::Rules;
+use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_north::local::SocketPath;
+use drivegate_north::{
     bacnet as bacnet_server, http as http_server, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client,
     slot as slot_server,
 };
-use crate::order::AuditFileOptions;
-use crate::permit::Rules;
-use crate::process_image::{BusSpec, DriveSpec};
 
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(super) const ENVIRONMENT: &str = "DRIVEGATE";

@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use super::settings::BusSettings;
-use crate::bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
-use crate::codec::{RequestPdu, Table};
-use crate::document::Finding;
-use crate::drive::control::{ControlItem, OwnWord};
-use crate::drive::plan::WireTime;
-use crate::process_image::{Access, DriveSpec, OnShutdown, Timing};
+use drivegate_bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
+use drivegate_core::process_image::{Access, DriveSpec, OnShutdown, Timing};
+use drivegate_model::document::Finding;
+use drivegate_model::drive::control::{ControlItem, OwnWord};
+use drivegate_model::drive::plan::WireTime;
+use drivegate_proto::{RequestPdu, Table};
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
 pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);

@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 use super::http::Listener;
 use super::keys::{BUS, SLOT};
 use super::values;
-use crate::bus::Mode;
-use crate::codec::{LineFormat, Protocol};
-use crate::document::{Place, Reader};
-use crate::north::slot::{Slot, SlotAccess};
-use crate::process_image::Access;
+use drivegate_bus::Mode;
+use drivegate_core::process_image::Access;
+use drivegate_model::document::{Place, Reader};
+use drivegate_north::slot::{Slot, SlotAccess};
+use drivegate_proto::{LineFormat, Protocol};
 
 /// The valid settings of a `[[bus.slot]]`.
 pub(super) struct Found {

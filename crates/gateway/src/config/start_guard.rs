@@ -1,10 +1,10 @@
 //! Reads `guard` and `interlocks` of a drive.
 
 use super::keys::{DRIVE, GUARD, INTERLOCK};
-use crate::document::{Place, Reader};
-use crate::drive::{ModelPoint, Profile};
-use crate::process_image::Access;
-use crate::start_guard::{Guard, Interlock};
+use drivegate_core::process_image::Access;
+use drivegate_core::start_guard::{Guard, Interlock};
+use drivegate_model::document::{Place, Reader};
+use drivegate_model::drive::{ModelPoint, Profile};
 
 /// Start guard and interlocks as configured, with the places of the keys that depend on other drives.
 #[derive(Debug, Default)]

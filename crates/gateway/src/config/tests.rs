@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use super::load::parse;
 use super::*;
-use crate::document::Problem;
-use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, Profile};
-use crate::north::mqtt as mqtt_client;
-use crate::process_image::{Access, TriggerLimit};
+use drivegate_core::process_image::{Access, TriggerLimit};
+use drivegate_model::document::Problem;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{ModelPoint, Profile};
+use drivegate_north::mqtt as mqtt_client;
 
 mod certificates;
 mod files;
@@ -112,7 +112,7 @@ fn settings(source: &str) -> Settings {
 
 #[test]
 fn slots_read_only_and_take_this_machine_unless_told_otherwise() {
-    use crate::north::slot::SlotAccess;
+    use drivegate_north::slot::SlotAccess;
     let all = settings(&FULL);
     let slot = &all.slots.as_ref().unwrap().slots[0];
     assert_eq!(
@@ -196,17 +196,17 @@ sparkplug = { group = "plant", primary_host = "scada" }
     assert_eq!(line.spec.format.to_string(), "38400 8E1");
     assert_eq!(
         line.options.silence,
-        crate::codec::wire::Silence::Fixed(Duration::from_millis(3))
+        drivegate_proto::wire::Silence::Fixed(Duration::from_millis(3))
     );
-    let options = crate::line::LineOptions {
-        rs485: crate::line::Rs485::KernelInverted,
+    let options = drivegate_line::LineOptions {
+        rs485: drivegate_line::Rs485::KernelInverted,
         rts_before_send: Duration::from_millis(1),
         rts_after_send: Duration::from_millis(2),
         rx_during_tx: true,
         termination: true,
-        rts: crate::line::Level::Driver,
-        dtr: crate::line::Level::Off,
-        spin: crate::line::Spin::Off,
+        rts: drivegate_line::Level::Driver,
+        dtr: drivegate_line::Level::Off,
+        spin: drivegate_line::Spin::Off,
         receives_only: false,
     };
     assert_eq!(line.options.line, options);
@@ -218,9 +218,9 @@ sparkplug = { group = "plant", primary_host = "scada" }
     assert_eq!(drive.limits["speed_reference"], 0.0..=80.5);
     assert_eq!(drive.turnaround, Duration::from_micros(500));
     assert_eq!(drive.frequency_range, Some(10.0..=50.0));
-    let lease = crate::process_image::Supervision {
+    let lease = drivegate_core::process_image::Supervision {
         timeout: Duration::from_secs(5),
-        action: crate::process_image::LeaseAction::LeaveRunning,
+        action: drivegate_core::process_image::LeaseAction::LeaveRunning,
         adopt: true,
     };
     assert_eq!(drive.supervision, Some(lease));
@@ -232,7 +232,7 @@ sparkplug = { group = "plant", primary_host = "scada" }
         (8, Access::Monitor, fan.profile.turnaround)
     );
     assert_eq!(all.buses[1].spec.port, "rfc2217://10.0.0.9:4001");
-    assert_eq!(all.buses[1].options.line, crate::line::LineOptions::default());
+    assert_eq!(all.buses[1].options.line, drivegate_line::LineOptions::default());
     let modbus = all.modbus_tcp.as_ref().unwrap();
     assert_eq!(
         modbus.listeners[0]
@@ -356,8 +356,8 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     assert_eq!(all.modbus_tcp.unwrap().listeners[0].listen.len(), 2);
     assert_eq!(all.log.level, "debug");
     let mqtt = all.mqtt.unwrap();
-    let secret = crate::north::mqtt::Secret("12345".to_string());
-    assert_eq!(mqtt.password, Some(crate::north::mqtt::Password::Fixed(secret)));
+    let secret = drivegate_north::mqtt::Secret("12345".to_string());
+    assert_eq!(mqtt.password, Some(drivegate_north::mqtt::Password::Fixed(secret)));
     assert!(!format!("{mqtt:?}").contains("12345"));
 
     let loaded = load(&[

@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use super::keys::{DRIVE, ROOT};
 use super::{bacnet, bus, http, interlocks, modbus_tcp, unique};
-use crate::document::{Finding, Place, Reader};
-use crate::north::mqtt as mqtt_client;
-use crate::process_image::{Access, LeaseAction};
+use drivegate_core::process_image::{Access, LeaseAction};
+use drivegate_model::document::{Finding, Place, Reader};
+use drivegate_north::mqtt as mqtt_client;
 
 /// The sections by which clients reach the drives.
 pub(super) struct Clients<'c> {
@@ -136,7 +136,7 @@ const FAULT_TIME: Duration = Duration::from_secs(1);
 
 /// Warns about drives that may trip because they are polled too rarely.
 fn warn_of_fault_time(reader: &Reader<'_>, found: &bus::Found, cycle: Option<Duration>) {
-    let fault_time = crate::drive::COMMUNICATION_FAULT_TIME;
+    let fault_time = drivegate_model::drive::COMMUNICATION_FAULT_TIME;
     let Some(cycle) = cycle.filter(|cycle| *cycle > FAULT_TIME / 2) else {
         return;
     };
@@ -226,9 +226,9 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
             continue;
         }
         let known = [
-            crate::drive::FIELDBUS_FAULT_RESPONSE,
-            crate::drive::COMMUNICATION_TIMEOUT,
-            crate::drive::COMMUNICATION_ERROR_REACTION,
+            drivegate_model::drive::FIELDBUS_FAULT_RESPONSE,
+            drivegate_model::drive::COMMUNICATION_TIMEOUT,
+            drivegate_model::drive::COMMUNICATION_ERROR_REACTION,
         ];
         let known: Vec<&str> = known
             .into_iter()

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use super::bus::Found;
 use super::http::Listener;
 use super::modbus_tcp::DefaultDrive;
-use crate::document::{Document, Place, nearest};
-use crate::line::split_dial_in;
+use drivegate_line::split_dial_in;
+use drivegate_model::document::{Document, Place, nearest};
 
 pub(super) fn check(document: &Document, buses: &[Found]) {
     let names = buses.iter().filter_map(|bus| bus.name.as_ref());

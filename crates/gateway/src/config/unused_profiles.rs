@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use crate::document::{Node, Problem, Raw};
-use crate::drive::profile::Profiles;
+use drivegate_model::document::{Node, Problem, Raw};
+use drivegate_model::drive::profile::Profiles;
 
 /// The names of the profiles that the drives of a configuration name.
 pub(super) fn named_by_drives(root: &Node) -> BTreeSet<String> {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ipnet::IpNet;
 
-use crate::document::{Finding, Reader, nearest};
+use drivegate_model::document::{Finding, Reader, nearest};
 
 /// Longest name, in characters.
 pub(super) const NAME_LENGTH: usize = 64;

@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::drill::{DrillState, Drills, LOOK, SavedDrills};
-use crate::files::names::DRILLS;
-use crate::files::{self, Patience};
-use crate::order::{Origin, SourceKind};
-use crate::plant::SharedPlant;
+use drivegate_core::drill::{DrillState, Drills, LOOK, SavedDrills};
+use drivegate_core::files::names::DRILLS;
+use drivegate_core::files::{self, Patience};
+use drivegate_core::order::{Origin, SourceKind};
+use drivegate_core::plant::SharedPlant;
 
 /// Interval of the looks at an armed drill.
 const IDLE: Duration = Duration::from_millis(500);

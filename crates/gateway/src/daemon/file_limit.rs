@@ -4,7 +4,7 @@
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::config::Settings;
-use crate::north::{bacnet, http, modbus_tcp, slot};
+use drivegate_north::{bacnet, http, modbus_tcp, slot};
 
 /// Files that the process itself has open: logs, runtimes, queues, the configuration, MQTT with its buffer, local clients.
 const OWN_FILES: usize = 64;

@@ -5,12 +5,12 @@ use std::sync::Arc;
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
 use crate::config::Settings;
-use crate::files::{self, Keeper};
-use crate::history::{self, RecorderTask};
-use crate::north::parameter_jobs::{hold_unfinished, keep_reading};
-use crate::order::AuditFile;
-use crate::parameters::Store;
-use crate::start_guard;
+use drivegate_core::files::{self, Keeper};
+use drivegate_core::history::{self, RecorderTask};
+use drivegate_core::order::AuditFile;
+use drivegate_core::parameters::Store;
+use drivegate_core::start_guard;
+use drivegate_north::parameter_jobs::{hold_unfinished, keep_reading};
 
 impl Daemon {
     /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are on

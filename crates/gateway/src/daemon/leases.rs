@@ -6,12 +6,12 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::bus::master::CarriedState;
 use crate::config::BusSettings;
-use crate::drive::control::Control;
-use crate::event::{Event, EventKind};
-use crate::plant::BusHandle;
-use crate::process_image::{Access, DriveSpec, Machine};
+use drivegate_bus::master::CarriedState;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::{Access, DriveSpec, Machine};
+use drivegate_model::drive::control::Control;
 
 /// Time for which the lease of a drive is kept after a reload left the drive out.
 const RETURN: Duration = Duration::from_secs(120);

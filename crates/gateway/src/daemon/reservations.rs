@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::files::names::RESERVATIONS;
-use crate::files::{self, Patience};
-use crate::permit::KeptReservation;
-use crate::plant::{Plant, SharedPlant};
+use drivegate_core::files::names::RESERVATIONS;
+use drivegate_core::files::{self, Patience};
+use drivegate_core::permit::KeptReservation;
+use drivegate_core::plant::{Plant, SharedPlant};
 
 /// Interval of the checks for changed reservations.
 const CHECK: Duration = Duration::from_millis(50);

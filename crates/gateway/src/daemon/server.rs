@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::north::{NorthState, Reconfigure, Server, ServerError};
-use crate::plant::SharedPlant;
+use drivegate_core::plant::SharedPlant;
+use drivegate_north::{NorthState, Reconfigure, Server, ServerError};
 
 /// Time for orders in progress of a server that a reload removes, longer than any order waits for its bus; and the
 /// interval of checks whether they have ended.
@@ -261,7 +261,7 @@ mod tests {
     }
 
     fn world() -> (SharedPlant, Arc<NorthState>) {
-        let plant = crate::plant::Plant::new("test", Duration::from_secs(1), Vec::new());
+        let plant = drivegate_core::plant::Plant::new("test", Duration::from_secs(1), Vec::new());
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }
 

@@ -3,7 +3,7 @@
 use super::Daemon;
 use super::server::Prepared;
 use crate::config::Settings;
-use crate::north::{ServerError, bacnet, http, modbus_tcp, slot};
+use drivegate_north::{ServerError, bacnet, http, modbus_tcp, slot};
 
 /// The servers that listen on the network, prepared.
 #[derive(Default)]

@@ -1,7 +1,7 @@
 use drivegate_testkit::mqtt as packets;
 
 use super::*;
-use crate::event::EventKind;
+use drivegate_core::event::EventKind;
 
 /// A gateway with this number of buses, none of which has an adapter.
 fn without_adapters(buses: usize) -> Settings {

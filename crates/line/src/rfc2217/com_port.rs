@@ -2,8 +2,8 @@
 //! and receives the settings that the server uses.
 
 use super::telnet::{Command, Decoder, IAC, SB, SE, Verb, escape};
-use crate::codec::{LineFormat, Parity};
 use crate::options::Level;
+use drivegate_proto::{LineFormat, Parity};
 
 pub(super) const BINARY: u8 = 0;
 pub(super) const SUPPRESS_GO_AHEAD: u8 = 3;

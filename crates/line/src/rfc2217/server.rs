@@ -7,7 +7,7 @@ use super::com_port::{
     SET_PARITY, SET_STOP_BITS, SUPPRESS_GO_AHEAD, parity_code, set,
 };
 use super::telnet::{Command, Decoder, IAC, Verb};
-use crate::codec::LineFormat;
+use drivegate_proto::LineFormat;
 
 const SIGNATURE: u8 = 0;
 const NOTIFY_MODEM_STATE: u8 = 107;

@@ -18,7 +18,7 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
-pub use crate::codec::duration::format as format_duration;
+pub use drivegate_proto::duration::format as format_duration;
 pub use file::read_file;
 pub use reader::{Reader, candidates, nearest};
 pub use tree::{Entry, Node, Raw};

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::codec::duration;
+use drivegate_proto::duration;
 
 use super::{Finding, Node, Raw};
 

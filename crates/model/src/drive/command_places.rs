@@ -3,7 +3,7 @@
 use super::control::{Control, ControlItem, OwnWord, Run, Setting};
 use super::profile::Form;
 use super::{ModelPoint, PointIndex, Profile};
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 impl Control {
     /// All settings that commands write, including the steps to a run command.

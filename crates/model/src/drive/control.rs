@@ -6,7 +6,7 @@ use crate::drive::PointIndex;
 use std::time::Duration;
 
 use super::profile::Raw;
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 /// The section `[control]` of a profile.
 #[derive(Debug, Clone, PartialEq, Eq)]

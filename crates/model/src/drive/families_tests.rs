@@ -4,7 +4,7 @@
 use super::derive::{Bound, Derived};
 use super::profile::{Form, Profiles};
 use super::{ModelPoint, PollClass, Profile, Source, Step, Value};
-use crate::codec::{Protocol, Table};
+use drivegate_proto::{Protocol, Table};
 
 fn profile(name: &str) -> std::sync::Arc<Profile> {
     Profiles::built_in().get(name).unwrap().clone()

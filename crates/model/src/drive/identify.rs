@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::profile::{Probe, Profile, Profiles};
-use crate::codec::{Protocol, Table};
+use drivegate_proto::{Protocol, Table};
 
 /// A read that no profile's drive answers with values: a device that does has values everywhere, and then only what it refuses
 /// tells its family.

@@ -6,7 +6,7 @@ use crate::drive::PointIndex;
 use std::ops::RangeInclusive;
 
 use super::profile::Profile;
-use crate::codec::{Protocol, Table};
+use drivegate_proto::{Protocol, Table};
 
 pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::model::ModelPoint;
 use super::profile::{PollClass, Profile, Source};
-use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
+use drivegate_proto::{LineFormat, Protocol, RequestPdu, Table};
 
 /// A read request of a drive's plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -15,8 +15,8 @@ use super::control::{Always, Control, ControlItem, OwnWord, Reset, Run, Setting}
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use super::parameters::ParameterList;
-use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::{Node, Problem};
+use drivegate_proto::{N2Options, Protocol, RequestPdu, Table};
 
 pub use raw::{Equals, Form, MOST_REGISTERS, Order, Part, Raw};
 

@@ -6,7 +6,7 @@
 use std::ops::RangeInclusive;
 
 use super::Profile;
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 /// The raw writes that a drive's configuration allows in addition to its writable points.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use super::control::{Control, OwnWord};
 use super::{ModelPoint, PointIndex, Profile, Raw, Source};
-use crate::codec::{Protocol, Table};
+use drivegate_proto::{Protocol, Table};
 
 /// The shortest and the longest time between two refreshes.
 pub const REFRESH: std::ops::RangeInclusive<Duration> = Duration::from_millis(100)..=Duration::from_secs(60);

@@ -12,10 +12,10 @@ use super::Options;
 use super::rights::HostRights;
 use super::view::View;
 use super::writes::{self, JobProgress, Waiting};
-use crate::order::{Arrival, Connection, Outcome};
-use crate::permit::Settled;
-use crate::plant::{Plant, SharedPlant};
-use crate::process_image::{LeaseAction, Machine};
+use drivegate_core::order::{Arrival, Connection, Outcome};
+use drivegate_core::permit::Settled;
+use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_core::process_image::{LeaseAction, Machine};
 
 /// Maximum number of batches of datagrams whose arrival times are kept until their writes are processed.
 const MOST_KEPT: usize = 64;
@@ -70,7 +70,7 @@ fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
         network: view.options.network,
         foreign_devices: view.options.foreign_devices,
         vendor: (view.options.vendor, VENDOR.into()),
-        version: crate::version::VERSION.into(),
+        version: drivegate_core::version::VERSION.into(),
         bbmd: None,
     };
     Server::new(options, view.devices(), now)

@@ -12,13 +12,13 @@ use tokio::task::JoinHandle;
 
 use super::rights::HostRights;
 use crate::NorthState;
-use crate::drive::Value;
-use crate::event::{Event, EventKind, Events};
-use crate::files::{self, DISK};
-use crate::order::{Commanded, Entry, Origin, SourceKind};
-use crate::permit::PROTECTING;
-use crate::plant::{BusHandle, Plant};
-use crate::process_image::{Access, Machine};
+use drivegate_core::event::{Event, EventKind, Events};
+use drivegate_core::files::{self, DISK};
+use drivegate_core::order::{Commanded, Entry, Origin, SourceKind};
+use drivegate_core::permit::PROTECTING;
+use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::process_image::{Access, Machine};
+use drivegate_model::drive::Value;
 
 /// The name of the file in `state_dir`.
 pub(super) const FILE: &str = "bacnet-priorities.json";

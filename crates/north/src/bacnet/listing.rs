@@ -4,7 +4,7 @@ use drivegate_bacnet::{Access, Kind, Object};
 
 use super::objects::{self, Flat, ListedDevice};
 use super::{Options, units};
-use crate::process_image::{BusSpec, DriveSpec};
+use drivegate_core::process_image::{BusSpec, DriveSpec};
 
 /// An object in the printed list.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -10,7 +10,7 @@ use super::Options;
 use super::desk::{Desk, Ended};
 use super::rights::HostRights;
 use super::writes::Waiting;
-use crate::plant::SharedPlant;
+use drivegate_core::plant::SharedPlant;
 
 /// A server without sockets. Time is an argument.
 #[derive(Debug)]

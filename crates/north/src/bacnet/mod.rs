@@ -38,8 +38,8 @@ use self::sockets::Sockets;
 use self::task::{Task, ToTask};
 use super::{NorthState, ServerError, ServerKind};
 use crate::listener::ListenerState;
-use crate::plant::SharedPlant;
 use crate::server::{self, Reconfigure};
+use drivegate_core::plant::SharedPlant;
 
 /// The behaviour of an offline drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -7,11 +7,11 @@ use std::sync::Arc;
 use drivegate_bacnet::{Access as Written, Device, Kind, Mac, Object, ObjectId, ObjectType};
 
 use super::units;
-use crate::drive::model::Kind as Values;
-use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
-use crate::order::Commanded;
-use crate::process_image::{Access, BusSpec, DriveSpec};
+use drivegate_core::order::Commanded;
+use drivegate_core::process_image::{Access, BusSpec, DriveSpec};
+use drivegate_model::drive::model::Kind as Values;
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, PollClass, Source, State};
 
 /// Points shown as analog inputs from 1 on.
 const ANALOG: [ModelPoint; 12] = [

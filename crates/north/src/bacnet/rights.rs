@@ -9,7 +9,7 @@ use arc_swap::ArcSwapOption;
 use drivegate_bacnet::Address;
 
 use super::Options;
-use crate::order::{Grants, Right};
+use drivegate_core::order::{Grants, Right};
 
 /// The rights of all hosts. When the server shuts down, no host may write any more.
 #[derive(Debug, Clone)]

@@ -24,14 +24,14 @@ use super::rights::HostRights;
 use super::sockets::Sockets;
 use super::writes::Waiting;
 use super::{NorthState, Options};
-use crate::drive::ModelPoint;
-use crate::event::{Event, EventKind};
-use crate::files;
-use crate::order::Commanded;
-use crate::plant::SharedPlant;
-use crate::process_image::Snapshot;
 use crate::reading::{Reader, is_readable};
 use crate::stats::BacnetFigures;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::files;
+use drivegate_core::order::Commanded;
+use drivegate_core::plant::SharedPlant;
+use drivegate_core::process_image::Snapshot;
+use drivegate_model::drive::ModelPoint;
 
 /// Interval at which the task checks for due work.
 const TICK: Duration = Duration::from_millis(100);

@@ -7,12 +7,12 @@ use drivegate_testkit::{STALE_AFTER, bus, bus_spec, controlled, image, profile, 
 use super::view::View;
 use super::writes::{JobProgress, Waiting};
 use super::*;
-use crate::codec::{Reply, Table};
-use crate::drive::{ModelPoint, PointIndex, Value};
-use crate::order::{Arrival, Authority, Commanded, Order, Origin, Outcome, Refusal, SlotWrite, SourceKind};
-use crate::permit::{Follows, Settled};
-use crate::plant::{DriveHandle, OrderRequest, Plant};
-use crate::process_image::{DriveSpec, Link};
+use drivegate_core::order::{Arrival, Authority, Commanded, Order, Origin, Outcome, Refusal, SlotWrite, SourceKind};
+use drivegate_core::permit::{Follows, Settled};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Plant};
+use drivegate_core::process_image::{DriveSpec, Link};
+use drivegate_model::drive::{ModelPoint, PointIndex, Value};
+use drivegate_proto::{Reply, Table};
 
 mod objects;
 mod orders;

@@ -16,12 +16,12 @@ use subtle::ConstantTimeEq as _;
 use super::objects::{self, Flat, ListedDevice, Meaning};
 use super::rights::HostRights;
 use super::{Options, WhenOffline};
-use crate::codec::Table;
-use crate::drive::{ModelPoint, PointIndex, Quality, Source, Value};
-use crate::order::{Commanded, Entry, Origin, Refusal, SourceKind};
-use crate::permit::{self, Priorities};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::{Reading, Unavailable};
+use drivegate_core::order::{Commanded, Entry, Origin, Refusal, SourceKind};
+use drivegate_core::permit::{self, Priorities};
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::process_image::{Reading, Unavailable};
+use drivegate_model::drive::{ModelPoint, PointIndex, Quality, Source, Value};
+use drivegate_proto::Table;
 
 /// Object of the run command of each drive.
 const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
@@ -225,7 +225,7 @@ impl View {
     }
 
     fn state(&self, reading: &Reading<'_>) -> Sample {
-        use crate::drive::State;
+        use drivegate_model::drive::State;
         let at = reading.snapshot.fast_at.map(|at| self.wall(at));
         let (state, reliability) = match reading.state() {
             Some(State::Offline) => (State::Offline, Reliability::CommunicationFailure),

@@ -8,13 +8,13 @@ use drivegate_bacnet::{Address, Datum, Error, Job};
 use super::objects::Meaning;
 use super::rights::HostRights;
 use super::view::View;
-use crate::drive::{PointIndex, Value};
-use crate::order::{
+use drivegate_core::order::{
     Arrival, Authority, Commanded, DEFAULT_EXPIRY, Entry, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
 };
-use crate::permit::{self, Follows, Stage, client_access};
-use crate::plant::{DriveHandle, OrderRequest, Placed};
-use crate::process_image::Machine;
+use drivegate_core::permit::{self, Follows, Stage, client_access};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Placed};
+use drivegate_core::process_image::Machine;
+use drivegate_model::drive::{PointIndex, Value};
 
 /// The priority that belongs to minimum on and off times.
 const MINIMUM_TIMES: u8 = 6;

@@ -3,8 +3,8 @@
 use serde::Serialize;
 
 use super::result::ErrorObject;
-use crate::order::Refusal;
-use crate::permit::HoldView;
+use drivegate_core::order::Refusal;
+use drivegate_core::permit::HoldView;
 
 /// The holder of a drive, and the result of an action on the hold.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]

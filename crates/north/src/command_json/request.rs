@@ -10,12 +10,12 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::document::nearest;
-use crate::drive::model::Kind;
-use crate::drive::{PointIndex, Profile, Value};
-use crate::order::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, stop_of};
-use crate::permit::sets_twice;
-use crate::plant::{DriveHandle, OrderRequest, Placed, Plant};
+use drivegate_core::order::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, stop_of};
+use drivegate_core::permit::sets_twice;
+use drivegate_core::plant::{DriveHandle, OrderRequest, Placed, Plant};
+use drivegate_model::document::nearest;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{PointIndex, Profile, Value};
 
 /// Maximum size of a command, bytes.
 pub(crate) const MAX_PAYLOAD: usize = 64 * 1024;

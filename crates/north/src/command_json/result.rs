@@ -5,8 +5,8 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use super::Id;
-use crate::order::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
-use crate::plant::Shown;
+use drivegate_core::order::{Answer, CONFIRMED, Outcome, Refusal, milliseconds, milliseconds_or_null};
+use drivegate_core::plant::Shown;
 
 /// The only result of a command: `confirmed` if a read showed the effect in time, otherwise the answer of the bus.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
@@ -41,7 +41,7 @@ pub(crate) struct CommandResult<'r> {
     /// Why no read can show the effect of an acknowledged command.
     #[serde(skip_serializing_if = "Option::is_none")]
     note: Option<String>,
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     time: SystemTime,
 }

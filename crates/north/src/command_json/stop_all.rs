@@ -5,10 +5,10 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use super::excerpt;
-use crate::event::RefusedCommand;
-use crate::order::{Origin, Outcome, Refusal};
-use crate::plant::{Plant, turn_away};
-use crate::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
+use drivegate_core::event::RefusedCommand;
+use drivegate_core::order::{Origin, Outcome, Refusal};
+use drivegate_core::plant::{Plant, turn_away};
+use drivegate_core::stop_all::{LONGEST_WAIT, NothingToStop, Scope, WAIT};
 
 /// Names of a stop of several drives, and of its drives, in audit and events.
 const STOP_ALL: &str = "stop all";

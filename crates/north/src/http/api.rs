@@ -7,13 +7,15 @@ use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
 use crate::command_json::HoldFields;
-use crate::diagnosis::{self, Counted, Verdict};
-use crate::drill::StopProof;
-use crate::drive::why::Cause;
-use crate::drive::{self, ModelPoint, PointIndex, Quality, State};
-use crate::history::History;
-use crate::plant::{BusHandle, DriveHandle};
-use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
+use drivegate_core::diagnosis::{self, Counted, Verdict};
+use drivegate_core::drill::StopProof;
+use drivegate_core::history::History;
+use drivegate_core::plant::{BusHandle, DriveHandle};
+use drivegate_core::process_image::{
+    Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null,
+};
+use drivegate_model::drive::why::Cause;
+use drivegate_model::drive::{self, ModelPoint, PointIndex, Quality, State};
 
 /// A point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
@@ -38,7 +40,7 @@ impl Clock {
 
 /// RFC 3339 with milliseconds, UTC.
 #[derive(Debug, Serialize)]
-struct Time(#[serde(serialize_with = "crate::event::rfc3339")] SystemTime);
+struct Time(#[serde(serialize_with = "drivegate_core::event::rfc3339")] SystemTime);
 
 /// A drive with all its points.
 #[derive(Debug, Serialize, utoipa::ToSchema)]

@@ -13,7 +13,7 @@ use super::reached::Reached;
 use super::replies::{Replied, no_drive};
 use crate::NorthState;
 use crate::connection_limit::{ConnectionLimit, Limits};
-use crate::plant::{DriveHandle, SharedPlant};
+use drivegate_core::plant::{DriveHandle, SharedPlant};
 
 /// The state shared by all handlers.
 #[derive(Debug)]

@@ -11,8 +11,8 @@ use serde::Serialize;
 use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::Replied;
-use crate::event::{Before, Event, EventKind, RecordingMade, Search};
-use crate::history::{Entry, Recordings};
+use drivegate_core::event::{Before, Event, EventKind, RecordingMade, Search};
+use drivegate_core::history::{Entry, Recordings};
 
 /// Events of a reply without `limit`, and at most.
 const LIMITS: (usize, usize) = (100, 1000);

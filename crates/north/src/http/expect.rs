@@ -8,7 +8,7 @@ use percent_encoding::percent_decode;
 use super::messages::{EXPECT, Expected, ExpectedDrive, port_of};
 use super::reached::Reached;
 use crate::local::absolute;
-use crate::plant::Plant;
+use drivegate_core::plant::Plant;
 
 /// Why a request is meant for another gateway, with the status of the reply.
 type Unmet = (StatusCode, String);

@@ -11,10 +11,10 @@ use serde::Serialize;
 use super::api::{self, fine_millis, rounded};
 use super::app_state::AppState;
 use super::replies::{Replied, find_bus};
-use crate::history::Clock;
-use crate::history::line::{Exchanges, Figures, LastHour, LineHistory, STEP};
-use crate::plant::BusHandle;
-use crate::process_image::HistogramSnapshot;
+use drivegate_core::history::Clock;
+use drivegate_core::history::line::{Exchanges, Figures, LastHour, LineHistory, STEP};
+use drivegate_core::plant::BusHandle;
+use drivegate_core::process_image::HistogramSnapshot;
 
 /// A bus, its statistics, and their history by minute.
 pub(super) async fn bus(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Replied {
@@ -43,7 +43,7 @@ pub(super) struct Line<'b> {
 /// Load and cycle of the last hour; each step is least, greatest and last value, or `null` without a value.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 struct Hour {
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     from: SystemTime,
     step_s: u64,

@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use super::operating::Operating;
 use super::reached::{Client, Coverage, Reached};
 use super::routes;
-use crate::plant::SharedPlant;
+use drivegate_core::plant::SharedPlant;
 
 /// An HTTP server without its socket.
 pub struct Loopback {

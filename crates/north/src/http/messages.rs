@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
 pub use crate::command_json::StopBody;
-use crate::drill::Kind;
-use crate::drive::why::Explanation;
-use crate::drive::{ModelPoint, Point, Quality, Sample};
-use crate::parameters::{ParameterFile, Plan, RestoreStage, RestoreStatus, Status, StoredFile, read};
-use crate::process_image::{BusSpec, DriveSpec, value_or_null};
+use drivegate_core::drill::Kind;
+use drivegate_core::parameters::{ParameterFile, Plan, RestoreStage, RestoreStatus, Status, StoredFile, read};
+use drivegate_core::process_image::{BusSpec, DriveSpec, value_or_null};
+use drivegate_model::drive::why::Explanation;
+use drivegate_model::drive::{ModelPoint, Point, Quality, Sample};
 
 /// An error reply.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]

@@ -75,9 +75,9 @@ use super::log_throttle::LogThrottle;
 use super::reading::{Dated, Reader};
 use super::refusals::Refusals;
 use super::{NorthState, ServerError, ServerKind, tls_words};
-use crate::history::History;
-use crate::plant::{DriveHandle, SharedPlant};
 use crate::tcp_server::{TcpServer, TcpService};
+use drivegate_core::history::History;
+use drivegate_core::plant::{DriveHandle, SharedPlant};
 
 pub use self::credentials::{Credential, CredentialError, Credentials};
 pub use self::loopback::Loopback;

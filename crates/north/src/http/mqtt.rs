@@ -37,7 +37,7 @@ struct Link {
     broker: String,
     connected: bool,
     /// Time from which on it is connected, or is not.
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     since: SystemTime,
     /// Why the last connection ended or did not come about; also while another one is open.
@@ -47,7 +47,7 @@ struct Link {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 #[schema(as = MqttLinkError)]
 struct LinkError {
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     time: SystemTime,
     text: String,

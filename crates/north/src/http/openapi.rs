@@ -243,7 +243,9 @@ impl Api {
         let text: Arc<OnceLock<String>> = document.clone();
         let served = async move || ([(CONTENT_TYPE, JSON)], document.get().cloned().unwrap_or_default());
         let api = self.get(PATH, Doc::any("This description"), served);
-        let info = InfoBuilder::new().title("drivegate").version(crate::version::VERSION);
+        let info = InfoBuilder::new()
+            .title("drivegate")
+            .version(drivegate_core::version::VERSION);
         let mut components = Components::new();
         components.schemas = api.schemas;
         let described = OpenApiBuilder::new()

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::messages::Restore;
-use crate::parameters::{ParameterFile, RestoreStatus, Status};
+use drivegate_core::parameters::{ParameterFile, RestoreStatus, Status};
 
 /// The parameters of a drive.
 #[derive(Debug, Serialize, utoipa::ToSchema)]

@@ -11,11 +11,11 @@ use super::messages::{PointValue, Word};
 use super::operating::Viewer;
 use super::query;
 use super::replies::{Replied, not_found};
-use crate::codec::{Reply, RequestPdu};
-use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};
-use crate::order::{self, Authority, Order, Origin};
-use crate::plant::{DriveHandle, OrderRequest};
-use crate::process_image::{Link, Reading, Unavailable, public_points};
+use drivegate_core::order::{self, Authority, Order, Origin};
+use drivegate_core::plant::{DriveHandle, OrderRequest};
+use drivegate_core::process_image::{Link, Reading, Unavailable, public_points};
+use drivegate_model::drive::{Point, PointIndex, PollClass, Profile, Quality, Raw, Sample, Source};
+use drivegate_proto::{Reply, RequestPdu};
 
 /// Maximum number of points in one request, more than a profile has.
 const MAX_POINTS: usize = 1024;

@@ -10,7 +10,7 @@ use percent_encoding::percent_decode_str;
 
 use super::messages::ErrorReply;
 use super::replies::Refused;
-use crate::document::parse_duration;
+use drivegate_model::document::parse_duration;
 
 /// Why a query string is not valid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

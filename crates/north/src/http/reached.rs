@@ -13,7 +13,7 @@ use super::replies::Replied;
 use crate::connection_limit::ConnectionPlace;
 use crate::local::control::Control;
 use crate::log_throttle::LogThrottle;
-use crate::order::{Proof, Right, SourceKind};
+use drivegate_core::order::{Proof, Right, SourceKind};
 
 /// Requests that a connection may make.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

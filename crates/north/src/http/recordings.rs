@@ -10,8 +10,8 @@ use axum::response::{IntoResponse, Response};
 use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, not_found, refused};
-use crate::history::recording::ENDING;
-use crate::history::{Recording, export, pcapng};
+use drivegate_core::history::recording::ENDING;
+use drivegate_core::history::{Recording, export, pcapng};
 
 /// The output formats of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

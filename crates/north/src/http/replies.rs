@@ -5,7 +5,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 
 use super::messages::ErrorReply;
-use crate::plant::{BusHandle, Plant};
+use drivegate_core::plant::{BusHandle, Plant};
 
 /// A reply that refuses a request. Boxed, because it is part of many results.
 #[derive(Debug)]

@@ -24,11 +24,11 @@ use super::reached::{Client, Coverage, Reached};
 use super::{api, documents, event_log, expect, line, mqtt, page, points, recordings, replies, streams, trend, views};
 use crate::NorthState;
 use crate::command_json::{CommandResult, HoldReply, StopBody};
-use crate::drill::DrillReport;
-use crate::history::{Entry, RecordingObject};
-use crate::order::AuditRecord;
-use crate::plant::SharedPlant;
-use crate::stop_all::StopReport;
+use drivegate_core::drill::DrillReport;
+use drivegate_core::history::{Entry, RecordingObject};
+use drivegate_core::order::AuditRecord;
+use drivegate_core::plant::SharedPlant;
+use drivegate_core::stop_all::StopReport;
 
 /// The route exists only at the socket.
 const RELOAD: &str = "/api/v1/reload";

@@ -24,9 +24,9 @@ use super::reached::{Client, Coverage, LocalUser, Reached};
 use super::routes;
 use crate::NorthState;
 use crate::connection_limit::{ConnectionLimit, ConnectionPlace, Limits, Newcomer};
-use crate::order::{Authority, Proof, Right, SourceKind};
-use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader};
+use drivegate_core::order::{Authority, Proof, Right, SourceKind};
+use drivegate_core::plant::SharedPlant;
 
 /// Serves the connections of the local socket that use HTTP.
 #[derive(Debug, Clone)]

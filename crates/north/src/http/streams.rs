@@ -24,11 +24,11 @@ use super::app_state::AppState;
 use super::reached::Client;
 use super::replies::{Replied, no_bus};
 use super::{messages, query};
-use crate::codec::{Protocol, describe};
 use crate::connection_limit::{ConnectionPermit, LimitReached, Newcomer, NoPlace};
-use crate::event::Event;
-use crate::order::Authority;
-use crate::process_image::{Direction, FrameRecord};
+use drivegate_core::event::Event;
+use drivegate_core::order::Authority;
+use drivegate_core::process_image::{Direction, FrameRecord};
+use drivegate_proto::{Protocol, describe};
 
 /// Time after which a browser reconnects.
 const RETRY: Duration = Duration::from_secs(2);

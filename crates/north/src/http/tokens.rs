@@ -11,7 +11,7 @@ use ring::rand::{SecureRandom, SystemRandom};
 use subtle::ConstantTimeEq;
 
 use super::credentials::{Credential, CredentialError, Credentials, checked_name};
-use crate::hex;
+use drivegate_core::hex;
 
 /// Length of a token and of its hash, bytes.
 const BYTES: usize = 32;

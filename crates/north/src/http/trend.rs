@@ -13,9 +13,9 @@ use serde::Serialize;
 use super::app_state::AppState;
 use super::query::{self, QueryError};
 use super::replies::{Replied, no_drive, not_found};
-use crate::drive::ModelPoint;
-use crate::history::trend::{DriveTrend, Part, RANGES, Range, Reach, Step, points_of};
-use crate::history::{Clock, DriveHistory};
+use drivegate_core::history::trend::{DriveTrend, Part, RANGES, Range, Reach, Step, points_of};
+use drivegate_core::history::{Clock, DriveHistory};
+use drivegate_model::drive::ModelPoint;
 
 /// Time span shown without `from`.
 const SHOWN: Duration = Duration::from_secs(600);
@@ -177,10 +177,10 @@ pub(super) struct Shown<'p> {
     point: &'p str,
     unit: &'p str,
     step_s: u64,
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     from: SystemTime,
-    #[serde(serialize_with = "crate::event::rfc3339")]
+    #[serde(serialize_with = "drivegate_core::event::rfc3339")]
     #[schema(value_type = String)]
     to: SystemTime,
     /// The steps, each with its beginning (ms since 1970) and the least, greatest and last value; `null` without a

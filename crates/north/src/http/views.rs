@@ -18,8 +18,8 @@ use super::reached::Reached;
 use super::replies::{Replied, find_bus, no_drive, not_found, refused};
 use super::{api, page, query};
 use crate::local::control;
-use crate::parameters::{ParameterFile, Store, StoredFile};
 use crate::{metrics, readiness};
+use drivegate_core::parameters::{ParameterFile, Store, StoredFile};
 
 pub(super) async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
     let _turn = app.turn().await;

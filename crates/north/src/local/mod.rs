@@ -1,7 +1,7 @@
 //! The local socket: the HTTP API for commands on the machine of the gateway (`http/socket_door.rs`).
 //!
 //! The permissions of the socket's file decide who may connect, and any client that can connect may command as far
-//! as the drives allow. Commands are placed like all others ([`crate::plant::DriveHandle::place`]) and audited with
+//! as the drives allow. Commands are placed like all others ([`drivegate_core::plant::DriveHandle::place`]) and audited with
 //! the user id of the client's process. Connections and times are bounded; if there are too many connections, an
 //! idle one is closed in favour of the new one.
 
@@ -25,11 +25,11 @@ use tokio_util::task::TaskTracker;
 use self::path::Bound;
 use crate::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::http::{LocalUser, SocketDoor};
-use crate::order::{Authority, Proof, Right, SourceKind};
-use crate::plant::SharedPlant;
 use crate::reading::{Dated, Reader, is_readable};
 use crate::server;
 use crate::{NorthState, ServerError};
+use drivegate_core::order::{Authority, Proof, Right, SourceKind};
+use drivegate_core::plant::SharedPlant;
 
 pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};

@@ -7,14 +7,14 @@ use std::time::{Instant, SystemTime};
 use super::model::MODEL;
 use super::process;
 use super::series::{Families, FamilyId, Kind, Labels, SeriesValue};
-use crate::drive::{ModelPoint, PollClass, State, Value};
-use crate::history::TriggerKind;
-use crate::permit::HoldState;
-use crate::plant::{BusHandle, Plant};
-use crate::process_image::{BusHealth, BusImage, DriveImage, Outcome, Reading, public_points};
-use crate::start_guard::Reason;
-use crate::version::{self, VERSION};
 use crate::{NorthState, ServerKind};
+use drivegate_core::history::TriggerKind;
+use drivegate_core::permit::HoldState;
+use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::process_image::{BusHealth, BusImage, DriveImage, Outcome, Reading, public_points};
+use drivegate_core::start_guard::Reason;
+use drivegate_core::version::{self, VERSION};
+use drivegate_model::drive::{ModelPoint, PollClass, State, Value};
 
 /// All metric series, with the series of one family next to each other.
 pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Families {

@@ -18,7 +18,7 @@ use prometheus_client::registry::Registry;
 
 use self::series::{Families, Kind, SeriesValue};
 use super::NorthState;
-use crate::plant::Plant;
+use drivegate_core::plant::Plant;
 
 /// Text formats of the metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -179,7 +179,7 @@ mod tests {
     use drivegate_testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx};
 
     use super::*;
-    use crate::process_image::{DriveImage, DriveSpec, LeaseAction, Supervision};
+    use drivegate_core::process_image::{DriveImage, DriveSpec, LeaseAction, Supervision};
 
     fn drive(name: &str, supervision: Option<Supervision>) -> Arc<DriveImage> {
         image(DriveSpec {

@@ -1,6 +1,6 @@
 //! Metrics of the common drive model.
 
-use crate::drive::ModelPoint;
+use drivegate_model::drive::ModelPoint;
 
 macro_rules! gauges {
     ($($point:ident $metric:literal $help:literal)*) => { [$((ModelPoint::$point, $metric, $help)),*] };

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
-use crate::process_image::HistogramSnapshot;
+use drivegate_core::process_image::HistogramSnapshot;
 
 /// A label of a series: name and value.
 pub(super) type Label = (&'static str, Cow<'static, str>);

@@ -24,8 +24,8 @@ use crate::connection_limit::{
     CloseReason, ConnectionLimit, ConnectionPermit, ConnectionPlace, LimitReached, Newcomer,
 };
 use crate::listener::ConnectionHandler;
-use crate::order::Authority;
 use crate::reading::{Dated, Reader};
+use drivegate_core::order::Authority;
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.
 const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::routes::PlantView;
 use crate::connection_limit::Rights;
-use crate::order::{Authority, Grants, Origin, Proof, Right, SourceKind};
+use drivegate_core::order::{Authority, Grants, Origin, Proof, Right, SourceKind};
 
 /// A connected client.
 #[derive(Debug, Clone)]

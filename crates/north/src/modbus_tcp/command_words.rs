@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-use crate::process_image::Machine;
+use drivegate_core::process_image::Machine;
 
 /// The word last written at 0x8100 of each unit by any client, and the machine it was written to: a fault reset is
 /// a change of its bit 2. After a reload that puts another machine at a unit, a word that a client repeats changes

@@ -10,7 +10,7 @@ use super::forwarded_request::{AnsweredRequest, PendingRequest};
 use super::frame::{self, MAX_FRAME, NotModbus};
 use super::session::ClientSession;
 use crate::arrivals::Arrivals;
-use crate::order::Arrival;
+use drivegate_core::order::Arrival;
 
 /// Initial input buffer: two frames, so that a thousand idle clients use little memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;

@@ -10,12 +10,12 @@ use tokio::sync::oneshot;
 use super::client::Client;
 use super::frame::Header;
 use super::routes::At;
-use crate::codec::n2::Object;
-use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
-use crate::order::{Arrival, Authority, Order, Outcome, Refusal};
-use crate::plant::{DriveHandle, OrderRequest, Placed};
-use crate::process_image::{Reading, Unavailable};
 use crate::register_map::{BusState, DriveView};
+use drivegate_core::order::{Arrival, Authority, Order, Outcome, Refusal};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Placed};
+use drivegate_core::process_image::{Reading, Unavailable};
+use drivegate_proto::n2::Object;
+use drivegate_proto::{Exception, Protocol, Reply, RequestPdu, Table, describe};
 
 /// A request that is forwarded to a drive.
 #[derive(Debug)]

@@ -1,7 +1,7 @@
 //! MBAP framing: transaction id, protocol id 0, length, unit id, PDU.
 
-use crate::codec::modbus::MAX_PDU;
-use crate::codec::{ascii, rtu};
+use drivegate_proto::modbus::MAX_PDU;
+use drivegate_proto::{ascii, rtu};
 
 /// Bytes before the PDU: transaction id, protocol id, length, unit id.
 pub(crate) const HEADER: usize = 7;

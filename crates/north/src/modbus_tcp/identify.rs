@@ -1,6 +1,6 @@
 //! Function 43/14: device identification of the units.
 
-use crate::codec::{Exception, Reply};
+use drivegate_proto::{Exception, Reply};
 
 /// Maximum length of the text of an object, so that six objects fit into one reply.
 const MAX_TEXT: usize = 40;
@@ -40,7 +40,7 @@ impl Identity<'_> {
         let objects = [
             (0, VENDOR),
             (1, self.product),
-            (2, crate::version::VERSION),
+            (2, drivegate_core::version::VERSION),
             (4, self.title),
             (5, self.name),
         ];
@@ -86,8 +86,8 @@ fn ascii(text: &str) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::RequestPdu;
-    use crate::codec::modbus::MAX_PDU;
+    use drivegate_proto::RequestPdu;
+    use drivegate_proto::modbus::MAX_PDU;
 
     const NX: Identity<'static> = Identity {
         product: "vacon-nx",

@@ -12,9 +12,9 @@ use super::routes::{PlantView, View};
 use super::session::ClientSession;
 use super::{Options, ServerState};
 use crate::NorthState;
-use crate::order::Authority;
-use crate::plant::SharedPlant;
 use crate::reading::{Reader, Watch};
+use drivegate_core::order::Authority;
+use drivegate_core::plant::SharedPlant;
 
 /// A client of a server without sockets. Time is an argument of [`Loopback::receive`].
 #[derive(Debug)]

@@ -35,14 +35,14 @@ use self::command_words::CommandWords;
 use self::routes::PlantView;
 use self::tls::{Requirements, TlsAuthenticator};
 use crate::connection_limit::{ConnectionLimit, Limits};
-use crate::event::Events;
 use crate::listener::{ListenerSpec, Listeners, NewSockets};
 use crate::log_throttle::LogThrottle;
-use crate::plant::SharedPlant;
 use crate::reading::Watch;
 use crate::refusals::Refusals;
 use crate::tcp_server::{TcpServer, TcpService};
 use crate::{NorthState, ServerError, ServerKind, certificate};
+use drivegate_core::event::Events;
+use drivegate_core::plant::SharedPlant;
 
 pub use self::loopback::Loopback;
 pub use self::routes::{Registers, View};

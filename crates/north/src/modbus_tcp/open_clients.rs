@@ -12,7 +12,7 @@ use super::tls::{Requirements, Role};
 use crate::certificate;
 use crate::connection_limit::Rights;
 use crate::identity::seconds;
-use crate::order::Authority;
+use drivegate_core::order::Authority;
 
 /// Longest time between two looks at the calendar, which can be set at any time.
 const LOOK: Duration = Duration::from_secs(60);

@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use arc_swap::ArcSwap;
 
-use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 use crate::register_map::{FIRST, GATEWAY_UNIT, STOP_ALL};
-use crate::stop_all::{Scope, StopAll};
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use drivegate_core::stop_all::{Scope, StopAll};
 
 /// The part of the plant that the clients of one listener can see.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

@@ -15,19 +15,19 @@ use super::identify::Identity;
 use super::routes::{At, PlantView, Registers, Routes};
 use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
-use crate::codec::modbus::encode_exception;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command_json::{nothing_to_stop, refuse_stop_all};
-use crate::drive::{ModelPoint, PointIndex, Profile, State, Value};
 use crate::log_throttle::LogThrottle;
-use crate::order::{self, Arrival, Authority, Order, Outcome, Refusal};
-use crate::permit::Verb;
-use crate::plant::{BusHandle, DriveHandle};
-use crate::process_image::{Access, Unavailable};
 use crate::register_map::{
     self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, HEARTBEAT, HOLD, NOT_STANDING, STOP_ALL,
 };
-use crate::stop_all;
+use drivegate_core::order::{self, Arrival, Authority, Order, Outcome, Refusal};
+use drivegate_core::permit::Verb;
+use drivegate_core::plant::{BusHandle, DriveHandle};
+use drivegate_core::process_image::{Access, Unavailable};
+use drivegate_core::stop_all;
+use drivegate_model::drive::{ModelPoint, PointIndex, Profile, State, Value};
+use drivegate_proto::modbus::encode_exception;
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];

@@ -33,12 +33,12 @@ use super::session::{self, Client as _, Common, Will};
 use super::store::{Loaded, Store};
 use super::topics::Topics;
 use super::{Buffer, History, Options};
-use crate::event::{BURST, Event, EventKind};
-use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::log_throttle::LogThrottle;
-use crate::order::Right;
-use crate::plant::{Plant, SharedPlant};
 use crate::{MqttKind, NorthState};
+use drivegate_core::event::{BURST, Event, EventKind};
+use drivegate_core::files::names::{MQTT_EVENTS, MQTT_HISTORY};
+use drivegate_core::order::Right;
+use drivegate_core::plant::{Plant, SharedPlant};
 
 /// Part of the time for the orderly disconnect, for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);

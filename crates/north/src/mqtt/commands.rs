@@ -17,10 +17,10 @@ use super::topics::{Target, Topics};
 use crate::command_json::{
     HoldReply, Id, Repetition, SharedMemory, excerpt, nothing_to_stop, refuse_stop_all, refuse_unknown, stop_all,
 };
-use crate::order::{Answer, Arrival, Authority, Origin, Outcome, Proof, Refusal, Right, SourceKind};
-use crate::permit::{Stage, Verb, access};
-use crate::plant::{Placed, Plant, Shown};
-use crate::stop_all::{StopAll, StopReport};
+use drivegate_core::order::{Answer, Arrival, Authority, Origin, Outcome, Proof, Refusal, Right, SourceKind};
+use drivegate_core::permit::{Stage, Verb, access};
+use drivegate_core::plant::{Placed, Plant, Shown};
+use drivegate_core::stop_all::{StopAll, StopReport};
 
 /// Limits of the commands that wait for the bus. Only stops can reach them: the queues of the buses accept fewer other
 /// commands.

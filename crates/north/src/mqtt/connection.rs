@@ -31,8 +31,8 @@ use super::reasons::{CLOSED, is_closed, reason, reference, refusal};
 use super::request::Incoming;
 use super::trail::Trail;
 use super::{Broker, Options};
-use crate::order::Arrival;
 use crate::reading::{Dated, Reader};
+use drivegate_core::order::Arrival;
 
 /// The broker's reason for refusing filters with wildcards.
 pub(super) const NO_WILDCARDS: &str = "WildcardSubscriptionsNotSupported";

@@ -7,7 +7,7 @@ use tokio::sync::broadcast::Receiver;
 use super::Broker;
 use super::commands::OrdersLeft;
 use super::sparkplug::NodeOrdersLeft;
-use crate::event::Event;
+use drivegate_core::event::Event;
 
 /// State that the last clients left, until the next clients take it over.
 #[derive(Debug, Default)]

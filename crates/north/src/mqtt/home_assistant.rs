@@ -15,7 +15,7 @@ use self::device::Device;
 use super::Telemetry;
 use super::publisher::Update;
 use super::topics::Topics;
-use crate::plant::{DriveHandle, Plant};
+use drivegate_core::plant::{DriveHandle, Plant};
 
 /// Messages that wait for the broker at a time.
 const UNDER_WAY: usize = 8;

@@ -9,8 +9,8 @@ use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::topics::Topics;
 use crate::command_json::SharedMemory;
-use crate::order::{Arrival, Connection, Right};
-use crate::plant::SharedPlant;
+use drivegate_core::order::{Arrival, Connection, Right};
+use drivegate_core::plant::SharedPlant;
 
 /// A message that the gateway publishes: the result of a command.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -123,9 +123,9 @@ mod tests {
 
     use super::super::fixture;
     use super::*;
-    use crate::codec::Reply;
-    use crate::drive::Value;
-    use crate::order::{Order, Outcome, Urgency};
+    use drivegate_core::order::{Order, Outcome, Urgency};
+    use drivegate_model::drive::Value;
+    use drivegate_proto::Reply;
 
     #[test]
     fn forty_pairs_in_virtual_time() {

@@ -28,7 +28,7 @@ const DAMAGED: &str = ".damaged";
 const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
 /// Maximum number of messages that wait in memory because the disk does not accept them; their size is at most
 /// [`KEPT_BYTES`].
-const UNWRITTEN: usize = crate::event::BURST;
+const UNWRITTEN: usize = drivegate_core::event::BURST;
 /// Files with damaged records that are kept.
 const QUARANTINED: usize = 16;
 

@@ -64,8 +64,8 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
 use super::NorthState;
-use crate::plant::SharedPlant;
 use crate::{ServerError, server};
+use drivegate_core::plant::SharedPlant;
 
 pub use self::handover::Handover;
 pub use self::loopback::{Loopback, Published};

@@ -20,7 +20,7 @@ const RESULT_BYTES: usize = 32 << 20;
 const RESULTS_OF_TOPIC: usize = 2048;
 /// Maximum number of messages of a queue in memory, and their size in bytes; with a buffer, further messages wait
 /// on disk. An array of the history has up to 32 KiB.
-const KEPT: usize = crate::event::BURST;
+const KEPT: usize = drivegate_core::event::BURST;
 pub(super) const KEPT_BYTES: usize = 16 << 20;
 /// Maximum number of messages loaded from disk at once, more than any window, and the size at which loading stops.
 const LOADED: usize = 1024;

@@ -7,16 +7,16 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use super::topics::Topics;
 use crate::command_json::HoldFields;
-use crate::drive::{ModelPoint, Point, PointIndex, Profile, Quality, State, Value};
-use crate::event::Event;
-use crate::permit::HoldView;
-use crate::plant::{BusHandle, Plant};
-use crate::process_image::{BusHealth, Reading, value_or_null};
+use drivegate_core::event::Event;
+use drivegate_core::permit::HoldView;
+use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::process_image::{BusHealth, Reading, value_or_null};
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, Profile, Quality, State, Value};
 
 /// The published points of a drive: index in the profile and name. No name is a key of the state object, since
 /// profiles reject such names.
 pub(super) fn published_points(profile: &Profile) -> Vec<(PointIndex, &str)> {
-    crate::process_image::public_points(profile)
+    drivegate_core::process_image::public_points(profile)
 }
 
 /// The state object of a drive without its times; it is published when it changes.
@@ -297,12 +297,12 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
-    use crate::codec::Table;
-    use crate::process_image::{DriveImage, DriveSpec, Link};
+    use drivegate_core::process_image::{DriveImage, DriveSpec, Link};
+    use drivegate_proto::Table;
 
     #[test]
     fn bare_values_are_shortest_decimals() {
-        let profile = crate::drive::profile::Profiles::built_in()
+        let profile = drivegate_model::drive::profile::Profiles::built_in()
             .get("vacon-nx")
             .unwrap()
             .clone();
@@ -385,7 +385,7 @@ mod tests {
 
     #[test]
     fn a_state_that_is_not_known_is_null_and_not_good() {
-        let cx = crate::drive::profile::Profiles::built_in()
+        let cx = drivegate_model::drive::profile::Profiles::built_in()
             .get("vacon-cx")
             .unwrap()
             .clone();
@@ -448,7 +448,7 @@ mod tests {
             drive: Some("p1".to_string()),
             fault_code: Some(53),
             ..Event::new(
-                crate::event::EventKind::FaultEnd,
+                drivegate_core::event::EventKind::FaultEnd,
                 SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
                 "gone".to_string(),
             )
@@ -457,12 +457,12 @@ mod tests {
         let (to, payload) = event(&topics, &object, &plant);
         assert_eq!(to, ["drivegate/hall/drive/p1/event"]);
         let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
-        let boot = crate::event::boot();
+        let boot = drivegate_core::event::boot();
         let expected = serde_json::json!({"id": 4, "boot": boot, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
         assert_eq!(payload, expected);
         assert_eq!(recording(&topics, &object), None);
-        object.recording = Some(crate::event::RecordingMade {
+        object.recording = Some(drivegate_core::event::RecordingMade {
             id: "20231114T221320.001Z-p1".to_string(),
             trigger: "fault".into(),
             summary: "fault 53".to_string(),

@@ -16,9 +16,9 @@ use super::history::Recorder;
 use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject};
 use super::rounds::{self, LOOK};
 use super::topics::Topics;
-use crate::drive::{ModelPoint, PointIndex};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::{Reading, Snapshot};
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::process_image::{Reading, Snapshot};
+use drivegate_model::drive::{ModelPoint, PointIndex};
 
 /// Minimum time between publications because counters or load of a bus changed, which they do all the time.
 const FIGURES_INTERVAL: Duration = Duration::from_secs(1);

@@ -5,8 +5,8 @@ use std::time::SystemTime;
 use super::outbox::Message;
 use super::request::Incoming;
 use crate::command_json::{CommandResult, Id};
-use crate::order::Answer;
-use crate::plant::Shown;
+use drivegate_core::order::Answer;
+use drivegate_core::plant::Shown;
 
 /// Maximum number of levels of a response topic.
 const LEVELS: usize = 128;

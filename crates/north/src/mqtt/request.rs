@@ -7,8 +7,8 @@ use rumqttc::Publish;
 use serde_json::Value as Json;
 
 use crate::command_json::{self, Id, MAX_PAYLOAD, ParsedCommand, Taken, check_size, excerpt, find_id, resolve};
-use crate::drive::Profile;
-use crate::order::{Arrival, DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
+use drivegate_core::order::{Arrival, DEFAULT_EXPIRY, Origin, Refusal, SourceKind};
+use drivegate_model::drive::Profile;
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
@@ -147,8 +147,8 @@ mod tests {
 
     use super::*;
     use crate::command_json::MAX_ID;
-    use crate::drive::Value;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::Value;
+    use drivegate_model::drive::profile::Profiles;
 
     fn profile() -> Arc<Profile> {
         Profiles::built_in().get("vacon-nx").unwrap().clone()

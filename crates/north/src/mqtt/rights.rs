@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::Options;
-use crate::order::Right;
+use drivegate_core::order::Right;
 
 /// Rights to command: over the set topics, and as a Sparkplug host.
 #[derive(Debug, Default)]

@@ -14,7 +14,7 @@ use super::connection::Step;
 use super::link::{BrokerLink, Due};
 use super::request::Incoming;
 use crate::NorthState;
-use crate::plant::{Plant, SharedPlant};
+use drivegate_core::plant::{Plant, SharedPlant};
 
 /// Maximum time between two checks of the connection and the plant.
 pub(super) const CHECK: Duration = Duration::from_millis(25);

@@ -16,12 +16,12 @@ use tokio::sync::mpsc;
 use super::Buffer;
 use super::message_log::MessageLog;
 use super::outbox::{KEPT_BYTES, Message};
-use crate::files::names::MQTT_TOPICS;
 use crate::{MqttKind, NorthState};
+use drivegate_core::files::names::MQTT_TOPICS;
 
 /// Maximum number of jobs that wait for the disk: a burst of events and its acknowledgements. The size of their
 /// messages is at most [`KEPT_BYTES`].
-const JOBS: usize = 2 * crate::event::BURST;
+const JOBS: usize = 2 * drivegate_core::event::BURST;
 /// Messages that are written at a time.
 const BATCH: usize = 1024;
 /// Time after which messages on disk survive a power failure.

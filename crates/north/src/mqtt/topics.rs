@@ -1,6 +1,6 @@
 //! Names of the topics, made and recognised.
 
-use crate::plant::{DriveHandle, Plant};
+use drivegate_core::plant::{DriveHandle, Plant};
 
 /// The topics of one gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -10,14 +10,14 @@ use std::time::{Duration, Instant, SystemTime};
 
 pub use self::restore::{Again, carry_out, prepare, release, take_up};
 pub use self::unfinished::{hold_unfinished, orphans};
-use crate::drive::parameters::RawValue;
-use crate::event::{Event, EventKind};
-use crate::order::{Origin, Pace, SourceKind};
-use crate::parameters::{
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::order::{Origin, Pace, SourceKind};
+use drivegate_core::parameters::{
     Difference, NO_IDENTIFICATION, NOT_KNOWN, Names, Next, ParameterFile, Reading, Store, Vault, differences,
 };
-use crate::plant::{DriveHandle, SharedPlant};
-use crate::process_image::{Access, Machine};
+use drivegate_core::plant::{DriveHandle, SharedPlant};
+use drivegate_core::process_image::{Access, Machine};
+use drivegate_model::drive::parameters::RawValue;
 
 /// Longest time for which a request waits for its turn; then it is repeated.
 const EXPIRY: Duration = Duration::from_secs(60);

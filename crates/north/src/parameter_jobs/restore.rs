@@ -9,17 +9,17 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::unfinished::{concerning, held_unfinished, not_understood, unfinished_event};
 use super::{ReadProgress, identification, read};
-use crate::codec::RequestPdu;
-use crate::drive::Profile;
-use crate::drive::plan::WireTime;
-use crate::order::{Authority, Order, Origin, Pace, ParameterOrder, written};
-use crate::parameters::{
+use drivegate_core::order::{Authority, Order, Origin, Pace, ParameterOrder, written};
+use drivegate_core::parameters::{
     End, Journal, JournalFile, NO_IDENTIFICATION, NOT_KNOWN, Owner, ParameterFile, Phase, Plan, Prepared, Reading,
     Restoration, RestoreNeed, RestoreStage, Then, Vault, Wishes, plan,
 };
-use crate::permit::{limits_passed, may_restore};
-use crate::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
-use crate::process_image::Machine;
+use drivegate_core::permit::{limits_passed, may_restore};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Plant, SharedPlant};
+use drivegate_core::process_image::Machine;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::plan::WireTime;
+use drivegate_proto::RequestPdu;
 
 /// Longest time for which a command of a restore waits for its turn; then it is given again.
 const EXPIRY: Duration = Duration::from_secs(30);

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::restore::blocking;
-use crate::event::{Event, EventKind, Events};
-use crate::files::Patience;
-use crate::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
-use crate::plant::{DriveHandle, SharedPlant};
-use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
+use drivegate_core::event::{Event, EventKind, Events};
+use drivegate_core::files::Patience;
+use drivegate_core::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
+use drivegate_core::plant::{DriveHandle, SharedPlant};
+use drivegate_core::process_image::{Access, BusSpec, DriveSpec, Machine};
 
 /// A journal with its owner, if the owner can be read.
 type Found = (JournalFile, Result<Owner, String>);

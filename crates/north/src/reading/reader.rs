@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use super::Watch;
-use crate::order::{Arrival, Connection};
-use crate::stalls::Dated;
+use drivegate_core::order::{Arrival, Connection};
+use drivegate_core::stalls::Dated;
 
 /// The reader of a connection.
 #[derive(Debug)]

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::runtime::{Builder, Runtime};
 use tokio::time::MissedTickBehavior;
 
-use crate::event::Events;
-use crate::line::since_boot;
-use crate::stalls::{Dated, Stall, Stalls, TICK, UNNOTICED};
+use drivegate_core::event::Events;
+use drivegate_core::stalls::{Dated, Stall, Stalls, TICK, UNNOTICED};
+use drivegate_line::since_boot;
 
 thread_local! {
     /// The watch of the runtime that this thread works for.

@@ -1,8 +1,8 @@
 //! Writes to the command block.
 
 use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, HOLD, NO_I16, NO_U16, REVERSE, RUN, SPEED_REFERENCE};
-use crate::drive::{ModelPoint, PointIndex, Profile, Value};
-use crate::order::Refusal;
+use drivegate_core::order::Refusal;
+use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
 
 const FAULT_RESET: u16 = 1 << 2;
 

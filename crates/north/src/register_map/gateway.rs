@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::{Form, high_low};
-use crate::codec::Exception;
+use drivegate_proto::Exception;
 
 /// Number of registers of a bus.
 pub const BUS_BLOCK: u16 = 16;

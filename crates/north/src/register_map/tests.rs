@@ -3,9 +3,9 @@ use std::time::{Duration, Instant, SystemTime};
 use drivegate_testkit::{STALE_AFTER, controlled, profile};
 
 use super::*;
-use crate::codec::Table;
-use crate::drive::{PointIndex, Profile};
-use crate::process_image::{DriveImage, Link, Snapshot};
+use drivegate_core::process_image::{DriveImage, Link, Snapshot};
+use drivegate_model::drive::{PointIndex, Profile};
+use drivegate_proto::Table;
 
 fn nx() -> Profile {
     Profile::clone(&profile("vacon-nx"))
@@ -272,7 +272,7 @@ fn a_large_drive_reads_as_float() {
     let now = Instant::now();
     let mut profile = nx();
     let current = profile.model_index(ModelPoint::MotorCurrent).unwrap();
-    let crate::drive::Source::Raw(raw) = &mut profile.points.get_mut(current).unwrap().source else {
+    let drivegate_model::drive::Source::Raw(raw) = &mut profile.points.get_mut(current).unwrap().source else {
         panic!("motor_current is raw");
     };
     raw.scale = 1.0;
@@ -495,7 +495,7 @@ fn blocks_have_no_gap() {
 
 #[test]
 fn the_hold_is_mapped_where_authority_is_on() {
-    use crate::permit::{HoldState, HoldView};
+    use drivegate_core::permit::{HoldState, HoldView};
     let now = Instant::now();
     let image = running(now);
     let reading = image.reading(now, STALE_AFTER);

@@ -12,8 +12,8 @@ use tokio_util::sync::CancellationToken;
 use super::dialogue::Dialogue;
 use super::terms::Tool;
 use crate::connection_limit::{CloseReason, ConnectionPlace};
-use crate::line::{ServedPort, telnet_escaped};
 use crate::reading::{Dated, Source};
+use drivegate_line::{ServedPort, telnet_escaped};
 
 /// Time for a tool to take an answer.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);

@@ -12,8 +12,8 @@ use super::framing::{Framing, ToolFrame};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::terms::{Decision, Tool, Work};
 use crate::SlotOutcome;
-use crate::codec::{Protocol, Reply, RequestPdu};
-use crate::order::{Arrival, Outcome};
+use drivegate_core::order::{Arrival, Outcome};
+use drivegate_proto::{Protocol, Reply, RequestPdu};
 
 /// Time from the end of a request within which a tool is answered; later, the answer is dropped.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
@@ -306,8 +306,8 @@ fn frame_of(protocol: Protocol, request: &ToolRequest, pdu: &RequestPdu, outcome
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::Exception;
-    use crate::order::{Interruption, Refusal};
+    use drivegate_core::order::{Interruption, Refusal};
+    use drivegate_proto::Exception;
 
     /// Exception or error code of the answer to a write of two registers; 0 acknowledges it, `None` is silence.
     fn answer_code(protocol: Protocol, outcome: &Outcome) -> Option<u8> {
@@ -324,8 +324,8 @@ mod tests {
         match protocol {
             Protocol::N2 if frame == b"A\r" => Some(0),
             Protocol::N2 => std::str::from_utf8(frame.get(1..3)?).ok()?.parse().ok(),
-            Protocol::ModbusAscii => code(&crate::codec::ascii::open_frame(&frame)?.1),
-            Protocol::ModbusRtu => code(crate::codec::rtu::open_frame(&frame)?.1),
+            Protocol::ModbusAscii => code(&drivegate_proto::ascii::open_frame(&frame)?.1),
+            Protocol::ModbusRtu => code(drivegate_proto::rtu::open_frame(&frame)?.1),
         }
     }
 

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use super::request::ToolRequest;
 use crate::arrivals::Arrivals;
-use crate::codec::frames::Frames;
-use crate::codec::{LineFormat, Protocol};
-use crate::order::Arrival;
+use drivegate_core::order::Arrival;
+use drivegate_proto::frames::Frames;
+use drivegate_proto::{LineFormat, Protocol};
 
 /// Silence after an incomplete frame after which its rest is no longer expected: longer than the pauses of serial
 /// programs and the delayed acknowledgements of TCP, shorter than the time after which tools repeat a request.
@@ -94,7 +94,7 @@ mod tests {
 
     use super::super::request::{Meaning, Refused};
     use super::*;
-    use crate::codec::{Exception, RequestPdu, Table, ascii, rtu};
+    use drivegate_proto::{Exception, RequestPdu, Table, ascii, rtu};
 
     fn add(framing: &mut Framing, bytes: &[u8], now: Instant) {
         framing.add(bytes, Arrival::now(now), now);

@@ -10,11 +10,11 @@ use tokio_util::sync::CancellationToken;
 use super::terms::{Terms, Tool};
 use super::{MAX_TOOLS, connection, limits};
 use crate::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer};
-use crate::line::ServedPort;
 use crate::listener::ConnectionHandler;
-use crate::order::{Authority, Proof};
 use crate::reading::Dated;
 use crate::refusals::Refusals;
+use drivegate_core::order::{Authority, Proof};
+use drivegate_line::ServedPort;
 
 /// How the tools of an address are served.
 #[derive(Debug, Clone)]

@@ -10,8 +10,8 @@ use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
 use super::{Options, Slot, SlotAccess};
 use crate::NorthState;
-use crate::order::{Arrival, Connection, Proof};
-use crate::plant::SharedPlant;
+use drivegate_core::order::{Arrival, Connection, Proof};
+use drivegate_core::plant::SharedPlant;
 
 /// A tool of a slot without sockets.
 #[derive(Debug)]

@@ -31,9 +31,9 @@ use super::connection_limit::Limits;
 use super::listener::{ListenerSpec, Listeners, NewSockets};
 use super::refusals::Refusals;
 use super::{NorthState, ServerError, ServerKind};
-use crate::codec::{LineFormat, Protocol};
-use crate::plant::SharedPlant;
 use crate::tcp_server::{TcpServer, TcpService};
+use drivegate_core::plant::SharedPlant;
+use drivegate_proto::{LineFormat, Protocol};
 
 pub use self::loopback::Loopback;
 

@@ -16,9 +16,9 @@ use tokio_util::sync::CancellationToken;
 use super::connection::sleep_until;
 use super::dialogue::Dialogue;
 use super::terms::{Terms, Tool};
-use crate::line::Pty;
-use crate::order::Proof;
 use crate::reading::{Dated, Reader};
+use drivegate_core::order::Proof;
+use drivegate_line::Pty;
 
 /// Pause before a pseudo-terminal that could not be opened is tried again.
 const AGAIN: Duration = Duration::from_secs(5);

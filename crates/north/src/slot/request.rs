@@ -1,7 +1,7 @@
 //! The meaning of a tool's frame: a read, a write, or a request that may write. Pure.
 
-use crate::codec::n2::{self, Command};
-use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
+use drivegate_proto::n2::{self, Command};
+use drivegate_proto::{Exception, Protocol, RequestPdu, ascii, rtu};
 
 /// Diagnostics (function 8) that only read: the echo, the diagnostic register and the counters. The other
 /// subfunctions restart or silence the drive, or clear its counters.

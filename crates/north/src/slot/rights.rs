@@ -8,7 +8,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 
 use super::{Options, Slot, SlotAccess};
-use crate::order::{Grants, Proof, Right};
+use drivegate_core::order::{Grants, Proof, Right};
 
 /// The kind of connection by which a tool is connected.
 #[derive(Debug, Clone)]
@@ -79,8 +79,8 @@ mod tests {
 
     use super::super::Loopback;
     use super::*;
-    use crate::codec::{LineFormat, Protocol, RequestPdu, rtu};
-    use crate::plant::SharedPlant;
+    use drivegate_core::plant::SharedPlant;
+    use drivegate_proto::{LineFormat, Protocol, RequestPdu, rtu};
 
     fn slot(access: SlotAccess) -> Slot {
         Slot {

@@ -10,15 +10,15 @@ use arc_swap::ArcSwap;
 use super::request::{Meaning, Refused, ToolRequest};
 use super::rights::ToolRights;
 use super::{Options, Slot, SlotAccess};
-use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::drive::plan::WireTime;
-use crate::order::{Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
-use crate::permit::{self, Stage, client_access};
-use crate::plant::{
+use crate::{NorthState, SlotOutcome};
+use drivegate_core::order::{Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
+use drivegate_core::permit::{self, Stage, client_access};
+use drivegate_core::plant::{
     BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
 };
-use crate::process_image::Access;
-use crate::{NorthState, SlotOutcome};
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::plan::WireTime;
+use drivegate_proto::{LineFormat, Protocol, RequestPdu, describe};
 
 /// Share of the time of a line that writes of tools take at most, stops apart.
 const SHARE_OF_WRITES: f64 = 0.1;

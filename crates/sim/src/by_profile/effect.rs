@@ -1,7 +1,7 @@
 //! How a drive without hand-written words reacts to the words written to it, according to `[control]` of its profile.
 
 use super::reactions::{KnownState, MotorEffect, WordEffect};
-use crate::drive::control::{Control, ControlItem, Run, Setting, Step};
+use drivegate_model::drive::control::{Control, ControlItem, Run, Setting, Step};
 
 fn place_of(setting: &Setting, control: &Control) -> ControlItem {
     setting.place.unwrap_or(control.at)

@@ -7,10 +7,10 @@ use super::super::model::{Model, unsigned};
 use super::state_bits::{Bits, Key, Wish, fulfilled};
 use super::status::Shows;
 use super::{AT_REFERENCE_BAND, Given, ProfileDrive};
-use crate::codec::Table;
-use crate::drive::control::{Control, Mask, OwnWord, Run, Until};
-use crate::drive::profile::{Form, Part, PollClass, Raw};
-use crate::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source, Value};
+use drivegate_model::drive::control::{Control, Mask, OwnWord, Run, Until};
+use drivegate_model::drive::profile::{Form, Part, PollClass, Raw};
+use drivegate_model::drive::{Derived, ModelPoint, Point, PointIndex, Profile, Source, Value};
+use drivegate_proto::Table;
 
 /// Rank of a state that was given.
 const GIVEN: u8 = 0;
@@ -69,7 +69,7 @@ impl ProfileDrive {
 
     /// Whether a command register stays 0 until it is written.
     fn is_kept_back(&self, point: &Point, raw: &Raw) -> bool {
-        let is_place = |control: &crate::drive::control::Control| {
+        let is_place = |control: &drivegate_model::drive::control::Control| {
             let places = super::effect::places(control);
             places.iter().any(|place| raw.covers(place.table, place.address))
         };
@@ -314,7 +314,7 @@ impl ProfileDrive {
             Some(_) => steps.len(),
             None => self.shown_position(now),
         };
-        let wish = |(step, step_of): (usize, &crate::drive::control::Step)| {
+        let wish = |(step, step_of): (usize, &drivegate_model::drive::control::Step)| {
             let Until::State(mask) = step_of.until else {
                 return None;
             };

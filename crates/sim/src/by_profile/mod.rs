@@ -22,9 +22,9 @@ use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD};
 use super::motor::{Feed, Load, Ratings};
 use super::parameter_set::Writes;
 use super::random::Random;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Control, ControlItem, Run, Until};
-use crate::drive::{Bound, ModelPoint, PointIndex, Profile, Source, Value};
+use drivegate_model::drive::control::{Control, ControlItem, Run, Until};
+use drivegate_model::drive::{Bound, ModelPoint, PointIndex, Profile, Source, Value};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Time that a drive takes to reach the next state of its start sequence.
 const SETTLE: Duration = Duration::from_millis(30);
@@ -71,7 +71,7 @@ impl ProfileOptions {
     pub fn can_simulate(profile: &Profile) -> bool {
         let named = profile.simulator.as_deref();
         let known = named.is_none_or(|name| name == BY_CONTROL || FAMILIES.iter().any(|family| family.name == name));
-        known && !profile.protocols.contains(&crate::codec::Protocol::N2)
+        known && !profile.protocols.contains(&drivegate_proto::Protocol::N2)
     }
 
     /// PDU address of the holding register that trips the drive; the next one switches to panel control.

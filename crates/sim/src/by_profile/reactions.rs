@@ -1,7 +1,7 @@
 //! How the families react to the words written to them, written by hand from their manuals without using the profiles.
 
 use super::status::{self, Shows, Words};
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 /// Effect of a word on the motor and the start sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,11 +7,11 @@ use super::super::model::Model;
 use super::ProfileDrive;
 use super::effect;
 use super::state_bits::Key;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Control, ControlItem, OwnWord};
-use crate::drive::identify::{PRODUCT, VENDOR};
-use crate::drive::profile::Part;
-use crate::drive::{Point, Profile, Value, parameters};
+use drivegate_model::drive::control::{Control, ControlItem, OwnWord};
+use drivegate_model::drive::identify::{PRODUCT, VENDOR};
+use drivegate_model::drive::profile::Part;
+use drivegate_model::drive::{Point, Profile, Value, parameters};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Registers and bits by address; addresses not in the map do not exist.
 #[derive(Debug, Clone)]

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use crate::codec::Table;
-use crate::drive::profile::Part;
+use drivegate_model::drive::profile::Part;
+use drivegate_proto::Table;
 
 /// A register, or an item of a bit table.
 pub(super) type Key = (Table, u16);

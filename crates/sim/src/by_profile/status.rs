@@ -1,7 +1,7 @@
 //! The status words of the families, written by hand from their manuals without using the profiles.
 
 use super::reactions::is;
-use crate::drive::profile::Part;
+use drivegate_model::drive::profile::Part;
 
 /// The state that a status word shows.
 #[derive(Debug, Clone, Copy)]

@@ -5,10 +5,10 @@ use drivegate_testkit::{Family, Order, families, number, orders, rows};
 use proptest::prelude::*;
 
 use super::*;
-use crate::codec::Protocol;
-use crate::drive::identify::{self, Nameplate};
-use crate::drive::profile::Profiles;
 use crate::simulated_drive::{DriveOptions, ModelOptions, SimulatedDrive};
+use drivegate_model::drive::identify::{self, Nameplate};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::Protocol;
 
 struct ProfiledDrive {
     drive: SimulatedDrive,

@@ -1,6 +1,6 @@
 //! Function 08 of the simulated CX: event counters and Listen Only Mode (reference/drives.md 4.6).
 
-use crate::codec::{Exception, Reply};
+use drivegate_proto::{Exception, Reply};
 
 /// Numbers of the subfunctions.
 mod subfunction {

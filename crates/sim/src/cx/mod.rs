@@ -22,7 +22,7 @@ use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD, unsig
 use super::motor::{Feed, Ratings};
 use super::parameter_set::Writes;
 use super::random::Random;
-use crate::codec::{Exception, Reply, RequestPdu};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 
 /// The control bits (reference/drives.md 4.2).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

@@ -2,7 +2,7 @@
 
 use super::super::model::Beyond;
 use super::super::motor::Load;
-use crate::codec::Table;
+use drivegate_proto::Table;
 use std::str::FromStr;
 
 /// Items per message; the manual states no limits and shows one item everywhere (reference/drives.md 9.7).

@@ -4,7 +4,7 @@ use super::super::SimTime;
 use super::super::model::{Model, bit, signed, unsigned};
 use super::parameters::Refused;
 use super::{AT_REFERENCE_BAND, CxDrive, CxOptions, OutOfRange};
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Function codes that the board supports.
 pub(super) const FUNCTIONS: [u8; 7] = [1, 2, 3, 4, 5, 6, 8];

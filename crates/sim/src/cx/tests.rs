@@ -3,8 +3,8 @@
 use super::super::model::Beyond;
 use super::options::Limits;
 use super::*;
-use crate::codec::{Table, rtu};
 use crate::in_time::InTime;
+use drivegate_proto::{Table, rtu};
 use std::time::Duration;
 
 type CxInTime = InTime<CxDrive>;

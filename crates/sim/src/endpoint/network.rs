@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags};
 
 use super::no_wait;
-use crate::codec::rtu;
+use drivegate_proto::rtu;
 
 /// Header of a Modbus TCP frame without the unit id.
 const HEADER: usize = 6;

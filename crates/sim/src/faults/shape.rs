@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use super::{Fault, FaultPlan, Foreign};
-use crate::codec::Protocol;
 use crate::framing;
 use crate::random::Random;
+use drivegate_proto::Protocol;
 
 impl FaultPlan {
     /// The bytes that appear on the line for `reply` to `request` under a fault, in order.

@@ -1,8 +1,8 @@
 //! Register or bit of the simulated drive for each object of its N2 board: reference/drives.md 6.6 and 6.7.
 
-use crate::codec::Table;
-use crate::codec::n2::Region;
 use crate::simulated_drive::ModelOptions;
+use drivegate_proto::Table;
+use drivegate_proto::n2::Region;
 
 /// Source of an object's value, and destination of an override.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -2,7 +2,7 @@
 //! overrides (n2.md; reference/drives.md 6.2 to 6.7). Pure: the time is an argument.
 //!
 //! The drive behind the N2 board gets requests as over Modbus, see [`maps`]. Behaviour that no manual specifies is
-//! an option or an entry of [`crate::codec::n2::assumptions`].
+//! an option or an entry of [`drivegate_proto::n2::assumptions`].
 
 pub(crate) mod maps;
 #[cfg(test)]
@@ -15,10 +15,10 @@ pub(crate) use maps::{Entry, Map};
 
 use self::maps::{Backing, Beyond};
 use super::SimTime;
-use crate::codec::n2::assumptions::{CONFIG_REPORT_BIT, INVALID_FLOAT, N2Options, STATUS_OVERRIDE_BIT};
-use crate::codec::n2::command::{CHECKSUM, DATA, LONGEST_REPORT, RESTARTED, SIZE, TYPE, UNKNOWN, checksum};
-use crate::codec::n2::{Answer, Command, Object, Region};
-use crate::codec::{Exception, Reply, RequestPdu};
+use drivegate_proto::n2::assumptions::{CONFIG_REPORT_BIT, INVALID_FLOAT, N2Options, STATUS_OVERRIDE_BIT};
+use drivegate_proto::n2::command::{CHECKSUM, DATA, LONGEST_REPORT, RESTARTED, SIZE, TYPE, UNKNOWN, checksum};
+use drivegate_proto::n2::{Answer, Command, Object, Region};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 
 /// Time without a poll after which a drive considers itself disconnected (reference/drives.md 6.5).
 pub(crate) const MASTER_TIMEOUT: Duration = Duration::from_secs(600);
@@ -312,7 +312,7 @@ impl Board {
             (Some((low, high)), Beyond::Refuse) if !(low..=high).contains(&value) => return Err(DATA),
             _ => value,
         };
-        if table != crate::codec::Table::Holding {
+        if table != drivegate_proto::Table::Holding {
             return Err(TYPE);
         }
         let count = (value / scale).round() as i32 as u16;

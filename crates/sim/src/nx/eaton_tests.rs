@@ -2,7 +2,7 @@
 
 use super::tests::NxInTime;
 use super::*;
-use crate::codec::Exception;
+use drivegate_proto::Exception;
 
 fn svx() -> NxInTime {
     NxInTime::new(NxOptions::svx())

@@ -28,7 +28,7 @@ use super::model::{AT_REFERENCE_BAND, Body, Model};
 use super::motor::Feed;
 use super::parameter_set::Writes;
 use super::random::Random;
-use crate::codec::{Reply, RequestPdu};
+use drivegate_proto::{Reply, RequestPdu};
 
 /// Registers of process data in and out, IDs 2001..=2011 and 2101..=2111.
 const PROCESS_DATA: usize = 11;

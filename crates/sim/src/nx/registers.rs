@@ -4,7 +4,7 @@ use super::super::model::{Model, signed, unsigned};
 use super::parameters::{self, Parameters, Refused};
 use super::{Base, Beyond, ControlPlace, NxDrive, NxOptions, PROCESS_DATA, Unit, Values, control_word};
 use crate::SimTime;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Registers per message (reference/drives.md 9.26) and the answer to more.
 #[derive(Debug, Clone, Copy)]

@@ -1,8 +1,8 @@
 //! Behaviour of the simulated NX against reference/drives.md, sections 3 and 10, in virtual time.
 
 use super::*;
-use crate::codec::{Exception, Table};
 use crate::in_time::InTime;
+use drivegate_proto::{Exception, Table};
 use std::time::Duration;
 
 pub(super) type NxInTime = InTime<NxDrive>;

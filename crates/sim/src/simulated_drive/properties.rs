@@ -1,7 +1,7 @@
 //! Properties of every model, for any requests and any treatment.
 
 use super::*;
-use crate::codec::Table;
+use drivegate_proto::Table;
 use proptest::prelude::*;
 
 fn drive(name: &str) -> SimulatedDrive {

@@ -20,7 +20,7 @@ use super::model::{Body, Command, Model, UPDATE_PERIOD, unsigned};
 use super::motor::{Feed, Ratings};
 use super::parameter_set::Writes;
 use super::random::Random;
-use crate::codec::{Exception, Reply, RequestPdu};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 
 /// Bits of the operation signals, register 0001H (reference/drives.md 5.3).
 pub(crate) mod operation {

@@ -3,7 +3,7 @@
 use super::super::model::{Model, unsigned};
 use super::parameters::{self, RegisterKind};
 use super::{Mode, TecoDrive, TecoOptions};
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 /// Function codes that the card supports.
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];

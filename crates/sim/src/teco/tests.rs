@@ -4,8 +4,8 @@ use super::super::model::ReadOnly;
 use super::super::motor::Load;
 use super::options::{DetectionLevels, Digits};
 use super::*;
-use crate::codec::{Exception, Table, lrc};
 use crate::in_time::InTime;
+use drivegate_proto::{Exception, Table, lrc};
 use std::time::Duration;
 
 const VALUE: Exception = Exception(0x21);

@@ -8,8 +8,8 @@ use std::path::Path;
 use std::process::Command;
 
 use super::privileged;
-use crate::config::{NamedFile, environment, named_files};
-use crate::document::{Finding, Problem};
+use drivegate_gateway::config::{NamedFile, environment, named_files};
+use drivegate_model::document::{Finding, Problem};
 
 const UNIT: &str = "drivegate.service";
 /// Group of the shipped unit, used where systemd cannot be queried.
@@ -183,7 +183,7 @@ fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::FileKind;
+    use drivegate_gateway::config::FileKind;
 
     const PASSWD: &str = "root:x:0:0::/root:/bin/sh\ngateway:x:990:991::/:/bin/false\n";
     const GROUP: &str = "root:x:0:\ndialout:x:20:\nkeys:x:900:a,b\ngateway:x:991:\n";

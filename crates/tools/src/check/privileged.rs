@@ -4,8 +4,8 @@ use std::fs;
 use std::net::SocketAddr;
 use std::path::Path;
 
-use crate::config::Settings;
-use crate::document::{Finding, Problem};
+use drivegate_gateway::config::Settings;
+use drivegate_model::document::{Finding, Problem};
 
 /// The first port that every program may listen on, where the system does not say another.
 const USUAL_FIRST: u16 = 1024;

@@ -12,8 +12,8 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::{ClientError, Url};
-use crate::north::http::{InProcess, basic_authorization};
-use crate::north::{GATEWAY, client_tls, explain};
+use drivegate_north::http::{InProcess, basic_authorization};
+use drivegate_north::{GATEWAY, client_tls, explain};
 
 /// Remedy for a failed TLS handshake whose error suggests none.
 const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";

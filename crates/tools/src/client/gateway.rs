@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::door::Network;
 use super::{Client, Door, Url};
-use crate::config::{Settings, environment};
-use crate::north::http::messages::Expected;
-use crate::north::local::{RuntimeDirectories, SocketPath, absolute};
+use drivegate_gateway::config::{Settings, environment};
+use drivegate_north::http::messages::Expected;
+use drivegate_north::local::{RuntimeDirectories, SocketPath, absolute};
 
 /// Address where `[http]` listens by default.
 const USUAL: &str = "http://127.0.0.1:9488";

@@ -22,7 +22,7 @@ mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosqu
 
 {}{}{}{configured}
 Ctrl-C ends the demo.",
-        crate::version::VERSION,
+        drivegate_core::version::VERSION,
         lines(&place.ports),
         reading_hints(&quoted(&program), sides),
         page(place, sides),

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::{seconds, state_text};
-use crate::drill::{DrillReport, DrillStep, Kind};
+use drivegate_core::drill::{DrillReport, DrillStep, Kind};
 
 const STYLE: &str = "body{font:11pt sans-serif;max-width:48em;margin:2em auto}table{border-collapse:collapse;width:100%}\
     th,td{border:1px solid #999;padding:.3em .5em;text-align:left;vertical-align:top}.result{font-size:1.5em}\

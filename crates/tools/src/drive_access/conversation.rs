@@ -3,7 +3,7 @@
 use super::direct::{Direct, Needs};
 use super::{RequestRoute, Target};
 use crate::client::{Client, ClientError, GatewayRequest, Reply};
-use crate::config::{LogFormat, LogSettings};
+use drivegate_gateway::config::{LogFormat, LogSettings};
 
 /// Requests about one drive, to the gateway or to the bus of this process.
 pub(super) struct Conversation {

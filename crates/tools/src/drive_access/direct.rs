@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use super::Configured;
 use crate::client::{Client, Door};
-use crate::config::{BusSettings, ParamsSettings, Settings};
-use crate::daemon::Daemon;
-use crate::drive::{Point, PointIndex, PollClass, Profile, Quality, Source};
-use crate::north::http::InProcess;
-use crate::north::http::messages::Word;
-use crate::north::local::SocketPath;
-use crate::plant::DriveHandle;
-use crate::process_image::{OnShutdown, Reading};
+use drivegate_core::plant::DriveHandle;
+use drivegate_core::process_image::{OnShutdown, Reading};
+use drivegate_gateway::config::{BusSettings, ParamsSettings, Settings};
+use drivegate_gateway::daemon::Daemon;
+use drivegate_model::drive::{Point, PointIndex, PollClass, Profile, Quality, Source};
+use drivegate_north::http::InProcess;
+use drivegate_north::http::messages::Word;
+use drivegate_north::local::SocketPath;
 
 /// Time to open the port, on a machine however busy; and how long one that cannot be opened is tried.
 const OPEN: Duration = Duration::from_secs(10);
@@ -203,7 +203,10 @@ fn is_settled(reading: &Reading<'_>, index: PointIndex) -> bool {
         reading.sample(source).quality == Quality::Good
             || raw.is_none_or(|raw| {
                 let words = reading.words(raw.table, raw.address, raw.form.items());
-                matches!(words, Ok(_) | Err(crate::process_image::Unavailable::Refused(_)))
+                matches!(
+                    words,
+                    Ok(_) | Err(drivegate_core::process_image::Unavailable::Refused(_))
+                )
             })
     })
 }

@@ -4,13 +4,13 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use super::export::quoted;
-use crate::config::Settings;
 use crate::failure::{Failure, Outcome};
-use crate::files;
-use crate::north::bacnet::ede::{self, Ede};
-use crate::north::bacnet::listing::{self, COLUMNS, Line};
-use crate::north::bacnet::objects::ListedDevice;
 use crate::report;
+use drivegate_core::files;
+use drivegate_gateway::config::Settings;
+use drivegate_north::bacnet::ede::{self, Ede};
+use drivegate_north::bacnet::listing::{self, COLUMNS, Line};
+use drivegate_north::bacnet::objects::ListedDevice;
 
 /// The devices that the configuration shows; none without `[bacnet]`.
 pub(crate) fn devices(settings: &Settings) -> Option<Vec<ListedDevice>> {

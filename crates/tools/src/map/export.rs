@@ -7,9 +7,9 @@ use serde_json::{Map as Object, Value, json};
 
 use super::Map;
 use super::rows::{COLUMNS, Row, drive_rows};
-use crate::codec::Table;
-use crate::north::register_map::GATEWAY_UNIT;
-use crate::process_image::{Access, DriveSpec};
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_north::register_map::GATEWAY_UNIT;
+use drivegate_proto::Table;
 
 /// Rows of all units, with unit and drive.
 fn rows(map: &Map<'_>) -> Vec<(u8, String, Row)> {

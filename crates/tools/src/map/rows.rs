@@ -1,12 +1,12 @@
 //! The rows of the map: the content of each address.
 
-use crate::codec::Table;
-use crate::drive::profile::{Form as RawForm, Raw};
-use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
-use crate::north::modbus_tcp::Registers;
-use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::Access;
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::profile::{Form as RawForm, Raw};
+use drivegate_model::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
+use drivegate_north::modbus_tcp::Registers;
+use drivegate_north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
+use drivegate_proto::Table;
 
 /// A row of the map.
 #[derive(Debug, Clone, PartialEq)]

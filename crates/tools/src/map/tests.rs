@@ -4,8 +4,8 @@ use drivegate_testkit::{STALE_AFTER, bus, bus_spec, image, monitored, nx};
 
 use super::export::quoted;
 use super::*;
-use crate::north::modbus_tcp::Registers;
-use crate::process_image::Access;
+use drivegate_core::process_image::Access;
+use drivegate_north::modbus_tcp::Registers;
 
 fn plant() -> Plant {
     let profile = nx();

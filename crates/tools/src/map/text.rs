@@ -6,12 +6,12 @@ use comfy_table::{Table as TextTable, presets};
 
 use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
-use crate::codec::Table;
-use crate::drive::raw_writes;
-use crate::north::modbus_tcp::Registers;
-use crate::north::register_map::GATEWAY_UNIT;
 use crate::printable;
-use crate::process_image::{Access, DriveSpec};
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_model::drive::raw_writes;
+use drivegate_north::modbus_tcp::Registers;
+use drivegate_north::register_map::GATEWAY_UNIT;
+use drivegate_proto::Table;
 
 /// The whole map as tables.
 pub(super) fn render(map: &Map<'_>) -> String {

@@ -9,8 +9,8 @@ use super::super::drive_access::target;
 use super::super::failure::{Failure, Outcome, negative};
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
 use super::{StatusLine, read_from_drive, read_written};
-use crate::north::http::messages::{ReadParameters, Restore, RestoreAct, RestoreWish, Stage};
-use crate::parameters::{Entry, Id, ParameterFile};
+use drivegate_core::parameters::{Entry, Id, ParameterFile};
+use drivegate_north::http::messages::{ReadParameters, Restore, RestoreAct, RestoreWish, Stage};
 
 #[derive(Debug, clap::Args)]
 pub(super) struct RestoreArgs {

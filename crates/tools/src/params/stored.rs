@@ -7,9 +7,9 @@ use super::super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::super::failure::{Failure, Outcome};
 use super::super::{printable, report, settings};
 use super::{built_in, names, read_written};
-use crate::drive::parameters::RawValue;
-use crate::north::http::messages::StoredReading;
-use crate::parameters::{ParameterFile, Store};
+use drivegate_core::parameters::{ParameterFile, Store};
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_north::http::messages::StoredReading;
 
 /// The parameter store of the configuration.
 fn store(config: &Path) -> Result<Store, Failure> {

@@ -5,10 +5,10 @@ use std::time::Instant;
 
 use super::super::failure::{Failure, Outcome};
 use super::super::{EXIT_CONFIG, report};
-use crate::bus::proof;
-use crate::document;
-use crate::drive::Profile;
-use crate::drive::profile::Profiles;
+use drivegate_bus::proof;
+use drivegate_model::document;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::profile::Profiles;
 
 pub(super) fn run(file: &Path, known: &Profiles) -> Outcome {
     let name = file.display().to_string();

@@ -1,9 +1,9 @@
 //! `[control]` of a profile as text.
 
 use super::name_of;
-use crate::document::format_duration;
-use crate::drive::Profile;
-use crate::drive::control::{Control, ControlItem, Mask, OwnWord, Run, Setting, Step, Until};
+use drivegate_model::document::format_duration;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::control::{Control, ControlItem, Mask, OwnWord, Run, Setting, Step, Until};
 
 /// A line for each command, with the words of the command in hexadecimal.
 pub(super) fn lines(profile: &Profile, control: &Control) -> Vec<(&'static str, String)> {

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::Path;
 
-use crate::codec::Table;
-use crate::document::{Finding, Problem, nearest};
-use crate::drive::Profile;
-use crate::parameters::cells;
+use drivegate_core::parameters::cells;
+use drivegate_model::document::{Finding, Problem, nearest};
+use drivegate_model::drive::Profile;
+use drivegate_proto::Table;
 
 /// Column names of a point list.
 const COLUMNS: [&str; 17] = [
@@ -366,7 +366,7 @@ fn check(file: &str, text: &str, points: &[(usize, Row)]) -> Result<(), Vec<Prob
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Form;
+    use drivegate_model::drive::profile::Form;
 
     fn made(text: &str) -> Result<Profile, String> {
         let path = Path::new("our meter 2.csv");

@@ -1,7 +1,7 @@
 //! `drivegate profiles new`: the beginning of a profile.
 
-use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Point, Profile};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{ModelPoint, Point, Profile};
 
 /// The text of a profile based on another one, with possible changes as remarks.
 pub(super) fn over(name: &str, base: &Profile) -> String {
@@ -75,7 +75,7 @@ class = "fast"
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::drive::profile::Profiles;
+    use drivegate_model::drive::profile::Profiles;
 
     /// The printed text is a valid profile, also with its commented lines enabled.
     #[test]

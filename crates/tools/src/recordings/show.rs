@@ -4,10 +4,10 @@ use std::fmt::Write as _;
 
 use serde_json::Value as Json;
 
-use crate::history::Recording;
-use crate::history::recording::hex;
-use crate::process_image::Verdict;
 use crate::{printable, report};
+use drivegate_core::history::Recording;
+use drivegate_core::history::recording::hex;
+use drivegate_core::process_image::Verdict;
 
 /// Samples that are shown before and after the trigger.
 const SHOWN: (usize, usize) = (8, 6);

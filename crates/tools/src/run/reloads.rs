@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
-use crate::config::Loaded;
-use crate::daemon::Daemon;
-use crate::document::Problem;
 use crate::loading::{Loads, NotLoaded};
 use crate::log::LogHandle;
-use crate::north::http::messages::ReloadOutcome;
-use crate::north::local::ReloadOrder;
+use drivegate_gateway::config::Loaded;
+use drivegate_gateway::daemon::Daemon;
+use drivegate_model::document::Problem;
+use drivegate_north::http::messages::ReloadOutcome;
+use drivegate_north::local::ReloadOrder;
 
 use super::watch::Watch;
 

@@ -7,9 +7,9 @@ use tokio::sync::mpsc::Receiver;
 use super::Signals;
 use super::reloads::{Reloads, apply};
 use super::watch::Watch;
-use crate::daemon::Daemon;
 use crate::log::LogHandle;
-use crate::north::local::ReloadOrder;
+use drivegate_gateway::daemon::Daemon;
+use drivegate_north::local::ReloadOrder;
 
 /// Serves until the daemon is to stop.
 pub(super) async fn until_stopped(

@@ -7,13 +7,13 @@ use sd_notify::NotifyState;
 use tokio::time::Interval;
 
 use super::notify;
-use crate::daemon::{BusHeartbeats, Daemon};
-use crate::event::{Event, EventKind};
 use crate::log::LogHandle;
-use crate::north::NorthState;
-use crate::north::http::messages::ReloadOutcome;
-use crate::plant::{Plant, SharedPlant};
 use crate::printable;
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_gateway::daemon::{BusHeartbeats, Daemon};
+use drivegate_north::NorthState;
+use drivegate_north::http::messages::ReloadOutcome;
 
 /// Longest status in characters, for one line of `systemctl status`.
 const LONGEST_STATUS: usize = 300;

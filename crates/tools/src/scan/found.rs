@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::settings::Setting;
-use crate::drive::profile::Profiles;
+use drivegate_model::drive::profile::Profiles;
 
 /// A drive that answered the scan.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -72,7 +72,7 @@ impl Found {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
+    use drivegate_proto::{LineFormat, Protocol};
 
     #[test]
     fn silence_is_no_refusal() {

@@ -11,17 +11,17 @@ use super::progress::Progress;
 use super::settings::{Options, Part, Setting, parts};
 use super::snippet::Snippet;
 use super::{values, wishes};
-use crate::bus::Mode;
-use crate::bus::prober::{Answer, Prober};
-use crate::bus::transaction::Ended;
-use crate::codec::n2::Session;
-use crate::codec::{Exception, LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
-use crate::diagnosis::signature::Shape;
-use crate::drive::identify::{Nameplate, PRODUCT, PRODUCT_NAME, VENDOR};
-use crate::drive::profile::{Profile, Profiles};
-use crate::drive::{Probe, identify};
-use crate::line::{Line, LineOptions};
 use crate::port_users;
+use drivegate_bus::Mode;
+use drivegate_bus::prober::{Answer, Prober};
+use drivegate_bus::transaction::Ended;
+use drivegate_core::diagnosis::signature::Shape;
+use drivegate_line::{Line, LineOptions};
+use drivegate_model::drive::identify::{Nameplate, PRODUCT, PRODUCT_NAME, VENDOR};
+use drivegate_model::drive::profile::{Profile, Profiles};
+use drivegate_model::drive::{Probe, identify};
+use drivegate_proto::n2::Session;
+use drivegate_proto::{Exception, LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 
 /// Bytes received during the search, apart from replies.
 #[derive(Debug, Default)]

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use super::wishes::{Wish, parse_wish};
 use crate::addresses::{Addresses, parse_addresses};
-use crate::codec::{LineFormat, Protocol};
-use crate::config;
-use crate::document::Finding;
 use crate::report;
+use drivegate_gateway::config;
+use drivegate_model::document::Finding;
+use drivegate_proto::{LineFormat, Protocol};
 
 /// Bauds of Modbus RTU tried by default: the factory settings of the drives of the built-in profiles, and those often chosen.
 const USUAL_BAUDS: [u32; 5] = [9600, 19_200, 38_400, 115_200, 57_600];

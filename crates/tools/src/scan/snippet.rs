@@ -6,12 +6,12 @@ use std::time::Duration;
 
 use super::found::Found;
 use super::settings::Setting;
-use crate::bus::{Mode, predict};
-use crate::codec::LineFormat;
-use crate::config::{BusSettings, Settings};
-use crate::document::format_duration;
-use crate::drive::profile::Profiles;
-use crate::process_image::DriveSpec;
+use drivegate_bus::{Mode, predict};
+use drivegate_core::process_image::DriveSpec;
+use drivegate_gateway::config::{BusSettings, Settings};
+use drivegate_model::document::format_duration;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::LineFormat;
 
 /// Address of the status page.
 const HTTP: &str = "127.0.0.1:9488";
@@ -208,7 +208,7 @@ fn commented(comment: bool, text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
+    use drivegate_proto::{LineFormat, Protocol};
 
     fn found(protocol: Protocol, address: u8, profiles: &[&str]) -> Found {
         let format = LineFormat::new(9600, "8N1").unwrap();

@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::bus::prober::Prober;
-use crate::bus::transaction::Ended;
-use crate::codec::{Reply, Request};
-use crate::drive::{ModelPoint, PlannedRead, Point, PointIndex, Profile, Quality, Source, State};
-use crate::line::Lost;
-use crate::process_image::{DriveImage, DriveSpec, Link, Reading, value_or_null};
+use drivegate_bus::prober::Prober;
+use drivegate_bus::transaction::Ended;
+use drivegate_core::process_image::{DriveImage, DriveSpec, Link, Reading, value_or_null};
+use drivegate_line::Lost;
+use drivegate_model::drive::{ModelPoint, PlannedRead, Point, PointIndex, Profile, Quality, Source, State};
+use drivegate_proto::{Reply, Request};
 
 /// The points that are shown.
 const SHOWN: [ModelPoint; 7] = [

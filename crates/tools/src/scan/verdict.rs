@@ -4,10 +4,10 @@ use std::collections::BTreeSet;
 use std::time::Duration;
 
 use super::{Found, Setting, StrayBytes};
-use crate::diagnosis::Cause;
-use crate::drive::Step;
-use crate::drive::commissioning::{Shared, gather};
-use crate::drive::profile::{Profile, Profiles};
+use drivegate_core::diagnosis::Cause;
+use drivegate_model::drive::Step;
+use drivegate_model::drive::commissioning::{Shared, gather};
+use drivegate_model::drive::profile::{Profile, Profiles};
 
 /// Number of bytes that may result from switching the port on, or from single disturbances.
 const FEW_BYTES: usize = 8;
@@ -174,7 +174,7 @@ fn most_garbage(heard: &StrayBytes) -> Option<(Setting, usize)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
+    use drivegate_proto::{LineFormat, Protocol};
 
     fn at(baud: u32) -> Setting {
         Setting {

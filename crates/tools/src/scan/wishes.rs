@@ -2,9 +2,9 @@
 
 use super::found::Found;
 use crate::addresses::{Addresses, parse_addresses};
-use crate::document::nearest;
-use crate::drive::Profile;
-use crate::drive::profile::Profiles;
+use drivegate_model::document::nearest;
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::profile::Profiles;
 
 /// A profile that the command line names.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -86,8 +86,8 @@ fn is_kind_of(profile: &Profile, found: &Found) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{LineFormat, Protocol};
     use crate::scan::Setting;
+    use drivegate_proto::{LineFormat, Protocol};
 
     #[test]
     fn a_named_profile_does_not_contradict_what_a_drive_answers() {

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::sim::simulated_drive::SimulatedDrive;
-use crate::sim::statistics::Statistics;
-use crate::sim::wire::SimulatedBus;
+use drivegate_sim::simulated_drive::SimulatedDrive;
+use drivegate_sim::statistics::Statistics;
+use drivegate_sim::wire::SimulatedBus;
 
 /// Prints the lines and, once a second on a terminal, their counters; ends on Ctrl-C and SIGTERM.
 pub(super) fn serve(lines: &[SimulatedBus]) -> io::Result<()> {

@@ -9,7 +9,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use crate::process_image::Direction;
+use drivegate_core::process_image::Direction;
 
 /// Link type LINKTYPE_RTAC_SERIAL of pcap files.
 const LINK_TYPE: u32 = 250;

@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use super::Stop;
 use super::dialog::Keyboard;
-use crate::codec::Protocol;
-use crate::drive::Profile;
-use crate::drive::profile::Profiles;
 use crate::printable;
 use crate::scan::{Found, Search, can_be};
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::Protocol;
 
 /// Asks for the profile of the devices that are not identified, one question a protocol.
 pub(super) fn name_the_unknown(search: &mut Search<'_>, stop: &Stop, keyboard: &Keyboard) {
@@ -118,8 +118,8 @@ fn chosen<'p>(answer: &str, profiles: &'p [Arc<Profile>]) -> Option<&'p Arc<Prof
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::LineFormat;
     use crate::scan::Setting;
+    use drivegate_proto::LineFormat;
 
     fn found(protocol: Protocol, address: u8) -> Found {
         Found {

@@ -7,15 +7,15 @@ use std::time::{Duration, Instant};
 use super::dialog::{Keyboard, is_terminal, write_new};
 use super::starting::next_steps;
 use super::{Args, Stop};
-use crate::config::{LogFormat, LogSettings, Settings};
-use crate::daemon::Daemon;
-use crate::drive::{ModelPoint, State};
 use crate::failure::{Failure, Outcome};
-use crate::north::http;
-use crate::north::local::SocketPath;
-use crate::plant::SharedPlant;
 use crate::scan::figure;
 use crate::{EXIT_FAILED, demo, report};
+use drivegate_core::plant::SharedPlant;
+use drivegate_gateway::config::{LogFormat, LogSettings, Settings};
+use drivegate_gateway::daemon::Daemon;
+use drivegate_model::drive::{ModelPoint, State};
+use drivegate_north::http;
+use drivegate_north::local::SocketPath;
 
 /// Preferred port of the status page.
 const HTTP: u16 = 9488;

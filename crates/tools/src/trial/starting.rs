@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
-use crate::config::BusSettings;
-use crate::drive::ModelPoint;
-use crate::process_image::DriveSpec;
+use drivegate_core::process_image::DriveSpec;
+use drivegate_gateway::config::BusSettings;
+use drivegate_model::drive::ModelPoint;
 
 /// Who is added as a user in the printed command.
 const USER: &str = "alice";
@@ -57,7 +57,7 @@ fn start(file: &Path, drive: &DriveSpec, before_commands: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Settings;
+    use drivegate_gateway::config::Settings;
 
     const FOUND: &str = "[gateway]\nname = \"g\"\n[[bus]]\nname = \"line1\"\nport = \"/dev/x\"\nbaud = 38400\ncycle = \"1s\"\n\
         [[bus.drive]]\nname = \"drive-1\"\naddress = 1\nprofile = \"PROFILE\"\n[http]\n";
@@ -82,7 +82,7 @@ mod tests {
             };
             let of_drive = lines("below `name = \"drive-1\"`:\n", "     and below");
             let of_http = lines("and below [http]:\n", "  2. ");
-            let user = crate::north::http::User::new("alice", "a long password").unwrap();
+            let user = drivegate_north::http::User::new("alice", "a long password").unwrap();
             let users = crate::credentials_file::CredentialsFile::open(&folder.path().join("users"));
             users.put(&user, true).unwrap();
             let text = text

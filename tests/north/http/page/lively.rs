@@ -4,19 +4,19 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{Reply, crc16};
-use drivegate::drive::profile::Profiles;
-use drivegate::event::{Event, EventKind};
-use drivegate::history::assemble::assemble;
-use drivegate::history::recorder::{Note, NoteBody};
-use drivegate::history::{Clock, Recorder, RecorderOptions, RecorderTask, Store};
-use drivegate::north::NorthState;
-use drivegate::order::{self, Origin, SourceKind, Ticket};
-use drivegate::plant::{BusHandle, Plant};
-use drivegate::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedRead, Verdict};
+use drivegate_core::event::{Event, EventKind};
+use drivegate_core::history::assemble::assemble;
+use drivegate_core::history::recorder::{Note, NoteBody};
+use drivegate_core::history::{Clock, Recorder, RecorderOptions, RecorderTask, Store};
+use drivegate_core::order::{self, Origin, SourceKind, Ticket};
+use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::process_image::{BusImage, DriveImage, Outcome, TapedFrame, TapedRead, Verdict};
+use drivegate_model::drive::profile::Profiles;
+use drivegate_north::NorthState;
+use drivegate_proto::{Reply, crc16};
 
 use super::super::plant::{self, STALE_AFTER};
-use drivegate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 /// Length of the recorded past of the plant.
 const PAST: Duration = Duration::from_secs(3900);

@@ -3,9 +3,9 @@
 
 use super::super::control::Made;
 use super::*;
-use crate::drive::control::{Control, ControlItem, OwnWord, Run};
-use crate::drive::{Derived, PointIndex, Raw, Source};
-use crate::order::{Arrival, Window, written};
+use drivegate_core::order::{Arrival, Window, written};
+use drivegate_model::drive::control::{Control, ControlItem, OwnWord, Run};
+use drivegate_model::drive::{Derived, PointIndex, Raw, Source};
 
 /// What happened at a drive since its last poll, when its motor ran by a word of the gateway.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,7 +56,7 @@ impl<'p> AnyDrive<'p> {
         let word = self.words.entry((raw.table, address)).or_default();
         let flipped = (0..16).map(|bit| *word ^ (1 << bit));
         for candidate in [*word].into_iter().chain(flipped).chain([0]) {
-            let read = raw.decode(&[candidate], crate::drive::model::Kind::Bool);
+            let read = raw.decode(&[candidate], drivegate_model::drive::model::Kind::Bool);
             if read == Some(Value::Bool(on)) {
                 *word = candidate;
                 return;

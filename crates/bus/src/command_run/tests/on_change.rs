@@ -1,7 +1,7 @@
 //! Writes of values that a drive keeps in memory that wears out: N2 overrides.
 
 use super::*;
-use crate::codec::n2::Session;
+use drivegate_proto::n2::Session;
 
 /// 50 % as the float of AO 1.
 const HALF: [u16; 2] = [0x4248, 0x0000];

@@ -1,8 +1,8 @@
 //! Background transactions: their share of the line, and what they must never do.
 
 use super::*;
-use crate::drive::DriveIndex;
-use crate::order::{BackgroundRequest, Pace};
+use drivegate_core::order::{BackgroundRequest, Pace};
+use drivegate_model::drive::DriveIndex;
 
 /// Address of a register that no poll reads.
 const REGISTER: u16 = 700;

@@ -2,7 +2,7 @@
 
 use super::family_drive::FamilyDrive;
 use super::*;
-use crate::permit::DrillLock;
+use drivegate_core::permit::DrillLock;
 
 /// The gate closes between the look and the write: the order is refused, and not chosen again without end.
 #[test]

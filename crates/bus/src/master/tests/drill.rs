@@ -1,9 +1,9 @@
 //! A drill on the line: what is sent to a drive meanwhile, and what counts as proven.
 
 use super::*;
-use crate::event::EventKind;
-use crate::plant::Plant;
 use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind};
+use drivegate_core::event::EventKind;
+use drivegate_core::plant::Plant;
 
 const LIMIT: Duration = Duration::from_secs(2);
 

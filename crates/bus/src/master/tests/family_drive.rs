@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::drive::control::{Control, ControlItem, Mask, Run, Setting, Until};
-use crate::drive::profile::Form;
-use crate::drive::{Derived, ModelPoint, Profile, Raw, Source};
-use crate::order::written;
+use drivegate_core::order::written;
+use drivegate_model::drive::control::{Control, ControlItem, Mask, Run, Setting, Until};
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{Derived, ModelPoint, Profile, Raw, Source};
+use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 pub(super) struct FamilyDrive {
     profile: Arc<Profile>,

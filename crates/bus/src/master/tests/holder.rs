@@ -1,10 +1,10 @@
 //! The holder of a drive, on the line: no order of another client, and every stop.
 
 use super::*;
-use crate::drive::DriveIndex;
-use crate::order::{Proof, Refusal};
-use crate::permit::{Mode, Principal, Rules, Verb};
-use crate::plant::{DriveHandle, OrderRequest, Plant};
+use drivegate_core::order::{Proof, Refusal};
+use drivegate_core::permit::{Mode, Principal, Rules, Verb};
+use drivegate_core::plant::{DriveHandle, OrderRequest, Plant};
+use drivegate_model::drive::DriveIndex;
 use std::time::Duration as Time;
 
 /// Bit by which the NX reports that the fieldbus controls it.
@@ -47,14 +47,14 @@ fn who(name: &str) -> Origin {
     Origin::new(SourceKind::Mqtt, name).proven(Proof::Topic(name.into()))
 }
 
-fn place(rig: &Rig, plant: &Plant, name: &str, point: ModelPoint, value: Value) -> crate::plant::Placed {
+fn place(rig: &Rig, plant: &Plant, name: &str, point: ModelPoint, value: Value) -> drivegate_core::plant::Placed {
     let drive = drive(plant, 0);
     let index = drive.image.spec.profile.model_index(point).unwrap();
     let order = Order::Points(vec![(index, value)]);
     drive.place(OrderRequest::new(order, who(name), Authority::Write), rig.now)
 }
 
-fn code(placed: &mut crate::plant::Placed) -> &'static str {
+fn code(placed: &mut drivegate_core::plant::Placed) -> &'static str {
     placed.answer().map_or("none", |answer| answer.outcome.code())
 }
 

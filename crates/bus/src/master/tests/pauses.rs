@@ -1,8 +1,8 @@
 //! The thread of the bus is stalled and then continues.
 
 use super::*;
-use crate::order::{Arrival, Connection, Interruption, Window};
-use crate::stalls::Stall;
+use drivegate_core::order::{Arrival, Connection, Interruption, Window};
+use drivegate_core::stalls::Stall;
 
 const MS: Duration = Duration::from_millis(1);
 const FIRST: DriveIndex = DriveIndex::new(0);

@@ -5,9 +5,9 @@ mod words;
 
 use super::family_drive::FamilyDrive;
 use super::*;
-use crate::drive::Profile;
-use crate::order::written;
-use crate::permit::DrillLock;
+use drivegate_core::order::written;
+use drivegate_core::permit::DrillLock;
+use drivegate_model::drive::Profile;
 
 const EVERY: Duration = Duration::from_secs(1);
 
@@ -332,7 +332,7 @@ fn another_masters_word_and_reference_stay() {
         let control = plant.profile.control.clone().unwrap();
         plant.starts();
         plant.rig.run(Duration::from_secs(5));
-        if !control.is_read() || !by_word || control.own_word == crate::drive::control::OwnWord::Shadow {
+        if !control.is_read() || !by_word || control.own_word == drivegate_model::drive::control::OwnWord::Shadow {
             continue;
         }
         // Bits without a defined meaning, and the bit for the other direction.
@@ -375,7 +375,7 @@ fn stands_still(rig: &mut Rig, ms: u64) {
     let began = rig.now;
     rig.now += Duration::from_millis(ms);
     rig.master
-        .after_stall(crate::stalls::Stall::new(began, rig.now), rig.now);
+        .after_stall(drivegate_core::stalls::Stall::new(began, rig.now), rig.now);
 }
 
 /// Values read in a round are no longer valid if the port was lost, or the thread was stalled, before the write of

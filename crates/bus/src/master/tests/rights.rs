@@ -3,8 +3,8 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
-use crate::order::{Arrival, Right};
-use crate::plant::{Exchange, OrderRequest, Plant, Question, Target};
+use drivegate_core::order::{Arrival, Right};
+use drivegate_core::plant::{Exchange, OrderRequest, Plant, Question, Target};
 
 struct Client {
     origin: Origin,
@@ -35,7 +35,7 @@ fn rig() -> (Rig, Plant) {
     (rig, plant)
 }
 
-fn place(rig: &Rig, plant: &Plant, client: &Client, sets: &[(ModelPoint, Value)]) -> crate::plant::Placed {
+fn place(rig: &Rig, plant: &Plant, client: &Client, sets: &[(ModelPoint, Value)]) -> drivegate_core::plant::Placed {
     let drive = plant.drives().next().unwrap();
     let index = |point| drive.image.spec.profile.model_index(point).unwrap();
     let order = Order::Points(sets.iter().map(|(point, value)| (index(*point), *value)).collect());
@@ -45,7 +45,7 @@ fn place(rig: &Rig, plant: &Plant, client: &Client, sets: &[(ModelPoint, Value)]
     )
 }
 
-fn code(placed: &mut crate::plant::Placed) -> &'static str {
+fn code(placed: &mut drivegate_core::plant::Placed) -> &'static str {
     placed.answer().map_or("none", |answer| answer.outcome.code())
 }
 

@@ -1,7 +1,7 @@
 //! A stop of all drives: the broadcast and the stops on the line, and the result for each drive.
 
 use super::*;
-use crate::plant::Plant;
+use drivegate_core::plant::Plant;
 use drivegate_core::stop_all::{Scope, StopAll, StopOrder, StopReport, Stopped, WAIT, not_standing};
 
 /// A plant that consists of this bus only.

@@ -1,7 +1,7 @@
 //! Times of one drive that differ from those of its bus.
 
 use super::*;
-use crate::process_image::Timing;
+use drivegate_core::process_image::Timing;
 
 const SLOW: Timing = Timing {
     response_timeout: Some(Duration::from_millis(400)),

@@ -1,7 +1,7 @@
 //! How commands and polls share the line.
 
 use super::*;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 #[test]
 fn eight_commands_then_a_poll() {

@@ -1,8 +1,8 @@
 //! Drives that are away, refuse or cannot be understood.
 
 use super::*;
-use crate::drive::DriveIndex;
-use crate::drive::profile::Profiles;
+use drivegate_model::drive::DriveIndex;
+use drivegate_model::drive::profile::Profiles;
 
 impl PolledLine {
     /// Lets the schedule choose polls for `time`; every poll takes `COST` and is answered by `answer`. Returns the changes.

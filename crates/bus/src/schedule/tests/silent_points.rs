@@ -1,8 +1,8 @@
 //! Drives that answer others and never one point.
 
 use super::*;
-use crate::drive::DriveIndex;
-use crate::drive::profile::Profiles;
+use drivegate_model::drive::DriveIndex;
+use drivegate_model::drive::profile::Profiles;
 
 /// A drive that never answers reads that cover `address`: its polls, and how often it went offline and returned.
 struct Silent {

@@ -5,8 +5,8 @@ use std::time::Duration;
 use drivegate_testkit::profile;
 
 use super::super::*;
-use crate::codec::Table;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::Table;
 
 /// Reaction of a drive to a read of several bits.
 #[derive(Clone, Copy, PartialEq)]

@@ -1,7 +1,7 @@
 //! When a lease begins, and what holds it.
 
 use super::*;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 #[test]
 fn an_order_that_waits_holds_the_lease_no_longer_than_it_may_wait() {

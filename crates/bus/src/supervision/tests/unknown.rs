@@ -1,7 +1,7 @@
 //! Drives that do not report whether they run, and what their registers show of a response of their own.
 
 use super::*;
-use crate::drive::DriveIndex;
+use drivegate_model::drive::DriveIndex;
 
 fn cx() -> SupervisedDrive {
     let rig = SupervisedDrive::of(&drivegate_testkit::profile("vacon-cx"), LeaseAction::Stop);

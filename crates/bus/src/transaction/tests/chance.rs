@@ -101,7 +101,7 @@ proptest! {
             }),
             (2u8..=247, any::<[u8; 4]>()).prop_map(|(address, [a, b, c, d])| {
                 let mut frame = Vec::new();
-                crate::codec::ascii::encode_frame(address, &[3, 4, a, b, c, d], &mut frame);
+                drivegate_proto::ascii::encode_frame(address, &[3, 4, a, b, c, d], &mut frame);
                 frame
             }),
             proptest::collection::vec(any::<u8>(), 0..6),

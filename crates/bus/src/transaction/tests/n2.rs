@@ -1,8 +1,8 @@
 //! Answers on an N2 line that may be late ones.
 
 use super::*;
-use crate::codec::Table;
 use crate::n2_late_replies::{LateRequest, N2LateReplies};
+use drivegate_proto::Table;
 
 const WINDOW: Duration = Duration::from_millis(750);
 

@@ -7,10 +7,10 @@ use tokio::sync::broadcast::error::TryRecvError;
 
 use super::{Cause, Run, Step, named};
 use crate::drill::Kind;
-use crate::drive::ModelPoint;
 use crate::order::{AuditRecord, Origin, SourceKind};
 use crate::plant::Plant;
 use crate::process_image::Reading;
+use drivegate_model::drive::ModelPoint;
 
 /// Speed above `max_speed` that ends a drill, %.
 const TOO_FAST: f64 = 5.0;

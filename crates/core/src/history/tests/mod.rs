@@ -10,12 +10,12 @@ use super::assemble::assemble;
 use super::recorder::{Note, NoteBody};
 use super::recording::Recording;
 use super::*;
-use crate::codec::{LineFormat, Table};
-use crate::drive::{DriveIndex, ModelPoint};
 use crate::process_image::{
     BusImage, BusSpec, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit, Verdict,
 };
 use crate::testkit::{self, bus_spec, monitored, nx};
+use drivegate_model::drive::{DriveIndex, ModelPoint};
+use drivegate_proto::{LineFormat, Table};
 
 const POLL: Duration = Duration::from_millis(10);
 const STALE_AFTER: Duration = Duration::from_secs(1);

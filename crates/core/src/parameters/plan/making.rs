@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use super::super::difference::Difference;
 use super::super::file::{Entry, Id, ParameterFile};
 use super::{Handling, Need, ParameterWrite, Plan, Risk, Wishes, order, text};
-use crate::drive::Profile;
-use crate::drive::parameters::{RawValue, has};
+use drivegate_model::drive::Profile;
+use drivegate_model::drive::parameters::{RawValue, has};
 
 /// A plan of a restore that is being made.
 pub(super) struct Making<'a> {

@@ -8,7 +8,7 @@
 use std::collections::BTreeMap;
 
 use super::ParameterWrite;
-use crate::drive::parameters::{Limit, RawValue};
+use drivegate_model::drive::parameters::{Limit, RawValue};
 
 /// The writes in an order in which no limit is violated; `present` is the value of the drive at an address.
 pub(super) fn safe(

@@ -6,9 +6,9 @@ use proptest::prelude::*;
 use super::super::file::Entry;
 use super::super::names::Names;
 use super::*;
-use crate::drive::parameters::{Limit, Parameter, ParameterList};
-use crate::drive::profile::Profiles;
 use crate::testkit;
+use drivegate_model::drive::parameters::{Limit, Parameter, ParameterList};
+use drivegate_model::drive::profile::Profiles;
 
 fn family(name: &str) -> Arc<Profile> {
     testkit::profile(name)

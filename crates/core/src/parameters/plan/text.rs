@@ -4,7 +4,7 @@ use std::fmt::{self, Display};
 
 use super::super::file::Id;
 use super::Plan;
-use crate::drive::parameters::RawValue;
+use drivegate_model::drive::parameters::RawValue;
 
 /// Parameters that a list names; more are counted.
 const NAMED: usize = 12;

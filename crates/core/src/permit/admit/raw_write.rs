@@ -1,12 +1,12 @@
 //! Decides which raw writes are allowed: checks the addresses, then the control word, then values. Pure.
 
 use super::{checked, related_limits};
-use crate::codec::n2::Object;
-use crate::codec::{Protocol, RequestPdu, Table};
-use crate::drive::control::ControlItem;
-use crate::drive::model::Kind;
 use crate::order::{FrequencyRange, Refusal, rests_on, written};
 use crate::process_image::Reading;
+use drivegate_model::drive::control::ControlItem;
+use drivegate_model::drive::model::Kind;
+use drivegate_proto::n2::Object;
+use drivegate_proto::{Protocol, RequestPdu, Table};
 
 /// The frequency ranges on which a raw write rests.
 pub(super) fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange>, Refusal> {

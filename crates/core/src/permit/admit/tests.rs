@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
-use crate::codec::{Exception, RequestPdu};
-use crate::drive::RawWrites;
-use crate::drive::parameters::RawValue;
-use crate::drive::profile::Profiles;
-use crate::drive::{PointIndex, Profile};
 use crate::process_image::{DriveImage, DriveSpec, Link};
 use crate::testkit;
+use drivegate_model::drive::RawWrites;
+use drivegate_model::drive::parameters::RawValue;
+use drivegate_model::drive::profile::Profiles;
+use drivegate_model::drive::{PointIndex, Profile};
+use drivegate_proto::{Exception, RequestPdu};
 
 fn drive(access: Access) -> DriveImage {
     let profile = testkit::nx();

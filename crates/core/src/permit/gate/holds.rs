@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::{DriveGate, Gate};
-use crate::drive::DriveIndex;
 use crate::order::{Asks, Command, Holder, Origin, Refusal};
 use crate::permit::holder::{Claim, Denial, HoldChange, HoldView, Holding, Mode, Rules, Verb};
 use crate::permit::judge::Ask;
+use drivegate_model::drive::DriveIndex;
 
 /// Maximum number of changes of holds that wait to be published, which happens several times a second; beyond that the
 /// oldest is dropped.

@@ -5,8 +5,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use super::*;
-use crate::codec::RequestPdu;
-use crate::drive::{ModelPoint, PointIndex, Value};
 use crate::order::{
     Admitted, Arrival, Command, Commanded, Connection, Entry, Proof, Right, SourceKind, Ticket, Urgency, Window,
 };
@@ -14,6 +12,8 @@ use crate::permit::{DrillLock, Mode, Principal, Rules, Verb};
 use crate::process_image::{DriveImage, RestoreLock};
 use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
 use crate::testkit::{bus_spec, controlled, image, nx, read};
+use drivegate_model::drive::{ModelPoint, PointIndex, Value};
+use drivegate_proto::RequestPdu;
 
 const SECOND: Duration = Duration::from_secs(1);
 const DRIVE: usize = 0;
@@ -188,7 +188,7 @@ impl Rig {
             }
             _ => {
                 let read = RequestPdu::Read {
-                    table: crate::codec::Table::Holding,
+                    table: drivegate_proto::Table::Holding,
                     start: 2100,
                     count: 1,
                 };

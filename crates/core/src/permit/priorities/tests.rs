@@ -325,7 +325,7 @@ fn inactives_that_protect_outlive_a_restart() {
 fn outcomes_settle_slots() {
     use crate::order::{Interruption, Refusal};
     let cases = [
-        (Outcome::Acknowledged(crate::codec::Reply::Written), Settled::Done),
+        (Outcome::Acknowledged(drivegate_proto::Reply::Written), Settled::Done),
         (Outcome::TimedOut, Settled::Unknown),
         (Outcome::Interrupted(Interruption::Stop), Settled::Unknown),
         (Outcome::Purged, Settled::Failed),

@@ -3,11 +3,11 @@ use std::time::Duration;
 
 use super::super::admit;
 use super::*;
-use crate::codec::{Protocol, RequestPdu};
-use crate::drive::{PointIndex, RawWrites};
 use crate::order::Authority;
 use crate::process_image::{Access, DriveImage, DriveSpec, Link};
 use crate::testkit;
+use drivegate_model::drive::{PointIndex, RawWrites};
+use drivegate_proto::{Protocol, RequestPdu};
 
 /// A drive with this limit on a point, whose registers were read `ago`.
 fn drive(profile: &str, limit: (&str, f64), words: &[(Table, u16, &[u16])], ago: Duration) -> DriveImage {

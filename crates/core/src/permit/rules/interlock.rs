@@ -1,12 +1,12 @@
 //! Whether the interlock points of a start are read, good and have the required values; also for a reference that
 //! would turn a motor whose run command is on.
 
-use crate::drive::{ModelPoint, Value};
 use crate::order::Refusal;
 use crate::permit::gate::{DriveGate, Gate};
 use crate::permit::judge::{Ask, Rule, Stage, Verdict};
 use crate::process_image::Reading;
 use crate::start_guard::ByRun;
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// Output frequency in Hz below which a motor with its run command on counts as standing or in sleep mode.
 const TURNS: f64 = 0.5;

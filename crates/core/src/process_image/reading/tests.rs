@@ -2,10 +2,10 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
-use crate::codec::Exception;
-use crate::drive::Profile;
 use crate::process_image::{Cadence, Link};
 use crate::testkit::{STALE_AFTER, image, monitored, nx, online, profile};
+use drivegate_model::drive::Profile;
+use drivegate_proto::Exception;
 
 /// A value that depends on the drive's frequency range is not shown worse than the values of that range.
 #[test]
@@ -108,7 +108,7 @@ fn parameters_from_before_a_drive_went_away_are_not_believed() {
 fn what_a_family_lacks_decides_nothing() {
     let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
          [[point]]\nname = \"running\"\nat = \"holding 1.0\"\nclass = \"fast\"\n";
-    let profile = crate::drive::Profile::parse("m.toml", source, false).unwrap();
+    let profile = drivegate_model::drive::Profile::parse("m.toml", source, false).unwrap();
     let image = image(monitored("m", "line1", 1, &Arc::new(profile)));
     let now = Instant::now();
     for (word, state) in [(1, State::Running), (0, State::NotReady)] {
@@ -157,7 +157,7 @@ fn a_scale_in_another_register() {
         [[point]]\nname = \"sf\"\nat = \"holding 5\"\ntype = \"i16\"\ninvalid = [0x8000]\nclass = \"slow\"\nhidden = true\n\
         [[point]]\nname = \"count\"\nat = \"holding 1\"\ntype = \"u64\"\nclass = \"fast\"\n\
         [[point]]\nname = \"motor_current\"\nat = \"holding 6\"\ninvalid = [0x7FFF]\nclass = \"fast\"\n";
-    let profile = Arc::new(crate::drive::Profile::parse("p.toml", text, false).unwrap());
+    let profile = Arc::new(drivegate_model::drive::Profile::parse("p.toml", text, false).unwrap());
     let names: Vec<_> = crate::process_image::public_points(&profile)
         .into_iter()
         .map(|(_, n)| n.to_string())

@@ -2,9 +2,9 @@
 //! before a stop.
 
 use super::*;
-use crate::codec::{Reply, RequestPdu};
-use crate::drive::{DriveIndex, PointIndex};
 use crate::order::{Effect, Effects, Intent, NO_DRIVE, PassedOn};
+use drivegate_model::drive::{DriveIndex, PointIndex};
+use drivegate_proto::{Reply, RequestPdu};
 
 const START: u16 = 1;
 const STOP: u16 = 0;

@@ -1,10 +1,10 @@
 //! Orders of other sides and the slots of BACnet's clients: accepted, refused and withdrawn in one order.
 
 use super::*;
-use crate::codec::RequestPdu;
-use crate::drive::DriveIndex;
 use crate::order::{Commanded, Effect, Effects, Entry, Intent, NO_DRIVE, PassedOn, SlotWrite};
 use crate::permit::Settled;
+use drivegate_model::drive::DriveIndex;
+use drivegate_proto::RequestPdu;
 
 fn effect(run: bool) -> Effect {
     Effect {

@@ -1,7 +1,7 @@
 //! Stops: at most two of a drive wait, none is refused, and a redundant one has no precedence.
 
 use super::*;
-use crate::codec::{Reply, RequestPdu};
+use drivegate_proto::{Reply, RequestPdu};
 
 fn raw(value: u16) -> Order {
     Order::Write(RequestPdu::write_register(2000, value))

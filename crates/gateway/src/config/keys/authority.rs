@@ -1,7 +1,7 @@
 //! `[authority]` and its principals.
 
 use super::forms::*;
-use crate::permit::Mode;
+use drivegate_core::permit::Mode;
 
 keys! {
     /// [Who holds a drive](commands.md#who-holds-a-drive), where several clients command it.

@@ -1,7 +1,7 @@
 //! `[bacnet]`.
 
 use super::forms::*;
-use crate::north::bacnet::WhenOffline;
+use drivegate_north::bacnet::WhenOffline;
 
 /// Port of a BBMD that is written without one.
 const PORT: u16 = 47808;

@@ -2,13 +2,13 @@
 
 use super::drive::Drive;
 use super::forms::*;
-use crate::bus::Mode;
-use crate::codec::wire::Silence;
-use crate::codec::{Protocol, n2};
 use crate::config::capped::Capped;
-use crate::document::format_duration;
-use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
-use crate::north::slot::SlotAccess;
+use drivegate_bus::Mode;
+use drivegate_line::{Level, MOST_RTS_DELAY, Rs485, Spin};
+use drivegate_model::document::format_duration;
+use drivegate_north::slot::SlotAccess;
+use drivegate_proto::wire::Silence;
+use drivegate_proto::{Protocol, n2};
 
 /// Longest fixed silence that a bus can have.
 pub(super) const MOST_SILENCE: Duration = Duration::from_secs(1);

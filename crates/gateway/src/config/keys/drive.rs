@@ -2,8 +2,8 @@
 
 use super::bus::{LONGEST_TIMEOUT, MOST_SILENCE, SHORTEST_TIMEOUT};
 use super::forms::*;
-use crate::process_image::{Access, LeaseAction, OnShutdown, ParamsAccess};
-use crate::start_guard::MOST_STARTS;
+use drivegate_core::process_image::{Access, LeaseAction, OnShutdown, ParamsAccess};
+use drivegate_core::start_guard::MOST_STARTS;
 
 /// Most that `frequency_range` may contain, Hz.
 pub(in crate::config) const MOST_HERTZ: f64 = 10_000.0;

@@ -9,8 +9,8 @@ pub(super) use serde_json::{Value, json};
 
 pub(super) use crate::config::key::*;
 pub(super) use crate::config::values;
-pub(super) use crate::document::Finding;
-use crate::document::parse_duration;
+pub(super) use drivegate_model::document::Finding;
+use drivegate_model::document::parse_duration;
 
 pub(super) const HOUR: Duration = Duration::from_secs(3600);
 /// Range of cadences and timeouts.
@@ -51,7 +51,9 @@ pub(super) const REPEATED: Parsed<Option<Duration>> = Parsed {
 fn parse_refresh(text: &str) -> Result<Option<Duration>, Finding> {
     match text {
         "off" => Ok(None),
-        text => Time(crate::drive::REFRESH).check(parse_duration(text)?).map(Some),
+        text => Time(drivegate_model::drive::REFRESH)
+            .check(parse_duration(text)?)
+            .map(Some),
     }
 }
 

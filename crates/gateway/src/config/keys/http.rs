@@ -1,7 +1,7 @@
 //! `[http]`.
 
 use super::forms::*;
-use crate::north::http;
+use drivegate_north::http;
 
 const HOSTS: List<String> = List {
     parse: parse_host,

@@ -1,7 +1,7 @@
 //! `[modbus_tcp]`, its listeners and TLS.
 
 use super::forms::*;
-use crate::north::modbus_tcp::{Registers, Role, Uncached};
+use drivegate_north::modbus_tcp::{Registers, Role, Uncached};
 
 const CONNECTIONS: Number = Number(1..=10_000, None);
 pub(in crate::config) const ROLES: Words<Role> = Words(&[("monitor", Role::Monitor), ("control", Role::Control)]);

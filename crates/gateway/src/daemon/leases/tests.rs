@@ -1,8 +1,8 @@
 use std::time::Instant;
 
 use super::*;
-use crate::bus::supervision::Lease;
 use crate::config::Settings;
+use drivegate_bus::supervision::Lease;
 
 /// A lease that has been running since then.
 fn held(since: Instant) -> CarriedState {

@@ -1,7 +1,7 @@
 //! Contradictions within `[control]` of a profile. Pure.
 
 use super::{Control, Run, Setting};
-use crate::codec::Table;
+use drivegate_proto::Table;
 
 impl Control {
     /// Contradictions: the key, the fault and the remedy.

@@ -4,8 +4,8 @@ mod contents;
 mod form;
 
 use super::super::model::{Kind, Text, Value, tidy, tidy_product};
-use crate::codec::Table;
 use crate::drive::PointIndex;
+use drivegate_proto::Table;
 
 pub use contents::Part;
 pub use form::{Form, Order};

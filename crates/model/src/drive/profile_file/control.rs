@@ -12,8 +12,8 @@ use super::derived::point_of;
 use super::place::parse_place;
 use super::ranges::Offsets;
 use super::reset;
-use crate::codec::Table;
 use crate::document::{Finding, Reader};
+use drivegate_proto::Table;
 
 /// Time after which a step that does not end fails.
 const STEP_TIMEOUT: Duration = Duration::from_secs(2);

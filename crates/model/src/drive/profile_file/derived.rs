@@ -3,9 +3,9 @@
 use super::super::derive::{Bound, Derived};
 use super::super::model::Kind;
 use super::super::profile::{Point, PollClass, Source};
-use crate::codec::Table;
 use crate::document::{self, Finding, Reader};
 use crate::drive::{PerPoint, Plan, PlannedRead, PointIndex, Profile};
+use drivegate_proto::Table;
 
 /// Value of `maximum` for a band that only the configuration of a drive defines: its key there.
 const CONFIGURED: &str = "frequency_range";

@@ -2,8 +2,8 @@
 
 use super::super::profile::{Expected, Probe};
 use super::place::parse_address;
-use crate::codec::Table;
 use crate::document::{Finding, Reader};
+use drivegate_proto::Table;
 
 pub(super) fn read(reader: &Reader<'_>) -> Vec<Expected> {
     reader.tables("identify").iter().filter_map(read_one).collect()

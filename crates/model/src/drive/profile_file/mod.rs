@@ -29,9 +29,9 @@ use std::time::Duration;
 use super::model::ModelPoint;
 use super::parameters::ParameterList;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
-use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, check_sums, keep_ends_fresh};
+use drivegate_proto::{LineFormat, Protocol};
 use points::{check_factors, check_monitor, check_object, check_scale, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_functions, read_range};
 

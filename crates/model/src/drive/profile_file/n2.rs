@@ -1,12 +1,12 @@
-//! `[n2]` of a profile file: where the family's N2 differs from [`crate::codec::n2::ASSUMPTIONS`].
+//! `[n2]` of a profile file: where the family's N2 differs from [`drivegate_proto::n2::ASSUMPTIONS`].
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::codec::n2::RegionWidth;
-use crate::codec::{N2Options, Protocol};
 use crate::document::Reader;
 use crate::drive::profile::Point;
+use drivegate_proto::n2::RegionWidth;
+use drivegate_proto::{N2Options, Protocol};
 
 /// Time between two polls: drives assume that the master has failed after about 10 minutes without a poll.
 const POLLS: RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(480);

@@ -8,8 +8,8 @@ use super::super::model::Kind;
 use super::super::parameters::{Addresses, Limit, Lock, ParameterList, WriteRules};
 use super::super::profile::{AddressRange, Point};
 use super::place::parse_address;
-use crate::codec::Table;
 use crate::document::{Reader, nearest};
+use drivegate_proto::Table;
 
 /// Reads the rules of `table`; the parameters in them are those of `list` and, in parts that come from a base, also
 /// those of `bases`.

@@ -5,8 +5,8 @@ use super::super::control::ControlItem;
 use super::super::profile::{AddressRange, Form, MOST_REGISTERS, Order, Raw, Source};
 use super::interpretation;
 use super::ranges::{Offsets, read_table};
-use crate::codec::Table;
 use crate::document::{Finding, Reader};
+use drivegate_proto::Table;
 
 /// Keys of a point that has `at`.
 const KEYS: [&str; 12] = [

@@ -11,8 +11,8 @@ use super::derived::{point_of, read_derived};
 use super::place::read_raw;
 use super::ranges::Offsets;
 use super::{is_name, read_pair};
-use crate::codec::Table;
 use crate::document::{Finding, Reader};
+use drivegate_proto::Table;
 
 /// Names that are keys of states and commands, or have their own metrics: a point with such a name could not be
 /// distinguished from them.

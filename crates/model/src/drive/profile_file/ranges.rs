@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 
 use super::super::profile::{AddressRange, WriteFunctions};
-use crate::codec::Table;
 use crate::document::{FromNode, Node, Reader, ValueError};
+use drivegate_proto::Table;
 
 pub(super) fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<Table> {
     let table = Table::from_name(text);
@@ -28,7 +28,7 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     let write: u16 = reader.or("write", 0);
     let holes = reader.or("holes", false);
     let try_read: u16 = reader.or("try_read", 0);
-    let is_bits = table.is_some_and(crate::codec::Table::is_bits);
+    let is_bits = table.is_some_and(drivegate_proto::Table::is_bits);
     if try_read > 0 && (!is_bits || try_read <= read || try_read > 16) {
         reader.problem(
             "try_read",

@@ -264,9 +264,9 @@ unit = "°C"
         point("zero_speed").raw().unwrap().form,
         Form::Bit { bit: 9, invert: false }
     );
-    assert_eq!(ours.range(crate::codec::Table::Holding, 101).unwrap().read, 8);
-    assert_eq!(ours.range(crate::codec::Table::Holding, 505).unwrap().read, 4);
-    assert_eq!(ours.range(crate::codec::Table::Holding, 511).unwrap().read, 8);
+    assert_eq!(ours.range(drivegate_proto::Table::Holding, 101).unwrap().read, 8);
+    assert_eq!(ours.range(drivegate_proto::Table::Holding, 505).unwrap().read, 4);
+    assert_eq!(ours.range(drivegate_proto::Table::Holding, 511).unwrap().read, 8);
     assert_eq!(ours.fault_text(7), "short circuit");
     assert_eq!(ours.fault_text(53), "fieldbus fault");
     let wrong = source.replace("scale = 0.1\nunit", "scale = 0.1\nuint");

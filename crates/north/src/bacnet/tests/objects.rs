@@ -1,7 +1,7 @@
 use super::*;
-use crate::drive::profile::Profiles;
-use crate::process_image::Access;
 use drivegate_bacnet::{Kind, Mac};
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::profile::Profiles;
 use std::collections::{BTreeMap, HashSet};
 
 use crate::bacnet::ede;
@@ -98,7 +98,7 @@ fn quality_is_told_and_never_better_than_it_is() {
     };
     drive
         .image
-        .update(|snapshot| snapshot.refuse(raw.table, raw.address, 1, crate::codec::Exception::ADDRESS));
+        .update(|snapshot| snapshot.refuse(raw.table, raw.address, 1, drivegate_proto::Exception::ADDRESS));
     assert_eq!(reliability(&rig), Reliability::UnreliableOther, "refused");
     rig.read(1);
     drive

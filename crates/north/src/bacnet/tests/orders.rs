@@ -47,7 +47,7 @@ fn what_failed_leaves_the_slot_and_what_is_unknown_leaves_what_is_read() {
         RUN,
         8,
         on(false),
-        Outcome::Exception(crate::codec::Exception::DEVICE_FAILURE),
+        Outcome::Exception(drivegate_proto::Exception::DEVICE_FAILURE),
     );
     assert_eq!(rig.slots(RUN), [(8, Datum::Bool(true))]);
     rig.order("127.0.0.5", RUN, 8, on(false), Outcome::TimedOut);
@@ -67,8 +67,8 @@ fn what_failed_leaves_the_slot_and_what_is_unknown_leaves_what_is_read() {
 
 #[test]
 fn errors_say_what_happened() {
-    use crate::codec::Exception;
-    use crate::order::Interruption;
+    use drivegate_core::order::Interruption;
+    use drivegate_proto::Exception;
     let cases = [
         (
             Outcome::Exception(Exception::DEVICE_FAILURE),
@@ -192,7 +192,7 @@ fn a_stop_between_plan_and_acceptance_keeps_the_next_slot_from_starting() {
     let order = Order::Points(vec![(run, entry.value)]);
     let null = null.governed_by(&entry);
     let mut placed = drive.place(
-        crate::plant::OrderRequest::new(order, entry.origin, Authority::Write)
+        drivegate_core::plant::OrderRequest::new(order, entry.origin, Authority::Write)
             .within(Duration::from_secs(2))
             .by_slot(null),
         rig.now,

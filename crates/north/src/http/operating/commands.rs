@@ -19,12 +19,12 @@ use super::asker::{Commander, Viewer};
 use super::restart;
 use super::state::{Operating, Operator};
 use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
-use crate::drive::model::Kind;
-use crate::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
-use crate::order::{Answer, Arrival, Origin, Outcome, Refusal, SourceKind};
-use crate::plant::{DriveHandle, Placed, Plant, Shown};
-use crate::process_image::Access;
 use crate::reading::Reader;
+use drivegate_core::order::{Answer, Arrival, Origin, Outcome, Refusal, SourceKind};
+use drivegate_core::plant::{DriveHandle, Placed, Plant, Shown};
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
 
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct CommandReply {

@@ -4,7 +4,7 @@ use axum::http::header::{self, HeaderMap, HeaderValue};
 use ring::hmac;
 
 use super::super::users::User;
-use crate::hex;
+use drivegate_core::hex;
 
 /// Time for which a browser stays known, s.
 const KNOWN: u32 = 90 * 86_400;

@@ -12,7 +12,7 @@ use super::super::app_state::AppState;
 use super::super::messages::DrillWish;
 use super::super::replies::{Refused, Replied, not_found, refused};
 use super::asker::{Commander, Ordered};
-use crate::drill::{DrillRefusal, DrillReport, Kind};
+use drivegate_core::drill::{DrillRefusal, DrillReport, Kind};
 
 /// Handler: all known drills, newest first.
 pub(in crate::http) async fn drills(State(app): State<Arc<AppState>>) -> Json<Vec<DrillReport>> {

@@ -13,8 +13,8 @@ use super::super::messages::HoldAct;
 use super::super::replies::{Replied, refused};
 use super::asker::{Ordered, Viewer};
 use crate::command_json::HoldReply;
-use crate::order::Authority;
-use crate::permit::Verb;
+use drivegate_core::order::Authority;
+use drivegate_core::permit::Verb;
 
 /// Handler: the holder of the drive.
 pub(in crate::http) async fn hold_of(

@@ -11,10 +11,10 @@ use super::super::app_state::AppState;
 use super::super::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, RestoreWish};
 use super::super::replies::{Refused, Replied, refused};
 use super::asker::Ordered;
-use crate::order::{Origin, Pace};
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
-use crate::parameters::{Id, ParameterFile, Wishes};
-use crate::plant::DriveHandle;
+use drivegate_core::order::{Origin, Pace};
+use drivegate_core::parameters::{Id, ParameterFile, Wishes};
+use drivegate_core::plant::DriveHandle;
 
 /// Maximum number of bytes of a request: a parameter file with some thousand parameters.
 const MAX_BODY: usize = 256 * 1024;

@@ -4,11 +4,11 @@
 use std::future::poll_fn;
 use std::time::{Duration, Instant};
 
-use crate::codec::{Reply, RequestPdu};
-use crate::drive::RESTART_COMMUNICATION;
-use crate::order::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
-use crate::plant::{DriveHandle, Question, Shown, Target};
-use crate::process_image::Access;
+use drivegate_core::order::{Answer, Arrival, DEFAULT_EXPIRY, Origin, Outcome, Refusal};
+use drivegate_core::plant::{DriveHandle, Question, Shown, Target};
+use drivegate_core::process_image::Access;
+use drivegate_model::drive::RESTART_COMMUNICATION;
+use drivegate_proto::{Reply, RequestPdu};
 
 /// Time within which the drive must be polled again and answer: somewhat longer than the longest pause between two probes.
 const BACK: Duration = Duration::from_secs(12);

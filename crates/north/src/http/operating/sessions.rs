@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::super::tokens::hash;
-use crate::hex;
+use drivegate_core::hex;
 
 /// Time without activity of the user after which a session ends. Reading values does not count as activity, so the
 /// session of an unattended page ends.

@@ -23,7 +23,7 @@ use super::throttle::{Source, Throttle};
 use super::verifier::Verifier;
 use crate::NorthState;
 use crate::log_throttle::LogThrottle;
-use crate::order::{Authority, Grants, Proof, Right, SourceKind};
+use drivegate_core::order::{Authority, Grants, Proof, Right, SourceKind};
 /// Time for which a password that a program sends with each request is not hashed again.
 const VERIFIED: Duration = Duration::from_secs(300);
 /// Maximum number of remembered passwords, and of addresses that are known to belong to a user.
@@ -65,7 +65,7 @@ pub(super) struct State {
 #[derive(Debug, Clone)]
 pub(in crate::http) struct Operator {
     pub(super) user: Arc<str>,
-    /// Login name; see [`crate::order::Origin::with_login`].
+    /// Login name; see [`drivegate_core::order::Origin::with_login`].
     pub(super) login: Arc<str>,
     pub(super) address: IpAddr,
     /// The interface that the user used.

@@ -12,8 +12,8 @@ use super::super::app_state::AppState;
 use super::super::replies::{Replied, not_found, refused};
 use super::asker::Ordered;
 use crate::command_json::{nothing_to_stop, refuse_stop_all, stop_all};
-use crate::order::Refusal;
-use crate::stop_all::NothingToStop;
+use drivegate_core::order::Refusal;
+use drivegate_core::stop_all::NothingToStop;
 
 /// Replies 200 if every drive is at standstill, 504 if the standstill of a drive is not proven.
 pub(in crate::http) async fn stop(State(app): State<Arc<AppState>>, Ordered(operator, payload): Ordered) -> Replied {

@@ -8,9 +8,9 @@
 use std::fmt::{self, Write as _};
 use std::time::Instant;
 
-use crate::drive::{ModelPoint, Quality, State};
-use crate::plant::Plant;
-use crate::process_image::Reading;
+use drivegate_core::plant::Plant;
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::{ModelPoint, Quality, State};
 
 const DOCUMENT: &str = include_str!("index.html");
 
@@ -168,9 +168,9 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::drive::profile::Profiles;
-    use crate::event::EventKind;
-    use crate::history::TriggerKind;
+    use drivegate_core::event::EventKind;
+    use drivegate_core::history::TriggerKind;
+    use drivegate_model::drive::profile::Profiles;
 
     /// Size limit of the page with all its files, bytes.
     const MOST_BYTES: usize = 224 * 1024;

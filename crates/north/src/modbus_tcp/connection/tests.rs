@@ -11,9 +11,9 @@ use super::super::{Options, ServerState, Uncached};
 use super::*;
 use crate::NorthState;
 use crate::connection_limit::{ConnectionLimit, Limits, Newcomer};
-use crate::order::Authority;
-use crate::plant::Plant;
 use crate::reading::Dated;
+use drivegate_core::order::Authority;
+use drivegate_core::plant::Plant;
 
 /// Reads input register 0 of unit 255 in a plant without a bus; answered at once with exception 02.
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 255, 4, 0, 0, 0, 1];

@@ -2,8 +2,8 @@ use arc_swap::ArcSwap;
 
 use super::super::{Broker, Buffer, Qos, Telemetry, fixture};
 use super::*;
-use crate::event::{BURST, EventKind};
-use crate::process_image::{BusImage, BusSpec};
+use drivegate_core::event::{BURST, EventKind};
+use drivegate_core::process_image::{BusImage, BusSpec};
 
 pub(in crate::mqtt) fn options(buffer: Option<Buffer>) -> Options {
     Options {

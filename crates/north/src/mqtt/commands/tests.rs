@@ -5,10 +5,10 @@ use serde_json::Value as Json;
 
 use super::super::fixture;
 use super::*;
-use crate::codec::Reply as BusReply;
 use crate::command_json::REMEMBERED;
-use crate::drive::Value;
-use crate::order::{Arrival, Order, Outcome, Receipt, Urgency};
+use drivegate_core::order::{Arrival, Order, Outcome, Receipt, Urgency};
+use drivegate_model::drive::Value;
+use drivegate_proto::Reply as BusReply;
 
 struct SetTopics {
     plant: Plant,
@@ -16,7 +16,7 @@ struct SetTopics {
     memory: SharedMemory,
     stop_all: Arc<StopAll>,
     now: Instant,
-    events: tokio::sync::broadcast::Receiver<Arc<crate::event::Event>>,
+    events: tokio::sync::broadcast::Receiver<Arc<drivegate_core::event::Event>>,
 }
 
 impl SetTopics {
@@ -85,7 +85,7 @@ impl SetTopics {
 
     /// Lets the drive acknowledge the next command; no read has shown its effect yet.
     fn take_order(&self) -> Option<(Order, Receipt)> {
-        let pop = |bus: &crate::plant::BusHandle| next_command(&mut bus.queue.lock(), Urgency::Read, self.now);
+        let pop = |bus: &drivegate_core::plant::BusHandle| next_command(&mut bus.queue.lock(), Urgency::Read, self.now);
         let command = self.plant.buses.iter().find_map(pop)?;
         let outcome = Outcome::Acknowledged(BusReply::Written);
         Some((command.intent.order, command.ticket.acknowledge(outcome, self.now)))
@@ -218,7 +218,7 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
         assert_eq!((&result["ok"], &result["error"]["code"]), (&false.into(), &code.into()));
         assert!(!result["error"]["message"].as_str().unwrap().is_empty());
         let event = bench.events.try_recv().unwrap();
-        assert_eq!(event.kind, crate::event::EventKind::RefusedCommand);
+        assert_eq!(event.kind, drivegate_core::event::EventKind::RefusedCommand);
     }
     assert_eq!(bench.queued(), 0);
     assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
@@ -227,7 +227,7 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
         (&result["error"]["code"], &result["id"]),
         (&"unknown_drive".into(), &21.into())
     );
-    let unknown = (crate::order::SourceKind::Mqtt, "unknown_drive");
+    let unknown = (drivegate_core::order::SourceKind::Mqtt, "unknown_drive");
     assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
     let record = audited(bench.plant.writes.audit()).pop().unwrap();
     assert_eq!(
@@ -298,7 +298,7 @@ fn commands_are_queued_in_the_order_of_their_messages() {
         let drive = bench.plant.drive("p1").unwrap();
         drive.image.spec.profile.point_index(name).unwrap()
     };
-    let bool_of = |name, on| Order::Points(vec![(index(name), crate::drive::Value::Bool(on))]);
+    let bool_of = |name, on| Order::Points(vec![(index(name), drivegate_model::drive::Value::Bool(on))]);
     // The stop is sent first and has removed the commands before it; nothing was polled in between.
     assert_eq!(taken(&bench), Some(bool_of("run", false)));
     assert_eq!(taken(&bench), Some(bool_of("run", true)));
@@ -398,7 +398,7 @@ fn messages_beyond_the_limit_stay_with_the_broker() {
 #[test]
 fn a_refusal_of_the_queue_has_its_reason() {
     let mut bench = SetTopics::new();
-    let results: Vec<Json> = (0..crate::order::CAPACITY + 2)
+    let results: Vec<Json> = (0..drivegate_core::order::CAPACITY + 2)
         .filter_map(|_| bench.take(set("p1/set/run", "1")))
         .map(|message| json(&message))
         .collect();
@@ -406,7 +406,7 @@ fn a_refusal_of_the_queue_has_its_reason() {
     assert_eq!(results[0]["error"]["code"], "queue_full");
     let text = results[0]["error"]["message"].as_str().unwrap();
     assert!(text.starts_with("64 commands are already waiting"), "{text}");
-    assert_eq!(bench.queued(), crate::order::CAPACITY);
+    assert_eq!(bench.queued(), drivegate_core::order::CAPACITY);
 }
 
 #[test]

@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 
 use super::entity::{self, Entities, extend};
 use super::{Sources, id_of};
-use crate::plant::{DriveHandle, Plant};
+use drivegate_core::plant::{DriveHandle, Plant};
 
 /// Manufacturers with whose names titles of profiles begin.
 const MANUFACTURERS: [&str; 18] = [
@@ -45,7 +45,7 @@ enum Kind {
 
 impl Device {
     pub(super) fn gateway(id: &str, plant: &Plant) -> Device {
-        let name = |bus: &crate::plant::BusHandle| bus.image.spec.name.clone();
+        let name = |bus: &drivegate_core::plant::BusHandle| bus.image.spec.name.clone();
         Device {
             id: id.to_string(),
             kind: Kind::Gateway {
@@ -95,7 +95,7 @@ impl Device {
     }
 
     fn head(&self, sources: &Sources, name: &str, (manufacturer, model): (&str, &str), gateway: Option<&str>) -> Value {
-        let version = crate::version::VERSION;
+        let version = drivegate_core::version::VERSION;
         let mut device = match gateway {
             Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
             None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),

@@ -5,12 +5,12 @@
 use serde_json::{Map, Value, json};
 
 use super::Sources;
-use crate::drive::model::Kind;
-use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, PollClass, State};
-use crate::event::EventKind;
 use crate::mqtt::payload;
-use crate::process_image::{Access, DriveSpec};
+use drivegate_core::event::EventKind;
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{ModelPoint, Point, PollClass, State};
 
 /// Entities with their keys in the message, in order.
 pub(super) type Entities = Vec<(String, Value)>;

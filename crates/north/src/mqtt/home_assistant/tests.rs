@@ -4,8 +4,8 @@ use serde_json::Value;
 
 use super::super::{History, fixture};
 use super::*;
-use crate::drive::profile::{Profile, Profiles};
-use crate::process_image::{Access, DriveSpec};
+use drivegate_core::process_image::{Access, DriveSpec};
+use drivegate_model::drive::profile::{Profile, Profiles};
 
 fn sources(base: &str, commands: bool, [state, points]: [bool; 2]) -> Sources {
     Sources {
@@ -107,9 +107,15 @@ fn there_is_one_entity_for_each_published_point() {
                 assert_eq!(keys.len(), all.len(), "{}: a key is there twice", profile.name);
                 let published = super::super::payload::published_points(profile);
                 let is_shown = published.iter().any(|(_, name)| *name == "fault_reset");
-                let has_reset = profile.model_index(crate::drive::ModelPoint::FaultReset).is_some();
+                let has_reset = profile
+                    .model_index(drivegate_model::drive::ModelPoint::FaultReset)
+                    .is_some();
                 let reset = usize::from(access == Access::Control && has_reset && !is_shown);
-                let code = usize::from(profile.model_index(crate::drive::ModelPoint::FaultCode).is_some());
+                let code = usize::from(
+                    profile
+                        .model_index(drivegate_model::drive::ModelPoint::FaultCode)
+                        .is_some(),
+                );
                 let expected = published.len() + code + reset + 2;
                 assert_eq!(present(&all).count(), expected, "{} {access:?}", profile.name);
                 let ids: BTreeSet<&str> = present(&all).map(|(_, e)| e["uniq_id"].as_str().unwrap()).collect();
@@ -167,7 +173,7 @@ fn entities_keep_the_rules_of_home_assistant() {
                         }
                         "event" => assert_eq!(
                             entity["evt_typ"].as_array().unwrap().len(),
-                            crate::event::EventKind::ALL.len()
+                            drivegate_core::event::EventKind::ALL.len()
                         ),
                         "switch" | "button" => {}
                         other => panic!("platform {other}"),

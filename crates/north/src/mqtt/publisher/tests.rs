@@ -2,8 +2,8 @@ use serde_json::Value as Json;
 
 use super::super::{History, fixture};
 use super::*;
-use crate::codec::{Exception, Table};
-use crate::process_image::Link;
+use drivegate_core::process_image::Link;
+use drivegate_proto::{Exception, Table};
 
 struct PublishedPlant {
     plant: Plant,

@@ -29,10 +29,10 @@ use super::topics::{Received, StateForm, Topics};
 use super::wire::{MetricValue, Payload};
 use super::{Options, model::COMMAND_ERROR, model::COMMAND_RESULT};
 use crate::log_throttle::LogThrottle;
-use crate::order::Right;
-use crate::plant::{Plant, SharedPlant};
-use crate::process_image::Snapshot;
 use crate::{MqttKind, NorthState};
+use drivegate_core::order::Right;
+use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_core::process_image::Snapshot;
 
 /// Maximum number of messages published before other events are handled.
 const MESSAGES: usize = 64;

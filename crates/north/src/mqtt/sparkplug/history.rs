@@ -64,7 +64,7 @@ impl Recorder {
 mod tests {
     use super::super::metric::Datum;
     use super::*;
-    use crate::drive::Quality;
+    use drivegate_model::drive::Quality;
 
     #[test]
     fn the_newest_changes_are_kept() {

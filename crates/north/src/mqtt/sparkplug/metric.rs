@@ -3,7 +3,7 @@
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use super::wire::{self, DataType, MetricValue, PropertyContent, PropertySet};
-use crate::drive::{Quality, Value};
+use drivegate_model::drive::{Quality, Value};
 
 /// A moment on two clocks: the monotonic clock for intervals, and the calendar.
 #[derive(Debug, Clone, Copy)]

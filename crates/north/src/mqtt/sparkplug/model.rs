@@ -5,11 +5,11 @@ use std::time::SystemTime;
 use super::super::payload;
 use super::metric::{Datum, Definition, Moment, Pace, Sample};
 use super::wire::DataType;
-use crate::drive::model::Kind;
-use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, PointIndex, Quality, State};
-use crate::plant::{BusHandle, DriveHandle, Plant};
-use crate::process_image::Reading;
+use drivegate_core::plant::{BusHandle, DriveHandle, Plant};
+use drivegate_core::process_image::Reading;
+use drivegate_model::drive::model::Kind;
+use drivegate_model::drive::profile::Form;
+use drivegate_model::drive::{ModelPoint, Point, PointIndex, Quality, State};
 
 /// Name of the metric for the result of the last command over Sparkplug: its code, and why it failed.
 pub(super) const COMMAND_RESULT: &str = "command_result";

@@ -14,9 +14,9 @@ use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command_json::{ParsedCommand, SharedMemory, Taken, excerpt, refuse_unknown, resolve};
-use crate::drive::{ModelPoint, Profile};
-use crate::order::{Answer, Arrival, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
-use crate::plant::{Placed, Plant};
+use drivegate_core::order::{Answer, Arrival, CONFIRMED, DEFAULT_EXPIRY, Proof, Refusal, Right, SourceKind};
+use drivegate_core::plant::{Placed, Plant};
+use drivegate_model::drive::{ModelPoint, Profile};
 
 /// Commands whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit
 /// only.

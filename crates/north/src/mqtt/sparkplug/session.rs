@@ -11,7 +11,7 @@ use super::host::Host;
 use super::metric::{Datum, Definition, Moment, Naming, Sample};
 use super::topics::{Kind, StateForm, Topics};
 use super::wire::{DataType, Metric, Payload};
-use crate::drive::Quality;
+use drivegate_model::drive::Quality;
 
 /// Minimum time between two births of the node on one connection: requests in between are served together.
 const REBIRTH: Duration = Duration::from_millis(250);

@@ -1,7 +1,7 @@
 //! Words that are never repeated, and orders after which nothing is.
 
 use super::*;
-use crate::drive::RawWrites;
+use drivegate_model::drive::RawWrites;
 
 impl Plant {
     /// Writes the control word as a client that knows the drive's own register.

@@ -103,7 +103,7 @@ mod tests {
     use super::super::super::super::model::{Kind, Value};
     use super::super::Order;
     use super::*;
-    use crate::codec::Table;
+    use drivegate_proto::Table;
 
     fn words(parts: &[Part]) -> Vec<u16> {
         parts.iter().map(|part| part.value).collect()

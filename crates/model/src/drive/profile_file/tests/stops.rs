@@ -1,9 +1,9 @@
 //! `also_stop` of `[control]`: words by which a drive stops by other means.
 
 use super::*;
-use crate::codec::Table;
 use crate::drive::ModelPoint;
 use crate::drive::control::ControlItem;
+use drivegate_proto::Table;
 
 /// The text of a profile with this `[control]`.
 fn source(control: &str) -> String {

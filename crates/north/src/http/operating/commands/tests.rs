@@ -5,7 +5,7 @@ use drivegate_testkit::next_command;
 use super::*;
 use crate::http::operating::state::IN_PROGRESS;
 use crate::mqtt::fixture;
-use crate::plant::OrderRequest;
+use drivegate_core::plant::OrderRequest;
 
 fn operator(user: &str, login: &str) -> Operator {
     Operator {
@@ -13,8 +13,8 @@ fn operator(user: &str, login: &str) -> Operator {
         login: login.into(),
         address: [192, 0, 2, 1].into(),
         kind: SourceKind::Http,
-        proof: crate::order::Proof::User(user.into()),
-        right: crate::order::Right::lasting(),
+        proof: drivegate_core::order::Proof::User(user.into()),
+        right: drivegate_core::order::Right::lasting(),
         cookie: None,
     }
 }
@@ -151,13 +151,13 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
     let origin = Origin::new(SourceKind::Mqtt, "t");
     let points = vec![(
         drive.image.spec.profile.point_index("run").unwrap(),
-        crate::drive::Value::Bool(false),
+        drivegate_model::drive::Value::Bool(false),
     )];
     let _placed = drive.place(
         OrderRequest::new(
-            crate::order::Order::Points(points),
+            drivegate_core::order::Order::Points(points),
             origin,
-            crate::order::Authority::Write,
+            drivegate_core::order::Authority::Write,
         )
         .within(Duration::from_secs(1)),
         rig.now,
@@ -167,7 +167,7 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
 
 #[test]
 fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
-    use crate::order::Urgency;
+    use drivegate_core::order::Urgency;
     let rig = OperatedPlant::new();
     let alice = operator("alice", "alice#1");
     let bodies = [
@@ -181,7 +181,7 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
             panic!("{body}");
         };
         while let Some(command) = next_command(&mut rig.plant.buses[0].queue.lock(), Urgency::Read, rig.now) {
-            command.answer(&Outcome::Acknowledged(crate::codec::Reply::Written), rig.now);
+            command.answer(&Outcome::Acknowledged(drivegate_proto::Reply::Written), rig.now);
         }
         let answer = waiting.placed.answer().unwrap();
         let code = match &answer.outcome {

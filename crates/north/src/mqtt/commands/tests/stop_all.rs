@@ -139,7 +139,10 @@ fn retained_messages_are_refused_and_told() {
         assert_eq!(event.is_some(), is_known, "{topic} {payload}");
         if let Some(event) = event {
             let of = event.drive.as_deref().unwrap_or("all drives");
-            assert_eq!((event.kind, of), (crate::event::EventKind::RefusedCommand, drive));
+            assert_eq!(
+                (event.kind, of),
+                (drivegate_core::event::EventKind::RefusedCommand, drive)
+            );
             assert!(event.text.contains("retained"), "{}", event.text);
         }
     }

@@ -1,11 +1,11 @@
 use super::*;
-use crate::codec::Reply;
 use crate::command_json::REMEMBERED;
-use crate::drive::{PointIndex, Value};
 use crate::mqtt::fixture;
 use crate::mqtt::sparkplug::session::Rules;
 use crate::mqtt::sparkplug::topics::Topics;
-use crate::order::{Arrival, Order, Outcome, Urgency};
+use drivegate_core::order::{Arrival, Order, Outcome, Urgency};
+use drivegate_model::drive::{PointIndex, Value};
+use drivegate_proto::Reply;
 use drivegate_testkit::{audited, next_command};
 
 struct OrderedDrive {
@@ -65,7 +65,7 @@ impl OrderedDrive {
             .take(message, device, target, &self.session, &self.plant, self.now)
     }
 
-    fn pop(&self) -> Option<crate::order::Command> {
+    fn pop(&self) -> Option<drivegate_core::order::Command> {
         let mut queue = self.plant.buses[0].queue.lock();
         next_command(&mut queue, Urgency::Command, self.now)
     }
