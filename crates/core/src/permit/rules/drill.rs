@@ -17,7 +17,7 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, _: &Gate) -> Verdict {
         return Verdict::refuse(Refusal::HeldByOther(Box::new(Holder {
             who: drill.who.clone(),
             rank: "drill".to_string(),
-            keeps: "is under way; a stop ends it".to_string(),
+            keeps: "is in progress; a stop ends it".to_string(),
             left_s: None,
         })));
     }
