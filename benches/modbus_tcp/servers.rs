@@ -132,8 +132,9 @@ fn one_drive(port: &str) -> Result<Settings, Box<dyn Error>> {
         keys: "cycle = \"10ms\"",
         drive_keys: "turnaround = \"0.5ms\"",
     };
-    let server = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nmax_connections_per_address = 1000\nstale_after = \"5s\"\n";
-    settings(&(bus.toml() + server))
+    let server =
+        "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nmax_connections_per_address = 1000\n";
+    settings(&format!("stale_after = \"5s\"\n{}{server}", bus.toml()))
 }
 
 /// drivegate's server before an image that is rewritten a hundred times a second, as a bus would.
@@ -149,7 +150,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
     image.update_health(|health| health.up = true);
     let plant = Plant {
         gateway: "bench".to_string(),
-        stale_after: settings.stale_after,
+        stale_after: settings.stale_after.limit,
         buses: vec![BusHandle {
             formerly: std::sync::Arc::default(),
             image: Arc::new(image),

@@ -214,9 +214,9 @@ class Gateway:
 
         certificates = self.plant.certificates
         return {
-            "gateway": {"name": self.name, "socket": "socket", "state_dir": "state"},
+            "gateway": {"name": self.name, "socket": "socket", "state_dir": "state", "stale_after": "5s"},
             "bus": [bus("a", [drive("a1", 1), drive("a2", 2)]), bus("b", [drive("b1", 1) | {"unit": 11}])],
-            "modbus_tcp": {"listen": [f"127.0.0.1:{self.modbus}"], "write": ["127.0.0.1/32"], "stale_after": "5s"},
+            "modbus_tcp": {"listen": [f"127.0.0.1:{self.modbus}"], "write": ["127.0.0.1/32"]},
             "mqtt": {"url": f"mqtts://localhost:{self.plant.broker_tls}", "ca": certificates.path("authority.crt"),
                      "certificate": certificates.path("client.crt"), "key": certificates.path("client.key"),
                      "topics": ["state"]},

@@ -49,12 +49,12 @@ impl Line {
             modbus: free_port(),
         };
         let text = format!(
-            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\n\
+            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\nstale_after = \"1min\"\n\
              [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nresponse_timeout = \"1s\"\n\
              [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
              limits = {{ speed_reference = [0.0, 80.0] }}\nraw_writes = [[1998, 1998]]\n\
              [[bus.drive]]\nname = \"pump-5\"\naddress = 5\nprofile = \"vacon-nx\"\n\
-             [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n",
+             [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\n",
             line.modbus
         );
         std::fs::write(line.config(), text).unwrap();

@@ -15,7 +15,7 @@ use tokio_modbus::client::{Reader as _, Writer as _};
 use tokio_modbus::slave::{Slave, SlaveContext as _};
 
 use crate::support::process::{Running, api, drivegate, get, until};
-use crate::support::site::{HTTP, Site, nx_in_ascii};
+use crate::support::site::{HTTP, MODBUS_TCP, Site, nx_in_ascii};
 use crate::support::tools::{python, root, run_well, tool};
 
 /// Exchanges of each master; more with the variable `DRIVEGATE_EXCHANGES`.
@@ -73,9 +73,7 @@ impl Shared {
         for address in 1..=drives {
             text += &format!("[[bus.drive]]\nname = \"d{address}\"\naddress = {address}\nprofile = \"{profile}\"\n");
         }
-        let modbus =
-            "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
-        self.site.configure(&[&text, modbus, HTTP]);
+        self.site.configure(&[&text, MODBUS_TCP, HTTP]);
         let gateway = self.site.run();
         until("an open port", || {
             let (_, buses) = get(self.site.http, "/api/v1/buses")?;

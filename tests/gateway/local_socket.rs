@@ -313,10 +313,10 @@ impl Family {
         until("the line", || link.exists().then_some(()));
         let config = directory.path().join("drivegate.toml");
         let text = format!(
-            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = {baud}\n\
+            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\nstale_after = \"10s\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = {baud}\n\
              response_timeout = \"500ms\"\nretries = 5\n{line}\
              [[bus.drive]]\nname = \"fan-1\"\naddress = 2\nprofile = \"{profile}\"\naccess = \"control\"\n{more}\n\
-             [modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nstale_after = \"10s\"\nwrite = [\"127.0.0.1/32\"]\n"
+             [modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nwrite = [\"127.0.0.1/32\"]\n"
         );
         std::fs::write(&config, text).unwrap();
         let gateway = Running::drivegate(&["run", "--config", config.to_str().unwrap()]);

@@ -271,8 +271,8 @@ fn a_reload_carries_stale_after_to_the_buses_that_run() {
     let site = site("");
     let _line = site.line(&[1]);
     let slow = LINE1.replace("silence =", "cycle = \"1h\"\nsilence =");
-    let patient = MODBUS_TCP.replace("1min", "1h");
-    site.configure(&[&slow, &controlled("pump-1", 1, ""), &patient, HTTP]);
+    let patient = slow.replace("[gateway]\n", "[gateway]\nstale_after = \"1h\"\n");
+    site.configure(&[&patient, &controlled("pump-1", 1, ""), MODBUS_TCP, HTTP]);
     let gateway = site.run_ready();
     let is_good = || site.point("pump-1", "output_frequency").is_number();
     until("values", || is_good().then_some(()));

@@ -18,9 +18,7 @@ use super::tools::{feed, root, run, tool};
 /// The gateway and its bus `line1`; its time limits tolerate replies that a busy machine delays.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
      [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nsilence = \"chars\"\nresponse_timeout = \"2s\"\n";
-/// With this limit, no value becomes stale because the test machine is busy.
-pub(crate) const MODBUS_TCP: &str =
-    "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
+pub(crate) const MODBUS_TCP: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n";
 pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n";
 pub(crate) const HTTP: &str = "[http]\nlisten = \"127.0.0.1:{http}\"\n";
 /// Commands over HTTP, by users in the file `users`.
@@ -56,6 +54,18 @@ fn with_own_socket(text: &str) -> String {
     match without.contains("\nsocket = ") {
         true => without,
         false => without.replacen("[gateway]\n", &format!("[gateway]\n{OWN_SOCKET}"), 1),
+    }
+}
+
+/// With this limit, no value becomes stale because the test machine is busy.
+const PATIENT: &str = "stale_after = \"1min\"\n";
+
+/// The configuration as the gateway reads it: a local socket of its own, and patience where Modbus TCP shows values.
+fn completed(text: &str) -> String {
+    let text = with_own_socket(text);
+    match text.contains("[modbus_tcp]") && !text.contains("\nstale_after = ") {
+        true => text.replacen("[gateway]\n", &format!("[gateway]\n{PATIENT}"), 1),
+        false => text,
     }
 }
 
@@ -106,14 +116,14 @@ impl Site {
         let text = ports.iter().fold(parts.concat(), |text, (place, port)| {
             text.replace(place, &port.to_string())
         });
-        self.write("drivegate.conf", &with_own_socket(&text));
+        self.write("drivegate.conf", &completed(&text));
     }
 
     /// Replaces a part of the configuration and writes it; returns the previous configuration.
     pub(crate) fn change(&self, from: &str, to: &str) -> String {
         let text = std::fs::read_to_string(self.config()).unwrap();
         assert!(text.contains(from), "{from} does not stand in\n{text}");
-        self.write("drivegate.conf", &with_own_socket(&text.replace(from, to)));
+        self.write("drivegate.conf", &completed(&text.replace(from, to)));
         text
     }
 

@@ -140,7 +140,7 @@ impl Daemon {
         let plant = Plant {
             events: events.clone(),
             writes: writes.clone(),
-            ..Plant::new(&settings.gateway, settings.stale_after, Vec::new())
+            ..Plant::new(&settings.gateway, settings.stale_after.limit, Vec::new())
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let reservations = ReservationsFile::default();
@@ -332,11 +332,7 @@ impl Daemon {
             bus.queue.close(Outcome::ShuttingDown, Instant::now());
         }
         for (bus, task) in &kept {
-            // Without a configured `stale_after`, data of a slow bus becomes stale only after three rounds.
-            let floor = match settings.stale_after_written {
-                true => Duration::ZERO,
-                false => 3 * bus.achievable().0,
-            };
+            let floor = settings.stale_after.floor(bus.achievable().0);
             let drives = &task.handle().image.drives;
             drives.iter().for_each(|drive| drive.set_stale_floor(floor));
         }
@@ -374,7 +370,7 @@ impl Daemon {
         self.watch(buses);
         self.plant.store(Arc::new(Plant {
             gateway: settings.gateway.clone(),
-            stale_after: settings.stale_after,
+            stale_after: settings.stale_after.limit,
             buses: buses.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
@@ -385,10 +381,10 @@ impl Daemon {
             named.collect::<Vec<_>>()
         };
         let drives = buses.iter().flat_map(|(_, task)| of_bus(&task.handle().image));
-        self.guards.watch(drives, settings.stale_after, Instant::now());
+        self.guards.watch(drives, settings.stale_after.limit, Instant::now());
         if let Some(recorder) = &self.recorder {
             let images = buses.iter().map(|(_, task)| task.handle().image.clone());
-            recorder.adopt(images.collect(), settings.stale_after);
+            recorder.adopt(images.collect(), settings.stale_after.limit);
         }
     }
 

@@ -149,7 +149,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
     };
     Ok(Plant::new(
         settings.gateway.clone(),
-        settings.stale_after,
+        settings.stale_after.limit,
         settings.buses.iter().map(bus).collect::<io::Result<_>>()?,
     ))
 }

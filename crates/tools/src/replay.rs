@@ -74,7 +74,7 @@ pub(super) fn run(args: &Args) -> failure::Outcome {
             return Err(Failure::Reported(EXIT_DATA));
         }
     };
-    Ok(report::print(&play(bus, &packets, settings.stale_after)?))
+    Ok(report::print(&play(bus, &packets, settings.stale_after.limit)?))
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, String> {

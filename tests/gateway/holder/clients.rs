@@ -13,8 +13,7 @@ use crate::support::process::{Running, api, until};
 use crate::support::site::{HTTP, LINE1, MQTT, Site, USERS, controlled};
 use crate::support::tools::{python, root, run_well, tool};
 
-const MODBUS_TCP: &str =
-    "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\nstale_after = \"1min\"\n";
+const MODBUS_TCP: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n";
 const AUTHORITY: &str = r#"
 [mqtt.sparkplug]
 group = "plant"

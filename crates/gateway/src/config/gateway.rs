@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::keys::GATEWAY;
-use super::values;
+use super::{stale, values};
 use drivegate_model::document::{Problem, Reader};
 use drivegate_model::drive::profile::Profiles;
 use drivegate_north::local::SocketPath;
@@ -18,6 +18,7 @@ pub(super) struct Gateway {
     pub(super) state_dir: PathBuf,
     pub(super) profile_dirs: Vec<PathBuf>,
     pub(super) profiles: Profiles,
+    pub(super) stale_after: stale::Written,
     pub(super) errors: Vec<Problem>,
 }
 
@@ -29,6 +30,7 @@ impl Default for Gateway {
             state_dir: default_state_dir(),
             profile_dirs: Vec::new(),
             profiles: Profiles::built_in(),
+            stale_after: None,
             errors: Vec::new(),
         }
     }
@@ -53,6 +55,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path) -> Gateway {
             ),
         }
     }
+    let stale_after = stale::written(&GATEWAY.stale_after, reader);
     reader.finish();
     Gateway {
         name,
@@ -60,6 +63,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path) -> Gateway {
         state_dir,
         profile_dirs,
         profiles,
+        stale_after,
         errors,
     }
 }

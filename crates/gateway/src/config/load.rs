@@ -4,12 +4,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use super::gateway::{self, Gateway};
-use super::keys::{MODBUS_TCP, ROOT};
+use super::keys::ROOT;
 use super::params::ParamsSettings;
 use super::settings::{BusSettings, ENVIRONMENT, Settings, Unusable};
 use super::together::{Clients, judge};
 use super::{
-    authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings, unused_profiles,
+    authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings, stale, unused_profiles,
 };
 use drivegate_bus::proof;
 use drivegate_core::process_image::Access;
@@ -153,6 +153,7 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
         state_dir,
         profile_dirs,
         profiles,
+        stale_after,
         ..
     } = gateway;
     let tables = ROOT.bus.tables(reader);
@@ -194,7 +195,10 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
         http: http.as_ref(),
         bacnet: bacnet.as_ref(),
     };
+    let former = modbus_tcp.as_ref().and_then(|section| section.stale_after.clone());
+    let stale_after = stale::of_sections(reader.document(), stale_after, former);
     judge(reader, &buses, &clients);
+    stale::warn_of_cycles(reader.document(), &buses, &stale_after);
     if let Some((
         authority::Authority {
             rules: Ok(Some(rules)), ..
@@ -226,11 +230,7 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
         recordings: recordings?,
         profile_dirs,
         profiles,
-        stale_after: match &modbus_tcp {
-            Some(modbus_tcp) => modbus_tcp.stale_after,
-            None => MODBUS_TCP.stale_after.read_default()?,
-        },
-        stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
+        stale_after: stale::settings(&stale_after)?,
         buses: settings,
         slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
         modbus_tcp: options_of(modbus_tcp, |m| m.options).ok()?,

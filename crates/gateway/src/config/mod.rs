@@ -29,6 +29,7 @@ mod recordings;
 mod settings;
 mod shutdown;
 mod slot;
+mod stale;
 mod start_guard;
 mod together;
 mod unique;
@@ -43,6 +44,7 @@ pub use named_files::{FileKind, NamedFile, named_files};
 pub use params::ParamsSettings;
 pub use port::check as check_port;
 pub use settings::{BusSettings, Settings};
+pub use stale::StaleAfter;
 
 #[cfg(test)]
 mod tests;

@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::Path;
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use ipnet::IpNet;
 
 use super::http::Listener as Address;
 use super::key::Key;
 use super::keys::{LISTENER, MODBUS_TCP, ROLES, TLS};
-use super::{files, values};
+use super::{files, stale, values};
 use drivegate_model::document::{Place, Reader};
 use drivegate_north::TlsFile;
 use drivegate_north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
@@ -25,9 +25,8 @@ pub(super) type DefaultDrive = (String, Place, Option<Vec<String>>);
 pub(super) struct ModbusTcp {
     /// Absent when a certificate or key cannot be used, which is reported.
     pub(super) options: Option<modbus_tcp::Options>,
-    pub(super) stale_after: Duration,
-    pub(super) stale_written: bool,
-    pub(super) stale_place: Place,
+    /// The former place of the key of `[gateway]`.
+    pub(super) stale_after: stale::Written,
     pub(super) addresses: Vec<Address>,
     /// The buses that each listener shows, `None` for all buses.
     pub(super) selections: Vec<Option<Vec<String>>>,
@@ -79,8 +78,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     warn_of_shares(reader, &allowed, max_connections, max_connections_per_address);
     let idle_timeout = MODBUS_TCP.idle_timeout.get(reader);
     let uncached = MODBUS_TCP.uncached.get(reader);
-    let stale_after = MODBUS_TCP.stale_after.get(reader);
-    let stale_written = reader.has(MODBUS_TCP.stale_after.name);
+    let stale_after = stale::written(&MODBUS_TCP.stale_after, reader);
     reader.finish();
     let Found {
         listeners,
@@ -103,8 +101,6 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     ModbusTcp {
         options,
         stale_after,
-        stale_written,
-        stale_place: MODBUS_TCP.stale_after.place(reader),
         addresses,
         selections,
         default_drives,

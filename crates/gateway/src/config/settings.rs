@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use super::log::LogSettings;
 use super::params::ParamsSettings;
+use super::stale::StaleAfter;
 use drivegate_bus::predict::{self, Prediction};
 use drivegate_bus::{BusOptions, Mode};
 use drivegate_core::drill::DrillOptions;
@@ -44,9 +45,7 @@ pub struct Settings {
     /// Built-in profiles and the user's.
     pub profiles: Profiles,
     /// Age from which a sample of process data is stale.
-    pub stale_after: Duration,
-    /// Whether `stale_after` was configured, so that it also applies to slow lines.
-    pub stale_after_written: bool,
+    pub stale_after: StaleAfter,
     /// The buses in the order of the file.
     pub buses: Vec<BusSettings>,
     /// Slots of all buses; absent if no bus has a slot.

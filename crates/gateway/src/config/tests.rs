@@ -139,6 +139,7 @@ fn a_full_configuration_says_what_is_meant() {
     let source = r#"
 [gateway]
 name = "pump-house"
+stale_after = "2s"
 [[bus]]
 name = "line1"
 port = "ttyS0"
@@ -178,7 +179,6 @@ profile = "vacon-nx"
 listen = ["127.0.0.1:0", "[::1]:1502"]
 write = ["127.0.0.1"]
 uncached = "refuse"
-stale_after = "2s"
 [mqtt]
 url = "mqtts://broker"
 commands = true
@@ -188,7 +188,7 @@ sparkplug = { group = "plant", primary_host = "scada" }
 "#;
     let all = settings(source);
     assert_eq!(
-        (all.gateway.as_str(), all.stale_after),
+        (all.gateway.as_str(), all.stale_after.limit),
         ("pump-house", Duration::from_secs(2))
     );
     let line = &all.buses[0];

@@ -60,8 +60,7 @@ pub(super) fn judge(reader: &Reader<'_>, buses: &[bus::Found], clients: &Clients
         warn_of_idle_stops(reader, buses);
         warn_of_long_shutdowns(reader, buses);
         warn_of_refreshes(reader, buses);
-        let written = modbus_tcp.filter(|m| m.stale_written);
-        warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
+        warn_of_cadence(reader, buses);
     }
 }
 
@@ -104,8 +103,8 @@ fn warn_of_emptiness(reader: &Reader<'_>) {
     }
 }
 
-/// Cadences that the line cannot carry, and a written `stale_after` that is shorter than a cycle.
-fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Option<(Duration, &Place)>) {
+/// Cadences that the line cannot carry.
+fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found]) {
     for found in buses {
         let Some(settings) = &found.settings else { continue };
         let prediction = settings.predict();
@@ -116,17 +115,6 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             reader.document().warning(place, what, remedy);
         }
         warn_of_fault_time(reader, found, prediction.fast_cycle);
-        if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
-            && cycle > limit
-        {
-            let [cycle, limit] = [cycle, limit].map(|time| time.as_secs_f64() * 1e3);
-            let bus = &settings.spec.name;
-            reader.document().warning(
-                place,
-                format!("process data of bus `{bus}` is read every {cycle:.0} ms and stale after {limit:.0} ms"),
-                "raise stale_after, leave it out, or reduce the load of the bus",
-            );
-        }
     }
 }
 

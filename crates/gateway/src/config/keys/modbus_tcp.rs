@@ -39,9 +39,8 @@ keys! {
         idle_timeout: Option<Duration> = IDLE_TIMEOUT, default "1h";
         /// Raw reads of registers that are not polled: forwarded to the drive, or refused with exception 02.
         uncached: Uncached = Words(&[("forward", Uncached::Forward), ("refuse", Uncached::Refuse)]), default "forward";
-        /// Older samples of process data are [stale](#stale), on every interface. If not set, it is three cycles on a
-        /// slower bus; if set, it applies to every bus.
-        stale_after: Duration = TIMES, default "1s";
+        /// Former place of `stale_after` of `[gateway]`; version 0.2 refuses it.
+        stale_after: Duration = TIMES, or "that of `[gateway]`";
         /// Listeners with separate permissions and buses.
         listener: Present = Own { schema: || each(Listener::schema()), range: "[[modbus_tcp.listener]]" }, or "none";
         /// Listener with TLS.

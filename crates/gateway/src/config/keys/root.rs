@@ -46,6 +46,9 @@ keys! {
         /// Directories with custom [profiles](profiles.md), `*.toml`; one with the name of a built-in profile replaces
         /// it.
         profile_dirs: Vec<PathBuf> = List { parse: values::path, empty: None, range: "directories" }, or "none";
+        /// Older samples of process data are [stale](#stale), on every interface. If not set, it is three cycles on a
+        /// slower bus; if set, it applies to every bus.
+        stale_after: Duration = TIMES, default "1s";
     }
 }
 

@@ -89,10 +89,10 @@ fn the_defaults_of_the_schema_are_those_of_the_loader() {
     );
     let mut filled = settings(&filled);
     assert!(
-        filled.stale_after_written,
+        filled.stale_after.written,
         "a default that is written down holds for slow lines too"
     );
-    filled.stale_after_written = false;
+    filled.stale_after.written = false;
     assert!(filled == settings(&FULL), "a default of the schema is not the loader's");
 }
 
