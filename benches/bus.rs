@@ -17,6 +17,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use drivegate_proto::wire::usual_bauds;
 use drivegate_proto::{LineFormat, Request, RequestPdu, Table};
 use drivegate_sim::half_duplex::LineRules;
 use drivegate_sim::statistics::{Direction, Statistics};
@@ -28,7 +29,6 @@ use bus::peers::{self, Libmodbus};
 use common::{median, option, rate, starts};
 
 const DRIVES: std::ops::RangeInclusive<u8> = 1..=10;
-const BAUDS: [u32; 5] = [9_600, 19_200, 38_400, 57_600, 115_200];
 /// Time limit for a reply.
 const TIMEOUT: Duration = Duration::from_millis(100);
 /// Last part of a pause in which a master spins on the clock, since the kernel wakes it about ten microseconds late.
@@ -94,7 +94,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
     let time = Duration::from_secs_f64(option("--seconds", 2.0)?);
     let runs: usize = option("--runs", 7)?;
     let one: u32 = option("--baud", 0)?;
-    let bauds = if one == 0 { BAUDS.to_vec() } else { vec![one] };
+    let bauds = if one == 0 { usual_bauds().collect() } else { vec![one] };
     let libmodbus = Libmodbus::build();
     if let Err(why) = &libmodbus {
         println!("libmodbus is left out: {why}");

@@ -4,6 +4,22 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
+/// Standard baud rates in rising order: all that drives and meters can be set to, and 230400 of faster device servers. A
+/// reply that is too early for all of them did not come over a serial wire.
+pub const BAUDS: [u32; 11] = [
+    300, 600, 1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400,
+];
+
+/// Rates at which nearly all drives are delivered or set, in rising order.
+pub fn usual_bauds() -> impl Iterator<Item = u32> {
+    BAUDS.into_iter().filter(|baud| (9600..=115_200).contains(baud))
+}
+
+/// The order in which an unknown line is searched: the usual rates, then the slower ones, the next slower first.
+pub fn searched_bauds() -> impl Iterator<Item = u32> {
+    usual_bauds().chain(BAUDS.into_iter().rev().filter(|baud| *baud < 9600))
+}
+
 /// Parity bit of a character.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Parity {

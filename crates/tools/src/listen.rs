@@ -18,6 +18,7 @@ use drivegate_bus::listener::survey::Survey;
 use drivegate_bus::listener::{Decoder, Traffic};
 use drivegate_line::{Lost, Receiver, Woken};
 use drivegate_model::drive::profile::Profiles;
+use drivegate_proto::wire::searched_bauds;
 use drivegate_proto::{LineFormat, Protocol};
 
 /// Time for each setting while the right one is looked for.
@@ -26,8 +27,6 @@ const DWELL: Duration = Duration::from_secs(3);
 const ROUNDS: u32 = 2;
 /// Longest single wait for bytes.
 const LOOK: Duration = Duration::from_millis(20);
-/// Baud rates that are tried by default.
-const BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Formats that are tried by default; Modbus ASCII with 7 data bits is seen through 8N1.
 const FORMATS: [&str; 3] = ["8N1", "8E1", "8O1"];
 
@@ -84,7 +83,7 @@ fn settings(args: &Args) -> Result<(Vec<Protocol>, Vec<LineFormat>), String> {
     }
     let protocols = scan::protocols(&args.protocol)?;
     let bauds = if args.baud.is_empty() {
-        BAUDS.to_vec()
+        searched_bauds().collect()
     } else {
         args.baud.clone()
     };

@@ -12,6 +12,7 @@ use super::counters::{Contrast, FADE, InPhase, LATENCY, LONGEST_AGE, MAINS, Runn
 use super::signature::{self, Answering, Shape};
 use drivegate_model::drive::{DriveIndex, PerDrive};
 use drivegate_proto::describe::{self, Kind};
+use drivegate_proto::wire::BAUDS;
 use drivegate_proto::{LineFormat, Protocol, Request};
 
 /// Maximum memory per drive; a line has at most 2 KiB in addition.
@@ -27,9 +28,6 @@ const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
-
-/// Usual baud rates in rising order. A reply that is too early for all of them did not come over a serial wire.
-pub const BAUDS: [u32; 8] = [2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
 /// The result of a transaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -10,10 +10,9 @@ use crate::addresses::{Addresses, parse_addresses};
 use crate::report;
 use drivegate_gateway::config;
 use drivegate_model::document::Finding;
+use drivegate_proto::wire::{searched_bauds, usual_bauds};
 use drivegate_proto::{LineFormat, Protocol};
 
-/// Bauds of Modbus RTU tried by default: the factory settings of the drives of the built-in profiles, and those often chosen.
-const USUAL_BAUDS: [u32; 5] = [9600, 19_200, 38_400, 115_200, 57_600];
 /// The settings of Modbus RTU that drives most often have as delivered, the likeliest first; the other usual ones follow.
 const LIKELY: [(u32, &str); 7] = [
     (9600, "8N1"),
@@ -29,8 +28,6 @@ const ASCII_BAUDS: [u32; 4] = [19_200, 9600, 4800, 2400];
 /// Baud rate assumed for a raw device server, which sets up its line itself: the highest usual one, because a reply
 /// later than the wire needs is accepted, and an earlier one is not.
 const ASSUMED_BAUD: u32 = 38_400;
-/// All baud rates of the built-in profiles, and the rates of faster devices.
-const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 /// Addresses that are tried first with all settings: most lines have a drive among them.
 const LIKELY_ADDRESSES: u8 = 10;
 /// Up to this number of addresses are tried in one pass.
@@ -221,14 +218,14 @@ pub(crate) fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
 
 fn bauds(protocol: Protocol, wanted: &[String], by_server: bool) -> Result<Vec<u32>, String> {
     if wanted.iter().any(|text| text == "all") {
-        return Ok(ALL_BAUDS.to_vec());
+        return Ok(searched_bauds().collect());
     }
     if wanted.is_empty() {
         return Ok(match protocol {
             Protocol::N2 => vec![9600],
             _ if by_server => vec![ASSUMED_BAUD],
             Protocol::ModbusAscii => ASCII_BAUDS.to_vec(),
-            Protocol::ModbusRtu => USUAL_BAUDS.to_vec(),
+            Protocol::ModbusRtu => usual_bauds().collect(),
         });
     }
     let one = |text: &String| {
@@ -306,10 +303,7 @@ mod tests {
         for (place, setting) in likely.iter().enumerate() {
             assert_eq!(usual[place + 1], format!("modbus-rtu {setting}"));
         }
-        for (baud, format) in USUAL_BAUDS
-            .iter()
-            .flat_map(|baud| ["8N1", "8E1", "8N2"].map(|format| (baud, format)))
-        {
+        for (baud, format) in usual_bauds().flat_map(|baud| ["8N1", "8E1", "8N2"].map(|format| (baud, format))) {
             let setting = format!("modbus-rtu {baud} {format}");
             assert_eq!(usual.iter().filter(|one| **one == setting).count(), 1, "{setting}");
         }

@@ -3,8 +3,9 @@
 use super::{FEW_OF_LINE, Rules, damaged_replies};
 use crate::diagnosis::counters::Contrast;
 use crate::diagnosis::failure_rates::{FEW, LASTING, share, sums};
-use crate::diagnosis::figures::{BAUDS, Sign};
+use crate::diagnosis::figures::Sign;
 use crate::diagnosis::{Cause, Certainty};
+use drivegate_proto::wire::BAUDS;
 
 /// Longest `response_timeout` that a verdict proposes, ms.
 const MOST_PROPOSED: u32 = 5000;
