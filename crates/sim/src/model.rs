@@ -1,7 +1,7 @@
 //! The interface of a simulated drive of any model, for line, board, autopilot and tests.
 
 use super::SimTime;
-use super::motor::{Load, Motor};
+use super::motor::{Feed, Load, Motor};
 use super::parameter_set::Writes;
 use super::random::Random;
 use drivegate_proto::{Exception, Reply, RequestPdu};
@@ -26,6 +26,26 @@ pub struct Command {
     pub reverse: bool,
     /// Speed reference in units of 0.01 % of the drive's 100 %, -10000..=10000.
     pub reference: i16,
+}
+
+impl Command {
+    /// Share of the drive's 100 %, at most 1, whatever the direction.
+    pub(super) fn share(self) -> f64 {
+        f64::from(self.reference.unsigned_abs()).min(10_000.0) / 10_000.0
+    }
+
+    /// Whether the motor turns counterclockwise: by the direction or a negative reference, but not by both.
+    pub(super) fn is_reverse(self) -> bool {
+        self.reverse != (self.reference < 0)
+    }
+
+    /// A frequency with the sign of the direction.
+    pub(super) fn directed(self, frequency: f64) -> f64 {
+        match self.is_reverse() {
+            true => -frequency,
+            false => frequency,
+        }
+    }
 }
 
 /// State of any drive as seen from outside.
@@ -78,6 +98,15 @@ impl Body {
     pub(super) fn turns_reverse(&self, target: f64) -> bool {
         let shaft = self.motor.shaft;
         shaft < 0.0 || (shaft == 0.0 && self.running && target < 0.0)
+    }
+
+    /// What feeds the motor of a healthy drive: its target while it runs, then the ramp down to standstill.
+    pub(super) fn feed(&self, target: f64) -> Feed {
+        match self.motor.fed && self.motor.output != 0.0 {
+            _ if self.running => Feed::To(target),
+            true => Feed::To(0.0),
+            false => Feed::Off,
+        }
     }
 
     /// A fault, with which the motor coasts.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::random::Random;
+use drivegate_proto::Exception;
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Parameter {
@@ -18,7 +19,7 @@ pub(crate) struct Parameter {
 
 /// Why a parameter was not written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refused {
+pub(crate) enum Refused {
     /// There is no parameter with this key.
     Unknown,
     /// The value is outside the parameter's range, or beyond a parameter that limits it.
@@ -43,7 +44,18 @@ pub(crate) struct ParameterSet {
     all: Vec<Parameter>,
     /// Pairs of keys: the first is never below the second.
     limits: Vec<(u16, u16)>,
+    /// Whether each write goes into the memory that keeps values without power.
+    kept_at_once: bool,
     writes: BTreeMap<u16, Writes>,
+}
+
+impl From<Refused> for Exception {
+    fn from(refused: Refused) -> Exception {
+        match refused {
+            Refused::Unknown => Exception::ADDRESS,
+            Refused::Value => Exception::VALUE,
+        }
+    }
 }
 
 impl ParameterSet {
@@ -59,6 +71,7 @@ impl ParameterSet {
         ParameterSet {
             all,
             limits: Vec::new(),
+            kept_at_once: false,
             writes: BTreeMap::new(),
         }
     }
@@ -66,6 +79,12 @@ impl ParameterSet {
     /// The first of each pair is never below the second.
     pub(crate) fn limited(mut self, limits: impl IntoIterator<Item = (u16, u16)>) -> ParameterSet {
         self.limits.extend(limits);
+        self
+    }
+
+    /// A set whose values are stored permanently with each write over the bus.
+    pub(crate) fn kept_at_once(mut self) -> ParameterSet {
+        self.kept_at_once = true;
         self
     }
 
@@ -124,6 +143,7 @@ impl ParameterSet {
         let writes = self.writes.entry(key).or_default();
         writes.taken += 1;
         writes.while_fed += u32::from(fed);
+        writes.stored_writes += u32::from(self.kept_at_once);
         Ok(())
     }
 

@@ -90,7 +90,7 @@ impl CxDrive {
         let mut parameters = Parameters::new(options.frequency_step);
         for &((group, number), value) in &options.parameters {
             if group <= 98 && (1..=99).contains(&number) {
-                let _ = parameters.set(parameters::address(group, number), value);
+                let _ = parameters.set.set(parameters::address(group, number), value);
             }
         }
         let ratings = parameters.ratings();
@@ -165,13 +165,7 @@ impl CxDrive {
 
     /// The frequency of a command in percent of the maximum frequency, Hz.
     fn frequency(&self, command: Command) -> f64 {
-        let share = f64::from(command.reference.unsigned_abs()).min(10_000.0) / 10_000.0;
-        let frequency = (share * self.ratings.maximum).max(self.parameters.minimum());
-        if command.reverse != (command.reference < 0) {
-            -frequency
-        } else {
-            frequency
-        }
+        command.directed((command.share() * self.ratings.maximum).max(self.parameters.minimum()))
     }
 
     /// Counts the outcome of a message to this drive.
@@ -208,12 +202,9 @@ impl Model for CxDrive {
     fn step(&mut self, _now: SimTime) {
         let (run, target) = self.held();
         self.body.running = self.body.latch.obeys(run);
-        let feed = if self.body.running {
-            Feed::To(target)
-        } else if self.body.latch.fault() == 0 && self.body.motor.fed && self.body.motor.output != 0.0 {
-            Feed::To(0.0)
-        } else {
-            Feed::Off
+        let feed = match self.body.latch.fault() {
+            0 => self.body.feed(target),
+            _ => Feed::Off,
         };
         let seconds = UPDATE_PERIOD.as_secs_f64();
         self.body.motor.step(seconds, feed, &self.ratings, &self.options.load);
@@ -288,11 +279,11 @@ impl Model for CxDrive {
     }
 
     fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
-        self.parameters.writes()
+        self.parameters.set.writes().clone()
     }
 
     fn fill_parameters(&mut self, random: &mut Random) {
-        self.parameters.fill(random);
+        self.parameters.set.fill(random, &[]);
         self.ratings = self.parameters.ratings();
     }
 

@@ -3,12 +3,8 @@
 //! The manual names only Par 0.1, 1.1, 1.2 and 3.2. The others, their ranges and defaults are plausible values of
 //! the drive's applications, so that there are parameters to read and the motor has nameplate data.
 
-use std::collections::BTreeMap;
-
 use super::super::motor::Ratings;
-pub(super) use super::super::parameter_set::Refused;
-use super::super::parameter_set::{ParameterSet, Writes};
-use super::super::random::Random;
+use super::super::parameter_set::ParameterSet;
 
 /// The address of a parameter, 1..=99 of group 0..=98: groups 1 to 98 by hundreds, group 0 at the end.
 pub(super) const fn address(group: u16, number: u16) -> u16 {
@@ -60,10 +56,10 @@ const TABLE: [(u16, u16, u16, u16, u16); 28] = [
 /// cos phi of the motor, which no parameter holds.
 const COS_PHI: f64 = 0.85;
 
-/// All parameters of one drive by address, which survive a power cycle.
+/// All parameters of one drive by address, which survive a power cycle; each write over the bus is stored permanently.
 #[derive(Debug, Clone)]
 pub(super) struct Parameters {
-    set: ParameterSet,
+    pub(super) set: ParameterSet,
     frequency_step: f64,
 }
 
@@ -81,42 +77,11 @@ impl Parameters {
             (key, counts(min), counts(max), counts(value))
         });
         Parameters {
-            set: ParameterSet::new(set).limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)]),
+            set: ParameterSet::new(set)
+                .limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)])
+                .kept_at_once(),
             frequency_step,
         }
-    }
-
-    pub(super) fn get(&self, address: u16) -> Option<u16> {
-        self.set.get(address)
-    }
-
-    /// Sets a parameter, not over the bus.
-    ///
-    /// # Errors
-    /// If there is no such parameter, or the value is outside its range or would put the minimum frequency above
-    /// the maximum. No value is set then.
-    pub(super) fn set(&mut self, address: u16, value: u16) -> Result<(), Refused> {
-        self.set.set(address, value)
-    }
-
-    /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
-    ///
-    /// # Errors
-    /// If the value is refused; see [`Parameters::set`].
-    pub(super) fn write(&mut self, address: u16, value: u16, fed: bool) -> Result<(), Refused> {
-        self.set.write(address, value, fed)?;
-        self.set.record_kept(address);
-        Ok(())
-    }
-
-    /// Writes received over the bus, by address.
-    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
-        self.set.writes().clone()
-    }
-
-    /// Gives all parameters random values.
-    pub(super) fn fill(&mut self, random: &mut Random) {
-        self.set.fill(random, &[]);
     }
 
     /// The minimum frequency parameter, Hz.
@@ -142,6 +107,7 @@ impl Parameters {
 
 #[cfg(test)]
 mod tests {
+    use super::super::super::parameter_set::Refused;
     use super::*;
 
     #[test]
@@ -156,10 +122,10 @@ mod tests {
             let mut parameters = Parameters::new(step);
             assert_eq!(parameters.ratings().maximum, 50.0);
             assert_eq!(
-                parameters.set(MINIMUM_FREQUENCY, (51.0 / step) as u16),
+                parameters.set.set(MINIMUM_FREQUENCY, (51.0 / step) as u16),
                 Err(Refused::Value)
             );
-            assert_eq!(parameters.set(MINIMUM_FREQUENCY, (10.0 / step) as u16), Ok(()));
+            assert_eq!(parameters.set.set(MINIMUM_FREQUENCY, (10.0 / step) as u16), Ok(()));
             assert!((parameters.minimum() - 10.0).abs() < 1e-9);
             assert!(parameters.set.iter().all(|p| p.min <= p.value && p.value <= p.max));
         }

@@ -2,7 +2,6 @@
 
 use super::super::SimTime;
 use super::super::model::{Model, bit, signed, unsigned};
-use super::parameters::Refused;
 use super::{AT_REFERENCE_BAND, CxDrive, CxOptions, OutOfRange};
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
@@ -95,7 +94,7 @@ impl CxDrive {
             (Table::Input, FAULT) => Some(self.body.latch.fault()),
             (Table::Input, _) => self.variable(item),
             (_, REFERENCE) => Some(self.reference),
-            _ => self.parameters.get(item),
+            _ => self.parameters.set.get(item),
         };
         value.ok_or(Exception::ADDRESS)
     }
@@ -149,11 +148,7 @@ impl CxDrive {
         if REFERENCES.contains(&item) {
             return Err(Exception::ADDRESS);
         }
-        let written = self.parameters.write(item, value, self.body.motor.fed);
-        written.map_err(|refused| match refused {
-            Refused::Unknown => Exception::ADDRESS,
-            Refused::Value => Exception::VALUE,
-        })?;
+        self.parameters.set.write(item, value, self.body.motor.fed)?;
         self.ratings = self.parameters.ratings();
         Ok(())
     }

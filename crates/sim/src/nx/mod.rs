@@ -22,11 +22,11 @@ pub use signals::StatusBits;
 
 use std::collections::BTreeMap;
 
-use self::parameters::{Parameters, Settings, StopFunction};
+use self::parameters::{Settings, StopFunction, parameters};
 use super::SimTime;
 use super::model::{AT_REFERENCE_BAND, Body, Model};
 use super::motor::Feed;
-use super::parameter_set::Writes;
+use super::parameter_set::{ParameterSet, Writes};
 use super::random::Random;
 use drivegate_proto::{Reply, RequestPdu};
 
@@ -129,7 +129,7 @@ pub struct NxState {
 #[derive(Debug, Clone)]
 pub struct NxDrive {
     options: NxOptions,
-    parameters: Parameters,
+    parameters: ParameterSet,
     settings: Settings,
     body: Body,
     /// Process data in as written, IDs 2001 to 2011.
@@ -154,12 +154,12 @@ pub struct NxDrive {
 impl NxDrive {
     /// A drive that is switched on at `now`, with the motor at rest.
     pub fn new(options: NxOptions, now: SimTime) -> NxDrive {
-        let mut parameters = Parameters::default();
+        let mut parameters = parameters();
         for &(id, value) in &options.parameters {
             let _ = parameters.set(id, value);
         }
         let mut drive = NxDrive {
-            settings: parameters.settings(),
+            settings: Settings::of(&parameters),
             body: Body::new(&options.load, now),
             parameters,
             options,
@@ -197,7 +197,7 @@ impl NxDrive {
     /// Gives control to the fieldbus, the panel or the terminals, as parameter ID 125 does.
     pub fn set_control_place(&mut self, place: ControlPlace) {
         let _ = self.parameters.set(parameters::CONTROL_PLACE, place.parameter());
-        self.settings = self.parameters.settings();
+        self.settings = Settings::of(&self.parameters);
     }
 
     /// Sets the commands from panel and terminals, which are obeyed while one of them is the control place.
@@ -297,11 +297,7 @@ impl NxDrive {
             (Unit::Percent, Base::Maximum) => (size.min(10_000.0) / 10_000.0 * maximum).max(minimum),
             (Unit::Hertz, _) => (size / 100.0).min(maximum).max(minimum),
         };
-        if command.reverse != (command.reference < 0) {
-            -frequency
-        } else {
-            frequency
-        }
+        command.directed(frequency)
     }
 
     /// The command in force.
@@ -396,18 +392,19 @@ impl Model for NxDrive {
     fn power_on(&mut self, now: SimTime) {
         let mut fresh = NxDrive::new(self.options.clone(), now);
         fresh.parameters = self.parameters.clone();
-        fresh.settings = fresh.parameters.settings();
+        fresh.settings = Settings::of(&fresh.parameters);
         fresh.refresh_output();
         *self = fresh;
     }
 
     fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
-        self.parameters.writes()
+        let writes = self.parameters.writes().iter();
+        writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
     }
 
     fn fill_parameters(&mut self, random: &mut Random) {
-        self.parameters.fill(random);
-        self.settings = self.parameters.settings();
+        self.parameters.fill(random, &[parameters::CONTROL_PLACE]);
+        self.settings = Settings::of(&self.parameters);
     }
 
     fn trip(&mut self, fault: u16) {

@@ -3,12 +3,8 @@
 //! The IDs are those of reference/drives.md 3.11 and 11.1. Ranges and defaults that no available manual states are
 //! plausible values of the All in One applications.
 
-use std::collections::BTreeMap;
-
 use super::super::motor::Ratings;
-pub use super::super::parameter_set::Refused;
-use super::super::parameter_set::{ParameterSet, Writes};
-use super::super::random::Random;
+use super::super::parameter_set::ParameterSet;
 use super::ControlPlace;
 
 /// ID of the minimum frequency, 0.01 Hz.
@@ -42,110 +38,37 @@ pub const OUT_SELECTION: u16 = 852;
 /// Items of process data out 1 to 8 by default (reference/drives.md 3.8): IDs 1 to 7, then the active fault.
 const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
 
-/// All parameters of one drive by ID, which survive a power cycle.
-#[derive(Debug, Clone)]
-pub struct Parameters(ParameterSet);
-
-impl Default for Parameters {
-    fn default() -> Self {
-        // Fields: ID, minimum, maximum, default.
-        let plain = [
-            (MINIMUM_FREQUENCY, 0, 32_000, 0),
-            (MAXIMUM_FREQUENCY, 100, 32_000, 5000),
-            (ACCELERATION_TIME, 1, 30_000, 30),
-            (DECELERATION_TIME, 1, 30_000, 30),
-            (105, 0, 32_000, 1000),
-            (106, 0, 32_000, 2000),
-            (107, 1, 4000, 44),
-            (108, 0, 3, 0),
-            (109, 0, 1, 0),
-            (NOMINAL_VOLTAGE, 180, 690, 400),
-            (NOMINAL_FREQUENCY, 800, 32_000, 5000),
-            (NOMINAL_SPEED, 24, 20_000, 1500),
-            (NOMINAL_CURRENT, 1, 60_000, 22),
-            (117, 0, 4, 3),
-            (COS_PHI, 30, 100, 85),
-            (CONTROL_PLACE, 1, 3, 3),
-            (505, 0, 1, 0),
-            (STOP_FUNCTION, 0, 1, 1),
-            (FIELDBUS_FAULT_RESPONSE, 0, 3, 0),
-            (SLOT_FAULT_RESPONSE, 0, 3, 0),
-            (850, 0, 320, 0),
-            (851, 0, 320, 0),
-        ];
-        let selectors = OUT_DEFAULTS
-            .iter()
-            .zip(OUT_SELECTION..)
-            .map(|(&item, id)| (id, 0, 1999, item));
-        let set = ParameterSet::new(plain.into_iter().chain(selectors));
-        Parameters(set.limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)]))
-    }
-}
-
-impl Parameters {
-    /// The value of a parameter.
-    pub fn get(&self, id: u16) -> Option<u16> {
-        self.0.get(id)
-    }
-
-    /// Sets a parameter, not over the bus.
-    ///
-    /// # Errors
-    /// If the ID is unknown, or the value is outside its range or would put the minimum frequency above the
-    /// maximum. No value is set then.
-    pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
-        self.0.set(id, value)
-    }
-
-    /// A write over the bus, which is stored permanently at once; `fed` means that the inverter feeds the motor.
-    ///
-    /// # Errors
-    /// If the value is refused; see [`Parameters::set`].
-    pub(super) fn write(&mut self, id: u16, value: u16, fed: bool) -> Result<(), Refused> {
-        self.0.write(id, value, fed)?;
-        self.0.record_kept(id);
-        Ok(())
-    }
-
-    /// Writes received over the bus, by PDU address.
-    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
-        let writes = self.0.writes().iter();
-        writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
-    }
-
-    /// Sets all parameters except the control place to random values.
-    pub(super) fn fill(&mut self, random: &mut Random) {
-        self.0.fill(random, &[CONTROL_PLACE]);
-    }
-
-    fn number(&self, id: u16) -> u16 {
-        self.0.number(id)
-    }
-
-    /// The parameters that the drive works with, in engineering units.
-    pub fn settings(&self) -> Settings {
-        let number = |id| f64::from(self.number(id));
-        Settings {
-            minimum: number(MINIMUM_FREQUENCY) / 100.0,
-            motor: Ratings {
-                maximum: number(MAXIMUM_FREQUENCY) / 100.0,
-                acceleration: number(ACCELERATION_TIME) / 10.0,
-                deceleration: number(DECELERATION_TIME) / 10.0,
-                voltage: number(NOMINAL_VOLTAGE),
-                frequency: number(NOMINAL_FREQUENCY) / 100.0,
-                speed: number(NOMINAL_SPEED),
-                current: number(NOMINAL_CURRENT) / 10.0,
-                cos_phi: number(COS_PHI) / 100.0,
-            },
-            place: ControlPlace::from_parameter(self.number(CONTROL_PLACE)),
-            stop: if self.number(STOP_FUNCTION) == 0 {
-                StopFunction::Coast
-            } else {
-                StopFunction::Ramp
-            },
-            fieldbus_fault: self.number(FIELDBUS_FAULT_RESPONSE),
-        }
-    }
+/// All parameters of one drive by ID, which survive a power cycle; each write over the bus is stored permanently.
+pub(super) fn parameters() -> ParameterSet {
+    // Fields: ID, minimum, maximum, default.
+    let plain = [
+        (MINIMUM_FREQUENCY, 0, 32_000, 0),
+        (MAXIMUM_FREQUENCY, 100, 32_000, 5000),
+        (ACCELERATION_TIME, 1, 30_000, 30),
+        (DECELERATION_TIME, 1, 30_000, 30),
+        (105, 0, 32_000, 1000),
+        (106, 0, 32_000, 2000),
+        (107, 1, 4000, 44),
+        (108, 0, 3, 0),
+        (109, 0, 1, 0),
+        (NOMINAL_VOLTAGE, 180, 690, 400),
+        (NOMINAL_FREQUENCY, 800, 32_000, 5000),
+        (NOMINAL_SPEED, 24, 20_000, 1500),
+        (NOMINAL_CURRENT, 1, 60_000, 22),
+        (117, 0, 4, 3),
+        (COS_PHI, 30, 100, 85),
+        (CONTROL_PLACE, 1, 3, 3),
+        (505, 0, 1, 0),
+        (STOP_FUNCTION, 0, 1, 1),
+        (FIELDBUS_FAULT_RESPONSE, 0, 3, 0),
+        (SLOT_FAULT_RESPONSE, 0, 3, 0),
+        (850, 0, 320, 0),
+        (851, 0, 320, 0),
+    ];
+    let selectors = OUT_DEFAULTS.iter().zip(OUT_SELECTION..);
+    let selectors = selectors.map(|(&item, id)| (id, 0, 1999, item));
+    let set = ParameterSet::new(plain.into_iter().chain(selectors));
+    set.limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)]).kept_at_once()
 }
 
 /// How the drive stops the motor.
@@ -172,15 +95,43 @@ pub struct Settings {
     pub fieldbus_fault: u16,
 }
 
+impl Settings {
+    /// The parameters of a drive in engineering units.
+    pub(super) fn of(parameters: &ParameterSet) -> Settings {
+        let number = |id| f64::from(parameters.number(id));
+        Settings {
+            minimum: number(MINIMUM_FREQUENCY) / 100.0,
+            motor: Ratings {
+                maximum: number(MAXIMUM_FREQUENCY) / 100.0,
+                acceleration: number(ACCELERATION_TIME) / 10.0,
+                deceleration: number(DECELERATION_TIME) / 10.0,
+                voltage: number(NOMINAL_VOLTAGE),
+                frequency: number(NOMINAL_FREQUENCY) / 100.0,
+                speed: number(NOMINAL_SPEED),
+                current: number(NOMINAL_CURRENT) / 10.0,
+                cos_phi: number(COS_PHI) / 100.0,
+            },
+            place: ControlPlace::from_parameter(parameters.number(CONTROL_PLACE)),
+            stop: if parameters.number(STOP_FUNCTION) == 0 {
+                StopFunction::Coast
+            } else {
+                StopFunction::Ramp
+            },
+            fieldbus_fault: parameters.number(FIELDBUS_FAULT_RESPONSE),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use super::super::super::parameter_set::Refused;
     use super::*;
 
     #[test]
     fn ranges_and_order() {
-        let mut p = Parameters::default();
+        let mut p = parameters();
         assert!(
-            p.0.iter().all(|p| p.min <= p.value && p.value <= p.max),
+            p.iter().all(|p| p.min <= p.value && p.value <= p.max),
             "defaults lie in their ranges"
         );
         assert_eq!(

@@ -1,7 +1,7 @@
 //! The registers of the simulated NX family: groups, limits, refusals (reference/drives.md 3.2, 3.3, 3.10).
 
 use super::super::model::{Model, signed, unsigned};
-use super::parameters::{self, Parameters, Refused};
+use super::parameters::{self, Settings};
 use super::{Base, Beyond, ControlPlace, NxDrive, NxOptions, PROCESS_DATA, Unit, Values, control_word};
 use crate::SimTime;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
@@ -152,12 +152,8 @@ impl NxDrive {
             self.trip(value);
             return Ok(());
         }
-        let written = self.parameters.write(id, value, self.body.motor.fed);
-        written.map_err(|refused| match refused {
-            Refused::Unknown => Exception::ADDRESS,
-            Refused::Value => Exception::VALUE,
-        })?;
-        self.settings = self.parameters.settings();
+        self.parameters.write(id, value, self.body.motor.fed)?;
+        self.settings = Settings::of(&self.parameters);
         Ok(())
     }
 
@@ -260,14 +256,10 @@ impl NxDrive {
         let head = [self.status(), self.general_status(), signed(self.actual_speed())];
         let items = (parameters::OUT_SELECTION..).take(PROCESS_DATA - head.len());
         let items: Vec<u16> = items
-            .map(|selector| self.item(selected(&self.parameters, selector)))
+            .map(|selector| self.item(self.parameters.number(selector)))
             .collect();
         for (register, value) in self.output.iter_mut().zip(head.into_iter().chain(items)) {
             *register = value;
         }
     }
-}
-
-fn selected(parameters: &Parameters, selector: u16) -> u16 {
-    parameters.get(selector).unwrap_or(0)
 }

@@ -223,12 +223,8 @@ impl Model for TecoDrive {
         self.take_over();
         let feed = if self.body.latch.fault() != 0 || self.baseblocked() {
             Feed::Off
-        } else if self.body.running {
-            Feed::To(self.target())
-        } else if self.body.motor.fed && self.body.motor.output != 0.0 {
-            Feed::To(0.0)
         } else {
-            Feed::Off
+            self.body.feed(self.target())
         };
         let seconds = UPDATE_PERIOD.as_secs_f64();
         self.body.motor.step(seconds, feed, &self.ratings, &self.options.load);
@@ -274,7 +270,7 @@ impl Model for TecoDrive {
     }
 
     fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
-        self.parameters.writes()
+        self.parameters.ram.writes().clone()
     }
 
     fn fill_parameters(&mut self, random: &mut Random) {
@@ -303,10 +299,9 @@ impl Model for TecoDrive {
     }
 
     fn command(&mut self, command: Command) {
-        let share = f64::from(command.reference.unsigned_abs()).min(10_000.0) / 10_000.0;
-        self.control.frequency = unsigned(share * self.ratings.maximum * 100.0);
+        self.control.frequency = unsigned(command.share() * self.ratings.maximum * 100.0);
         let rest = self.control.operation & !(operation::RUN | operation::REVERSE);
-        let reverse = command.reverse != (command.reference < 0);
+        let reverse = command.is_reverse();
         self.set_operation(
             rest | (u16::from(command.run) * operation::RUN) | (u16::from(reverse) * operation::REVERSE),
         );
@@ -324,7 +319,7 @@ impl Model for TecoDrive {
     /// Sn-08 in RAM: 1100, or 1111 for operator and terminals.
     fn set_remote(&mut self, on: bool) {
         let word = self.options.digits.register([true, true, !on, !on]);
-        let _ = self.parameters.set(parameters::SN_08, word);
+        let _ = self.parameters.ram.set(parameters::SN_08, word);
         self.take_over();
     }
 }

@@ -3,11 +3,8 @@
 //! Ranges are those of the N2 map (reference/drives.md 6.7), where it has them. Defaults that the manual does not
 //! state are plausible values for a small 440 V drive.
 
-use std::collections::BTreeMap;
-
 use super::super::motor::Ratings;
-pub(super) use super::super::parameter_set::Refused;
-use super::super::parameter_set::{Parameter, ParameterSet, Writes};
+use super::super::parameter_set::{Parameter, ParameterSet};
 use super::super::random::Random;
 use super::options::Digits;
 
@@ -93,7 +90,7 @@ pub(super) mod function {
 
 /// Parameters whose range or default is known or matters here: (register, minimum, maximum, default). All others
 /// accept any value and start at 0.
-const KNOWN: [(u16, u16, u16, u16); 52] = [
+const KNOWN: [(u16, u16, u16, u16); 44] = [
     (SN_15, 0, 15, function::STEP_1),
     (0x0110, 0, 15, function::STEP_2),
     (0x0111, 0, 15, function::JOG),
@@ -130,14 +127,6 @@ const KNOWN: [(u16, u16, u16, u16); 52] = [
     (CN_32, 0, 1800, 0),
     (CN_33, 0, 1800, 0),
     (0x0223, 0, 10, 0),
-    (AN_01, 0, 18_000, 0),
-    (0x0401, 0, 18_000, 0),
-    (0x0402, 0, 18_000, 0),
-    (0x0403, 0, 18_000, 0),
-    (0x0404, 0, 18_000, 0),
-    (0x0405, 0, 18_000, 0),
-    (0x0406, 0, 18_000, 0),
-    (0x0407, 0, 18_000, 0),
     (AN_09, 0, 18_000, 600),
     (BN_01, 0, 60_000, 30),
     (BN_02, 0, 60_000, 30),
@@ -181,7 +170,7 @@ pub(super) fn place(register: u16) -> Option<RegisterKind> {
 /// The parameters in RAM and EEPROM.
 #[derive(Debug, Clone)]
 pub(super) struct Parameters {
-    ram: ParameterSet,
+    pub(super) ram: ParameterSet,
     eeprom: ParameterSet,
 }
 
@@ -197,8 +186,14 @@ impl Parameters {
             .flat_map(|group| group.first..=group.last)
             .filter(|register| place(*register).is_some_and(|place| !place.reserved))
             .map(|register| (register, 0, u16::MAX, 0));
+        let frequencies = (AN_01..AN_09).map(|register| (register, 0, 18_000, 0));
         // If several registers are equal, the first one is used.
-        let all = coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others);
+        let all = coded
+            .into_iter()
+            .chain(KNOWN)
+            .chain(frequencies)
+            .chain([BN_16])
+            .chain(others);
         let mut ram = ParameterSet::new(all).limited(LIMITS);
         for &(register, value) in set {
             let _ = ram.set(register, value);
@@ -217,20 +212,6 @@ impl Parameters {
     /// A parameter stored in tenths, as a number.
     pub(super) fn tenths(&self, register: u16) -> f64 {
         f64::from(self.number(register)) / 10.0
-    }
-
-    pub(super) fn check(&self, register: u16, value: u16) -> Result<(), Refused> {
-        self.ram.check(register, value)
-    }
-
-    /// Sets a value in RAM, not over the bus.
-    pub(super) fn set(&mut self, register: u16, value: u16) -> Result<(), Refused> {
-        self.ram.set(register, value)
-    }
-
-    /// A write over the bus to RAM; `fed` whether the inverter feeds the motor.
-    pub(super) fn write(&mut self, register: u16, value: u16, fed: bool) -> Result<(), Refused> {
-        self.ram.write(register, value, fed)
     }
 
     /// Copies RAM to EEPROM, except On-20 to On-24.
@@ -258,11 +239,6 @@ impl Parameters {
     /// Simulates a power cycle: RAM takes the values of the EEPROM.
     pub(super) fn reload(&mut self) {
         self.ram.take_values(&self.eeprom);
-    }
-
-    /// Writes received over the bus, by register.
-    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
-        self.ram.writes().clone()
     }
 
     /// Random values for all, but that the source of commands stays; in EEPROM, too.

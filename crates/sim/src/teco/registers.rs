@@ -184,7 +184,7 @@ impl TecoDrive {
             Register::Control => address != 0x0002 || value <= MOST_FREQUENCY,
             Register::Parameter(place) => {
                 place.reserved
-                    || (!self.options.locked.contains(&address) && self.parameters.check(address, value).is_ok())
+                    || (!self.options.locked.contains(&address) && self.parameters.ram.check(address, value).is_ok())
             }
             Register::Monitor | Register::Save | Register::Trip => true,
         }
@@ -198,7 +198,7 @@ impl TecoDrive {
             (Register::Control, 0x000A) => self.control.analogue[0] = value,
             (Register::Control, 0x000B) => self.control.analogue[1] = value,
             (Register::Parameter(_), _) => {
-                let _ = self.parameters.write(address, value, self.body.motor.fed);
+                let _ = self.parameters.ram.write(address, value, self.body.motor.fed);
                 self.ratings = self.parameters.ratings();
             }
             (Register::Save, _) => self.parameters.save(),
