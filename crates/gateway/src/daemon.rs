@@ -23,6 +23,7 @@ use self::leases::RemovedDrives;
 pub use self::pulse::BusHeartbeats;
 use self::reservations::ReservationsFile;
 use self::server::{ServerSlot, within};
+use self::servers::PreparedServers;
 use crate::config::{BusSettings, Settings};
 use drivegate_bus::line_state::Learned;
 use drivegate_bus::master::Handover;
@@ -180,15 +181,9 @@ impl Daemon {
         daemon.apply_audit(&settings).await;
         // MQTT starts after the buses; subscribing now lets its first messages include their events.
         daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
-        // The guards must be applied before the first start is counted.
-        daemon.apply_guards(&settings).await;
-        let prepared = daemon.prepare_buses(&settings)?;
+        let buses = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
-        daemon.apply_params(&settings);
-        daemon.hold_unfinished(&settings).await;
-        daemon.replace_buses(&settings, prepared).await;
-        daemon.apply_reservations(&settings);
-        daemon.apply_drills(&settings).await;
+        daemon.apply(&settings, buses, PreparedServers::default()).await;
         reservations::restore(&daemon.reservations, &daemon.north.patience, &daemon.plant.load_full()).await;
         daemon.apply_mqtt(&settings).await?;
         daemon.discard_kept_slots(&settings).await;
@@ -238,23 +233,13 @@ impl Daemon {
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
         // All steps that can fail come before any running part is stopped or changed.
-        let prepared = self.prepare_buses(&settings)?;
+        let buses = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
         if let Err(error) = self.apply_recorder(&settings).await {
             self.abort_servers(servers).await;
             return Err(error);
         }
-        // The guards must be applied before the first start is counted.
-        self.apply_guards(&settings).await;
-        self.apply_params(&settings);
-        self.hold_unfinished(&settings).await;
-        self.end_rights(&settings);
-        self.commit_servers(servers).await;
-        self.end_drill_of_changed_bus(&settings).await;
-        self.replace_buses(&settings, prepared).await;
-        self.void_slots();
-        self.apply_reservations(&settings);
-        self.apply_drills(&settings).await;
+        self.apply(&settings, buses, servers).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
@@ -262,6 +247,22 @@ impl Daemon {
         let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
         Ok(changes)
+    }
+
+    /// The steps in the middle of a start and of a reload, none of which can fail. A start has no servers yet, which report
+    /// readiness.
+    async fn apply(&mut self, settings: &Settings, buses: Vec<(BusSettings, BusTask)>, servers: PreparedServers) {
+        // The guards must be applied before the first start is counted.
+        self.apply_guards(settings).await;
+        self.apply_params(settings);
+        self.hold_unfinished(settings).await;
+        self.end_rights(settings);
+        self.commit_servers(servers).await;
+        self.end_drill_of_changed_bus(settings).await;
+        self.replace_buses(settings, buses).await;
+        self.void_slots();
+        self.apply_reservations(settings);
+        self.apply_drills(settings).await;
     }
 
     /// Prepares the buses that are new or changed.
