@@ -3,6 +3,7 @@
 //! Metrics are added, never renamed or removed. Every drive is read once per scrape, so its series are consistent.
 //! A point that is not good has no series, so that a graph shows a gap instead of an old value.
 
+mod drive;
 mod families;
 mod model;
 mod process;

@@ -1,13 +1,22 @@
 //! Metrics of the common drive model.
 
+use super::drive::Look;
+use super::series::{Row, rows};
 use drivegate_model::drive::ModelPoint;
 
+/// Gauges of the common model: point, metric, help.
 macro_rules! gauges {
-    ($($point:ident $metric:literal $help:literal)*) => { [$((ModelPoint::$point, $metric, $help)),*] };
+    ($($point:ident $metric:literal $help:literal)*) => {
+        /// Points of the model that have a metric of their own.
+        pub(super) const MODEL: &[ModelPoint] = &[$(ModelPoint::$point),*];
+
+        pub(super) fn families<'a>() -> Vec<Row<Look<'a>>> {
+            rows! { Look<'a>; $(Gauge $metric $help => |look, series| series.add_some(look.model(ModelPoint::$point));)* }
+        }
+    };
 }
 
-/// Gauges of the common model: point, metric, help.
-pub(super) const MODEL: [(ModelPoint, &str, &str); 19] = gauges! {
+gauges! {
     Ready "drivegate_drive_ready" "Whether the drive is ready to run."
     Running "drivegate_drive_running" "Whether the drive runs."
     Reversed "drivegate_drive_reversed" "Whether the drive turns in reverse."
@@ -28,7 +37,7 @@ pub(super) const MODEL: [(ModelPoint, &str, &str); 19] = gauges! {
     Energy "drivegate_drive_energy_kilowatthours" "Energy counter of the drive."
     OperatingHours "drivegate_drive_operating_hours" "Operating hours of the drive."
     FaultCode "drivegate_drive_fault_code" "Active fault code of the drive family, 0 without a fault."
-};
+}
 
 #[cfg(test)]
 mod tests {
@@ -47,7 +56,7 @@ mod tests {
     #[test]
     fn every_model_point_has_a_metric_or_an_exception() {
         for point in ModelPoint::ALL {
-            let own = MODEL.iter().filter(|(p, ..)| p == point).count();
+            let own = MODEL.iter().filter(|own| *own == point).count();
             assert_eq!(own, usize::from(!WITHOUT.contains(point)), "{}", point.name());
         }
     }

@@ -108,43 +108,90 @@ pub(super) struct Family {
     pub(super) kind: Kind,
 }
 
-/// Index of a metric family.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct FamilyId(usize);
+/// A family, and the series that a `T` has in it.
+#[derive(Debug)]
+pub(super) struct Row<T> {
+    pub(super) family: Family,
+    pub(super) series: fn(&T, &mut Series<'_>),
+}
 
-/// All series of a scrape in one list: a separate list for each family would fragment the heap with every scrape.
+/// Writes the rows of a table: the `T`, then kind, name and help of each family, and a closure that adds the series.
+macro_rules! rows {
+    ($of:ty; $($kind:ident $name:literal $help:literal => $series:expr;)*) => {{
+        use $crate::metrics::series::{Family, Kind, Row};
+        let rows: Vec<Row<$of>> = vec![$(Row::<$of> {
+            family: Family { name: $name, help: $help, kind: Kind::$kind },
+            series: $series,
+        }),*];
+        rows
+    }};
+}
+pub(super) use rows;
+
+/// The series of one family and one `T` of its [`Row`], whose labels they have.
+#[derive(Debug)]
+pub(super) struct Series<'a> {
+    all: &'a mut Vec<(usize, Labels, SeriesValue)>,
+    family: usize,
+    labels: &'a Labels,
+}
+
+impl Series<'_> {
+    pub(super) fn add(&mut self, figure: impl Into<SeriesValue>) {
+        self.labelled(self.labels.clone(), figure);
+    }
+
+    /// No series if the figure is absent.
+    pub(super) fn add_some(&mut self, figure: Option<impl Into<SeriesValue>>) {
+        if let Some(figure) = figure {
+            self.add(figure);
+        }
+    }
+
+    /// A series with one more label.
+    pub(super) fn with(
+        &mut self,
+        name: &'static str,
+        value: impl Into<Cow<'static, str>>,
+        figure: impl Into<SeriesValue>,
+    ) {
+        self.labelled(self.labels.with(name, value), figure);
+    }
+
+    /// A series with two more labels.
+    pub(super) fn with_both(&mut self, first: Label, second: Label, figure: impl Into<SeriesValue>) {
+        self.labelled(self.labels.with_both(first, second), figure);
+    }
+
+    /// A series with labels of its own.
+    pub(super) fn labelled(&mut self, labels: Labels, figure: impl Into<SeriesValue>) {
+        self.all.push((self.family, labels, figure.into()));
+    }
+}
+
+/// All series of a scrape in one list, each with the index of its family: a separate list for each family would fragment the
+/// heap with every scrape.
 #[derive(Debug, Default)]
 pub(super) struct Families {
     families: Vec<Family>,
-    series: Vec<(FamilyId, Labels, SeriesValue)>,
+    series: Vec<(usize, Labels, SeriesValue)>,
 }
 
 impl Families {
-    pub(super) fn gauge(&mut self, name: &'static str, help: &'static str) -> FamilyId {
-        self.family(Kind::Gauge, name, help)
-    }
-
-    pub(super) fn counter(&mut self, name: &'static str, help: &'static str) -> FamilyId {
-        self.family(Kind::Counter, name, help)
-    }
-
-    pub(super) fn histogram(&mut self, name: &'static str, help: &'static str) -> FamilyId {
-        self.family(Kind::Histogram, name, help)
-    }
-
-    fn family(&mut self, kind: Kind, name: &'static str, help: &'static str) -> FamilyId {
-        self.families.push(Family { name, help, kind });
-        FamilyId(self.families.len() - 1)
-    }
-
-    pub(super) fn add(&mut self, family: FamilyId, labels: Labels, figure: impl Into<SeriesValue>) {
-        self.series.push((family, labels, figure.into()));
-    }
-
-    /// A family of one series without labels.
-    pub(super) fn one(&mut self, kind: Kind, name: &'static str, help: &'static str, figure: impl Into<SeriesValue>) {
-        let family = self.family(kind, name, help);
-        self.add(family, Labels::default(), figure);
+    /// Adds the families of a table, with the series of these things.
+    pub(super) fn fill<T>(&mut self, table: &[Row<T>], things: impl IntoIterator<Item = (Labels, T)>) {
+        let first = self.families.len();
+        self.families.extend(table.iter().map(|row| row.family));
+        for (labels, thing) in things {
+            for (family, row) in (first..).zip(table) {
+                let mut series = Series {
+                    all: &mut self.series,
+                    family,
+                    labels: &labels,
+                };
+                (row.series)(&thing, &mut series);
+            }
+        }
     }
 
     /// Brings together the series of each family without changing their order.
@@ -153,8 +200,8 @@ impl Families {
     }
 
     /// The families that have series, with these.
-    pub(super) fn iter(&self) -> impl Iterator<Item = (&Family, &[(FamilyId, Labels, SeriesValue)])> {
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&Family, &[(usize, Labels, SeriesValue)])> {
         let chunks = self.series.chunk_by(|a, b| a.0 == b.0);
-        chunks.filter_map(|series| Some((self.families.get(series.first()?.0.0)?, series)))
+        chunks.filter_map(|series| Some((self.families.get(series.first()?.0)?, series)))
     }
 }
