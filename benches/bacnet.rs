@@ -32,15 +32,8 @@ fn measure() -> Result<(), Box<dyn Error>> {
     let changes: u64 = option("--changes", 200)?;
     let baud: u32 = option("--baud", 38_400)?;
     let line = line(baud, DRIVES)?;
-    let bus = Bus {
-        name: "line",
-        port: &line.address(),
-        baud,
-        drives: DRIVES,
-        profile: "vacon-nx",
-        keys: "",
-        drive_keys: "access = \"control\"",
-    };
+    let address = line.address();
+    let bus = Bus::commanded(&address, baud, DRIVES, "");
     let port = UdpSocket::bind("127.0.0.1:0")?.local_addr()?.port();
     let bacnet = format!("[bacnet]\nlisten = \"127.0.0.1:{port}\"\n");
     let gateway = Gateway::start(settings(&format!("{bacnet}{}", bus.toml()))?)?;

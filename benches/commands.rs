@@ -29,15 +29,8 @@ fn measure() -> Result<(), Box<dyn Error>> {
     let commands: u16 = option("--commands", 300)?;
     let baud: u32 = option("--baud", 38_400)?;
     let line = line(baud, DRIVES)?;
-    let bus = Bus {
-        name: "line",
-        port: &line.address(),
-        baud,
-        drives: DRIVES,
-        profile: "vacon-nx",
-        keys: "cycle = \"10ms\"",
-        drive_keys: "access = \"control\"",
-    };
+    let port = line.address();
+    let bus = Bus::commanded(&port, baud, DRIVES, "cycle = \"10ms\"");
     let gateway = Gateway::start(settings(&bus.toml())?)?;
     let (plant, image) = (&gateway.plant, gateway.bus()?);
     gateway.runtime.block_on(async {

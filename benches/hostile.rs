@@ -46,15 +46,8 @@ struct North {
 fn measure() -> Result<(), Box<dyn Error>> {
     let time = Duration::from_secs_f64(option("--seconds", 8.0)?);
     let line = line(115_200, DRIVES)?;
-    let bus = Bus {
-        name: "line",
-        port: &line.address(),
-        baud: 115_200,
-        drives: DRIVES,
-        profile: "vacon-nx",
-        keys: "cycle = \"100ms\"",
-        drive_keys: "access = \"control\"",
-    };
+    let port = line.address();
+    let bus = Bus::commanded(&port, 115_200, DRIVES, "cycle = \"100ms\"");
     let rights = "[modbus_tcp]\nwrite = [\"127.0.0.2/32\"]\n";
     let gateway = Gateway::start(settings(&(bus.toml() + &NORTH.replace("[modbus_tcp]\n", rights)))?)?;
     let modbus = *gateway.daemon.modbus_tcp_addresses().first().ok_or("no Modbus TCP")?;

@@ -35,7 +35,20 @@ pub struct Bus<'a> {
     pub drive_keys: &'a str,
 }
 
-impl Bus<'_> {
+impl<'a> Bus<'a> {
+    /// Vacon NX drives that may be commanded, behind `port`.
+    pub fn commanded(port: &'a str, baud: u32, drives: u8, keys: &'a str) -> Bus<'a> {
+        Bus {
+            name: "line",
+            port,
+            baud,
+            drives,
+            profile: "vacon-nx",
+            keys,
+            drive_keys: "access = \"control\"",
+        }
+    }
+
     pub fn toml(&self) -> String {
         let (name, keys, profile) = (self.name, self.drive_keys, self.profile);
         let drive =
