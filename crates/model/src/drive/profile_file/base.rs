@@ -3,40 +3,13 @@
 //! The trees of a file and its base are merged before anything is read, so that every check sees the whole profile.
 //! Problems of parts from the base name the base instead of a line.
 
+use super::place;
 use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 
 /// Keys that belong to a derived point.
 const DERIVATION: [&str; 7] = ["derive", "of", "to", "within", "minimum", "maximum", "weights"];
-/// Keys of a point that is read from registers.
-const PLACE: [&str; 14] = [
-    "at",
-    "type",
-    "byte",
-    "words",
-    "order",
-    "invert",
-    "scale",
-    "offset",
-    "class",
-    "mask",
-    "equals",
-    "invalid",
-    "scale_from",
-    "factor_from",
-];
-/// Keys of a register that a bit does not have.
-const REGISTER: [&str; 10] = [
-    "type",
-    "byte",
-    "words",
-    "order",
-    "scale",
-    "offset",
-    "mask",
-    "equals",
-    "scale_from",
-    "factor_from",
-];
+/// Keys of a value that a bit has, too.
+const OF_BITS: [&str; 2] = ["invert", "invalid"];
 
 /// Name and base of a file that is not read yet.
 pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {
@@ -229,12 +202,14 @@ fn merge_point(point: &mut Node, own: Vec<Entry>) {
             })
     };
     if text("derive").is_some() {
-        into.retain(|(key, ..)| !PLACE.contains(&key.as_str()) && !DERIVATION.contains(&key.as_str()));
+        let is_read = |key: &str| matches!(key, "at" | "class") || place::KEYS.contains(&key);
+        into.retain(|(key, ..)| !is_read(key) && !DERIVATION.contains(&key.as_str()));
     }
     if let Some(at) = text("at") {
         into.retain(|(key, ..)| !DERIVATION.contains(&key.as_str()));
         if at.contains('.') || at.starts_with("coil") || at.starts_with("discrete") {
-            into.retain(|(key, ..)| !REGISTER.contains(&key.as_str()));
+            let of_registers = |key: &str| place::KEYS.contains(&key) && !OF_BITS.contains(&key);
+            into.retain(|(key, ..)| !of_registers(key));
         }
     }
     merge_keys(into, own);

@@ -9,7 +9,7 @@ use crate::document::{Finding, Reader};
 use drivegate_proto::Table;
 
 /// Keys of a point that has `at`.
-const KEYS: [&str; 12] = [
+pub(super) const KEYS: [&str; 12] = [
     "type",
     "byte",
     "words",
