@@ -20,7 +20,6 @@ struct Plant {
     site: Site,
     line: SimulatedBus,
     gateway: Running,
-    reloads: usize,
 }
 
 impl Plant {
@@ -33,27 +32,12 @@ impl Plant {
         for name in ["pump-1", "pump-2"] {
             site.until_state(name, "ready");
         }
-        Plant {
-            site,
-            line,
-            gateway,
-            reloads: 0,
-        }
+        Plant { site, line, gateway }
     }
 
-    fn reload(&mut self, drives: &str) {
+    fn reload(&self, drives: &str) {
         configure(&self.site, drives);
-        self.reload_file();
-    }
-
-    fn reload_file(&mut self) {
-        self.gateway.signal("HUP");
-        self.reloads += 1;
-        until("the reload", || {
-            let output = self.gateway.output();
-            assert!(!output.contains("reload rejected"), "{output}");
-            (output.matches("configuration reloaded").count() == self.reloads).then_some(())
-        });
+        self.gateway.reload();
     }
 
     /// The control words that the drive at that address was sent.
@@ -128,7 +112,7 @@ fn begin_over_http(site: &Site, drive: &str, body: &str) -> UnixStream {
 /// The head of an order arrives, a reload gives its name to the other machine, and the rest arrives.
 #[test]
 fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
-    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let plant = Plant::new(&pair("pump-1", "pump-2"));
     let mut names = [pair("pump-2", "pump-1"), pair("pump-1", "pump-2")].into_iter().cycle();
     let stop = "{\"run\": false}";
     for body in ["{\"run\": true}", "{\"reverse\": true}", "{\"speed_reference\": 20}"] {
@@ -180,7 +164,7 @@ fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
 /// A controller keeps run and reset bit set at a unit id; a reload puts another drive there.
 #[test]
 fn a_bit_that_a_controller_holds_is_no_edge_at_another_machine() {
-    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let plant = Plant::new(&pair("pump-1", "pump-2"));
     let mut plc = plant.modbus();
     assert_eq!(write(&mut plc, 12, 1)[7], 6);
     assert_eq!(write(&mut plc, 11, 5)[7], 6);
@@ -220,7 +204,7 @@ fn a_stop_that_waits_is_sent_before_its_machine_is_given_up() {
         ("on a line of another master", listening, true),
     ];
     for (what, after, listens) in table {
-        let mut plant = Plant::new(&both);
+        let plant = Plant::new(&both);
         let mut plc = plant.modbus();
         assert_eq!(write(&mut plc, 11, 1)[7], 6, "{what}");
         plant.site.until_state("pump-1", "running");
@@ -233,7 +217,7 @@ fn a_stop_that_waits_is_sent_before_its_machine_is_given_up() {
         if listens {
             plant.site.change("[[bus]]\n", "[[bus]]\nmode = \"listen\"\n");
         }
-        plant.reload_file();
+        plant.gateway.reload();
         assert!(!plant.runs(1), "{what}");
         assert_eq!(reply(&mut plc)[7], 6, "{what}: its client is told so");
     }

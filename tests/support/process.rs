@@ -80,6 +80,18 @@ impl Running {
         );
     }
 
+    /// Reloads the configuration and waits until the gateway runs with it.
+    pub(crate) fn reload(&self) {
+        let done = || self.output().matches("configuration reloaded").count();
+        let before = done();
+        self.signal("HUP");
+        until("the reload", || {
+            let output = self.output();
+            assert!(!output.contains("reload rejected"), "{output}");
+            (done() > before).then_some(())
+        });
+    }
+
     /// Stops all threads of the process (SIGSTOP); on a busy machine that takes a moment.
     pub(crate) fn stand(&self) {
         self.signal("STOP");
