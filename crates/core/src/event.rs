@@ -1,20 +1,24 @@
 //! Events: state changes, each published once.
 
 mod fair_ring;
+mod kind;
 mod log;
 mod refusals;
+#[cfg(test)]
+mod tests;
 
 use std::borrow::Cow;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Instant, SystemTime};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use tokio::sync::broadcast;
 
 use crate::stalls::{Pauses, Stall};
 
 pub use fair_ring::{FairRing, in_order};
+pub use kind::EventKind;
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
@@ -30,194 +34,6 @@ const OF_EACH_DRIVE: usize = 16;
 const KEPT: usize = 4096;
 /// Refused commands kept in addition.
 const REFUSALS_KEPT: usize = 512;
-
-/// The kind of an event.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum EventKind {
-    /// A drive replies (again).
-    Online,
-    /// A drive no longer replies.
-    Offline,
-    /// A fault appeared, or its code changed.
-    Fault,
-    /// The fault cleared.
-    FaultEnd,
-    /// A motor started.
-    Started,
-    /// A motor stopped.
-    Stopped,
-    /// A warning appeared.
-    Warning,
-    /// The warning cleared.
-    WarningEnd,
-    /// A drive came under control from the fieldbus, or left it.
-    ControlPlace,
-    /// A drive has restarted.
-    Restarted,
-    /// A drive reports a different device type than its profile expects.
-    UnlikeProfile,
-    /// Process data does not match the profile: a selector in the drive was changed.
-    SelectionDiffers,
-    /// A lease expired, and its action begins.
-    Supervision,
-    /// The action of a lease, or the stop of a shutdown, failed.
-    SupervisionFailed,
-    /// A controlled drive has neither a lease nor a response of its own to a silent master.
-    Unsupervised,
-    /// A command was refused.
-    RefusedCommand,
-    /// An acknowledged command showed no effect in time.
-    NotConfirmed,
-    /// The port of a bus was opened.
-    BusUp,
-    /// The port of a bus was lost or cannot be opened.
-    BusDown,
-    /// A recording was made, or lost.
-    Recording,
-    /// A new configuration was not applied; the previous one stays.
-    ReloadRefused,
-    /// The other master of a line commands a drive.
-    ForeignCommand,
-    /// Parameters changed that the gateway did not write.
-    ParametersChanged,
-    /// A restore of parameters was interrupted, or its journal belongs to no drive that is configured.
-    RestoreUnfinished,
-    /// A verdict about a line appeared, became more certain, or cleared.
-    Diagnosis,
-    /// A start was refused as too frequent or too early.
-    Guarded,
-    /// A start was refused, or a motor stopped, since an interlock does not hold.
-    Interlock,
-    /// A client took hold of a drive.
-    Held,
-    /// The hold of a client ended.
-    Released,
-    /// A client took a drive from its holder.
-    HoldBroken,
-    /// A drill has ended.
-    Drill,
-    /// The process, or one of its threads, did not run for longer than a second.
-    Paused,
-    /// A BACnet client lost its right to write, and with it the values that it had in a slot.
-    SlotVoid,
-}
-
-impl EventKind {
-    pub const ALL: [EventKind; 33] = [
-        EventKind::Online,
-        EventKind::Offline,
-        EventKind::Fault,
-        EventKind::FaultEnd,
-        EventKind::Started,
-        EventKind::Stopped,
-        EventKind::Warning,
-        EventKind::WarningEnd,
-        EventKind::ControlPlace,
-        EventKind::Restarted,
-        EventKind::UnlikeProfile,
-        EventKind::SelectionDiffers,
-        EventKind::Supervision,
-        EventKind::SupervisionFailed,
-        EventKind::Unsupervised,
-        EventKind::RefusedCommand,
-        EventKind::NotConfirmed,
-        EventKind::BusUp,
-        EventKind::BusDown,
-        EventKind::Recording,
-        EventKind::ReloadRefused,
-        EventKind::ForeignCommand,
-        EventKind::ParametersChanged,
-        EventKind::RestoreUnfinished,
-        EventKind::Diagnosis,
-        EventKind::Guarded,
-        EventKind::Interlock,
-        EventKind::Held,
-        EventKind::Released,
-        EventKind::HoldBroken,
-        EventKind::Drill,
-        EventKind::Paused,
-        EventKind::SlotVoid,
-    ];
-
-    /// Whether the event needs attention: the log has it as a warning.
-    pub(crate) fn is_trouble(self) -> bool {
-        match self {
-            EventKind::Offline
-            | EventKind::Fault
-            | EventKind::Warning
-            | EventKind::UnlikeProfile
-            | EventKind::SelectionDiffers
-            | EventKind::Supervision
-            | EventKind::SupervisionFailed
-            | EventKind::Unsupervised
-            | EventKind::NotConfirmed
-            | EventKind::BusDown
-            | EventKind::Diagnosis
-            | EventKind::RestoreUnfinished
-            | EventKind::Interlock
-            | EventKind::Paused
-            | EventKind::SlotVoid
-            | EventKind::ReloadRefused => true,
-            EventKind::Online
-            | EventKind::FaultEnd
-            | EventKind::Started
-            | EventKind::Stopped
-            | EventKind::WarningEnd
-            | EventKind::ControlPlace
-            | EventKind::Restarted
-            | EventKind::RefusedCommand
-            | EventKind::BusUp
-            | EventKind::Recording
-            | EventKind::ForeignCommand
-            | EventKind::Guarded
-            | EventKind::Held
-            | EventKind::Released
-            | EventKind::HoldBroken
-            | EventKind::Drill
-            | EventKind::ParametersChanged => false,
-        }
-    }
-
-    /// The name in payloads.
-    pub fn name(self) -> &'static str {
-        match self {
-            EventKind::Online => "online",
-            EventKind::Offline => "offline",
-            EventKind::Fault => "fault",
-            EventKind::FaultEnd => "fault_end",
-            EventKind::Started => "started",
-            EventKind::Stopped => "stopped",
-            EventKind::Warning => "warning",
-            EventKind::WarningEnd => "warning_end",
-            EventKind::ControlPlace => "control_place",
-            EventKind::Restarted => "restarted",
-            EventKind::UnlikeProfile => "unlike_profile",
-            EventKind::SelectionDiffers => "selection_differs",
-            EventKind::Supervision => "supervision",
-            EventKind::SupervisionFailed => "supervision_failed",
-            EventKind::Unsupervised => "unsupervised",
-            EventKind::RefusedCommand => "refused_command",
-            EventKind::NotConfirmed => "not_confirmed",
-            EventKind::BusUp => "bus_up",
-            EventKind::BusDown => "bus_down",
-            EventKind::Recording => "recording",
-            EventKind::ReloadRefused => "reload_refused",
-            EventKind::ForeignCommand => "foreign_command",
-            EventKind::ParametersChanged => "parameters_changed",
-            EventKind::RestoreUnfinished => "restore_unfinished",
-            EventKind::Diagnosis => "diagnosis",
-            EventKind::Guarded => "guarded",
-            EventKind::Interlock => "interlock",
-            EventKind::Held => "held",
-            EventKind::Released => "released",
-            EventKind::HoldBroken => "hold_broken",
-            EventKind::Drill => "drill",
-            EventKind::Paused => "paused",
-            EventKind::SlotVoid => "slot_void",
-        }
-    }
-}
 
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
@@ -521,94 +337,5 @@ impl Store {
     /// publishers do not wait.
     fn lines(&self) -> Vec<(u64, Arc<str>)> {
         in_order(&self.kept, &self.refused)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-
-    fn event(text: String) -> Event {
-        Event {
-            bus: "line1".to_string(),
-            ..Event::new(EventKind::Offline, SystemTime::UNIX_EPOCH, text)
-        }
-    }
-
-    /// A new kind does not compile until it is here, and then in `ALL`.
-    #[test]
-    fn all_kinds_are_listed() {
-        use EventKind::*;
-        for (place, kind) in EventKind::ALL.into_iter().enumerate() {
-            let last = match kind {
-                Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
-                | Restarted | UnlikeProfile | SelectionDiffers | Supervision | SupervisionFailed | Unsupervised
-                | RefusedCommand | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged | RestoreUnfinished | Diagnosis | Guarded | Interlock | Held | Released
-                | HoldBroken | Drill => false,
-                Paused => false,
-                SlotVoid => true,
-            };
-            assert_eq!(kind as usize, place);
-            assert_eq!(last, place + 1 == EventKind::ALL.len());
-        }
-    }
-
-    #[test]
-    fn a_burst_of_all_drives_reaches_who_is_busy_and_who_comes_late() {
-        for (drives, burst) in [(4, 4096), (300, 4800), (1_000_000, BURST)] {
-            let events = Events::of_drives(drives);
-            let mut busy = events.subscribe();
-            (0..burst).for_each(|n| events.publish(event(n.to_string())));
-            let heard = std::iter::from_fn(|| busy.try_recv().ok());
-            assert!(heard.map(|e| e.id).eq(1..=burst as u64), "{drives} drives");
-            let kept = events.recent();
-            assert_eq!(kept.len(), KEPT);
-            assert_eq!(kept.last().map(|e| e.id), Some(burst as u64));
-        }
-    }
-
-    #[test]
-    fn refusals_push_out_no_event_of_a_drive_and_a_drive_none_of_another() {
-        let (events, start) = (Events::default(), Instant::now());
-        let fault = |drive: &str, kind| Event {
-            kind,
-            drive: Some(drive.to_string()),
-            ..event("F1".to_string())
-        };
-        events.publish(fault("pump-1", EventKind::Fault));
-        let client = |n: u32| Arc::from(format!("modbus_tcp 10.0.0.{}", n % 64));
-        for n in 0..100_000 {
-            let refused = RefusedCommand {
-                client: &client(n),
-                reason: "not_allowed",
-                bus: "line1",
-                drive: "pump-1",
-                text: "refused".to_string(),
-            };
-            events.publish_refusal(refused, start + Duration::from_millis(n.into()));
-        }
-        events.publish_due(start + Duration::from_secs(200));
-        let refused: Vec<_> = events
-            .recent()
-            .into_iter()
-            .filter(|e| e.kind == EventKind::RefusedCommand)
-            .collect();
-        assert_eq!(refused.len(), REFUSALS_KEPT);
-        assert!(
-            refused
-                .last()
-                .unwrap()
-                .text
-                .contains("commands of this client were refused)")
-        );
-        (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Online)));
-        (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Fault)));
-        let kept = events.recent();
-        assert_eq!(kept.len(), KEPT + REFUSALS_KEPT);
-        assert_eq!((kept[0].id, kept[0].drive.as_deref()), (1, Some("pump-1")));
-        assert!(kept.is_sorted_by_key(|event| event.id));
     }
 }
