@@ -1,5 +1,9 @@
 //! Interprets the requests of one client and builds the replies.
 
+mod gateway_unit;
+mod model_registers;
+mod request;
+
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -15,19 +19,16 @@ use super::identify::Identity;
 use super::routes::{At, PlantView, Registers, Routes};
 use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
-use crate::command_json::{nothing_to_stop, refuse_stop_all};
 use crate::log_throttle::LogThrottle;
-use crate::register_map::{
-    self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, HEARTBEAT, HOLD, NOT_STANDING, STOP_ALL,
-};
-use drivegate_core::order::{self, Arrival, Authority, Order, Outcome, Refusal};
-use drivegate_core::permit::Verb;
-use drivegate_core::plant::{BusHandle, DriveHandle};
+use crate::register_map::{self, GATEWAY_UNIT, STOP_ALL};
+use drivegate_core::order::{Arrival, Authority, Order, Outcome};
+use drivegate_core::plant::DriveHandle;
 use drivegate_core::process_image::{Access, Unavailable};
-use drivegate_core::stop_all;
-use drivegate_model::drive::{ModelPoint, PointIndex, Profile, State, Value};
+use drivegate_model::drive::{ModelPoint, Value};
 use drivegate_proto::modbus::encode_exception;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
+
+use request::{answers, has_function, not_readable, read_limit, stop_in, stops_all_only, stops_by};
 
 /// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
@@ -385,65 +386,6 @@ impl ClientSession {
         self.client.rights.authority() == Authority::Write && drive.image.spec.access == Access::Control
     }
 
-    /// Unit 255: the input registers, which can also be read as holding registers, since many clients cannot read
-    /// input registers.
-    fn gateway(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
-        if WRITES.contains(&frame.function) {
-            return self.stop_all(frame, now);
-        }
-        let request = RequestPdu::decode(frame.pdu)?;
-        let plant = &self.routes.plant;
-        let reply = match request {
-            RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
-                if (start, count) != (NOT_STANDING, 1) {
-                    return Err(Exception::ADDRESS);
-                }
-                let drives = stop_all::not_standing(self.routes.drives(), now);
-                Reply::Registers(vec![u16::try_from(drives).unwrap_or(u16::MAX - 1)])
-            }
-            RequestPdu::Read { table, start, count } if !table.is_bits() => {
-                let bus = |place: usize| self.routes.bus(place).map(figures);
-                Reply::Registers(register_map::gateway(start, count, bus)?)
-            }
-            RequestPdu::DeviceIdentification { code, object } => {
-                let identity = Identity {
-                    product: "gateway",
-                    title: "drivegate",
-                    name: &plant.gateway,
-                };
-                identity.reply(code, object)?
-            }
-            _ => return Err(Exception::FUNCTION),
-        };
-        Ok(Decision::Reply(request, reply))
-    }
-
-    /// Handles a write to unit 255: 1 at the register that stops all drives that the listener serves. The drives are stopped
-    /// whatever else the write covers.
-    fn stop_all(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
-        if self.client.rights.authority() != Authority::Write {
-            return Err(Exception::FUNCTION);
-        }
-        let request = RequestPdu::decode(frame.pdu)?;
-        let written = order::written(&request).filter(|(table, _)| *table == Table::Holding);
-        let mut items = written.map(|(_, items)| items).unwrap_or_default().into_iter();
-        let (_, value) = items
-            .find(|(address, _)| *address == STOP_ALL)
-            .ok_or(Exception::FUNCTION)?;
-        if value != 1 {
-            return Err(Exception::VALUE);
-        }
-        let (plant, scope, origin) = (&self.routes.plant, self.routes.scope(), self.client.origin());
-        match self.routes.stop_all.order(plant, &scope, &origin, stop_all::WAIT, now) {
-            Ok(order) => Ok(Decision::StopAll(request, order.acknowledged)),
-            // The client has no right to write here.
-            Err(why) => {
-                refuse_stop_all(plant, nothing_to_stop(&why), &origin, now);
-                Err(Exception::FUNCTION)
-            }
-        }
-    }
-
     fn raw_read(&self, header: Header, drive: &DriveHandle, request: RequestPdu, now: Instant) -> Decision {
         let RequestPdu::Read { table, start, count } = request else {
             return Exception::FUNCTION.into();
@@ -473,105 +415,10 @@ impl ClientSession {
             }
         }
     }
-
-    /// Reads from the blocks from 0x8000 on.
-    fn common(&self, drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
-        common(drive, &self.client, start, count, now).map_or_else(Decision::from, |words| {
-            Decision::Reply(request, Reply::Registers(words))
-        })
-    }
-
-    /// A write of `value` to the register of the hold, also in one write with the heartbeat.
-    fn hold(&self, drive: &DriveHandle, request: RequestPdu, start: u16, value: u16, now: Instant) -> Decision {
-        let verb = match value {
-            0 => Verb::Release,
-            1 => Verb::Take,
-            2 => Verb::Break,
-            _ => return Exception::VALUE.into(),
-        };
-        let origin = self.client.origin();
-        match drive.hold(verb, &origin, self.client.rights.authority(), now) {
-            Ok(_) => {
-                if start == HEARTBEAT {
-                    drive.heartbeat(&origin, now);
-                }
-                Decision::Reply(request, Reply::Written)
-            }
-            Err(refusal) => refusal.exception().into(),
-        }
-    }
-
-    /// Calls `update` with the word last written at 0x8100 of this drive.
-    fn last_word<T>(&self, drive: &DriveHandle, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
-        let unit = drive.image.spec.unit;
-        self.state.command_words.update(unit, drive.machine(), update)
-    }
-
-    /// Executes a write to the blocks from 0x8000 on, by a client that may write to the drive.
-    fn command(
-        &self,
-        header: Header,
-        drive: &DriveHandle,
-        request: RequestPdu,
-        start: u16,
-        values: &[u16],
-        now: Instant,
-    ) -> Decision {
-        // The register of the hold may only be written alone: in any other write it is refused like a missing
-        // register, after a stop in the write was carried out.
-        match (start, values) {
-            (HOLD, [value]) | (HEARTBEAT, [_, value]) if drive.has_authority() => {
-                return self.hold(drive, request, start, *value, now);
-            }
-            _ => {}
-        }
-        let spec = &drive.image.spec;
-        let fault = drive.reading(now).state() == Some(State::Fault);
-        let write = self.last_word(drive, |last| {
-            let before = register_map::CommandContext { word: *last, fault };
-            let write = register_map::command(&spec.profile, start, values, before)?;
-            let resets = write.refused.is_none() && write.word.is_some_and(|word| before.resets(word));
-            *last = write.word.or(*last);
-            Ok((write, resets))
-        });
-        let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
-        let work = match write {
-            Ok((
-                CommandWrite {
-                    points,
-                    refused: Some(refusal),
-                    ..
-                },
-                _,
-            )) => BusWork::Stop(Order::Points(points), refusal),
-            // A heartbeat alone is not a command, so it is answered at once and not audited.
-            Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
-                drive.heartbeat(&self.client.origin(), now);
-                return Decision::Reply(request, Reply::Written);
-            }
-            Ok((CommandWrite { points, .. }, resets)) => {
-                forwarded.resets = resets;
-                BusWork::Order(Order::Points(points))
-            }
-            Err(refusal) => BusWork::Refused(refusal),
-        };
-        Decision::Drive(Box::new((forwarded, work)))
-    }
 }
 
 fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
     Decision::Drive(Box::new((ForwardedRequest::new(header, drive, request), work)))
-}
-
-/// Whether a write to holding registers sets the register to 1.
-fn stops_by(request: &RequestPdu, register: u16) -> bool {
-    let items = match request {
-        RequestPdu::ReadWrite {
-            write_start, values, ..
-        } => order::written(&RequestPdu::write_registers(*write_start, values)),
-        request => order::written(request),
-    };
-    items.is_some_and(|(table, items)| table == Table::Holding && items.contains(&(register, 1)))
 }
 
 /// The drive at units 0 and 255 is stopped by the write that elsewhere stops all drives.
@@ -586,93 +433,4 @@ fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> 
         false => BusWork::Stop(stop, not_readable(Exception::ADDRESS, STOP_ALL)),
     };
     forwarded(header, drive, request, work)
-}
-
-/// The refusal of the values next to a stop that is carried out.
-fn not_readable(code: Exception, address: u16) -> Refusal {
-    match code {
-        Exception::ADDRESS => {
-            Refusal::NotWritable(format!("0x{address:04X} is followed by a register that does not exist"))
-        }
-        code => Refusal::BadValue(format!("register 0x{address:04X} cannot be read now ({code})")),
-    }
-}
-
-/// The stop that an order contains.
-fn stop_in(drive: &DriveHandle, order: &Order) -> Option<Order> {
-    let profile = &drive.image.spec.profile;
-    let run = profile.model_index(ModelPoint::Run)?;
-    let stops = match order {
-        Order::Points(values) => values.contains(&(run, Value::Bool(false))),
-        Order::Write(pdu) => order::written(pdu).is_some_and(|(table, items)| {
-            let runs = |(address, word): &(u16, u16)| profile.runs_by(table, *address, *word);
-            items.iter().find_map(runs) == Some(false)
-        }),
-        Order::Parameter(_) | Order::Read(_) => false,
-    };
-    stops.then(|| match order {
-        Order::Points(values) => {
-            let keeps = |point: &PointIndex| *point == run || profile.model_index(ModelPoint::Reverse) == Some(*point);
-            Order::Points(values.iter().filter(|(point, _)| keeps(point)).copied().collect())
-        }
-        order => order.clone(),
-    })
-}
-
-/// Whether a write that stops all drives names no other register.
-fn stops_all_only(request: &RequestPdu) -> bool {
-    order::written(request).is_some_and(|(_, items)| items.len() == 1)
-}
-
-/// Whether the family has the table that a function code accesses. No family supports 22; 23 is carried out as 16 and 3.
-fn has_function(profile: &Profile, function: u8) -> bool {
-    let table = match function {
-        1 | 5 | 15 => Table::Coil,
-        2 => Table::DiscreteInput,
-        3 | 6 | 16 | 23 => Table::Holding,
-        4 => profile.canonical(Table::Input),
-        _ => return false,
-    };
-    profile.ranges.iter().any(|r| r.table == table)
-}
-
-/// Maximum number of items in one read of this span, from the limits of the profile's ranges that it touches.
-fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
-    let table = profile.canonical(table);
-    let last = start.saturating_add(count.saturating_sub(1));
-    let touched = profile
-        .ranges
-        .iter()
-        .filter(|r| r.table == table && *r.addresses.start() <= last && start <= *r.addresses.end());
-    touched.map(|r| r.read).min().unwrap_or(table.max_read())
-}
-
-/// Whether the reply of a drive has the form that the request expects.
-fn answers(request: &RequestPdu, reply: &Reply) -> bool {
-    match (request, reply) {
-        (RequestPdu::Read { table, count, .. }, Reply::Bits(bits)) => {
-            table.is_bits() && bits.len() == usize::from(*count)
-        }
-        (RequestPdu::Read { table, count, .. }, Reply::Registers(words)) => {
-            !table.is_bits() && words.len() == usize::from(*count)
-        }
-        (RequestPdu::ReadWrite { read_count, .. }, Reply::Registers(words)) => words.len() == usize::from(*read_count),
-        (RequestPdu::ReadWrite { .. }, _) => false,
-        (_, Reply::Written) => request.is_write(),
-        _ => false,
-    }
-}
-
-fn figures(bus: &BusHandle) -> BusFigures {
-    let health = bus.image.health();
-    BusFigures {
-        up: health.up,
-        drives: bus.image.drives.len(),
-        online: bus.image.online(),
-        load: health.load,
-        cycle: health.fast.last,
-        transactions: bus.image.transactions_total(),
-        errors: bus.image.errors_total(),
-        queued: bus.queue.lock().writes(),
-    }
 }
