@@ -481,7 +481,7 @@ fn an_inventory_is_the_configuration_again() {
     let again = dir.path().join("drivegate.toml");
     fs::write(dir.path().join("password"), "x").unwrap();
     let odd = format!(
-        "{SOUND}[mqtt]\nusername = \"no \\\"\\\\ \u{e4}: #\"\npassword_file = \"password\"\nhome_assistant = false\n"
+        "{SOUND}[mqtt]\nusername = \"no \\\"\\\\ \u{e4}: #\"\nclient_id = \"12:30\"\npassword_file = \"password\"\nhome_assistant = false\n"
     )
     .replace(
         "turnaround = \"0.5ms\"\n[[",

@@ -1,7 +1,5 @@
 //! `drivegate inventory`: a configuration as an Ansible inventory.
 
-mod yaml;
-
 use std::path::Path;
 
 use toml::{Table, Value};
@@ -46,11 +44,9 @@ fn inventory(path: &Path) -> Result<String, Vec<Problem>> {
 
 /// The inventory of the gateway `name` with the valid configuration `source`, or the key that must not be in it.
 fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
-    let unreadable = |error: toml::de::Error| {
-        let finding = Finding::new(error.message().to_string(), "write it as TOML");
-        (String::new(), finding)
-    };
-    let configuration: Table = source.parse().map_err(unreadable)?;
+    let unreadable = |what: &str| (String::new(), Finding::new(what, "write it as TOML"));
+    let parsed: Result<Table, toml::de::Error> = source.parse();
+    let configuration = parsed.map_err(|error| unreadable(error.message()))?;
     for ([section, key], file) in SECRETS {
         if configuration.get(section).and_then(|table| table.get(key)).is_some() {
             let what = "an inventory contains no secrets";
@@ -65,7 +61,10 @@ fn of(name: &str, source: &str) -> Result<String, (String, Finding)> {
     }
     let nested = |key: &str, value| Value::Table([(key.to_string(), value)].into_iter().collect());
     let host = nested(name, nested(VARIABLE, configuration));
-    Ok(yaml::document(&nested(GROUP, nested("hosts", host))))
+    // Each string stays on the line of its key.
+    let options = serde_saphyr::ser_options! { prefer_block_scalars: false };
+    serde_saphyr::to_string_with_options(&nested(GROUP, nested("hosts", host)), options)
+        .map_err(|error| unreadable(&error.to_string()))
 }
 
 /// The first string that Ansible would take for a template, with its key.
