@@ -252,7 +252,7 @@ impl Schedule {
     /// not to the polls that the command must wait for.
     pub(crate) fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
         match self.next(now, waiting) {
-            Decision::Poll(_) if self.turn != PollReason::Asked => self.next(now, highest),
+            Decision::Poll(_) if highest != waiting && self.turn != PollReason::Asked => self.next(now, highest),
             decision => decision,
         }
     }

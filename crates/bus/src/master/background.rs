@@ -130,7 +130,9 @@ impl Master {
     /// # Errors
     /// When to check again; `None` if no request waits.
     pub(super) fn background(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
-        self.drop_background_in_vain(now);
+        if !self.drop_background_in_vain(now) && self.bus.queue.lock().is_empty() {
+            return Err(None);
+        }
         let mut again: Option<Instant> = None;
         // Both kinds take turns, since they have equal shares.
         for passed_on in [!self.passed_on_last, self.passed_on_last] {
@@ -163,8 +165,8 @@ impl Master {
         }
     }
 
-    /// Ends requests that can no longer be sent: they expired, or their drive is offline.
-    fn drop_background_in_vain(&mut self, now: Instant) {
+    /// Ends requests that can no longer be sent: they expired, or their drive is offline. Returns whether others wait.
+    fn drop_background_in_vain(&mut self, now: Instant) -> bool {
         let Master { bus, schedule, .. } = self;
         let mut queue = bus.queue.background();
         if !queue.is_empty() {
@@ -180,6 +182,7 @@ impl Master {
                 r.drive != NO_DRIVE && !schedule.is_online(r.drive)
             });
         }
+        !queue.is_empty()
     }
 
     /// Takes the next request of this pace from the queue, if it may be sent.
