@@ -335,20 +335,18 @@ impl Report {
     /// Reports faults that appeared or cleared with the last poll. Returns whether one appeared.
     fn check_fault(&mut self, index: DriveIndex, reading: &Reading<'_>) -> bool {
         let now = reading.now;
-        let Some(fault) = reading.model(ModelPoint::Fault).good() else {
+        let fault = reading.model(ModelPoint::Fault);
+        let Some(is_active) = fault.good().map(Value::as_bool) else {
             return false;
         };
-        let shown = reading.model(ModelPoint::FaultCode);
-        let code = match shown.good() {
-            Some(Value::Integer(code)) => code,
-            _ => 0,
+        let shown = is_active.then(|| reading.model(ModelPoint::FaultCode));
+        let active = match shown.map(|shown| (shown.good(), shown.at)) {
+            None => None,
+            Some((Some(Value::Integer(code)), _)) if code != 0 => Some(code),
+            // A fault code that was read in a separate request before the fault appeared does not belong to the fault.
+            Some((Some(_), at)) if at < fault.at => return false,
+            Some(_) => Some(0),
         };
-        // A fault code that was read in a separate request before the fault appeared does not belong to the fault.
-        let before_the_fault = shown.at < reading.model(ModelPoint::Fault).at;
-        if fault.as_bool() && code == 0 && shown.good().is_some() && before_the_fault {
-            return false;
-        }
-        let active = fault.as_bool().then_some(code);
         match self.faults.get_mut(index) {
             // The code disappears before its bit, or is sometimes not read: the fault is still the same one.
             Some(Some(before)) if active == Some(0) && *before != 0 => return false,

@@ -124,8 +124,9 @@ impl Report {
     /// an event; a change while the drive was offline is one.
     pub(super) fn report_state(&mut self, index: DriveIndex, reading: &Reading<'_>) {
         let now = reading.now;
-        for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
-            let Some(Value::Bool(value)) = reading.model(point).good() else {
+        let samples = WATCHED.map(|(point, _)| reading.model(point));
+        for ((place, (point, changes)), sample) in WATCHED.into_iter().enumerate().zip(&samples) {
+            let Some(Value::Bool(value)) = sample.good() else {
                 continue;
             };
             let watched = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place));
@@ -154,8 +155,8 @@ impl Report {
                 ..Event::new(kind, SystemTime::now(), text)
             });
         }
-        let age = reading
-            .model(ModelPoint::Running)
+        let [running, ..] = &samples;
+        let age = running
             .at
             .map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
         let runs = self.watched.iter().any(|[running, ..]| running.is_set());

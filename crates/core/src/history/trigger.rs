@@ -145,8 +145,8 @@ impl Watch {
 
     fn fault(&mut self, reading: &Reading<'_>) -> Option<(TriggerKind, String)> {
         let fault = reading.model(ModelPoint::Fault).good()?.as_bool();
-        let code = match reading.model(ModelPoint::FaultCode).good() {
-            Some(Value::Integer(code)) if fault => code,
+        let code = match fault.then(|| reading.model(ModelPoint::FaultCode).good()) {
+            Some(Some(Value::Integer(code))) => code,
             _ => 0,
         };
         let came = fault && self.fault.replace(fault) == Some(false);
