@@ -154,14 +154,14 @@ impl Report {
                 format!("an interlock of {name} is not satisfied: {why}; the drive is being stopped")
             }),
         }
-        let News::Read { drive, read, at, .. } = news else {
+        let News::Read { drive, read, words, at } = news else {
             return RequiredReads::default();
         };
         let index = *drive;
         let Some(drive) = self.drive(index) else {
             return RequiredReads::default();
         };
-        let monitors = self.compare_selection((index, &drive), read, *at);
+        let monitors = self.compare_selection((index, &drive), (read, words), *at);
         let reading = drive.reading(now, RECENT);
         let new_fault = self.check_fault(index, &reading);
         self.report_state(index, &reading);

@@ -10,7 +10,9 @@
 use std::time::{Duration, Instant};
 
 use drivegate_core::process_image::Reading;
-use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Raw};
+use drivegate_model::drive::profile::MOST_REGISTERS;
+use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, PerPoint, PlannedRead, Point, PointIndex, Value};
+use drivegate_proto::Table;
 
 /// Number of consecutive comparisons that differ, all with the same selection, after which the selection counts as changed.
 const DIFFERING: u8 = 3;
@@ -43,10 +45,23 @@ struct DriveSelections {
 struct Compared {
     point: PointIndex,
     monitor: PointIndex,
+    /// Registers of the process data, and of its monitoring register.
+    registers: Option<(Registers, Registers)>,
+    is_code: bool,
+    /// Whether the value is 0 if all its registers are.
+    is_0_by_registers: bool,
     trust: Trust,
     /// Process data before the monitoring register was read, and that register: to be compared with the next process data.
     open: Option<(f64, f64)>,
     last: f64,
+}
+
+/// The registers of a value.
+#[derive(Debug, Clone, Copy)]
+struct Registers {
+    table: Table,
+    first: u16,
+    last: u16,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -86,18 +101,25 @@ pub(super) struct Findings {
 impl Selections {
     /// The comparisons of drives with these points.
     pub(super) fn new<'p>(drives: impl Iterator<Item = &'p PerPoint<Point>>, now: Instant) -> Selections {
-        let compared = |(point, monitor): (PointIndex, PointIndex)| Compared {
-            point,
-            monitor,
-            trust: Trust::Unproven(now, PAUSE.0),
-            open: None,
-            last: 0.0,
-        };
         let of = |points: &PerPoint<Point>| {
-            let pairs = points.enumerate();
-            let pairs = pairs.filter_map(|(index, point)| Some((index, point.monitor?)));
+            let compared = |(index, point): (PointIndex, &Point)| {
+                let monitor = point.monitor?;
+                Some(Compared {
+                    point: index,
+                    monitor,
+                    registers: Registers::of(point).zip(points.get(monitor).and_then(Registers::of)),
+                    is_code: is_code(point),
+                    is_0_by_registers: point.raw().is_some_and(|raw| {
+                        let zeros = [0; MOST_REGISTERS];
+                        raw.decode(&zeros, point.kind()).map(Value::as_f64) == Some(0.0)
+                    }),
+                    trust: Trust::Unproven(now, PAUSE.0),
+                    open: None,
+                    last: 0.0,
+                })
+            };
             DriveSelections {
-                points: pairs.map(compared).collect(),
+                points: points.enumerate().filter_map(compared).collect(),
                 reported: false,
             }
         };
@@ -121,10 +143,8 @@ impl Selections {
         reading: &Reading<'_>,
         now: Instant,
     ) -> Findings {
-        let points = &reading.spec.profile.points;
         for compared in self.points(drive) {
-            let raw = points.get(compared.monitor).and_then(Point::raw);
-            if raw.is_some_and(|raw| covers(read, raw)) {
+            if compared.is_monitor_in(read) {
                 compared.open = None;
                 if matches!(compared.trust, Trust::Doubted(..)) {
                     compared.trust = Trust::Unproven(now + PAUSE.1, PAUSE.1);
@@ -134,8 +154,21 @@ impl Selections {
         self.findings(drive, reading, Vec::new(), Vec::new(), Vec::new())
     }
 
-    /// Notes that the drive answered this read and has the values of `reading` after it.
-    pub(super) fn read(&mut self, drive: DriveIndex, read: &PlannedRead, reading: &Reading<'_>) -> Findings {
+    /// Whether a read that was answered with `words` at `now` concerns a comparison. Most reads concern none: once the
+    /// process data has proved right, only its monitoring registers do.
+    pub(super) fn are_concerned_by(&self, drive: DriveIndex, read: &PlannedRead, words: &[u16], now: Instant) -> bool {
+        let mut points = self.drives.get(drive).into_iter().flat_map(|drive| &drive.points);
+        points.any(|compared| compared.is_monitor_in(read) || compared.looks_at(read, words, now))
+    }
+
+    /// Notes that the drive answered this read with `words` and has the values of `reading` after it.
+    pub(super) fn read(
+        &mut self,
+        drive: DriveIndex,
+        read: &PlannedRead,
+        words: &[u16],
+        reading: &Reading<'_>,
+    ) -> Findings {
         let now = reading.now;
         let profile = &reading.spec.profile;
         let runs = || {
@@ -152,18 +185,18 @@ impl Selections {
             else {
                 continue;
             };
-            if monitor.raw().is_some_and(|raw| covers(read, raw)) {
+            if compared.is_monitor_in(read) {
                 compared.open = value(compared.point).zip(value(compared.monitor));
                 continue;
             }
-            if !compared.looks_at(point, now) || !point.raw().is_some_and(|raw| covers(read, raw)) {
+            if !compared.looks_at(read, words, now) {
                 continue;
             }
             let Some(own) = value(compared.point) else { continue };
             let Some((before, monitored)) = compared.open.take() else {
                 wanted.extend(
                     compared
-                        .comparison_due(point, own, &runs, now)
+                        .comparison_due(own, &runs, now)
                         .map(|at| (compared.monitor, at)),
                 );
                 compared.last = own;
@@ -224,20 +257,32 @@ impl Compared {
         matches!(self.trust, Trust::Doubted(..) | Trust::Differs(_))
     }
 
-    /// Whether process data that was just read is to be compared: evaluated after each read.
-    fn looks_at(&self, point: &Point, now: Instant) -> bool {
-        match self.trust {
-            Trust::Unproven(next, _) => now >= next || is_code(point) || self.open.is_some(),
-            _ => self.open.is_some(),
-        }
+    /// Whether the process data is to be compared and is in this read: evaluated after each read.
+    fn looks_at(&self, read: &PlannedRead, words: &[u16], now: Instant) -> bool {
+        let Some((own, _)) = self.registers.filter(|(own, _)| own.are_in(read)) else {
+            return false;
+        };
+        self.open.is_some()
+            || match self.trust {
+                Trust::Unproven(next, _) => {
+                    // A code that stays 0 gives no reason.
+                    let stays_0 = || self.is_0_by_registers && self.last == 0.0 && own.are_0_in(read, words);
+                    now >= next || self.is_code && !stays_0()
+                }
+                Trust::Proven | Trust::Doubted(..) | Trust::Differs(_) => false,
+            }
+    }
+
+    fn is_monitor_in(&self, read: &PlannedRead) -> bool {
+        self.registers.is_some_and(|(_, monitor)| monitor.are_in(read))
     }
 
     /// When to compare the point, if the process data just read gives a reason for it.
-    fn comparison_due(&mut self, point: &Point, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
+    fn comparison_due(&mut self, own: f64, runs: &dyn Fn() -> bool, now: Instant) -> Option<Instant> {
         let Trust::Unproven(next, pause) = self.trust else {
             return None;
         };
-        let came = is_code(point) && self.last == 0.0 && own != 0.0;
+        let came = self.is_code && self.last == 0.0 && own != 0.0;
         if !came && now < next {
             return None;
         }
@@ -300,11 +345,27 @@ fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict 
     }
 }
 
-fn covers(read: &PlannedRead, raw: &Raw) -> bool {
-    let after = |start: u16, count: u16| u32::from(start) + u32::from(count);
-    raw.table == read.table
-        && raw.address >= read.start
-        && after(raw.address, raw.form.items()) <= after(read.start, read.count)
+impl Registers {
+    /// The registers of a point; `None` if it is derived.
+    fn of(point: &Point) -> Option<Registers> {
+        let raw = point.raw()?;
+        Some(Registers {
+            table: raw.table,
+            first: raw.address,
+            last: raw.address.checked_add(raw.form.items().checked_sub(1)?)?,
+        })
+    }
+
+    fn are_in(&self, read: &PlannedRead) -> bool {
+        self.table == read.table && self.first >= read.start && self.last - read.start < read.count
+    }
+
+    /// Whether all of them are 0 in the reply to a read that has them.
+    fn are_0_in(&self, read: &PlannedRead, words: &[u16]) -> bool {
+        let place = |address: u16| usize::from(address.saturating_sub(read.start));
+        let own = words.get(place(self.first)..=place(self.last));
+        own.is_some_and(|own| own.iter().all(|word| *word == 0))
+    }
 }
 
 #[cfg(test)]

@@ -14,10 +14,13 @@ impl Report {
     pub(super) fn compare_selection(
         &mut self,
         (index, drive): (DriveIndex, &DriveImage),
-        read: &PlannedRead,
+        (read, words): (&PlannedRead, &[u16]),
         at: Instant,
     ) -> Vec<(DriveIndex, PointIndex, Instant)> {
-        let findings = self.selections.read(index, read, &drive.reading(at, RECENT));
+        if !self.selections.are_concerned_by(index, read, words, at) {
+            return Vec::new();
+        }
+        let findings = self.selections.read(index, read, words, &drive.reading(at, RECENT));
         let wanted = findings.reads.iter().map(|(point, at)| (index, *point, *at));
         let wanted = wanted.collect();
         self.selection_found(drive, index, &findings);

@@ -47,6 +47,9 @@ fn trust_is_lost_after_three_and_comes_back_after_two() {
     let mut compared = Compared {
         point: PointIndex::new(0),
         monitor: PointIndex::new(1),
+        registers: None,
+        is_code: false,
+        is_0_by_registers: true,
         trust: Trust::Unproven(now, PAUSE.0),
         open: None,
         last: 0.0,
@@ -80,10 +83,32 @@ fn every_monitoring_register_is_in_a_request_of_its_own_class() {
         let profile = profiles.get(name).unwrap();
         let plan = drivegate_model::drive::Plan::of(profile);
         for point in profile.points.iter().filter(|point| point.monitor.is_some()) {
-            let raw = profile.points.get(point.monitor.unwrap()).unwrap().raw().unwrap();
-            let in_plan = plan.monitors.iter().filter(|read| covers(read, raw));
+            let monitor = Registers::of(profile.points.get(point.monitor.unwrap()).unwrap()).unwrap();
+            let in_plan = plan.monitors.iter().filter(|read| monitor.are_in(read));
             assert_eq!(in_plan.count(), 1, "{name} {}", point.name);
         }
         assert!(plan.monitors.iter().all(|read| read.class == PollClass::Monitor));
     }
+}
+
+#[test]
+fn a_code_that_stays_0_gives_no_reason_to_compare() {
+    let (nx, now, drive) = (nx(), Instant::now(), DriveIndex::new(0));
+    let mut selections = Selections::new([&nx.points].into_iter(), now);
+    let plan = drivegate_model::drive::Plan::of(&nx);
+    let code = Registers::of(pair(&nx, "fault_code").0).unwrap();
+    let read = plan.reads.iter().find(|read| code.are_in(read)).unwrap();
+    let mut words = vec![0; usize::from(read.count)];
+    assert!(
+        selections.are_concerned_by(drive, read, &words, now),
+        "nothing is proved"
+    );
+    for compared in selections.points(drive) {
+        compared.trust = Trust::Unproven(now + PAUSE.0, PAUSE.0);
+    }
+    assert!(!selections.are_concerned_by(drive, read, &words, now));
+    words[usize::from(code.first - read.start)] = 16;
+    assert!(selections.are_concerned_by(drive, read, &words, now), "a fault came");
+    let monitor = plan.monitors.first().unwrap();
+    assert!(selections.are_concerned_by(drive, monitor, &[0], now));
 }
