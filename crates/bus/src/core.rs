@@ -304,7 +304,7 @@ impl BusCore {
                 }
             }
         };
-        let mut frame = Vec::with_capacity(32);
+        let mut frame = self.line.take_frame();
         self.bus.image.spec.protocol.encode(&request, &mut frame);
         if frame.is_empty() {
             // The protocol has no such request, so the result is as if the drive had no such address.
@@ -425,8 +425,14 @@ impl BusCore {
             Purpose::Poll(_) | Purpose::Refresh | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
         };
         let Exchanged {
-            ended, began, at, took, ..
+            transaction,
+            ended,
+            began,
+            at,
+            took,
+            ..
         } = exchanged;
+        self.line.keep_buffers(transaction);
         let end = TurnEnd {
             ended,
             began,

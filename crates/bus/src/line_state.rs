@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use super::n2_late_replies::N2LateReplies;
-use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_its_reply};
+use super::transaction::{Buffers, CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_its_reply};
 use drivegate_model::drive::plan::WireTime;
 use drivegate_proto::{LineFormat, Protocol, Reply, Request};
 
@@ -100,6 +100,8 @@ pub struct LineState {
     left_alone: Instant,
     learned: Learned,
     underway: Option<Underway>,
+    /// The memory of the last transaction.
+    buffers: Buffers,
 }
 
 #[derive(Debug)]
@@ -131,6 +133,7 @@ impl LineState {
                 early_weight: 0,
             },
             underway: None,
+            buffers: Buffers::default(),
         }
     }
 
@@ -222,6 +225,7 @@ impl LineState {
             wire.reply,
             self.learned.echo,
         );
+        transaction.receive_into(std::mem::take(&mut self.buffers));
         transaction.expect_late(late);
         if self.learned.early_weight < WITHOUT_WIRE_TIME {
             transaction.ignore_before(sent);
@@ -240,6 +244,16 @@ impl LineState {
             late: sending.late_may_come,
             cut: false,
         });
+    }
+
+    /// Memory for the frame of the next request.
+    pub(crate) fn take_frame(&mut self) -> Vec<u8> {
+        std::mem::take(&mut self.buffers.frame)
+    }
+
+    /// Keeps the memory of an ended transaction for the next one.
+    pub(crate) fn keep_buffers(&mut self, transaction: Transaction) {
+        self.buffers = transaction.into_buffers();
     }
 
     /// The frame of the request that is on the line.

@@ -49,6 +49,14 @@ pub enum Step {
     Done(Ended),
 }
 
+/// The byte lists of an ended transaction, empty: the next one uses their memory, so that no exchange has to allocate it.
+#[derive(Debug, Default)]
+pub(crate) struct Buffers {
+    pub(crate) frame: Vec<u8>,
+    received: Vec<u8>,
+    seen: Vec<u8>,
+}
+
 /// A transaction whose request is on the line.
 #[derive(Debug)]
 pub struct Transaction {
@@ -99,8 +107,8 @@ impl Transaction {
             protocol,
             request,
             frame,
-            received: Vec::with_capacity(260),
-            seen: Vec::with_capacity(260),
+            received: Vec::new(),
+            seen: Vec::new(),
             deadline: end_of_transmission + response_timeout + reply_time,
             reply_time,
             garbage: None,
@@ -117,6 +125,20 @@ impl Transaction {
             late: N2LateReplies::default(),
             unless_another: None,
         }
+    }
+
+    /// Receives into the memory of an earlier transaction.
+    pub(crate) fn receive_into(&mut self, buffers: Buffers) {
+        (self.received, self.seen) = (buffers.received, buffers.seen);
+    }
+
+    /// The byte lists of an ended transaction.
+    pub(crate) fn into_buffers(self) -> Buffers {
+        let [frame, received, seen] = [self.frame, self.received, self.seen].map(|mut bytes| {
+            bytes.clear();
+            bytes
+        });
+        Buffers { frame, received, seen }
     }
 
     /// Rejects a reply that is complete before `earliest`, because request and reply cannot both have been on the
