@@ -125,17 +125,22 @@ impl<T: Packed> PackedRing<T> {
         let now = entry.at();
         let start = *self.start.get_or_insert(now);
         self.entry.clear();
+        self.entry.extend([0; HEAD]);
         entry.pack(&mut self.entry);
-        let Ok(length) = u32::try_from(self.entry.len()) else {
+        let Some((head, packed)) = self.entry.split_first_chunk_mut::<HEAD>() else {
             return;
         };
-        let size = HEAD + self.entry.len();
+        let Ok(length) = u32::try_from(packed.len()) else {
+            return;
+        };
+        let (of_length, of_time) = head.split_at_mut(size_of_val(&length));
+        of_length.copy_from_slice(&length.to_le_bytes());
+        of_time.copy_from_slice(&nanoseconds(start, now).to_le_bytes());
+        let size = self.entry.len();
         self.make_room(size, now, &mut gone);
         if self.bytes.capacity() - self.bytes.len() < size {
             self.bytes.reserve_exact(size.max(self.most_bytes / STEPS));
         }
-        self.bytes.extend(length.to_le_bytes());
-        self.bytes.extend(nanoseconds(start, now).to_le_bytes());
         self.bytes.extend(&self.entry);
     }
 

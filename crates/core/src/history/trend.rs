@@ -191,6 +191,24 @@ struct PointTrend {
     kept: Option<KeptValues>,
 }
 
+/// The time of a read, calculated once for all points.
+#[derive(Debug, Clone, Copy)]
+struct StepTime {
+    /// Time since the beginning.
+    since: Duration,
+    /// Number of the step in each range.
+    steps: [u64; RANGES.len()],
+}
+
+impl StepTime {
+    fn new(since: Duration) -> StepTime {
+        StepTime {
+            since,
+            steps: RANGES.map(|range| number(since, range.step)),
+        }
+    }
+}
+
 /// The kept values of a point's trend.
 #[derive(Debug)]
 struct KeptValues {
@@ -246,6 +264,7 @@ impl DriveTrend {
     /// before the drive went offline, and how long a value is good. A value counts for each step until the next
     /// value, as long as it is good.
     pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
+        let time = StepTime::new(read.at.saturating_duration_since(self.epoch));
         for point in &mut self.points {
             if !point.registers.iter().any(|registers| shows(read, registers)) {
                 continue;
@@ -259,9 +278,8 @@ impl DriveTrend {
             if point.derived && !is_known() {
                 continue;
             }
-            let since = read.at.saturating_duration_since(self.epoch);
             let kept = point.kept.get_or_insert_with(|| KeptValues::new(self.reach));
-            kept.add(since, value.as_f64() as f32, || known.good_for(point.index));
+            kept.add(time, value.as_f64() as f32, || known.good_for(point.index));
         }
     }
 
@@ -323,16 +341,16 @@ impl KeptValues {
         }
     }
 
-    /// Adds a value that was read `since` the beginning. The previous value was good for `good_for`; this only
-    /// matters if there are steps between the two values.
-    fn add(&mut self, since: Duration, value: f32, good_for: impl Fn() -> Duration) {
-        let [finest, ..] = RANGES;
+    /// Adds a value that was read at `time`. The previous value was good for `good_for`; this only matters if there are
+    /// steps between the two values.
+    fn add(&mut self, time: StepTime, value: f32, good_for: impl Fn() -> Duration) {
+        let StepTime { since, steps } = time;
+        let ([finest, ..], [newest, ..]) = (RANGES, steps);
         let before = self
             .last
-            .filter(|(at, _)| number(*at, finest.step) + 1 < number(since, finest.step))
+            .filter(|(at, _)| number(*at, finest.step) + 1 < newest)
             .filter(|(at, _)| since.saturating_sub(*at) <= good_for());
-        for (buckets, range) in self.ranges.iter_mut().zip(RANGES) {
-            let number = number(since, range.step);
+        for ((buckets, range), number) in self.ranges.iter_mut().zip(RANGES).zip(steps) {
             let between = before.map(|(at, before)| (self::number(at, range.step), before));
             if let Some((at, before)) = between.filter(|(at, _)| at + 1 < number) {
                 let first = at.max(number.saturating_sub(buckets.steps() as u64)) + 1;

@@ -45,7 +45,7 @@ impl Rig {
         trend
             .kept
             .get_or_insert_with(|| KeptValues::new(reach))
-            .add(since, value, || good_for);
+            .add(StepTime::new(since), value, || good_for);
         self.fed.push((self.clock.now, value, good_for));
     }
 
