@@ -88,7 +88,7 @@ pub(crate) fn run(data: &[u8]) {
         let Some(command) = chosen.and_then(|chosen| pending.take(chosen)) else { break };
         drop(pending);
         queued += 1;
-        assert!(!retain && command.intent.drive == 0, "only p1 is commanded, and never by a retained message");
+        assert!(!retain && command.drive().is_some_and(|drive| drive == 0), "only p1 is commanded, and never by a retained message");
         let Order::Points(points) = &command.intent.order else { panic!("points only") };
         let profile = &bus.image.drives[0].spec.profile;
         for (index, value) in points {

@@ -8,7 +8,7 @@ use drivegate_bus::core::{Action, BusCore, Closed};
 use drivegate_bus::master::{Handover, Purpose};
 use drivegate_bus::predict::predict;
 use drivegate_core::event::Events;
-use drivegate_core::order::{NO_DRIVE, WriteStats};
+use drivegate_core::order::WriteStats;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate_core::queue::CommandQueue;
@@ -26,6 +26,9 @@ use drivegate_sim::slave::Slaves;
 use drivegate_sim::statistics::Transcript;
 
 use super::scenario::Line;
+
+/// The place that stands for no drive: that of a broadcast.
+pub const NO_DRIVE: usize = usize::MAX;
 
 /// The last request on the line.
 #[derive(Debug, Clone)]
@@ -377,14 +380,14 @@ impl WorldBus {
         self.exchanges += 1;
         let turn = self.core.asked().expect("a turn is on the line");
         let asked = Asked {
-            drive: turn.drive.place(),
+            drive: turn.drive().map_or(NO_DRIVE, DriveIndex::place),
             pdu: turn.pdu().clone(),
             at: now,
             is_poll: matches!(turn.purpose, Purpose::Poll(_)),
-            is_refresh: turn.purpose == Purpose::Refresh,
+            is_refresh: matches!(turn.purpose, Purpose::Refresh(_)),
             last_read: match turn.pdu() {
                 RequestPdu::Read { table, start, .. } => {
-                    let image = self.handle.image.drives.get(turn.drive);
+                    let image = turn.drive().and_then(|drive| self.handle.image.drives.get(drive));
                     image.and_then(|image| image.snapshot().read_at(*table, *start))
                 }
                 _ => None,
@@ -394,7 +397,7 @@ impl WorldBus {
             acted: 0,
         };
         seen.push(Seen::Sent(asked.clone()));
-        if NO_DRIVE == asked.drive {
+        if asked.drive == NO_DRIVE {
             self.broadcast = Some(asked.clone());
         }
         self.asked = Some(asked);

@@ -72,7 +72,12 @@ fn the_first_probe_of_a_silent_drive_comes_within_ten_seconds() {
             for _ in 0..5 {
                 rig.bus.wire.slaves().drive(2).unwrap().set_alive(false);
                 rig.until("it counts as offline", MINUTE, |rig| !rig.is_online(1));
-                let asks = |rig: &Rig| rig.bus.core.asked().is_some_and(|turn| turn.drive == 1);
+                let asks = |rig: &Rig| {
+                    rig.bus
+                        .core
+                        .asked()
+                        .is_some_and(|turn| turn.drive().is_some_and(|drive| drive == 1))
+                };
                 let pause = rig.until("it is probed", MINUTE, asks);
                 let bounds = Duration::from_millis(500)..=Duration::from_secs(10);
                 assert!(bounds.contains(&pause), "{family}, {timeout:?}: {pause:?}");

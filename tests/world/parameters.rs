@@ -26,7 +26,7 @@ impl Rig {
         let writes = self.plant.writes.clone();
         let (ticket, mut answer) = Ticket::new(origin, "d0-1", String::new(), false, self.now, writes);
         let request = BackgroundRequest {
-            drive: DriveIndex::new(0),
+            target: DriveIndex::new(0).into(),
             pdu,
             pace: Pace::Slow,
             expires: self.now + PATIENCE,

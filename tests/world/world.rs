@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_core::event::{EventKind, Events};
-use drivegate_core::order::{Authority, CAPACITY, NO_DRIVE, Order, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate_core::order::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats, written};
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_core::process_image::{LeaseAction, OnShutdown};
 use drivegate_model::drive::{ModelPoint, Quality, RawWrites, Value};
@@ -29,7 +29,7 @@ use drivegate_sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
-use super::bus::{Asked, Parts, Seen, WorldBus};
+use super::bus::{Asked, NO_DRIVE, Parts, Seen, WorldBus};
 use super::clients::{Client, Servers, Waiting, Way, address, answers, write_frame};
 use super::drives::{AFTERMATH, Truth};
 use super::history::History;

@@ -14,11 +14,10 @@ use super::report::Report;
 use super::tap::Tap;
 use super::transaction::Ended;
 use drivegate_core::event::Events;
-use drivegate_core::order::{Outcome, Urgency, WriteStats};
+use drivegate_core::order::{Outcome, Target, Urgency, WriteStats};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::Taping;
 use drivegate_core::stalls::Stalls;
-use drivegate_model::drive::DriveIndex;
 use drivegate_proto::{Exception, Reply, Request};
 
 /// What the bus does next with the port.
@@ -293,10 +292,10 @@ impl BusCore {
             Ok(turn) => turn,
             Err(until) => return Some(until),
         };
-        let request = match self.master.stranger(&turn) {
-            Some(address) => Request::new(address, turn.pdu().clone()),
-            None => {
-                let image = self.bus.image.drives.get(turn.drive)?;
+        let request = match turn.target() {
+            Target::Address(address) => Request::new(address, turn.pdu().clone()),
+            Target::Drive(drive) => {
+                let image = self.bus.image.drives.get(drive)?;
                 Request {
                     address: image.spec.address,
                     pdu: turn.pdu().clone(),
@@ -372,8 +371,9 @@ impl BusCore {
         let needed = self.line.silence_before(self.master.silence_of(&turn));
         let paused = now.saturating_duration_since(quiet_since + needed.saturating_sub(self.line.silence()));
         self.report.diagnosis.sending(paused);
-        let drive = self.known(&turn);
-        self.tap = self.report.tape_request(drive, &request, &frame, quiet_since, now);
+        self.tap = self
+            .report
+            .tape_request(turn.drive(), &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
         self.line.send(request, frame, sending, late, now);
@@ -410,8 +410,8 @@ impl BusCore {
             };
             self.server.replied(now);
         }
-        self.report.exchanged(turn.drive, &exchanged, now);
-        let drive = self.known(&turn);
+        let drive = turn.drive();
+        self.report.exchanged(drive, &exchanged, now);
         let heard = exchanged.transaction.seen();
         self.report.tape_reply(drive, heard, &exchanged.ended, now);
         if let Some(tap) = self.tap.take() {
@@ -421,8 +421,8 @@ impl BusCore {
         let mangled = exchanged.transaction.is_mangled_reply();
         let doubted = exchanged.transaction.only_doubted();
         let frame = match turn.purpose {
-            Purpose::Background => exchanged.transaction.reply_frame().to_vec(),
-            Purpose::Poll(_) | Purpose::Refresh | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
+            Purpose::Background(_) => exchanged.transaction.reply_frame().to_vec(),
+            Purpose::Poll(_) | Purpose::Refresh(_) | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
         };
         let Exchanged {
             transaction,
@@ -450,11 +450,6 @@ impl BusCore {
         let mut news = std::mem::take(&mut self.news);
         self.master.done(turn, end, now, &mut news);
         self.report_all(news, now);
-    }
-
-    /// The drive of a turn, if it is configured on the bus.
-    fn known(&self, turn: &Turn) -> Option<DriveIndex> {
-        Some(turn.drive).filter(|drive| self.bus.image.drives.get(*drive).is_some())
     }
 
     fn report_all(&mut self, mut news: Vec<News>, now: Instant) {

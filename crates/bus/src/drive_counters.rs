@@ -125,7 +125,7 @@ fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteSta
         writes.clone(),
     );
     let request = BackgroundRequest {
-        drive,
+        target: drive.into(),
         pdu: CountedByDrive::request(so_far),
         pace: Pace::Slow,
         expires: now + EXPIRY,

@@ -42,7 +42,7 @@ use super::schedule::{Cadence, Poll, Schedule};
 use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
-use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
+use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Target, Urgency, WriteStats};
 use drivegate_core::plant::{BusHandle, turn_away};
 use drivegate_core::process_image::{DriveImage, Timing};
 use drivegate_model::drive::plan::WireTime;
@@ -62,12 +62,10 @@ const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
 /// One in this number of probes waits as long as any other request, because the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
 
-/// A transaction to send: drive, purpose and request.
+/// A transaction to send: purpose and request.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Turn {
-    /// Index of the drive on the bus.
-    pub drive: DriveIndex,
-    /// Purpose of the transaction.
+    /// Purpose of the transaction, with its drive.
     pub purpose: Purpose,
     pdu: RequestPdu,
 }
@@ -79,6 +77,8 @@ pub enum Purpose {
     Poll(Poll),
     /// A step of the started command in that slot, competing with that rank.
     Command {
+        /// The drive of the command.
+        drive: DriveIndex,
         /// The slot of the drive's started command.
         slot: Urgency,
         /// Rank with which the command competes for the line.
@@ -87,11 +87,12 @@ pub enum Purpose {
         step: StepPurpose,
     },
     /// The background request that is next to be sent.
-    Background,
+    Background(Target),
     /// A step of the refresh of the drive.
-    Refresh,
-    /// A step of the N2 session, needed before a read of the plan or a step of the started command in that slot.
-    Session(Session, Before),
+    Refresh(DriveIndex),
+    /// A step of the N2 session with the drive, needed before a read of the plan or a step of the started command in
+    /// that slot.
+    Session(DriveIndex, Session, Before),
 }
 
 /// Continuation after a step of an N2 session.
@@ -104,6 +105,20 @@ pub enum Before {
 }
 
 impl Turn {
+    /// Receiver of the request.
+    pub fn target(&self) -> Target {
+        match &self.purpose {
+            Purpose::Poll(poll) => poll.drive.into(),
+            Purpose::Command { drive, .. } | Purpose::Refresh(drive) | Purpose::Session(drive, ..) => (*drive).into(),
+            Purpose::Background(target) => *target,
+        }
+    }
+
+    /// The drive that receives the request; `None` if none is configured at its address.
+    pub fn drive(&self) -> Option<DriveIndex> {
+        self.target().drive()
+    }
+
     /// The request to send.
     pub fn pdu(&self) -> &RequestPdu {
         &self.pdu
@@ -112,15 +127,8 @@ impl Turn {
     /// The rank of the turn's command; `None` for a poll or a background transaction.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
-            Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
-            Purpose::Command { rank, .. } | Purpose::Session(_, Before::Command(_, rank)) => Some(*rank),
-        }
-    }
-
-    fn slot(&self) -> Option<Urgency> {
-        match &self.purpose {
-            Purpose::Poll(_) | Purpose::Background | Purpose::Refresh | Purpose::Session(_, Before::Poll(_)) => None,
-            Purpose::Command { slot, .. } | Purpose::Session(_, Before::Command(slot, _)) => Some(*slot),
+            Purpose::Command { rank, .. } | Purpose::Session(_, _, Before::Command(_, rank)) => Some(*rank),
+            Purpose::Poll(_) | Purpose::Background(_) | Purpose::Refresh(_) | Purpose::Session(..) => None,
         }
     }
 }
@@ -201,7 +209,7 @@ pub struct Master {
     /// Conditions that a transaction may have to wait for.
     waits: Waits,
     /// The last reply on the line, valid or damaged, of which a duplicate may arrive.
-    last_answered: Option<(DriveIndex, RequestPdu)>,
+    last_answered: Option<(Target, RequestPdu)>,
     turns: Turns,
     /// The background request that is next to be sent, or is on the line.
     background: Option<ChosenTransaction>,
@@ -459,8 +467,13 @@ impl Master {
 
     /// Notes that the turn is sent at `now`.
     pub fn sending(&mut self, turn: &Turn, now: Instant) -> Sending {
-        if let Purpose::Command { slot, step, .. } = &turn.purpose
-            && let Some(drive) = self.drives.get_mut(turn.drive)
+        if let Purpose::Command {
+            drive: index,
+            slot,
+            step,
+            ..
+        } = &turn.purpose
+            && let Some(drive) = self.drives.get_mut(*index)
         {
             let step = super::command_run::Step {
                 purpose: *step,
@@ -469,14 +482,15 @@ impl Master {
             drive.sent(*slot, &step, now);
             let start = drive.run(*slot).and_then(|run| run.start.clone());
             if let Some(starts) = self.waits.starts.as_ref().filter(|_| step.pdu.is_write())
-                && let Some(image) = self.bus.image.drives.get(turn.drive)
+                && let Some(image) = self.bus.image.drives.get(*index)
             {
-                starts.written(turn.drive, &image.spec.profile, &step.pdu, start.as_ref(), now);
+                starts.written(*index, &image.spec.profile, &step.pdu, start.as_ref(), now);
             }
         }
         if self.bus.image.spec.tells_replies_apart()
-            && let Some(drive) = self.drives.get_mut(turn.drive)
-            && let Some(image) = self.bus.image.drives.get(turn.drive)
+            && let Some(index) = turn.drive()
+            && let Some(drive) = self.drives.get_mut(index)
+            && let Some(image) = self.bus.image.drives.get(index)
         {
             drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
         }
@@ -488,13 +502,13 @@ impl Master {
             }
         );
         for (index, drive) in self.drives.enumerate_mut() {
-            if !(is_command && index == turn.drive)
+            if !(is_command && turn.target() == index)
                 && let Some(run) = drive.run(Urgency::Command)
             {
                 run.others_go_first();
             }
         }
-        if turn.purpose == Purpose::Background {
+        if let Purpose::Background(_) = turn.purpose {
             self.background_sent(now);
         }
         self.others_before_refresh(turn);
@@ -514,7 +528,7 @@ impl Master {
             // it is unknown.
             could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
-                false => *of == turn.drive && are_alike(last, &turn.pdu),
+                false => *of == turn.target() && are_alike(last, &turn.pdu),
             }),
         }
     }
@@ -523,33 +537,37 @@ impl Master {
         if let Some(timeout) = self.passed_on_timeout(turn) {
             return timeout;
         }
-        let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
-        let patient = probes <= self.retries_of(turn.drive) || probes.is_multiple_of(PATIENT_PROBES);
-        let timeout = self.response_timeout_of(turn.drive);
-        if self.schedule.is_online(turn.drive) || patient {
+        let Target::Drive(index) = turn.target() else {
+            return self.response_timeout;
+        };
+        let probes = self.probes.get(index).copied().unwrap_or(0);
+        let patient = probes <= self.retries_of(index) || probes.is_multiple_of(PATIENT_PROBES);
+        let timeout = self.response_timeout_of(index);
+        if self.schedule.is_online(index) || patient {
             return timeout;
         }
-        let known = self.drives.get(turn.drive).map(|drive| 2 * drive.answers_within);
+        let known = self.drives.get(index).map(|drive| 2 * drive.answers_within);
         timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
     }
 
     /// The drive's own times, if it has any configured.
-    fn timing_of(&self, drive: DriveIndex) -> Timing {
-        let image = self.bus.image.drives.get(drive);
+    fn timing_of(&self, target: Target) -> Timing {
+        let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
         image.map_or_else(Timing::default, |image| image.spec.timing)
     }
 
-    pub(super) fn response_timeout_of(&self, drive: DriveIndex) -> Duration {
-        self.timing_of(drive).response_timeout.unwrap_or(self.response_timeout)
+    pub(super) fn response_timeout_of(&self, target: impl Into<Target>) -> Duration {
+        let own = self.timing_of(target.into()).response_timeout;
+        own.unwrap_or(self.response_timeout)
     }
 
     pub(super) fn retries_of(&self, drive: DriveIndex) -> u32 {
-        self.timing_of(drive).retries.unwrap_or(self.retries)
+        self.timing_of(drive.into()).retries.unwrap_or(self.retries)
     }
 
     /// Silence before the request of this turn, and after its reply before a request to another drive.
     pub(crate) fn silence_of(&self, turn: &Turn) -> Duration {
-        self.timing_of(turn.drive).silence.unwrap_or(self.silence)
+        self.timing_of(turn.target()).silence.unwrap_or(self.silence)
     }
 
     /// Time within which a late reply may arrive on an N2 line.

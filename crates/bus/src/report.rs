@@ -470,7 +470,7 @@ impl Report {
     }
 
     /// A transaction has ended: updates counters, turnaround, load.
-    pub(super) fn exchanged(&mut self, index: DriveIndex, exchanged: &Exchanged, now: Instant) {
+    pub(super) fn exchanged(&mut self, drive: Option<DriveIndex>, exchanged: &Exchanged, now: Instant) {
         let transaction = &exchanged.transaction;
         self.busy += exchanged.took;
         self.image.transactions.observe(exchanged.took);
@@ -479,7 +479,7 @@ impl Report {
         if foreign > 0 {
             self.image.update_health(|h| h.foreign += foreign);
         }
-        let Some(drive) = self.image.drives.get(index) else {
+        let Some((index, drive)) = drive.and_then(|index| Some((index, self.image.drives.get(index)?))) else {
             return;
         };
         drive.count(counted(&exchanged.ended));

@@ -23,10 +23,11 @@ use drivegate_model::drive::DriveIndex;
 use drivegate_model::drive::why::Explanation;
 
 pub use self::earlier_meanings::{EarlierMeanings, follow_names};
-pub use self::exchange::{Exchange, Question, Target};
+pub use self::exchange::{Exchange, Question};
 pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
 pub use self::why::explain;
+pub use crate::order::Target;
 
 /// The present plant; a reload replaces it.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;

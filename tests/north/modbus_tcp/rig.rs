@@ -110,7 +110,7 @@ impl FakeBus {
                     };
                     seen.lock()
                         .unwrap()
-                        .push((command.intent.drive.place(), command.intent.order.clone()));
+                        .push((command.drive().unwrap().place(), command.intent.order.clone()));
                     match (script.lock().unwrap())(&command) {
                         Some(outcome) => command.answer(&outcome, Instant::now()),
                         None => kept.push(command),

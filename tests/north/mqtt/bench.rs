@@ -469,7 +469,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
         plant.load().report_refusals(now);
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
-                let drive = &bus.image.drives[command.intent.drive.place()];
+                let drive = &bus.image.drives[command.drive().unwrap().place()];
                 let name = |index: PointIndex| drive.spec.profile.points.get(index).unwrap().name.clone();
                 if let Order::Points(points) = &command.intent.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
@@ -478,7 +478,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
                     orders
                         .lock()
                         .unwrap()
-                        .push((command.intent.drive.place(), points, life));
+                        .push((command.drive().unwrap().place(), points, life));
                 }
                 command.answer(&Outcome::Acknowledged(Reply::Written), now);
             }

@@ -42,7 +42,7 @@ impl World {
             let text = pdu.clone();
             self.note(move || format!("line{bus} drive {} <- {text:?}", drive.wrapping_add(1)));
         }
-        if NO_DRIVE == drive {
+        if drive == NO_DRIVE {
             return self.line_stopped(bus, pdu);
         }
         self.truths[bus][drive].asked = Some(now);
@@ -276,7 +276,7 @@ impl World {
         let refused = matches!(asked.reply, Some(Reply::Exception(_)));
         let words = asked.reply.as_ref().and_then(Reply::words);
         let drive = match asked.drive {
-            drive if NO_DRIVE == drive => usize::from(asked.acted) - 1,
+            NO_DRIVE => usize::from(asked.acted) - 1,
             drive => drive,
         };
         let truth = &mut self.truths[bus][drive];

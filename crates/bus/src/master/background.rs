@@ -11,7 +11,7 @@ use crate::start_gate::Start;
 use crate::stop_of_line::BROADCAST_PAUSE;
 use crate::transaction::{CONNECTION_CLOSED, Ended};
 use drivegate_core::order::{
-    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind,
+    BackgroundRequest, Command, Interruption, Order, Origin, Outcome, Pace, PassedOn, Refusal, SourceKind, Target,
     Urgency, Work, written,
 };
 use drivegate_core::permit::{Stage, Verdict, client_access};
@@ -68,10 +68,10 @@ impl ChosenTransaction {
         }
     }
 
-    fn drive(&self) -> DriveIndex {
+    fn target(&self) -> Target {
         match &self.sending {
-            Sending::Command(command) => command.intent.drive,
-            Sending::Request(request) => request.drive,
+            Sending::Command(command) => command.intent.target,
+            Sending::Request(request) => request.target,
         }
     }
 
@@ -101,8 +101,7 @@ impl ChosenTransaction {
 
     pub(super) fn turn(&self) -> Option<Turn> {
         Some(Turn {
-            drive: self.drive(),
-            purpose: Purpose::Background,
+            purpose: Purpose::Background(self.target()),
             pdu: self.pdu()?.clone(),
         })
     }
@@ -178,8 +177,8 @@ impl Master {
             if let Some(refusal) = refusal {
                 queue.remove(now, &Outcome::Refused(refusal), |request| lost(request).is_some());
             }
-            queue.remove(now, &Outcome::Offline, |r| {
-                r.drive != NO_DRIVE && !schedule.is_online(r.drive)
+            queue.remove(now, &Outcome::Offline, |request| {
+                request.target.drive().is_some_and(|drive| !schedule.is_online(drive))
             });
         }
         !queue.is_empty()
@@ -195,7 +194,7 @@ impl Master {
         let mut blocked: Option<Instant> = None;
         let Master { drives, waits, .. } = self;
         let may = |request: &BackgroundRequest| {
-            let until = waits.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
+            let until = waits.blocks(request.target, &request.pdu, drives, now);
             let until = until.max(waits.quiet_until(request));
             blocked = blocked.into_iter().chain(until).min();
             until.is_none()
@@ -206,7 +205,7 @@ impl Master {
         let Some(request) = waiting.get(number) else {
             return Err(blocked);
         };
-        let cost = self.exchange_cost(request.drive, &request.pdu);
+        let cost = self.exchange_cost(request.target, &request.pdu);
         let admission = self.schedule.admits_background(pace, cost, idle, now);
         if let Admission::NotBefore(at) = admission {
             return Err(blocked.into_iter().chain([at]).min());
@@ -223,9 +222,9 @@ impl Master {
     }
 
     /// Duration of the transaction, as far as the profile gives it.
-    pub(super) fn exchange_cost(&self, drive: DriveIndex, pdu: &RequestPdu) -> Duration {
+    pub(super) fn exchange_cost(&self, target: Target, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
-        let image = self.bus.image.drives.get(drive);
+        let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
         let (turnaround, silence) = image.map_or((Duration::ZERO, self.silence), |image| {
             (image.spec.turnaround, image.spec.timing.silence_around(self.silence))
         });
@@ -297,9 +296,10 @@ impl Master {
 
     /// Answers a background transaction that has ended, whatever its result.
     pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
-        let index = turn.drive;
-        let heard = self.waits.sessions.transaction_ended(index, &end.ended);
-        if heard == Progress::Restarted {
+        let drive = turn.drive();
+        if let Some(index) = drive
+            && self.waits.sessions.transaction_ended(index, &end.ended) == Progress::Restarted
+        {
             self.restarted(index, now, news);
         }
         let Some(begun) = self.background.take() else {
@@ -315,22 +315,22 @@ impl Master {
                 self.schedule.background_owes(begun.pace(), end.took);
             }
         }
-        if answered {
+        if let Some(index) = drive.filter(|_| answered) {
             self.schedule.seen(index, now);
         }
         let frame = std::mem::take(&mut end.frame);
         let at = end.at;
-        let outcome = match self.is_broadcast_of(&begun) && end.ended == Ended::Silent {
+        let outcome = match self.is_broadcast(begun.target()) && end.ended == Ended::Silent {
             true => Outcome::Acknowledged(Reply::Written),
             false => self.background_outcome(turn, end, now),
         };
         if begun.passed_on().is_some_and(|passed_on| passed_on.may_write) {
             self.unchecked_write(&begun, turn, &outcome, now);
-        } else if turn.pdu.is_write() {
-            self.note_background_write(turn, &outcome, now);
+        } else if let Some(index) = drive.filter(|_| turn.pdu.is_write()) {
+            self.note_background_write(index, &turn.pdu, &outcome, now);
         }
-        if let Outcome::Acknowledged(reply) = &outcome {
-            self.note_background_read(turn, reply, (at, now), news);
+        if let (Outcome::Acknowledged(reply), Some(index)) = (&outcome, drive) {
+            self.note_background_read((index, &turn.pdu), reply, (at, now), news);
         }
         begun.answer(outcome, frame, now);
     }
@@ -339,12 +339,12 @@ impl Master {
     /// have reported a restart or changes to the tool, so it is read again.
     fn note_background_read(
         &mut self,
-        turn: &Turn,
+        (index, pdu): (DriveIndex, &RequestPdu),
         reply: &Reply,
         (at, now): (Instant, Instant),
         news: &mut Vec<News>,
     ) {
-        match (&turn.pdu, reply) {
+        match (pdu, reply) {
             (RequestPdu::Read { table, start, count }, reply) => {
                 let read = PlannedRead {
                     class: PollClass::Slow,
@@ -354,16 +354,16 @@ impl Master {
                     wide: 0,
                 };
                 if let Some(words) = reply.words() {
-                    self.learn(turn.drive, read, words, at, news);
+                    self.learn(index, read, words, at, news);
                 }
             }
             (_, Reply::Identified(_)) => {
-                if let Some(drive) = self.drives.get_mut(turn.drive) {
+                if let Some(drive) = self.drives.get_mut(index) {
                     drive.restarted();
                 }
-                self.schedule.read_again(turn.drive, now);
+                self.schedule.read_again(index, now);
             }
-            (_, Reply::Changes(digits)) if !digits.is_empty() => self.schedule.read_again(turn.drive, now),
+            (_, Reply::Changes(digits)) if !digits.is_empty() => self.schedule.read_again(index, now),
             _ => {}
         }
     }
@@ -400,38 +400,23 @@ impl Master {
         }
     }
 
-    /// The address of a turn, if no drive is configured at that address.
-    pub fn stranger(&self, turn: &Turn) -> Option<u8> {
-        let begun = self
-            .background
-            .as_ref()
-            .filter(|_| turn.purpose == Purpose::Background)?;
-        let passed_on = begun.passed_on()?;
-        (turn.drive == NO_DRIVE).then_some(passed_on.address)
-    }
-
-    /// Whether a turn is a broadcast, without a reply.
-    pub(super) fn is_broadcast(&self, turn: &Turn) -> bool {
-        self.stranger(turn) == Some(0) && self.waits.sessions.is_empty()
-    }
-
-    fn is_broadcast_of(&self, begun: &ChosenTransaction) -> bool {
-        let address = begun.passed_on().map(|passed_on| passed_on.address);
-        address == Some(0) && begun.drive() == NO_DRIVE && self.waits.sessions.is_empty()
+    /// Whether a request to that receiver is a broadcast, without a reply.
+    pub(super) fn is_broadcast(&self, target: Target) -> bool {
+        target == Target::Address(0) && self.waits.sessions.is_empty()
     }
 
     /// Time limit for the first byte of the reply, where it differs from the gateway's own requests: after a
     /// broadcast the drives get time to carry it out, and a request that is not decoded may take at most
     /// [`LONGEST_UNCHECKED`] of the line.
     pub(super) fn passed_on_timeout(&self, turn: &Turn) -> Option<Duration> {
-        if self.is_broadcast(turn) {
+        if self.is_broadcast(turn.target()) {
             return Some(BROADCAST_PAUSE);
         }
         let RequestPdu::Other(_) = &turn.pdu else { return None };
         let spec = &self.bus.image.spec;
         let wire = WireTime::of(spec.protocol, &spec.format, &turn.pdu);
         // The length of an unchecked reply is only known once it has arrived.
-        let patient = self.response_timeout_of(turn.drive) + spec.format.chars(LONGEST);
+        let patient = self.response_timeout_of(turn.target()) + spec.format.chars(LONGEST);
         Some(patient.min(LONGEST_UNCHECKED.saturating_sub(wire.request + wire.reply)))
     }
 
@@ -446,7 +431,7 @@ impl Master {
             Ended::Reply(Reply::Exception(code)) => return Outcome::Exception(code),
             Ended::Reply(reply) => reply,
         };
-        let Some(drive) = self.drives.get_mut(turn.drive) else {
+        let Some(drive) = turn.drive().and_then(|index| self.drives.get_mut(index)) else {
             return Outcome::Acknowledged(reply);
         };
         let proves_nothing = turn.pdu.is_write() && drive.late.proves_nothing(&turn.pdu, end.began, now);
@@ -460,20 +445,20 @@ impl Master {
     }
 
     /// Written registers are read back soon if polled, and the drive's command words are updated.
-    fn note_background_write(&mut self, turn: &Turn, outcome: &Outcome, now: Instant) {
-        if let Some(drive) = self.drives.get_mut(turn.drive) {
+    fn note_background_write(&mut self, index: DriveIndex, pdu: &RequestPdu, outcome: &Outcome, now: Instant) {
+        if let Some(drive) = self.drives.get_mut(index) {
             match outcome {
-                Outcome::Acknowledged(_) => drive.words.written(&turn.pdu),
+                Outcome::Acknowledged(_) => drive.words.written(pdu),
                 Outcome::Exception(_) => {}
                 _ => drive.words.forget(),
             }
         }
-        if let Some((table, items)) = written(&turn.pdu) {
-            let image = self.bus.image.drives.get(turn.drive);
+        if let Some((table, items)) = written(pdu) {
+            let image = self.bus.image.drives.get(index);
             if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
                 image.note_written(&items, now);
             }
-            self.note_write(turn.drive, table, &items, now);
+            self.note_write(index, table, &items, now);
         }
     }
 }

@@ -261,10 +261,7 @@ impl Master {
         let redundant = |drive: DriveIndex| stands.get(drive).copied().unwrap_or(false);
         let facts = AtTurn::of(drives, &bus.image.drives, now);
         for rank in RANKS {
-            let ready = |command: &Command| {
-                let online = schedule.is_online(command.intent.drive);
-                is_ready(command, online, waits, drives, now)
-            };
+            let ready = |command: &Command| is_ready(command, schedule, waits, drives, now);
             let choice = pending.next(rank, now, &facts, ready, redundant);
             if let Some(place) = commands.queued.get_mut(rank as usize) {
                 *place = choice.chosen;
@@ -296,10 +293,13 @@ impl Master {
 
     /// Begins a command from the queue. A stop is sent even to a drive that does not answer: it serves as the probe.
     fn begin(&mut self, mut command: Command, rank: Urgency, now: Instant) {
-        let index = command.intent.drive;
-        let online = self.schedule.is_online(index) || command.is_stop();
-        let known = self.drives.get_mut(index).zip(self.bus.image.drives.get(index));
-        let Some((drive, image)) = known.filter(|_| online) else {
+        let is_served = |index: &DriveIndex| self.schedule.is_online(*index) || command.is_stop();
+        let served = command.drive().filter(is_served);
+        let known = served.and_then(|index| {
+            let drive = self.drives.get_mut(index)?;
+            Some((index, drive, self.bus.image.drives.get(index)?))
+        });
+        let Some((index, drive, image)) = known else {
             command.answer(&Outcome::Offline, now);
             return;
         };
@@ -333,13 +333,12 @@ impl Master {
         } = ready;
         match self.waits.sessions.before(drive, Some(slot), now) {
             Some(session) => Turn {
-                drive,
-                purpose: Purpose::Session(session, Before::Command(slot, rank)),
+                purpose: Purpose::Session(drive, session, Before::Command(slot, rank)),
                 pdu: RequestPdu::N2(session),
             },
             None => Turn {
-                drive,
                 purpose: Purpose::Command {
+                    drive,
                     slot,
                     rank,
                     step: step.purpose,
@@ -364,12 +363,10 @@ impl Master {
         }
         let turn = match session {
             Some(session) => Turn {
-                drive: poll.drive,
-                purpose: Purpose::Session(session, Before::Poll(poll)),
+                purpose: Purpose::Session(poll.drive, session, Before::Poll(poll)),
                 pdu: RequestPdu::N2(session),
             },
             None => Turn {
-                drive: poll.drive,
                 purpose: Purpose::Poll(poll),
                 pdu,
             },
@@ -379,21 +376,22 @@ impl Master {
 
     /// Whether a turn chosen earlier may still be sent at `now`: the time of its command has not expired.
     pub(crate) fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
-        if turn.purpose == Purpose::Background {
-            return self.background_is_due(now);
-        }
-        if turn.purpose == Purpose::Refresh {
-            return self.may_still_refresh(turn, now);
-        }
-        let Some(slot) = turn.slot() else { return true };
-        if !self.may_still_write(turn.drive, slot, now) {
+        let (drive, slot) = match turn.purpose {
+            Purpose::Background(_) => return self.background_is_due(now),
+            Purpose::Refresh(drive) => return self.may_still_refresh(drive, now),
+            Purpose::Poll(_) | Purpose::Session(_, _, Before::Poll(_)) => return true,
+            Purpose::Command { drive, slot, .. } | Purpose::Session(drive, _, Before::Command(slot, _)) => {
+                (drive, slot)
+            }
+        };
+        if !self.may_still_write(drive, slot, now) {
             return false;
         }
-        let Some(run) = self.run_in_time(turn.drive, slot, now) else {
+        let Some(run) = self.run_in_time(drive, slot, now) else {
             return false;
         };
         let is_action = run.is_of_supervision() && run.is_owed();
-        !(is_action && self.client_is_back(turn.drive, now))
+        !(is_action && self.client_is_back(drive, now))
     }
 
     /// The command in progress, unless it expired while the bus waited for silence on the line.

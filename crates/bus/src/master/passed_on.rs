@@ -7,8 +7,8 @@ use super::permission::AtTurn;
 use super::waits::Waits;
 use super::{Master, Turn};
 use crate::drive_state::DriveState;
-use crate::schedule::Admission;
-use drivegate_core::order::{Command, NO_DRIVE, Order, Outcome, Pace, PassedOn};
+use crate::schedule::{Admission, Schedule};
+use drivegate_core::order::{Command, Order, Outcome, Pace, PassedOn};
 use drivegate_core::queue::{Choice, Pending, Ready};
 use drivegate_model::drive::PerDrive;
 
@@ -36,7 +36,7 @@ impl Master {
         let Order::Write(pdu) = &command.intent.order else {
             return Err(blocked);
         };
-        let cost = self.exchange_cost(command.intent.drive, pdu);
+        let cost = self.exchange_cost(command.intent.target, pdu);
         let admission = self.schedule.admits_background(Pace::Brisk, cost, idle, now);
         if let Admission::NotBefore(at) = admission {
             return Err(blocked.into_iter().chain([at]).min());
@@ -56,10 +56,7 @@ impl Master {
             ..
         } = self;
         let facts = AtTurn::of(drives, &bus.image.drives, now);
-        pending.next_passed_on(now, &facts, |command| {
-            let online = schedule.is_online(command.intent.drive);
-            is_ready(command, online, waits, drives, now)
-        })
+        pending.next_passed_on(now, &facts, |command| is_ready(command, schedule, waits, drives, now))
     }
 
     /// The broadcast of a stop of all drives, which is sent before their single stops if that is possible at once.
@@ -98,8 +95,7 @@ impl Master {
         admission: Option<Admission>,
         now: Instant,
     ) -> Option<Turn> {
-        let drive = command.intent.drive;
-        if drive != NO_DRIVE && !self.schedule.is_online(drive) {
+        if command.drive().is_some_and(|drive| !self.schedule.is_online(drive)) {
             command.answer(&Outcome::Offline, now);
             return None;
         }
@@ -116,16 +112,14 @@ impl Master {
 /// command is answered for it.
 pub(super) fn is_ready(
     command: &Command,
-    online: bool,
+    schedule: &Schedule,
     waits: &mut Waits,
     drives: &mut PerDrive<DriveState>,
     now: Instant,
 ) -> Ready {
-    match command.as_passed_on() {
-        Some(_) => waits.may_pass_on(command, drives, now),
-        None => match drives.get_mut(command.intent.drive) {
-            Some(drive) => super::choose::may_begin(drive, command, online, now),
-            None => Ready::Now,
-        },
+    let drive = command.drive().filter(|_| command.as_passed_on().is_none());
+    match drive.and_then(|index| Some((index, drives.get_mut(index)?))) {
+        Some((index, drive)) => super::choose::may_begin(drive, command, schedule.is_online(index), now),
+        None => waits.may_pass_on(command, drives, now),
     }
 }

@@ -123,19 +123,16 @@ impl Master {
             return None;
         }
         Some(Turn {
-            drive: index,
-            purpose: Purpose::Refresh,
+            purpose: Purpose::Refresh(index),
             pdu,
         })
     }
 
     /// Whether a chosen frame of a refresh may still be sent.
-    pub(super) fn may_still_refresh(&mut self, turn: &Turn, now: Instant) -> bool {
-        let is_under_way = self
-            .drives
-            .get(turn.drive)
-            .is_some_and(|drive| drive.refresh.is_under_way());
-        is_under_way && matches!(self.may_refresh(turn.drive, Stage::Write, now), May::Yes)
+    pub(super) fn may_still_refresh(&mut self, index: DriveIndex, now: Instant) -> bool {
+        let drive = self.drives.get(index);
+        let is_under_way = drive.is_some_and(|drive| drive.refresh.is_under_way());
+        is_under_way && matches!(self.may_refresh(index, Stage::Write, now), May::Yes)
     }
 
     /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, regardless of
@@ -201,27 +198,30 @@ impl Master {
     /// A frame is sent: rounds of other drives must read again before they write.
     pub(super) fn others_before_refresh(&mut self, turn: &Turn) {
         for ((index, drive), image) in self.drives.enumerate_mut().zip(&self.bus.image.drives) {
-            if drive.refresh.is_under_way() && !(turn.purpose == Purpose::Refresh && turn.drive == index) {
+            if drive.refresh.is_under_way() && turn.purpose != Purpose::Refresh(index) {
                 drive.refresh.others_go_first(&image.spec.profile);
             }
         }
-        if turn.purpose == Purpose::Refresh
+        if let Purpose::Refresh(index) = turn.purpose
             && turn.pdu.is_write()
-            && let Some(image) = self.bus.image.drives.get(turn.drive)
+            && let Some(image) = self.bus.image.drives.get(index)
         {
             image.count_refresh_write();
         }
     }
 
     /// A step of a refresh has ended.
-    pub(super) fn refreshed(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
+    pub(super) fn refreshed(
+        &mut self,
+        index: DriveIndex,
+        pdu: &RequestPdu,
+        end: TurnEnd,
+        now: Instant,
+        news: &mut Vec<News>,
+    ) {
         self.schedule.refreshed(end.took);
         self.refresh_debt = (self.refresh_debt + end.took).min(MOST_DEBT);
-        let Some((drive, image)) = self
-            .drives
-            .get_mut(turn.drive)
-            .zip(self.bus.image.drives.get(turn.drive))
-        else {
+        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
             return;
         };
         let Ended::Reply(reply) = end.ended else {
@@ -230,8 +230,8 @@ impl Master {
         };
         let is_answer = !matches!(reply, Reply::Exception(_));
         if is_answer {
-            let believed = !drive.late.proves_nothing(&turn.pdu, end.began, now);
-            drive.late.answered(&turn.pdu, end.began, now);
+            let believed = !drive.late.proves_nothing(pdu, end.began, now);
+            drive.late.answered(pdu, end.began, now);
             if !believed {
                 drive.refresh.not_answered(now);
                 return;
@@ -240,8 +240,8 @@ impl Master {
         if let Err(why) = drive.refresh.answered(&image.spec.profile, &reply, now) {
             drive.end_refresh(why);
         }
-        if let (RequestPdu::Read { table, start, count }, Some(words)) = (&turn.pdu, reply.words()) {
-            self.learn(turn.drive, read_of(*table, *start, *count), words, end.at, news);
+        if let (RequestPdu::Read { table, start, count }, Some(words)) = (pdu, reply.words()) {
+            self.learn(index, read_of(*table, *start, *count), words, end.at, news);
         }
     }
 }

@@ -9,7 +9,7 @@ use crate::n2_session::Progress;
 use crate::news::News;
 use crate::schedule::{Change, Poll, Polled, TRIAL_PAUSE};
 use crate::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
-use drivegate_core::order::{Command, Outcome, Pace, Urgency, is_range_end, written};
+use drivegate_core::order::{Command, Outcome, Pace, Target, Urgency, is_range_end, written};
 use drivegate_core::permit::is_reference;
 use drivegate_model::drive::{DriveIndex, PlannedRead, Point, PointIndex};
 use drivegate_proto::n2::Session;
@@ -20,17 +20,22 @@ impl Master {
     pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.note_late(turn, &end, now);
         match &turn.purpose {
-            Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, news),
+            Purpose::Session(drive, step, before) => self.session_went_on(*drive, *step, before, end, now, news),
             Purpose::Poll(poll) => self.polled(poll, end, now, news),
-            Purpose::Background => self.background_over(turn, end, now, news),
-            Purpose::Refresh => self.refreshed(turn, end, now, news),
-            Purpose::Command { slot, rank, step } => {
+            Purpose::Background(_) => self.background_over(turn, end, now, news),
+            Purpose::Refresh(drive) => self.refreshed(*drive, &turn.pdu, end, now, news),
+            Purpose::Command {
+                drive,
+                slot,
+                rank,
+                step,
+            } => {
                 let step = Step {
                     purpose: *step,
                     pdu: turn.pdu.clone(),
                 };
                 self.schedule.command_done(*rank, end.took);
-                self.commanded(turn.drive, *slot, &step, end, now, news);
+                self.commanded(*drive, *slot, &step, end, now, news);
             }
         }
     }
@@ -63,7 +68,8 @@ impl Master {
     /// Records the reply that may still arrive for the transaction. None is expected if the drive's own reply
     /// arrived damaged, unless the damaged one may have been a late reply to an earlier transaction.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
-        if self.is_broadcast(turn) {
+        let target = turn.target();
+        if self.is_broadcast(target) {
             // A broadcast has no reply.
             return;
         }
@@ -71,8 +77,7 @@ impl Master {
         if !self.waits.sessions.is_empty() {
             self.note_late_on_n2(turn, end, came_mangled, now);
         }
-        let stranger = self.stranger(turn);
-        let mut drive = self.drives.get_mut(turn.drive);
+        let mut drive = target.drive().and_then(|drive| self.drives.get_mut(drive));
         match &end.ended {
             Ended::Reply(reply) => {
                 if !says_no_answer(reply) {
@@ -82,29 +87,29 @@ impl Master {
                             drive.late.settled_by(&turn.pdu, now);
                         }
                     }
-                    if let Some(probes) = self.probes.get_mut(turn.drive) {
+                    if let Some(probes) = target.drive().and_then(|drive| self.probes.get_mut(drive)) {
                         *probes = 0;
                     }
                 }
-                self.last_answered = Some((turn.drive, turn.pdu.clone()));
+                self.last_answered = Some((target, turn.pdu.clone()));
             }
             Ended::Corrupt(_) if came_mangled => {
                 // A valid reply may follow the damaged one.
-                self.last_answered = Some((turn.drive, turn.pdu.clone()));
+                self.last_answered = Some((target, turn.pdu.clone()));
             }
             Ended::Silent | Ended::Corrupt(_) if self.bus.image.spec.tells_replies_apart() => {
-                if let Some((drive, image)) = drive.zip(self.bus.image.drives.get(turn.drive)) {
+                let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
+                if let Some((drive, image)) = drive.zip(image) {
                     drive.repeated_stops.not_answered(&image.spec.profile, &turn.pdu, now);
                 }
             }
             Ended::Silent | Ended::Corrupt(_) if self.waits.sessions.is_empty() => {
-                let late = match (drive, stranger) {
-                    (Some(drive), _) => Some(&mut drive.late),
-                    (None, Some(address)) => {
+                let late = match target {
+                    Target::Drive(_) => drive.map(|drive| &mut drive.late),
+                    Target::Address(address) => {
                         self.waits.strangers.retain(|_, late| late.may_come(now));
                         Some(self.waits.strangers.entry(address).or_default())
                     }
-                    (None, None) => None,
                 };
                 if let Some(late) = late {
                     late.given_up(&turn.pdu, end.began, now);
@@ -123,18 +128,16 @@ impl Master {
     /// Records the reply that may still arrive on an N2 line. Reads that waited for a late reply that will not come
     /// are due again.
     fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, came_mangled: bool, now: Instant) {
-        let configured = self.bus.image.drives.get(turn.drive);
-        let Some(address) = configured
-            .map(|image| image.spec.address)
-            .or_else(|| self.stranger(turn))
-        else {
-            return;
+        let address = match turn.target() {
+            Target::Drive(drive) => self.bus.image.drives.get(drive).map(|image| image.spec.address),
+            Target::Address(address) => Some(address),
         };
+        let Some(address) = address else { return };
         let window = self.n2_window();
         let asked = LateRequest {
             address,
             pdu: &turn.pdu,
-            device: self.waits.sessions.device(turn.drive),
+            device: turn.drive().map_or(0, |drive| self.waits.sessions.device(drive)),
             at: end.began,
         };
         match &end.ended {
@@ -275,7 +278,7 @@ impl Master {
             drive.went_offline(now);
         }
         self.waits.sessions.gone(index);
-        let gone = |c: &Command| c.intent.drive == index && !c.is_stop();
+        let gone = |c: &Command| c.intent.target == index && !c.is_stop();
         self.bus.queue.lock().remove(now, &Outcome::Offline, gone);
         news.push(News::Offline(index));
     }

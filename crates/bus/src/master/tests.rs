@@ -8,7 +8,7 @@ use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::transaction::MAY_BE_LATE;
-use drivegate_core::order::{Answer, Authority, Command, NO_DRIVE, Order, Ticket};
+use drivegate_core::order::{Answer, Authority, Command, Order, Target, Ticket};
 use drivegate_core::permit::admit;
 use drivegate_core::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use drivegate_line::LineOptions;
@@ -235,15 +235,15 @@ impl Rig {
     fn carry_out(&mut self, turn: Turn, news: &mut Vec<News>) {
         self.master.sending(&turn, self.now);
         let began = self.now;
-        let ended = match self.master.stranger(&turn) {
-            Some(0) => {
+        let ended = match turn.target() {
+            Target::Address(_) => {
                 let heard = self.drives.iter_mut().filter(|drive| !drive.silent && !self.deaf);
                 for drive in heard {
                     drive.answer(turn.pdu());
                 }
                 Ended::Silent
             }
-            _ => self.drives[turn.drive.place()].answer(turn.pdu()),
+            Target::Drive(drive) => self.drives[drive.place()].answer(turn.pdu()),
         };
         let took = if ended == Ended::Silent { TIMEOUT } else { COST };
         self.now += took;
@@ -412,7 +412,7 @@ fn stops_at_a_silent_drive_leave_the_line_to_the_others() {
     }
     let polls: Vec<Instant> = rig.wire[from..]
         .iter()
-        .filter(|(_, t)| t.drive == 1)
+        .filter(|(_, turn)| drive_of(turn) == 1)
         .map(|(at, _)| *at)
         .collect();
     let longest = polls.windows(2).map(|w| w[1] - w[0]).max().unwrap();
@@ -514,6 +514,11 @@ fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
     assert!(before.max() <= Some(32), "{ranks:?}");
 }
 
+/// Index of the drive of a turn.
+fn drive_of(turn: &Turn) -> usize {
+    turn.drive().expect("a drive").place()
+}
+
 #[test]
 fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
     let mut rig = Rig::new(2);
@@ -524,7 +529,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
         if turn.pdu().is_write() {
             break;
         }
-        let ended = rig.drives[turn.drive.place()].answer(turn.pdu());
+        let ended = rig.drives[drive_of(&turn)].answer(turn.pdu());
         let end = TurnEnd {
             ended,
             began: rig.now,
@@ -556,7 +561,7 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
     rig.run(Duration::from_millis(1500));
     let tries = rig.wire[from..]
         .iter()
-        .filter(|(_, turn)| turn.slot().is_some())
+        .filter(|(_, turn)| turn.rank().is_some())
         .count();
     assert!(tries <= 4, "{tries} times Identify for one stop");
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));

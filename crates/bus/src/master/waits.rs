@@ -8,7 +8,7 @@ use crate::late_replies::LateReplies;
 use crate::n2_late_replies::N2LateReplies;
 use crate::n2_session::N2Sessions;
 use crate::start_gate::StartGate;
-use drivegate_core::order::{BackgroundRequest, Command, Order, PassedOn, Urgency};
+use drivegate_core::order::{BackgroundRequest, Command, Order, Target, Urgency};
 use drivegate_core::queue::Ready;
 use drivegate_model::drive::{DriveIndex, PerDrive};
 use drivegate_proto::RequestPdu;
@@ -31,19 +31,18 @@ impl Waits {
     /// Until when a transaction is blocked; `None` if it is not.
     pub(super) fn blocks(
         &mut self,
-        (drive, pdu): (DriveIndex, &RequestPdu),
-        passed_on: Option<&PassedOn>,
+        target: Target,
+        pdu: &RequestPdu,
         drives: &mut PerDrive<DriveState>,
         now: Instant,
     ) -> Option<Instant> {
-        // Only a poll may identify the drive.
-        if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
-            return Some(now + super::LOOK_ROUND);
-        }
-        let late = match (passed_on, drives.get_mut(drive)) {
-            (_, Some(drive)) => Some(&mut drive.late),
-            (Some(passed_on), None) => self.strangers.get_mut(&passed_on.address),
-            (None, None) => None,
+        let late = match target {
+            // Only a poll may identify the drive.
+            Target::Drive(drive) if self.sessions.before(drive, Some(Urgency::Read), now).is_some() => {
+                return Some(now + super::LOOK_ROUND);
+            }
+            Target::Drive(drive) => drives.get_mut(drive).map(|drive| &mut drive.late),
+            Target::Address(address) => self.strangers.get_mut(&address),
         };
         let late = late.and_then(|late| late.blocks(pdu, now));
         late.max(self.n2_late.blocks(pdu, now))
@@ -52,7 +51,7 @@ impl Waits {
     /// Until when a request has to wait because it would reach a drive to which a drill lets nothing be sent.
     pub(super) fn quiet_until(&self, request: &BackgroundRequest) -> Option<Instant> {
         let (quiet, until) = self.quiet?;
-        (request.drive == quiet).then_some(until)
+        (request.target == quiet).then_some(until)
     }
 
     /// Whether the drives that a passed-on request reaches are ready: none of them has a command in progress.
@@ -64,7 +63,7 @@ impl Waits {
         let Order::Write(pdu) = &command.intent.order else {
             return Ready::Now;
         };
-        let until = self.blocks((command.intent.drive, pdu), command.as_passed_on(), drives, now);
+        let until = self.blocks(command.intent.target, pdu, drives, now);
         until.map_or(Ready::Now, Ready::At)
     }
 }

@@ -23,6 +23,7 @@ mod passed_on;
 mod raw;
 mod right;
 mod slot_write;
+mod target;
 mod ticket;
 mod touched;
 
@@ -39,10 +40,11 @@ pub use origin::{Acting, Authority, Origin, Proof, SourceKind};
 pub use outcome::{Answer, Holder, Interruption, Outcome, Refusal};
 pub use parameter::ParameterOrder;
 pub use parts::{Parts, StopEnd, joined, stop_of};
-pub use passed_on::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
+pub use passed_on::{BackgroundRequest, Pace, PassedOn};
 pub use raw::written;
 pub use right::{Grants, Right};
 pub use slot_write::{Commanded, Entry, SlotWrite};
+pub use target::Target;
 pub use ticket::{Receipt, Ticket, WriteStats};
 pub use touched::Touched;
 
@@ -172,8 +174,8 @@ pub struct Window {
 pub struct Intent {
     /// Identifies the command: no other command of the process has this number.
     pub number: u64,
-    /// Index of the drive on its bus.
-    pub drive: DriveIndex,
+    /// Receiver of the command: an address only for a broadcast.
+    pub target: Target,
     /// Content of the command.
     pub order: Order,
     /// Effects on each drive that the order reaches.
@@ -207,10 +209,10 @@ fn next_number() -> u64 {
 
 impl Intent {
     /// The intent of a new command.
-    pub fn new(drive: DriveIndex, order: Order, effects: Effects, window: Window) -> Intent {
+    pub fn new(target: impl Into<Target>, order: Order, effects: Effects, window: Window) -> Intent {
         Intent {
             number: next_number(),
-            drive,
+            target: target.into(),
             order,
             effects,
             ranges: Vec::new(),
@@ -287,6 +289,11 @@ impl Command {
             Work::Set(_) | Work::PassedOn(_) => Urgency::Command,
             Work::Read => Urgency::Read,
         }
+    }
+
+    /// The drive to which the command is sent; `None` for a broadcast.
+    pub fn drive(&self) -> Option<DriveIndex> {
+        self.intent.target.drive()
     }
 
     /// The drives that the command reaches.

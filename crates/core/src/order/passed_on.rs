@@ -4,8 +4,7 @@ use std::time::Instant;
 
 use tokio::sync::oneshot;
 
-use super::{Outcome, SourceKind, Ticket};
-use drivegate_model::drive::DriveIndex;
+use super::{Outcome, SourceKind, Target, Ticket};
 use drivegate_proto::RequestPdu;
 
 /// How much of a busy line background transactions may take, as shares of the wire time of process data; an idle
@@ -31,14 +30,9 @@ impl Pace {
     }
 }
 
-/// Index that belongs to no drive: used for a request to an address of the line at which no drive is configured.
-pub const NO_DRIVE: DriveIndex = DriveIndex::new(usize::MAX);
-
 /// A request passed on for a tool, which gets the drive's reply, or a broadcast.
 #[derive(Debug)]
 pub struct PassedOn {
-    /// The address on the line; 0 is the broadcast, except on N2.
-    pub address: u8,
     /// Whether the request may change a value of any drive that receives it.
     pub may_write: bool,
     /// Whether the request stops all drives that receive it, and precedes all waiting commands.
@@ -50,8 +44,8 @@ pub struct PassedOn {
 /// A request of the lowest rank: one transaction with one drive that is not a command.
 #[derive(Debug)]
 pub struct BackgroundRequest {
-    /// Index of the drive on its bus, or [`NO_DRIVE`].
-    pub drive: DriveIndex,
+    /// Receiver of the request.
+    pub target: Target,
     /// The request to send.
     pub pdu: RequestPdu,
     /// Share of a busy line that the request may take.

@@ -165,7 +165,9 @@ impl Gate {
             Clearance::Wait(until) => Verdict::Wait(until),
             Clearance::Refused(guarded) => {
                 let refusal = Refusal::Guarded(Box::new(guarded));
-                starts.count_refused(intent.drive, &refusal);
+                if let Some(drive) = intent.target.drive() {
+                    starts.count_refused(drive, &refusal);
+                }
                 Verdict::refuse(refusal)
             }
         }
@@ -258,10 +260,12 @@ impl Gate {
 
     /// Whether a stop waits until its motor has run for `min_run`.
     pub(crate) fn may_be_delayed(&self, stop: &Command) -> bool {
-        let (drive, origin) = (stop.intent.drive, stop.ticket.origin());
-        let last = self.drives.get(&drive).and_then(|drive| drive.last_stops.time());
+        let origin = stop.ticket.origin();
         let starts = self.starts.as_ref().filter(|_| origin.kind.stops_may_be_delayed());
-        starts.is_some_and(|starts| starts.is_ordinary_stop(drive, origin.client(), last))
+        starts.zip(stop.drive()).is_some_and(|(starts, drive)| {
+            let last = self.drives.get(&drive).and_then(|drive| drive.last_stops.time());
+            starts.is_ordinary_stop(drive, origin.client(), last)
+        })
     }
 
     /// Until when `min_run` delays an ordinary stop of the drive.

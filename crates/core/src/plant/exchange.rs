@@ -10,23 +10,14 @@ use tokio::sync::oneshot;
 use super::BusHandle;
 use super::orders::changes;
 use crate::order::{
-    Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, Pace,
-    PassedOn, Ticket, Touched, Window, WriteStats, written,
+    Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, Order, Origin, Outcome, Pace, PassedOn,
+    Target, Ticket, Touched, Window, WriteStats, written,
 };
 use crate::permit::{Stage, client_access};
 use crate::process_image::DriveImage;
 use crate::queue::Denied;
 use drivegate_model::drive::DriveIndex;
 use drivegate_proto::{Protocol, RequestPdu, describe};
-
-/// Receiver of a request on the line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Target {
-    /// The drive that is configured at this position of the bus.
-    Drive(DriveIndex),
-    /// An address at which no drive is configured; 0 is the broadcast, except on N2.
-    Address(u8),
-}
 
 /// A tool's request. The caller has checked that a write is allowed.
 #[derive(Debug, Clone)]
@@ -92,17 +83,11 @@ impl BusHandle {
 
     fn pass_on(&self, question: Question, first: bool, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         let (spec, drives) = (&self.image.spec, &self.image.drives);
-        let (drive, address, name) = match question.target {
-            Target::Drive(index) => {
-                let drive = drives.get(index);
-                let address = drive.map_or(0, |drive| drive.spec.address);
-                (
-                    index,
-                    address,
-                    drive.map_or_else(String::new, |drive| drive.spec.name.clone()),
-                )
-            }
-            Target::Address(address) => (NO_DRIVE, address, format!("address {address} of {}", spec.name)),
+        let name = match question.target {
+            Target::Drive(index) => drives
+                .get(index)
+                .map_or_else(String::new, |drive| drive.spec.name.clone()),
+            Target::Address(address) => format!("address {address} of {}", spec.name),
         };
         let what = describe::request_on(spec.protocol, &question.pdu);
         let may_write = question.may_write;
@@ -122,7 +107,6 @@ impl BusHandle {
         let ticket = ticket.with_runs(runs.collect());
         let (sender, frame) = oneshot::channel();
         let passed_on = PassedOn {
-            address,
             may_write,
             first,
             frame: sender,
@@ -134,7 +118,7 @@ impl BusHandle {
                 return Exchange { answer, frame };
             }
             let request = BackgroundRequest {
-                drive,
+                target: question.target,
                 pdu: question.pdu,
                 pace: Pace::Brisk,
                 expires: question.expires,
@@ -161,7 +145,7 @@ impl BusHandle {
             expires: question.expires,
             waits: false,
         };
-        let intent = Intent::new(drive, order.clone(), effects, window);
+        let intent = Intent::new(question.target, order.clone(), effects, window);
         let facts = self.at_accept(Duration::ZERO, now);
         let (origin, what) = (ticket.origin().clone(), ticket.what().to_string());
         let refusal = self

@@ -77,7 +77,8 @@ impl BusHandle {
         }
         let queue = self.queue.lock();
         let mut origins = command.origins();
-        origins.any(|origin| queue.gate.hold_renews(command.intent.drive, origin))
+        let renews = |drive| origins.any(|origin| queue.gate.hold_renews(drive, origin));
+        command.drive().is_some_and(renews)
     }
 }
 

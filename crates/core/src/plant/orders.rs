@@ -494,7 +494,7 @@ impl DriveHandle {
         let name = &self.image.spec.name;
         let (ticket, answer) = Ticket::new(origin, name, String::new(), false, now, self.writes.clone());
         let request = BackgroundRequest {
-            drive: self.index,
+            target: self.index.into(),
             pdu,
             pace,
             expires: now + expiry,

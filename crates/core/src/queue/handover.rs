@@ -43,7 +43,7 @@ impl Pending {
 
     /// Whether no bus sends anything to the drive of a command after this one.
     pub(super) fn is_last(&self, command: &Command) -> bool {
-        self.last.contains(&command.intent.drive)
+        command.drive().is_some_and(|drive| self.last.contains(&drive))
     }
 
     /// Passes on a stop that the bus had started when it ended: the bus that replaces it sends the stop.
@@ -75,9 +75,10 @@ impl Pending {
 impl Command {
     /// Changes the index of its drive to the one on the bus that serves the drive now.
     pub(super) fn move_to(&mut self, place: DriveIndex) {
-        let effect = self.effect(self.intent.drive);
-        self.intent.drive = place;
-        self.intent.effects = Effects::on_one(place, effect, Touched::Anything);
+        if let Some(drive) = self.drive() {
+            self.intent.effects = Effects::on_one(place, self.effect(drive), Touched::Anything);
+        }
+        self.intent.target = place.into();
     }
 }
 
@@ -91,7 +92,8 @@ impl CommandQueue {
         pending.remove(now, &outcome, |c| !c.is_stop());
         pending.closed = Some(outcome);
         pending.ending = true;
-        let hurried = pending.waiting.iter_mut().filter(|c| last.contains(&c.intent.drive));
+        let is_last = |c: &&mut Command| c.drive().is_some_and(|drive| last.contains(&drive));
+        let hurried = pending.waiting.iter_mut().filter(is_last);
         hurried.for_each(Command::end_delay);
         pending.last = last;
         drop(pending);
@@ -110,7 +112,7 @@ impl CommandQueue {
         let mut of_heir = heir.lock();
         let (stops, others): (VecDeque<Command>, _) = std::mem::take(&mut pending.waiting)
             .into_iter()
-            .partition(|c| c.intent.drive == drive && c.is_stop());
+            .partition(|c| c.intent.target == drive && c.is_stop());
         pending.waiting = others;
         for mut stop in stops {
             stop.move_to(place);

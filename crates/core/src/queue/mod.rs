@@ -17,7 +17,7 @@ pub use stops::{NotStopped, Stopping};
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Instant;
 
-use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Urgency};
+use crate::order::{CAPACITY, Command, Order, Origin, Outcome, Refusal, Target, Urgency};
 use crate::permit::{Facts, Gate, Stage, Verdict};
 use drivegate_model::drive::DriveIndex;
 
@@ -41,8 +41,8 @@ pub struct Pending {
     closed: Option<Outcome>,
     /// The gateway is about to stop: only stops get in.
     stops_only: bool,
-    /// Clients and their drives in the order in which they were served, the latest one last.
-    served: VecDeque<(String, DriveIndex)>,
+    /// Clients and the receivers of their commands in the order in which they were served, the latest one last.
+    served: VecDeque<(String, Target)>,
     /// Drives for which a stop arrived since the bus last checked, each once.
     stopped: Vec<DriveIndex>,
     /// The bus is ending and another one replaces it: stops wait for that bus.
@@ -119,8 +119,8 @@ impl Pending {
     /// If the gate refuses the command, its refusal; the command is answered by then.
     pub fn push(&mut self, mut command: Command, facts: &dyn Facts, now: Instant) -> Option<Refusal> {
         let is_stop = command.is_stop();
-        if is_stop && let Some((queue, place)) = self.heirs.get(&command.intent.drive).and_then(PresentQueue::served_by)
-        {
+        let heir = || self.heirs.get(&command.drive()?)?.served_by();
+        if is_stop && let Some((queue, place)) = heir() {
             command.move_to(place);
             return queue.submit(command, facts, now);
         }
@@ -193,7 +193,8 @@ impl Pending {
     /// The queued reference that a newer one replaces: the last one of the same points, unless a later command
     /// conflicts with it.
     fn replaced_by(&self, command: &Command) -> Option<usize> {
-        let to_drive = |c: &Command| c.urgency() != Urgency::Read && c.reaches(command.intent.drive);
+        let drive = command.drive()?;
+        let to_drive = |c: &Command| c.urgency() != Urgency::Read && c.reaches(drive);
         let same = |c: &Command| c.is_reference_only() && same_points(&c.intent.order, &command.intent.order);
         let touches = &command.intent.effects.touches;
         let ends = |c: &Command| same(c) || !c.intent.effects.touches.commutes(touches);
@@ -206,10 +207,10 @@ impl Pending {
     /// client of the new command, of the drive with the most; neither may have fewer than the new command's client
     /// or drive would have.
     fn victim(&self, command: &Command) -> Option<usize> {
-        let (client, drive) = (command.ticket.client(), command.intent.drive);
-        let of_client = |c: &Command| (c.ticket.client() == client).then_some(c.intent.drive);
+        let (client, target) = (command.ticket.client(), command.intent.target);
+        let of_client = |c: &Command| (c.ticket.client() == client).then_some(c.intent.target);
         self.youngest_of_most(|c| Some(c.ticket.client()), client)
-            .or_else(|| self.youngest_of_most(of_client, drive))
+            .or_else(|| self.youngest_of_most(of_client, target))
     }
 
     /// The newest command of the group with the most commands, if that group has more than the `own` group would
@@ -279,22 +280,22 @@ impl Pending {
         };
         // Drives whose later commands must wait: for an older command, or for a stop.
         let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);
-        let mut stopped: Vec<DriveIndex> = Vec::new();
+        let mut stopped: Vec<Target> = Vec::new();
         let mut best = None;
         for (index, command) in self.waiting.iter().enumerate() {
-            let (drive, urgency) = (command.intent.drive, command.urgency());
+            let (target, urgency) = (command.intent.target, command.urgency());
             if urgency == Urgency::Stop {
                 // The oldest stop of a drive is sent first, regardless of what else its client commands.
-                if stopped.contains(&drive) {
+                if stopped.contains(&target) {
                     continue;
                 }
-                stopped.push(drive);
+                stopped.push(target);
             }
             let is_passed_on = command.as_passed_on().is_some();
-            let own = match urgency {
-                Urgency::Command if !is_passed_on && behind.contains(&drive) => continue,
-                Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
-                urgency => urgency,
+            let own = match (urgency, target) {
+                (Urgency::Command, Target::Drive(drive)) if !is_passed_on && behind.contains(&drive) => continue,
+                (Urgency::Stop, Target::Drive(drive)) if redundant(drive) && !self.may_start(drive) => Urgency::Command,
+                _ => urgency,
             };
             keep_order(command, &mut behind);
             let number = command.intent.number;
@@ -322,7 +323,7 @@ impl Pending {
             return Verdict::Go;
         };
         if command.is_delayed_stop()
-            && let Some(until) = self.gate.stop_waits(command.intent.drive, now)
+            && let Some(until) = command.drive().and_then(|drive| self.gate.stop_waits(drive, now))
         {
             return Verdict::Wait(until);
         }
@@ -345,9 +346,9 @@ impl Pending {
 
     /// Answers an accepted command that is refused, and keeps the refusal to be reported.
     fn deny(&mut self, command: Command, outcome: &Outcome, now: Instant) {
-        if let Outcome::Refused(refusal) = outcome {
+        if let (Outcome::Refused(refusal), Some(drive)) = (outcome, command.reach().next()) {
             self.note_denied(Denied {
-                drive: command.reach().next().unwrap_or(command.intent.drive),
+                drive,
                 origin: command.ticket.origin().clone(),
                 what: command.ticket.what().to_string(),
                 refusal: refusal.clone(),
@@ -361,14 +362,14 @@ impl Pending {
         let index = self.waiting.iter().position(|c| c.intent.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
         if command.is_stop() {
-            self.begun_stops.push(command.intent.drive);
+            self.begun_stops.extend(command.drive());
         }
         for older in self.waiting.iter_mut().take(index) {
             if older.urgency() >= command.urgency() {
                 older.overtaken += 1;
             }
         }
-        let of = (command.ticket.client().to_string(), command.intent.drive);
+        let of = (command.ticket.client().to_string(), command.intent.target);
         self.served.retain(|served| *served != of);
         // Clients without waiting commands need no entry, so the list stays as short as the queue.
         if self.served.len() >= SERVED_KEPT {
@@ -386,13 +387,13 @@ impl Pending {
         let of_drive = self
             .served
             .iter()
-            .position(|(of, drive)| of == client && *drive == command.intent.drive);
+            .position(|(of, target)| of == client && *target == command.intent.target);
         (last, of_drive)
     }
 
     fn drives_of(&self, urgency: Urgency) -> Vec<DriveIndex> {
         let of_rank = self.waiting.iter().filter(|c| c.urgency() == urgency);
-        of_rank.map(|c| c.intent.drive).collect()
+        of_rank.filter_map(Command::drive).collect()
     }
 
     /// Whether a command waits that may start the drive.

@@ -16,7 +16,7 @@ impl Pending {
             return Vec::new();
         }
         let stops = self.waiting.iter().filter(|c| c.is_stop());
-        let mut first: Vec<DriveIndex> = stops.filter(|c| may(c)).map(|c| c.intent.drive).collect();
+        let mut first: Vec<DriveIndex> = stops.filter(|c| may(c)).filter_map(Command::drive).collect();
         let mut all = Vec::new();
         for command in self.waiting.iter().filter(|c| c.is_command()) {
             let free = command.as_passed_on().is_some() && command.reach().all(|drive| !first.contains(&drive));

@@ -59,7 +59,7 @@ impl Pending {
     /// Whether a cyclic client repeats its waiting delayed stop.
     fn repeats(&self, stop: &Command) -> bool {
         let origin = stop.ticket.origin();
-        let alike = |c: &Command| c.intent.drive == stop.intent.drive && c.intent.order == stop.intent.order;
+        let alike = |c: &Command| c.intent.target == stop.intent.target && c.intent.order == stop.intent.order;
         let own = |c: &Command| c.ticket.origin().client() == origin.client();
         let waits = |c: &Command| c.is_delayed_stop() && alike(c) && own(c);
         self.waiting.iter().any(waits) && self.gate.is_cyclic(origin)
@@ -67,7 +67,7 @@ impl Pending {
 
     /// Until when `min_run` delays the waiting stop of the drive.
     pub fn stop_waits(&self, drive: DriveIndex, now: Instant) -> Option<Instant> {
-        let delayed = |c: &Command| c.is_delayed_stop() && c.intent.drive == drive;
+        let delayed = |c: &Command| c.is_delayed_stop() && c.intent.target == drive;
         self.waiting
             .iter()
             .any(delayed)
@@ -82,16 +82,18 @@ impl Pending {
     /// At most one bare stop and one stop that also does more wait for each drive. Later ones join an equal one and
     /// are answered with it; if they differ, the newer one is sent.
     pub(super) fn push_stop(&mut self, stop: Command, now: Instant) {
-        let drive = stop.intent.drive;
+        let target = stop.intent.target;
         self.gate.accepted(&stop, now);
-        self.purge(drive, now);
+        if let Some(drive) = target.drive() {
+            self.purge(drive, now);
+        }
         // A second stop waits for nothing, nor does the first one any more.
         if !stop.is_delayed_stop() {
-            let of_drive = self.waiting.iter_mut().filter(|c| c.intent.drive == drive);
+            let of_drive = self.waiting.iter_mut().filter(|c| c.intent.target == target);
             of_drive.for_each(Command::end_delay);
         }
         let bare = stop.is_bare_stop();
-        let alike = |c: &Command| c.intent.drive == drive && c.is_stop() && c.is_bare_stop() == bare;
+        let alike = |c: &Command| c.intent.target == target && c.is_stop() && c.is_bare_stop() == bare;
         let waiting = self.waiting.iter_mut().find(|c| alike(c));
         match waiting.map(|waiting| (waiting.intent.order == stop.intent.order, &mut waiting.work)) {
             Some((true, Work::Stop(waiting))) => {
@@ -137,7 +139,7 @@ impl Pending {
     /// Withdraws a supervision action that has not started: a client commands the drive again.
     pub fn withdraw_supervision(&mut self, drive: DriveIndex, now: Instant) {
         self.remove(now, &Outcome::Withdrawn, |c| {
-            c.intent.drive == drive && c.origins().all(Origin::is_lease)
+            c.intent.target == drive && c.origins().all(Origin::is_lease)
         });
     }
 

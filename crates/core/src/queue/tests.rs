@@ -109,7 +109,7 @@ impl Clients {
     }
 
     fn pop(&mut self) -> Option<(usize, Urgency)> {
-        self.take().map(|c| (c.intent.drive.place(), c.urgency()))
+        self.take().map(|c| (c.drive().unwrap().place(), c.urgency()))
     }
 
     /// All waiting commands in the order in which they would be sent: client, drive and first point.
@@ -121,7 +121,7 @@ impl Clients {
             };
             all.push((
                 command.ticket.origin().who.clone(),
-                command.intent.drive.place(),
+                command.drive().unwrap().place(),
                 values[0].0.place(),
             ));
         }
@@ -229,7 +229,7 @@ fn later_commands_wait_behind_the_oldest_of_their_drive_that_cannot_begin() {
         &(),
         |command: &Command| {
             asked.push(command.intent.order.clone());
-            match command.intent.drive == DriveIndex::new(1) {
+            match command.intent.target == DriveIndex::new(1) {
                 true => Ready::No,
                 false => Ready::Now,
             }
@@ -341,7 +341,7 @@ fn nobody_is_overtaken_without_a_bound() {
     let mut turns = 0;
     loop {
         let _new = rig.push_from(&format!("new {turns}"), 2, &[2]);
-        if rig.take().unwrap().intent.drive == DriveIndex::new(1) {
+        if rig.take().unwrap().intent.target == DriveIndex::new(1) {
             break;
         }
         turns += 1;

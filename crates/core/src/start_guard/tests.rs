@@ -3,7 +3,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
 use crate::order::{
-    Arrival, Command, Effect, Effects, Intent, NO_DRIVE, Order, Origin, Outcome, PassedOn, Refusal, SourceKind, Ticket,
+    Arrival, Command, Effect, Effects, Intent, Order, Origin, Outcome, PassedOn, Refusal, SourceKind, Target, Ticket,
     Touched, Window,
 };
 use crate::permit::{Gate, Stage, Verdict};
@@ -146,9 +146,13 @@ fn judged(
     };
     let effects = drives.iter().map(|drive| (DriveIndex::new(*drive), RUN)).collect();
     let order = Order::Write(RequestPdu::write_register(2000, 1));
-    let intent = Intent::new(NO_DRIVE, order, Effects::on_all(effects, Touched::Anything), window);
+    let intent = Intent::new(
+        Target::Address(0),
+        order,
+        Effects::on_all(effects, Touched::Anything),
+        window,
+    );
     let passed_on = PassedOn {
-        address: 0,
         may_write: true,
         first: false,
         frame: tokio::sync::oneshot::channel().0,

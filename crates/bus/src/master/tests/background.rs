@@ -16,7 +16,7 @@ impl Rig {
         let origin = Origin::new(SourceKind::LocalSocket, who);
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), false, self.now, self.stats.clone());
         let request = BackgroundRequest {
-            drive: DriveIndex::new(drive),
+            target: DriveIndex::new(drive).into(),
             pdu: RequestPdu::read(Table::Holding, REGISTER, count),
             pace,
             expires: self.now + Duration::from_secs(60),
@@ -57,7 +57,7 @@ impl Rig {
 }
 
 fn is_background(turn: &Turn) -> bool {
-    turn.purpose == Purpose::Background
+    matches!(turn.purpose, Purpose::Background(_))
 }
 
 fn is_fast(turn: &Turn) -> bool {

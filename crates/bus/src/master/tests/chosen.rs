@@ -62,7 +62,7 @@ fn an_action_goes_out_though_an_order_waits_whose_time_is_over() {
         assert!(rig.now < until, "no action of the lease");
         let mut news = Vec::new();
         match rig.master.next(rig.now, &mut news) {
-            Ok(turn) if turn.slot() == Some(Urgency::Stop) => break turn,
+            Ok(turn) if turn.rank() == Some(Urgency::Stop) => break turn,
             Ok(turn) => rig.carry_out(turn, &mut news),
             Err(until) => rig.now = until,
         }

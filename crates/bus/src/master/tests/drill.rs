@@ -71,7 +71,7 @@ fn a_silent_gateway_sends_a_drive_nothing_and_its_fault_proves_the_stop() {
     let meanwhile = rig.wire[from..]
         .iter()
         .take_while(|(at, _)| *at < began + LIMIT - 2 * COST);
-    let asked: Vec<usize> = meanwhile.map(|(_, turn)| turn.drive.place()).collect();
+    let asked: Vec<usize> = meanwhile.map(|(_, turn)| drive_of(turn)).collect();
     assert!(!asked.contains(&0), "it was sent something");
     assert!(asked.len() > 50, "the other drive is read as ever: {}", asked.len());
 }

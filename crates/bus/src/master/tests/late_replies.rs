@@ -6,7 +6,7 @@ use super::*;
 fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() {
     let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
     let writes = |rig: &Rig, of: usize| -> Vec<Instant> {
-        let of = |(_, turn): &&(Instant, Turn)| turn.drive == of && turn.pdu().is_write();
+        let of = |(_, turn): &&(Instant, Turn)| turn.drive().is_some_and(|drive| drive == of) && turn.pdu().is_write();
         rig.wire.iter().filter(of).map(|(at, _)| *at).collect()
     };
     rig.drives[1].next_write = Some(Ended::Silent);
@@ -24,7 +24,9 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     // A drive answers in order: once each has answered another request, no late reply can arrive.
     let asked = |of: usize| {
         let between = |at: &Instant| *at > sent[0] && *at < sent[1];
-        rig.wire.iter().any(|(at, turn)| turn.drive == of && between(at))
+        rig.wire
+            .iter()
+            .any(|(at, turn)| turn.drive().is_some_and(|drive| drive == of) && between(at))
     };
     assert!(asked(0) && asked(1));
     assert!(sent[1] < sent[0] + rig.master.response_timeout * N2_LATE);
@@ -58,11 +60,13 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         let mut turn = read(&mut rig);
         // The reply before has another form than this one's.
         let written = RequestPdu::WriteCoil { address: 0, on: true };
-        rig.master.last_answered = Some((turn.drive, written));
+        rig.master.last_answered = Some((turn.target(), written));
         assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
         rig.now += COST;
         rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
-        turn.drive = DriveIndex::new(1 - turn.drive.place());
+        if let Purpose::Poll(poll) = &mut turn.purpose {
+            poll.drive = DriveIndex::new(1 - poll.drive.place());
+        }
         assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
     }
 }

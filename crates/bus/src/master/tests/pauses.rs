@@ -27,7 +27,7 @@ impl Rig {
                 }
                 Ok(turn) => {
                     self.master.sending(&turn, self.now);
-                    let ended = self.drives[turn.drive.place()].answer(turn.pdu());
+                    let ended = self.drives[drive_of(&turn)].answer(turn.pdu());
                     self.ends(&turn, ended, (self.now + COST, false));
                 }
             }

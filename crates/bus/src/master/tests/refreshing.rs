@@ -108,7 +108,7 @@ impl Plant {
         let wire = &self.rig.wire[from..];
         let writes = wire
             .windows(2)
-            .filter(|pair| pair[1].1.purpose == Purpose::Refresh && pair[1].1.pdu.is_write());
+            .filter(|pair| matches!(pair[1].1.purpose, Purpose::Refresh(_)) && pair[1].1.pdu.is_write());
         writes
             .map(|pair| (pair[1].0, pair[1].1.pdu.clone(), pair[0].1.clone()))
             .collect()
@@ -169,7 +169,7 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
             if let Some(again) = plant.has_word(pdu) {
                 assert!(by_word && again == word, "{name}: {pdu:?}, not {word:#06x}");
                 assert!(
-                    before.purpose == Purpose::Refresh && !before.pdu.is_write(),
+                    matches!(before.purpose, Purpose::Refresh(_)) && !before.pdu.is_write(),
                     "{name}: {before:?}"
                 );
             } else {
@@ -216,7 +216,7 @@ fn references_without_end_do_not_hold_up_the_word() {
             plant.rig.run(Duration::from_millis(150));
         }
         let wire = plant.rig.wire[from..].iter();
-        let words = wire.filter(|(_, turn)| turn.purpose == Purpose::Refresh && turn.pdu.is_write());
+        let words = wire.filter(|(_, turn)| matches!(turn.purpose, Purpose::Refresh(_)) && turn.pdu.is_write());
         let words = words.filter(|(_, turn)| plant.has_word(&turn.pdu).is_some()).count();
         assert!(words >= 4, "{name}: {words} in 6 s");
     }
@@ -287,7 +287,7 @@ fn from_the_acceptance_of_a_stop_no_run_word_is_repeated() {
         plant.rig.run(Duration::from_secs(5));
         let refreshed = plant.rig.wire[from..]
             .iter()
-            .any(|(_, turn)| turn.purpose == Purpose::Refresh);
+            .any(|(_, turn)| matches!(turn.purpose, Purpose::Refresh(_)));
         assert!(!refreshed && plant.drive().runs, "{name}");
         assert!(!plant.rig.bus.image.drives[0].is_refreshing(), "{name}");
     }
@@ -396,7 +396,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
             let mut plant = Plant::new(name);
             plant.starts();
             let until = plant.rig.now + Duration::from_secs(5);
-            let reads = |turn: &Turn| turn.purpose == Purpose::Refresh && !turn.pdu.is_write();
+            let reads = |turn: &Turn| matches!(turn.purpose, Purpose::Refresh(_)) && !turn.pdu.is_write();
             while !plant.rig.wire.last().is_some_and(|(_, turn)| reads(turn)) {
                 plant.rig.step();
                 assert!(plant.rig.now < until, "{name}");
@@ -408,7 +408,7 @@ fn a_round_that_was_interrupted_reads_again_before_it_writes() {
             plant.rig.run(Duration::from_secs(8));
             let writes = plant.rig.wire[from..]
                 .iter()
-                .filter(|(_, turn)| turn.purpose == Purpose::Refresh);
+                .filter(|(_, turn)| matches!(turn.purpose, Purpose::Refresh(_)));
             let words: Vec<Turn> = writes
                 .map(|(_, turn)| turn.clone())
                 .filter(|turn| turn.pdu.is_write() && plant.has_word(&turn.pdu).is_some())

@@ -21,7 +21,7 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
     assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
     // All other drives are stopped before the silent one gets further attempts.
     let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
-        let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
+        let stop = |(_, turn): &&(Instant, Turn)| turn.drive().is_some_and(|of| of == drive) && turn.pdu().is_write();
         rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
     });
     assert!(last.max().unwrap() < COST * 60);
@@ -34,7 +34,7 @@ fn shutdown_of(rig: &mut Rig) -> (Option<Duration>, Duration) {
     assert!(missing.is_empty(), "{missing:?}");
     let first = |broadcast: bool| {
         let mut sent = rig.wire[from..].iter();
-        let found = sent.find(|(_, turn)| turn.pdu().is_write() && (turn.drive == NO_DRIVE) == broadcast);
+        let found = sent.find(|(_, turn)| turn.pdu().is_write() && turn.drive().is_none() == broadcast);
         found.map(|(at, _)| *at - begin)
     };
     (first(true), first(false).expect("each drive has a stop of its own"))

@@ -68,10 +68,13 @@ fn a_broadcast_goes_before_all_and_each_drive_is_proven_to_stand() {
             .iter()
             .filter(|(_, turn)| turn.pdu().is_write())
             .collect();
-        assert_eq!(writes[0].1.drive, NO_DRIVE, "the broadcast goes first");
+        assert_eq!(writes[0].1.target(), Target::Address(0), "the broadcast goes first");
         assert!(writes[0].0 - begin <= COST);
         for drive in 0..20 {
-            assert!(writes.iter().any(|(_, turn)| turn.drive == drive), "a stop of its own");
+            assert!(
+                writes.iter().any(|(_, turn)| turn.target() == DriveIndex::new(drive)),
+                "a stop of its own"
+            );
             assert!(!rig.runs(drive));
         }
     }
@@ -118,7 +121,7 @@ fn no_broadcast_reaches_a_drive_that_is_not_concerned() {
     let mut order = order(&rig, &plant, &stop_all, &Scope::Group("pumps".to_string()));
     let report = answered(&mut rig, &plant, &stop_all, &mut order);
     assert!(report.ok && report.drives.len() == 2, "{report:?}");
-    assert!(rig.wire[from..].iter().all(|(_, turn)| turn.drive != NO_DRIVE));
+    assert!(rig.wire[from..].iter().all(|(_, turn)| turn.drive().is_some()));
     assert_eq!([0, 1, 2].map(|drive| rig.runs(drive)), [false, true, false]);
 }
 

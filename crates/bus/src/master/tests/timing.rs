@@ -29,7 +29,7 @@ fn tries_until_offline(rig: &mut Rig, drive: usize) -> usize {
     }
     let tries = rig.wire[from..]
         .iter()
-        .filter(|(_, turn)| turn.drive.place() == drive)
+        .filter(|(_, turn)| drive_of(turn) == drive)
         .count();
     rig.drives[drive].silent = false;
     tries
@@ -45,14 +45,14 @@ fn a_drive_has_its_own_time_and_silence_and_the_others_have_those_of_the_bus() {
             continue;
         };
         let sending = rig.master.sending(&turn, rig.now);
-        let (timeout, silence) = match turn.drive.place() {
+        let (timeout, silence) = match drive_of(&turn) {
             0 => (options().response_timeout, SILENCE),
             _ => (Duration::from_millis(400), Duration::from_millis(90)),
         };
         assert_eq!((sending.response_timeout, sending.silence), (timeout, silence));
-        asked[turn.drive.place()] = true;
+        asked[drive_of(&turn)] = true;
         let end = TurnEnd {
-            ended: rig.drives[turn.drive.place()].answer(turn.pdu()),
+            ended: rig.drives[drive_of(&turn)].answer(turn.pdu()),
             began: rig.now,
             at: rig.now + COST,
             stood: false,

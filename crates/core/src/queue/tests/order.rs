@@ -2,7 +2,7 @@
 //! before a stop.
 
 use super::*;
-use crate::order::{Effect, Effects, Intent, NO_DRIVE, PassedOn};
+use crate::order::{Effect, Effects, Intent, PassedOn, Target};
 use drivegate_model::drive::{DriveIndex, PointIndex};
 use drivegate_proto::{Reply, RequestPdu};
 
@@ -29,9 +29,8 @@ impl Clients {
         };
         let order = Order::Write(RequestPdu::write_register(2000, value));
         let effects = Effects::on_all(effects, Touched::Anything);
-        let intent = Intent::new(NO_DRIVE, order, effects, window);
+        let intent = Intent::new(Target::Address(0), order, effects, window);
         let passed_on = PassedOn {
-            address: 0,
             may_write: true,
             first: false,
             frame,
@@ -133,14 +132,10 @@ fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
     assert!(!rig.passes_on(), "an older order waits for drive 1");
     let _behind = rig.push_from("a", 2, &[2]);
     let _beside = rig.push_from("a", 3, &[3]);
-    let order: Vec<usize> = std::iter::from_fn(|| rig.take())
-        .map(|c| c.intent.drive.place())
-        .collect();
-    let place = |drive| order.iter().position(|d| *d == drive);
-    assert!(
-        place(1) < place(NO_DRIVE.place()) && place(NO_DRIVE.place()) < place(2),
-        "{order:?}"
-    );
+    let order: Vec<Target> = std::iter::from_fn(|| rig.take()).map(|c| c.intent.target).collect();
+    let place = |target| order.iter().position(|of| *of == target);
+    let (broadcast, drive) = (place(Target::Address(0)), |drive| place(DriveIndex::new(drive).into()));
+    assert!(drive(1) < broadcast && broadcast < drive(2), "{order:?}");
     assert_eq!(order.len(), 4);
     // A broadcast waits for idle time if no order waits for it.
     let _broadcast = rig.broadcast(STOP);
@@ -210,7 +205,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
     assert_eq!(outcome(&mut gone), Some(Outcome::ShuttingDown), "nobody takes it over");
     let mut sent = Vec::new();
     while let Some(stop) = crate::testkit::take_next(&new, now) {
-        sent.push(stop.intent.drive);
+        sent.extend(stop.drive());
         stop.answer(&Outcome::Acknowledged(Reply::Written), now);
     }
     assert_eq!(sent, [0, 1]);
@@ -248,7 +243,7 @@ fn a_stop_finds_the_last_of_many_buses_and_keeps_none_between() {
     };
     let _answer = give();
     assert_eq!(
-        crate::testkit::take_next(&last, now).unwrap().intent.drive,
+        crate::testkit::take_next(&last, now).unwrap().intent.target,
         DriveIndex::new(20)
     );
     drop(last);

@@ -1,7 +1,7 @@
 //! Orders of other sides and the slots of BACnet's clients: accepted, refused and withdrawn in one order.
 
 use super::*;
-use crate::order::{Commanded, Effect, Effects, Entry, Intent, NO_DRIVE, PassedOn, SlotWrite};
+use crate::order::{Commanded, Effect, Effects, Entry, Intent, PassedOn, SlotWrite, Target};
 use crate::permit::Settled;
 use drivegate_model::drive::DriveIndex;
 use drivegate_proto::RequestPdu;
@@ -82,7 +82,6 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
     let broadcast = |run: bool| {
         let (ticket, answer) = ticket(&Arc::default(), now);
         let passed_on = PassedOn {
-            address: 0,
             may_write: true,
             first: false,
             frame: tokio::sync::oneshot::channel().0,
@@ -95,7 +94,7 @@ fn what_a_tool_sends_to_all_is_refused_for_one_and_its_stop_withdraws() {
             waits: false,
         };
         let order = Order::Write(RequestPdu::write_register(1, 0));
-        let intent = Intent::new(NO_DRIVE, order, effects, window);
+        let intent = Intent::new(Target::Address(0), order, effects, window);
         (Command::passed_on(intent, passed_on, ticket), answer)
     };
     let (start, mut answer) = broadcast(true);

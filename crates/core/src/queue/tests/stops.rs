@@ -34,7 +34,7 @@ impl Clients {
             .chosen?;
         assert_eq!(chosen.rank, rank);
         let command = self.pending.take(chosen)?;
-        Some((command.intent.drive.place(), command.urgency()))
+        Some((command.drive().unwrap().place(), command.urgency()))
     }
 }
 

@@ -44,9 +44,9 @@ fn a_drive_that_may_not_be_fed_now_holds_up_no_other() {
             }
             rig.step();
         }
-        let is_fed = |turn: &Turn| turn.purpose == Purpose::Refresh && turn.pdu.is_write();
+        let is_fed = |turn: &Turn| matches!(turn.purpose, Purpose::Refresh(_)) && turn.pdu.is_write();
         let fed = rig.wire[from..].iter().filter(|(_, turn)| is_fed(turn));
-        let fed = fed.filter(|(_, turn)| turn.drive == DriveIndex::new(1)).count();
+        let fed = fed.filter(|(_, turn)| turn.target() == DriveIndex::new(1)).count();
         assert!(fed >= 7, "{name}: {fed} in 10 s");
     }
 }

@@ -156,7 +156,7 @@ fn a_refresh_that_is_not_answered_is_not_tried_again_at_once() {
         plant.rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));
         plant.rig.run(Duration::from_millis(2_500));
         let wire = plant.rig.wire[from..].iter();
-        let writes = wire.filter(|(_, turn)| turn.purpose == Purpose::Refresh && turn.pdu.is_write());
+        let writes = wire.filter(|(_, turn)| matches!(turn.purpose, Purpose::Refresh(_)) && turn.pdu.is_write());
         let writes: Vec<Instant> = writes.map(|(at, _)| *at).collect();
         let shortest = writes.windows(2).map(|pair| pair[1] - pair[0]).min();
         assert!(!writes.is_empty(), "{name}");
