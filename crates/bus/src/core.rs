@@ -295,7 +295,7 @@ impl BusCore {
         let request = match turn.target() {
             Target::Address(address) => Request::new(address, turn.pdu().clone()),
             Target::Drive(drive) => {
-                let image = self.bus.image.drives.get(drive)?;
+                let image = self.bus.image.drives.of(drive);
                 Request {
                     address: image.spec.address,
                     pdu: turn.pdu().clone(),

@@ -66,11 +66,7 @@ impl DriveCounters {
             let next = match state {
                 State::Idle(at, _) if now < *at => continue,
                 State::Idle(_, counted) => {
-                    let online = bus
-                        .image
-                        .drives
-                        .get(*drive)
-                        .is_some_and(|d| d.snapshot().link.is_online());
+                    let online = bus.image.drives.of(*drive).snapshot().link.is_online();
                     let counted = std::mem::take(counted);
                     match online && diagnosis.has_errors(*drive) {
                         true => {
@@ -114,7 +110,7 @@ impl DriveCounters {
 
 /// Requests the counter that follows those already read.
 fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
-    let name = bus.image.drives.get(drive).map_or("", |drive| drive.spec.name.as_str());
+    let name = &bus.image.drives.of(drive).spec.name;
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");
     let (ticket, answer) = Ticket::new(
         origin,

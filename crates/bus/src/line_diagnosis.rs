@@ -80,18 +80,17 @@ impl LineDiagnosis {
     /// Whether transactions with that drive failed in the last minute.
     pub(super) fn has_errors(&self, drive: DriveIndex) -> bool {
         let failed = [Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Silent];
-        let drive = self.figures.drives.get(drive);
-        drive.is_some_and(|drive| failed.iter().any(|sign| drive.sum(*sign) > 0))
+        let drive = self.figures.drives.of(drive);
+        failed.iter().any(|sign| drive.sum(*sign) > 0)
     }
 
     /// Notes counters that were read from a drive.
     pub(super) fn counted_by_drive(&mut self, drive: DriveIndex, counted: CountedByDrive) {
-        if let Some(known) = self.by_drive.get_mut(drive) {
-            // A drive that was switched off counts from 0 again.
-            let goes_on = |before: &CountedByDrive| counted.since(before).messages < u16::MAX / 2;
-            let first = known.map(|(_, before)| before).filter(goes_on).unwrap_or(counted);
-            *known = Some((first, counted));
-        }
+        let known = self.by_drive.of_mut(drive);
+        // A drive that was switched off counts from 0 again.
+        let goes_on = |before: &CountedByDrive| counted.since(before).messages < u16::MAX / 2;
+        let first = known.map(|(_, before)| before).filter(goes_on).unwrap_or(counted);
+        *known = Some((first, counted));
     }
 
     /// The disturbed direction, as far as the counters of the drives of a finding show it.
@@ -186,10 +185,9 @@ impl LineDiagnosis {
 
     /// Notes a new fault of a drive, if the drive's own communication timeout seems to be the cause.
     pub(super) fn tripped(&mut self, drive: DriveIndex, trip: own_timeout::Trip, now: Instant) {
-        let profile = self.image.drives.get(drive).map(|image| &image.spec.profile);
-        let found = profile.and_then(|profile| own_timeout::finding(drive, profile, trip));
-        if let (Some(found), Some(last)) = (found, self.trips.get_mut(drive)) {
-            *last = Some((now, found));
+        let profile = &self.image.drives.of(drive).spec.profile;
+        if let Some(found) = own_timeout::finding(drive, profile, trip) {
+            *self.trips.of_mut(drive) = Some((now, found));
         }
     }
 
@@ -207,8 +205,8 @@ impl LineDiagnosis {
     /// Answered and failed requests to this drive in the last minute, except those for registers that it never answers.
     fn answered_and_failed(&self, drive: DriveIndex) -> [u32; 2] {
         let sum = |signs: &[Sign]| {
-            let counts = self.figures.drives.get(drive);
-            counts.map_or(0, |counts| signs.iter().map(|sign| counts.sum(*sign)).sum())
+            let counts = self.figures.drives.of(drive);
+            signs.iter().map(|sign| counts.sum(*sign)).sum()
         };
         [
             sum(&[Sign::Answered]),
@@ -264,7 +262,7 @@ impl LineDiagnosis {
             }
             Verdict {
                 verdict: finding.cause,
-                drive: finding.drive.and_then(|drive| self.names.get(drive)).cloned(),
+                drive: finding.drive.map(|drive| self.names.of(drive).clone()),
                 certainty: finding.certainty,
                 meaning: finding.cause.meaning().to_string(),
                 evidence: format!("{}{}", finding.evidence, directions.next().unwrap_or_default()),

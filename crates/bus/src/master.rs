@@ -246,10 +246,9 @@ impl Master {
         };
         let plans: PerDrive<&Plan> = images.iter().map(|d| &d.plan).collect();
         let cost = |index: DriveIndex, read: &PlannedRead| {
-            let (turnaround, silence) = images.get(index).map_or((Duration::ZERO, silence), |drive| {
-                (drive.spec.turnaround, drive.spec.timing.silence_around(silence))
-            });
-            WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
+            let drive = &images.of(index).spec;
+            let silence = drive.timing.silence_around(silence);
+            WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(drive.turnaround, silence)
         };
         let fast = |(index, plan): (DriveIndex, &&Plan)| -> Duration {
             let reads = plan.reads.iter().filter(|read| read.class == PollClass::Fast);
@@ -383,7 +382,7 @@ impl Master {
             news.append(&mut starts.take_news());
         }
         let mut queue = self.bus.queue.lock();
-        queue.settle_stops(|drive| self.drives.get(drive).is_some_and(DriveState::is_stopping));
+        queue.settle_stops(|drive| self.drives.of(drive).is_stopping());
         let denied = queue.take_denied();
         drop(queue);
         news.extend(denied.into_iter().map(News::Denied));
@@ -473,25 +472,23 @@ impl Master {
             step,
             ..
         } = &turn.purpose
-            && let Some(drive) = self.drives.get_mut(*index)
         {
+            let drive = self.drives.of_mut(*index);
             let step = super::command_run::Step {
                 purpose: *step,
                 pdu: turn.pdu.clone(),
             };
             drive.sent(*slot, &step, now);
             let start = drive.run(*slot).and_then(|run| run.start.clone());
-            if let Some(starts) = self.waits.starts.as_ref().filter(|_| step.pdu.is_write())
-                && let Some(image) = self.bus.image.drives.get(*index)
-            {
-                starts.written(*index, &image.spec.profile, &step.pdu, start.as_ref(), now);
+            if let Some(starts) = self.waits.starts.as_ref().filter(|_| step.pdu.is_write()) {
+                let profile = &self.bus.image.drives.of(*index).spec.profile;
+                starts.written(*index, profile, &step.pdu, start.as_ref(), now);
             }
         }
         if self.bus.image.spec.tells_replies_apart()
             && let Some(index) = turn.drive()
-            && let Some(drive) = self.drives.get_mut(index)
-            && let Some(image) = self.bus.image.drives.get(index)
         {
+            let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
             drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
         }
         let is_command = matches!(
@@ -540,20 +537,19 @@ impl Master {
         let Target::Drive(index) = turn.target() else {
             return self.response_timeout;
         };
-        let probes = self.probes.get(index).copied().unwrap_or(0);
+        let probes = *self.probes.of(index);
         let patient = probes <= self.retries_of(index) || probes.is_multiple_of(PATIENT_PROBES);
         let timeout = self.response_timeout_of(index);
         if self.schedule.is_online(index) || patient {
             return timeout;
         }
-        let known = self.drives.get(index).map(|drive| 2 * drive.answers_within);
-        timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
+        timeout.min(PROBE_TIMEOUT.max(2 * self.drives.of(index).answers_within))
     }
 
     /// The drive's own times, if it has any configured.
     fn timing_of(&self, target: Target) -> Timing {
-        let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
-        image.map_or_else(Timing::default, |image| image.spec.timing)
+        let own = |drive| self.bus.image.drives.of(drive).spec.timing;
+        target.drive().map_or_else(Timing::default, own)
     }
 
     pub(super) fn response_timeout_of(&self, target: impl Into<Target>) -> Duration {

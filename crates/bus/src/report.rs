@@ -158,9 +158,7 @@ impl Report {
             return RequiredReads::default();
         };
         let index = *drive;
-        let Some(drive) = self.drive(index) else {
-            return RequiredReads::default();
-        };
+        let drive = self.drive(index);
         let monitors = self.compare_selection((index, &drive), (read, words), *at);
         let reading = drive.reading(now, RECENT);
         let new_fault = self.check_fault(index, &reading);
@@ -172,14 +170,12 @@ impl Report {
         }
     }
 
-    fn drive(&self, index: DriveIndex) -> Option<Arc<DriveImage>> {
-        self.image.drives.get(index).cloned()
+    fn drive(&self, index: DriveIndex) -> Arc<DriveImage> {
+        self.image.drives.of(index).clone()
     }
 
     fn read(&self, index: DriveIndex, read: &PlannedRead, words: &[u16], at: Instant) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+        let drive = self.image.drives.of(index);
         self.image.tape.read(index, || TapedRead {
             at,
             table: read.table,
@@ -270,23 +266,21 @@ impl Report {
     }
 
     fn online(&mut self, index: DriveIndex) {
-        let Some(drive) = self.drive(index) else { return };
+        let drive = self.drive(index);
         drive.update(|s| s.link = Link::Online(SystemTime::now()));
-        if let Some(response) = self.responses.get_mut(index) {
-            response.looked_at = false;
-        }
+        self.responses.of_mut(index).looked_at = false;
         self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} is online"));
     }
 
     fn offline(&mut self, index: DriveIndex) {
         self.selections.interrupted(index);
-        if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
+        if goes_offline(self.image.drives.of(index)) {
             self.offline_event(index, "it does not reply");
         }
     }
 
     fn unavailable(&mut self, index: DriveIndex, read: &PlannedRead, exception: Exception, now: Instant) {
-        let Some(drive) = self.drive(index) else { return };
+        let drive = self.drive(index);
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
         if read.class == PollClass::Monitor {
             return self.monitor_refused((index, &drive), read, exception, now);
@@ -301,9 +295,7 @@ impl Report {
     /// Reports a controlled drive that does not respond to a silent master: once, and again only if it did respond
     /// in between.
     fn check_own_response(&mut self, index: DriveIndex, reading: &Reading<'_>) {
-        let (Some(drive), Some(known)) = (self.image.drives.get(index), self.responses.get_mut(index)) else {
-            return;
-        };
+        let (drive, known) = (self.image.drives.of(index), self.responses.of_mut(index));
         if known.looked_at || drive.spec.access != Access::Control {
             return;
         }
@@ -347,13 +339,13 @@ impl Report {
             Some((Some(_), at)) if at < fault.at => return false,
             Some(_) => Some(0),
         };
-        match self.faults.get_mut(index) {
+        match self.faults.of_mut(index) {
             // The code disappears before its bit, or is sometimes not read: the fault is still the same one.
-            Some(Some(before)) if active == Some(0) && *before != 0 => return false,
-            Some(before) if *before != active => *before = active,
+            Some(before) if active == Some(0) && *before != 0 => return false,
+            before if *before != active => *before = active,
             _ => return false,
         }
-        if let Some((code, written)) = active.zip(self.written.get(index).copied().flatten()) {
+        if let Some((code, written)) = active.zip(*self.written.of(index)) {
             let trip = Trip {
                 fault: code,
                 after: now.saturating_duration_since(written),
@@ -452,9 +444,7 @@ impl Report {
         at: Instant,
         now: Instant,
     ) -> bool {
-        let Some(drive) = self.drive(index) else {
-            return false;
-        };
+        let drive = self.drive(index);
         self.image.tape.read(index, || TapedRead {
             at,
             table,
@@ -479,14 +469,11 @@ impl Report {
         if foreign > 0 {
             self.image.update_health(|h| h.foreign += foreign);
         }
-        let Some((index, drive)) = drive.and_then(|index| Some((index, self.image.drives.get(index)?))) else {
-            return;
-        };
+        let Some(index) = drive else { return };
+        let drive = self.image.drives.of(index);
         drive.count(counted(&exchanged.ended));
-        if matches!(&exchanged.ended, Ended::Reply(Reply::Written))
-            && let Some(written) = self.written.get_mut(index)
-        {
-            *written = Some(now);
+        if matches!(&exchanged.ended, Ended::Reply(Reply::Written)) {
+            *self.written.of_mut(index) = Some(now);
         }
         let mut turnaround = None;
         if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
@@ -506,9 +493,7 @@ impl Report {
     /// Runs the diagnosis every 5 s, with the reads to which drives never reply, and calculates the load once a second.
     pub(super) fn tick(&mut self, unanswered: impl FnOnce() -> PerDrive<Vec<PlannedRead>>, now: Instant) {
         for (drive, text) in self.diagnosis.tick(unanswered, now) {
-            let drive = drive
-                .and_then(|drive| self.drive(drive))
-                .map(|drive| drive.spec.name.clone());
+            let drive = drive.map(|drive| self.image.drives.of(drive).spec.name.clone());
             let about = drive.as_ref().map_or(String::new(), |drive| format!(", drive {drive}"));
             let text = format!("{}{about}: {text}", self.image.spec.name);
             self.event(EventKind::Diagnosis, drive, None, text);

@@ -280,8 +280,8 @@ impl Schedule {
 
     /// Notes the result of a poll.
     pub(crate) fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
-        let item = self.drives.get_mut(poll.drive);
-        if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
+        let items = &mut self.drives.of_mut(poll.drive).items;
+        if let Some(item) = items.iter_mut().find(|item| item.read == poll.read) {
             // A read without a result is repeated among the slow polls.
             item.is_pending |= item.changed_at.take().is_some();
         }
@@ -335,19 +335,17 @@ impl Schedule {
 
     /// Notes that the drive replied to a command: it is present, and is probed at once if it was offline.
     pub fn seen(&mut self, drive: DriveIndex, now: Instant) {
-        if let Some(drive) = self.drives.get_mut(drive) {
-            (drive.failures, drive.doubted) = (0, false);
-            if let Presence::Away(at, pause) = drive.presence {
-                drive.presence = Presence::Away(at.min(now), pause);
-            }
+        let drive = self.drives.of_mut(drive);
+        (drive.failures, drive.doubted) = (0, false);
+        if let Presence::Away(at, pause) = drive.presence {
+            drive.presence = Presence::Away(at.min(now), pause);
         }
     }
 
     /// An offline drive did not reply to a command, which counts as a probe: the next one does not follow immediately.
     pub(crate) fn probed_in_vain(&mut self, drive: DriveIndex, took: Duration, now: Instant) {
-        if let Some(drive) = self.drives.get_mut(drive)
-            && let Presence::Away(at, pause) = drive.presence
-        {
+        let drive = self.drives.of_mut(drive);
+        if let Presence::Away(at, pause) = drive.presence {
             drive.presence = Presence::Away(at.max(now + took), pause);
         }
     }
@@ -355,50 +353,38 @@ impl Schedule {
     /// Notes that an online drive did not reply to a command: its process data is read next, to find out whether it
     /// is still present before more is sent.
     pub(crate) fn doubted(&mut self, index: DriveIndex) {
-        let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
-        let Some(drive) = self.drives.get_mut(index).filter(online) else {
-            return;
-        };
-        let Some(read) = drive
-            .items
-            .iter()
-            .find(|item| item.is_process_data())
-            .map(|item| item.read)
-        else {
-            return;
-        };
-        if !self.round.is_empty() {
+        let drive = self.drives.of_mut(index);
+        if drive.presence == Presence::Online
+            && !self.round.is_empty()
+            && let Some(item) = drive.items.iter().find(|item| item.is_process_data())
+        {
+            let first = (index, item.read);
             drive.doubted = true;
-            self.round.retain(|waiting| *waiting != (index, read));
-            self.round.push_front((index, read));
+            self.round.retain(|waiting| *waiting != first);
+            self.round.push_front(first);
         }
     }
 
     /// Whether that read is longer than a manual states, and no reply has proved it.
     pub fn is_trial(&self, drive: DriveIndex, read: &PlannedRead) -> bool {
-        self.drives.get(drive).is_some_and(|drive| drive.is_trial(read))
+        self.drives.of(drive).is_trial(read)
     }
 
     /// Notes that a reply to this read contained more than its first item, which proves the read.
     pub fn proved(&mut self, drive: DriveIndex, read: &PlannedRead) {
-        if let Some(drive) = self.drives.get_mut(drive) {
-            drive.unproved.retain(|block| !block.covers(read.table, read.start));
-        }
+        let unproved = &mut self.drives.of_mut(drive).unproved;
+        unproved.retain(|block| !block.covers(read.table, read.start));
     }
 
     /// Notes that no reply has proved this read: its items are read singly, and the whole read is tried again later.
     pub(crate) fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
-        if let Some(drive) = self.drives.get_mut(drive) {
-            drive.take_apart(read, now, pause);
-        }
+        self.drives.of_mut(drive).take_apart(read, now, pause);
     }
 
     /// Postpones a poll until this time.
     pub(crate) fn postpone(&mut self, poll: &Poll, until: Instant) {
         self.round.retain(|waiting| *waiting != (poll.drive, poll.read));
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return;
-        };
+        let drive = self.drives.of_mut(poll.drive);
         drive.doubted = false;
         if let (Presence::Away(_, pause), true) = (drive.presence, poll.probe) {
             drive.presence = Presence::Away(until, pause);
@@ -439,9 +425,7 @@ impl Schedule {
 
     /// Makes the reads of an address due at once, because a command changed it.
     pub fn read_soon(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
-        let Some(drive) = self.drives.get_mut(drive) else {
-            return;
-        };
+        let drive = self.drives.of_mut(drive);
         for item in drive
             .items
             .iter_mut()
@@ -453,9 +437,7 @@ impl Schedule {
 
     /// Reads everything of a drive again, including points of the class `once`.
     pub(crate) fn read_again(&mut self, index: DriveIndex, now: Instant) {
-        let Some(drive) = self.drives.get_mut(index) else {
-            return;
-        };
+        let drive = self.drives.of_mut(index);
         let again = |item: &&mut Item| !item.refused && item.read.class != PollClass::Fault;
         for item in drive.items.iter_mut().filter(again) {
             item.is_pending = true;
@@ -466,13 +448,10 @@ impl Schedule {
 
     /// Moves the reads that decide a drive's state to the front of the round, except the one that was just answered.
     fn state_first(&mut self, index: DriveIndex, just_read: Option<PlannedRead>) {
-        let Some(drive) = self
-            .drives
-            .get(index)
-            .filter(|drive| drive.presence == Presence::Online)
-        else {
+        let drive = self.drives.of(index);
+        if drive.presence != Presence::Online {
             return;
-        };
+        }
         let may_go = |read: &PlannedRead| {
             let sound = |item: &Item| item.read == *read && !item.refused && !item.postponed;
             Some(*read) != just_read && drive.items.iter().any(sound)
@@ -493,8 +472,7 @@ impl Schedule {
     /// Makes the reads for a new fault due at once: those that the profile names for faults, and the slow reads
     /// that cover more details of it. They take no more of the line than other slow reads.
     pub(crate) fn fault_came(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
-        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
-        for item in items.into_iter().flatten() {
+        for item in &mut self.drives.of_mut(drive).items {
             match item.read.class {
                 PollClass::Fault => {
                     (item.is_pending, item.refused, item.failures) = (true, false, 0);
@@ -512,11 +490,8 @@ impl Schedule {
 
     /// Monitoring registers are to be read again at `due`, as far as the drive has them.
     pub fn monitor(&mut self, drive: DriveIndex, covers: impl Fn(&PlannedRead) -> bool, due: Instant) {
-        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
-        let monitors = items
-            .into_iter()
-            .flatten()
-            .filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.is_pending);
+        let items = self.drives.of_mut(drive).items.iter_mut();
+        let monitors = items.filter(|item| item.read.class == PollClass::Monitor && !item.refused && !item.is_pending);
         for item in monitors.filter(|item| covers(&item.read)) {
             (item.is_pending, item.due) = (true, due);
         }
@@ -524,11 +499,8 @@ impl Schedule {
 
     /// Requests a read from a drive, also of points read once.
     pub fn ask(&mut self, drive: DriveIndex, now: Instant) {
-        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
-        let mut sound = items
-            .into_iter()
-            .flatten()
-            .filter(|item| !item.refused && item.failures == 0);
+        let items = self.drives.of_mut(drive).items.iter_mut();
+        let mut sound = items.filter(|item| !item.refused && item.failures == 0);
         if let Some(item) =
             sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault | PollClass::Monitor))
         {
@@ -539,9 +511,8 @@ impl Schedule {
 
     /// Notes that a session step was sent before a drive's poll, which is still due: the other polls are served in between.
     pub(crate) fn session_done(&mut self, drive: DriveIndex) {
-        if let Some(drive) = self.drives.get_mut(drive) {
-            (drive.heard, drive.failures) = (true, 0);
-        }
+        let drive = self.drives.of_mut(drive);
+        (drive.heard, drive.failures) = (true, 0);
         self.probed = true;
         self.share.polled(Duration::ZERO);
     }
@@ -559,7 +530,7 @@ impl Schedule {
 
     /// Whether the drive replies.
     pub fn is_online(&self, drive: DriveIndex) -> bool {
-        self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)
+        self.drives.of(drive).presence == Presence::Online
     }
 
     /// Offline drives, and reads of the others that are postponed after failures.

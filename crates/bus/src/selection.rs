@@ -157,8 +157,10 @@ impl Selections {
     /// Whether a read that was answered with `words` at `now` concerns a comparison. Most reads concern none: once the
     /// process data has proved right, only its monitoring registers do.
     pub(super) fn are_concerned_by(&self, drive: DriveIndex, read: &PlannedRead, words: &[u16], now: Instant) -> bool {
-        let mut points = self.drives.get(drive).into_iter().flat_map(|drive| &drive.points);
-        points.any(|compared| compared.is_monitor_in(read) || compared.looks_at(read, words, now))
+        let points = &self.drives.of(drive).points;
+        points
+            .iter()
+            .any(|compared| compared.is_monitor_in(read) || compared.looks_at(read, words, now))
     }
 
     /// Notes that the drive answered this read with `words` and has the values of `reading` after it.
@@ -225,8 +227,9 @@ impl Selections {
         differ: Vec<(PointIndex, f64, f64)>,
         restored: Vec<PointIndex>,
     ) -> Findings {
-        let points = self.drives.get(drive).into_iter().flat_map(|drive| &drive.points);
+        let points = &self.drives.of(drive).points;
         let monitored = points
+            .iter()
             .filter(|compared| compared.is_monitored())
             .map(|compared| compared.point);
         let is_new = !monitored.clone().eq(reading.snapshot.monitored.iter().copied());
@@ -240,15 +243,11 @@ impl Selections {
 
     /// Whether this is the first report of a drive since the gateway started.
     pub(super) fn report_first(&mut self, drive: DriveIndex) -> bool {
-        let drive = self.drives.get_mut(drive);
-        drive.is_some_and(|drive| !std::mem::replace(&mut drive.reported, true))
+        !std::mem::replace(&mut self.drives.of_mut(drive).reported, true)
     }
 
     fn points(&mut self, drive: DriveIndex) -> impl Iterator<Item = &mut Compared> {
-        self.drives
-            .get_mut(drive)
-            .into_iter()
-            .flat_map(|drive| &mut drive.points)
+        self.drives.of_mut(drive).points.iter_mut()
     }
 }
 

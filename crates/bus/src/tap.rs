@@ -35,8 +35,7 @@ impl Tap {
         began: Instant,
     ) -> Tap {
         let format = image.spec.format;
-        let drive = index.and_then(|index| image.drives.get(index));
-        let drive = drive.map(|drive| drive.spec.name.clone());
+        let drive = index.map(|index| image.drives.of(index).spec.name.clone());
         Tap {
             image,
             drive,

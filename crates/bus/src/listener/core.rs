@@ -151,7 +151,7 @@ impl ListenCore {
         self.take(&mut heard, now);
         self.heard = heard;
         for index in self.drives.indexes() {
-            let Some(known) = self.drives.get_mut(index) else { break };
+            let known = self.drives.of_mut(index);
             let silent = SILENT.max(known.pause * 3);
             let is_silent = now.saturating_duration_since(known.heard) > silent;
             let due = known.commands.due(now);
@@ -242,9 +242,7 @@ impl ListenCore {
     }
 
     fn of_drive(&mut self, index: DriveIndex, exchange: &Exchange, now: Instant) {
-        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
-            return;
-        };
+        let (image, known) = (self.bus.image.drives.of(index), self.drives.of_mut(index));
         self.report.diagnosis.foreign_exchange(index, exchange);
         let no_answer = matches!(&exchange.ended, Some(Ended::Reply(Reply::Exception(code))) if code.is_no_answer());
         let answered = matches!(exchange.ended, Some(Ended::Reply(_))) && !no_answer;
@@ -311,9 +309,7 @@ impl ListenCore {
 
     /// Stores the values that were read. Values of which only a part was read are not stored.
     fn read(&mut self, index: DriveIndex, (table, start): (Table, u16), words: &[u16], at: Instant, now: Instant) {
-        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get(index)) else {
-            return;
-        };
+        let (image, known) = (self.bus.image.drives.of(index), self.drives.of(index));
         let table = image.spec.profile.canonical(table);
         let mut words = words;
         let mut start = start;
@@ -350,9 +346,7 @@ impl ListenCore {
         let Some(request) = exchange.request.as_ref().filter(|request| request.pdu.is_write()) else {
             return;
         };
-        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
-            return;
-        };
+        let (image, known) = (self.bus.image.drives.of(index), self.drives.of_mut(index));
         let of = (&image.spec, self.bus.image.spec.protocol);
         let ended = exchange.ended.as_ref();
         let commanded = known
@@ -364,9 +358,7 @@ impl ListenCore {
     }
 
     fn report_command(&self, index: DriveIndex, commanded: Commanded) {
-        let Some(image) = self.bus.image.drives.get(index) else {
-            return;
-        };
+        let image = self.bus.image.drives.of(index);
         let Commanded {
             what,
             changes,

@@ -224,7 +224,7 @@ impl Master {
     /// Duration of the transaction, as far as the profile gives it.
     pub(super) fn exchange_cost(&self, target: Target, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
-        let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
+        let image = target.drive().map(|drive| self.bus.image.drives.of(drive));
         let (turnaround, silence) = image.map_or((Duration::ZERO, self.silence), |image| {
             (image.spec.turnaround, image.spec.timing.silence_around(self.silence))
         });
@@ -259,17 +259,14 @@ impl Master {
         let (origin, pdu) = (command.ticket.origin(), begun.pdu());
         for (index, effect) in command.intent.effects.iter() {
             let renews = self.bus.renews(index, origin);
-            if let Some(drive) = self.drives.get_mut(index) {
-                drive.foreign_order(renews, now);
-            }
-            if let Some(starts) = &self.waits.starts
-                && let Some((image, pdu)) = self.bus.image.drives.get(index).zip(pdu)
-            {
+            self.drives.of_mut(index).foreign_order(renews, now);
+            if let (Some(starts), Some(pdu)) = (&self.waits.starts, pdu) {
                 let start = effect.starts().then(|| Start {
                     number: command.intent.number,
                     client: origin.client().clone(),
                 });
-                starts.written(index, &image.spec.profile, pdu, start.as_ref(), now);
+                let profile = &self.bus.image.drives.of(index).spec.profile;
+                starts.written(index, profile, pdu, start.as_ref(), now);
             }
         }
     }
@@ -358,9 +355,7 @@ impl Master {
                 }
             }
             (_, Reply::Identified(_)) => {
-                if let Some(drive) = self.drives.get_mut(index) {
-                    drive.restarted();
-                }
+                self.drives.of_mut(index).restarted();
                 self.schedule.read_again(index, now);
             }
             (_, Reply::Changes(digits)) if !digits.is_empty() => self.schedule.read_again(index, now),
@@ -374,21 +369,15 @@ impl Master {
         let writes = written(&turn.pdu);
         for index in begun.command().into_iter().flat_map(Command::reach) {
             let renews = self.bus.renews(index, begun.origin());
-            let Some(drive) = self.drives.get_mut(index) else {
-                continue;
-            };
+            let drive = self.drives.of_mut(index);
             drive.foreign_order(renews, now);
             if matches!(outcome, Outcome::Exception(_)) {
                 continue;
             }
             match &writes {
                 Some((table, items)) => {
-                    let image = self.bus.image.drives.get(index);
-                    drive.may_have_taken(
-                        *table,
-                        items,
-                        image.and_then(|image| image.spec.profile.control.as_ref()),
-                    );
+                    let profile = &self.bus.image.drives.of(index).spec.profile;
+                    drive.may_have_taken(*table, items, profile.control.as_ref());
                     self.note_write(index, *table, items, now);
                 }
                 None => {
@@ -431,7 +420,7 @@ impl Master {
             Ended::Reply(Reply::Exception(code)) => return Outcome::Exception(code),
             Ended::Reply(reply) => reply,
         };
-        let Some(drive) = turn.drive().and_then(|index| self.drives.get_mut(index)) else {
+        let Some(drive) = turn.drive().map(|index| self.drives.of_mut(index)) else {
             return Outcome::Acknowledged(reply);
         };
         let proves_nothing = turn.pdu.is_write() && drive.late.proves_nothing(&turn.pdu, end.began, now);
@@ -446,17 +435,15 @@ impl Master {
 
     /// Written registers are read back soon if polled, and the drive's command words are updated.
     fn note_background_write(&mut self, index: DriveIndex, pdu: &RequestPdu, outcome: &Outcome, now: Instant) {
-        if let Some(drive) = self.drives.get_mut(index) {
-            match outcome {
-                Outcome::Acknowledged(_) => drive.words.written(pdu),
-                Outcome::Exception(_) => {}
-                _ => drive.words.forget(),
-            }
+        let words = &mut self.drives.of_mut(index).words;
+        match outcome {
+            Outcome::Acknowledged(_) => words.written(pdu),
+            Outcome::Exception(_) => {}
+            _ => words.forget(),
         }
         if let Some((table, items)) = written(pdu) {
-            let image = self.bus.image.drives.get(index);
-            if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
-                image.note_written(&items, now);
+            if outcome.is_ok() && table == Table::Holding {
+                self.bus.image.drives.of(index).note_written(&items, now);
             }
             self.note_write(index, table, &items, now);
         }

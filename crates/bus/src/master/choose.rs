@@ -168,7 +168,7 @@ impl Master {
         let (drive, state) = drives
             .enumerate_mut()
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
-        let image = bus.image.drives.get(drive)?;
+        let image = bus.image.drives.of(drive);
         let want = |state: &mut DriveState| state.next_need(image, &waits.n2_late, now);
         match next_need(bus, drive, (state, image), want, now) {
             NextNeed::Step(Urgency::Command, step)
@@ -195,9 +195,8 @@ impl Master {
             .collect();
         drop(queue);
         for (index, is_delayed) in stopped {
-            if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
-                drive.purge(image, is_delayed, now);
-            }
+            let image = self.bus.image.drives.of(index);
+            self.drives.of_mut(index).purge(image, is_delayed, now);
         }
     }
 
@@ -258,7 +257,7 @@ impl Master {
             .zip(&bus.image.drives)
             .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, drive.fresh)))
             .collect();
-        let redundant = |drive: DriveIndex| stands.get(drive).copied().unwrap_or(false);
+        let redundant = |drive: DriveIndex| *stands.of(drive);
         let facts = AtTurn::of(drives, &bus.image.drives, now);
         for rank in RANKS {
             let ready = |command: &Command| is_ready(command, schedule, waits, drives, now);
@@ -294,15 +293,11 @@ impl Master {
     /// Begins a command from the queue. A stop is sent even to a drive that does not answer: it serves as the probe.
     fn begin(&mut self, mut command: Command, rank: Urgency, now: Instant) {
         let is_served = |index: &DriveIndex| self.schedule.is_online(*index) || command.is_stop();
-        let served = command.drive().filter(is_served);
-        let known = served.and_then(|index| {
-            let drive = self.drives.get_mut(index)?;
-            Some((index, drive, self.bus.image.drives.get(index)?))
-        });
-        let Some((index, drive, image)) = known else {
+        let Some(index) = command.drive().filter(is_served) else {
             command.answer(&Outcome::Offline, now);
             return;
         };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         if let Work::Set(set) = &command.work
             && set.behind.as_ref().is_some_and(StopEnd::has_failed)
         {
@@ -350,9 +345,9 @@ impl Master {
 
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
         let pdu = poll.read.pdu();
-        let drive = self.drives.get_mut(poll.drive)?;
+        let drive = self.drives.of_mut(poll.drive);
         let session = self.waits.sessions.before(poll.drive, None, now);
-        let address = self.bus.image.drives.get(poll.drive)?.spec.address;
+        let address = self.bus.image.drives.of(poll.drive).spec.address;
         let on_n2 = match session {
             Some(session) => self.waits.n2_late.blocks(&RequestPdu::N2(session), now),
             None => self.waits.n2_late.blocks_poll(address, &poll.read, now),
@@ -396,16 +391,15 @@ impl Master {
 
     /// The command in progress, unless it expired while the bus waited for silence on the line.
     fn run_in_time(&mut self, drive: DriveIndex, slot: Urgency, now: Instant) -> Option<&mut CommandRun> {
-        let run = self.drives.get_mut(drive).and_then(|drive| drive.run(slot));
+        let run = self.drives.of_mut(drive).run(slot);
         run.filter(|run| !run.is_late(now))
     }
 
     /// Whether a client came back while the line went silent, which suspends the action of its lease. An order that waits
     /// longer than its time, as a stop may, holds no lease: supervision would choose its action again without end.
     fn client_is_back(&self, drive: DriveIndex, now: Instant) -> bool {
-        let image = self.bus.image.drives.get(drive);
         let until = self.bus.queue.lock().client_waits_until(drive);
-        image.is_some_and(|image| image.has_heartbeat()) || until.is_some_and(|until| until > now)
+        self.bus.image.drives.of(drive).has_heartbeat() || until.is_some_and(|until| until > now)
     }
 
     /// Whether the gateway stops: the line belongs to the stops then.

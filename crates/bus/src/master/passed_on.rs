@@ -118,8 +118,8 @@ pub(super) fn is_ready(
     now: Instant,
 ) -> Ready {
     let drive = command.drive().filter(|_| command.as_passed_on().is_none());
-    match drive.and_then(|index| Some((index, drives.get_mut(index)?))) {
-        Some((index, drive)) => super::choose::may_begin(drive, command, schedule.is_online(index), now),
+    match drive {
+        Some(index) => super::choose::may_begin(drives.of_mut(index), command, schedule.is_online(index), now),
         None => waits.may_pass_on(command, drives, now),
     }
 }

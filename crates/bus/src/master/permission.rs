@@ -111,9 +111,7 @@ fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outco
 impl Master {
     /// Whether a chosen frame of a started command may still be sent.
     pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
-        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
-            return true;
-        };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         let written = drive.written;
         let Some(run) = drive.run(slot) else { return true };
         // A denied command is refused, or made to wait, at the next choice.

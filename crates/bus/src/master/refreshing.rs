@@ -107,7 +107,7 @@ impl Master {
         match self.may_refresh(index, Stage::Write, now) {
             May::Yes => {}
             May::NotNow => {
-                self.drives.get_mut(index)?.refresh.put_off(now);
+                self.drives.of_mut(index).refresh.put_off(now);
                 return None;
             }
             May::No(why) => {
@@ -115,7 +115,7 @@ impl Master {
                 return None;
             }
         }
-        let (drive, image) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index))?;
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         let profile = &image.spec.profile;
         let pdu = drive.words.formed(drive.refresh.request(profile)?, profile);
         if let Some(until) = drive.late.blocks(&pdu, now) {
@@ -130,17 +130,14 @@ impl Master {
 
     /// Whether a chosen frame of a refresh may still be sent.
     pub(super) fn may_still_refresh(&mut self, index: DriveIndex, now: Instant) -> bool {
-        let drive = self.drives.get(index);
-        let is_under_way = drive.is_some_and(|drive| drive.refresh.is_under_way());
+        let is_under_way = self.drives.of(index).refresh.is_under_way();
         is_under_way && matches!(self.may_refresh(index, Stage::Write, now), May::Yes)
     }
 
     /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, regardless of
     /// which client holds the drive now.
     fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
-        let Some((drive, image)) = self.drives.get(index).zip(self.bus.image.drives.get(index)) else {
-            return May::NotNow;
-        };
+        let (drive, image) = (self.drives.of(index), self.bus.image.drives.of(index));
         if self.shutdown.is_some() || drive.has_runs() || self.is_quiet(index) {
             return May::NotNow;
         }
@@ -190,9 +187,7 @@ impl Master {
     }
 
     fn end_refresh(&mut self, index: DriveIndex, why: End) {
-        if let Some(drive) = self.drives.get_mut(index) {
-            drive.end_refresh(why);
-        }
+        self.drives.of_mut(index).end_refresh(why);
     }
 
     /// A frame is sent: rounds of other drives must read again before they write.
@@ -204,9 +199,8 @@ impl Master {
         }
         if let Purpose::Refresh(index) = turn.purpose
             && turn.pdu.is_write()
-            && let Some(image) = self.bus.image.drives.get(index)
         {
-            image.count_refresh_write();
+            self.bus.image.drives.of(index).count_refresh_write();
         }
     }
 
@@ -221,9 +215,7 @@ impl Master {
     ) {
         self.schedule.refreshed(end.took);
         self.refresh_debt = (self.refresh_debt + end.took).min(MOST_DEBT);
-        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
-            return;
-        };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         let Ended::Reply(reply) = end.ended else {
             drive.refresh.not_answered(now);
             return;

@@ -42,9 +42,7 @@ impl Master {
 
     /// A drive has a new fault: the fault points of its profile are read.
     pub(crate) fn fault_came(&mut self, drive: DriveIndex, now: Instant) {
-        let Some(image) = self.bus.image.drives.get(drive) else {
-            return;
-        };
+        let image = self.bus.image.drives.of(drive);
         let profile = &image.spec.profile;
         let points = profile
             .on_fault
@@ -57,9 +55,7 @@ impl Master {
 
     /// Schedules the read of monitoring points for this time.
     pub fn monitor(&mut self, drive: DriveIndex, point: PointIndex, at: Instant) {
-        let Some(image) = self.bus.image.drives.get(drive) else {
-            return;
-        };
+        let image = self.bus.image.drives.of(drive);
         let raw = image.spec.profile.points.get(point).and_then(Point::raw);
         let covers = |read: &PlannedRead| raw.is_some_and(|raw| read.covers(raw.table, raw.address));
         self.schedule.monitor(drive, covers, at);
@@ -77,7 +73,7 @@ impl Master {
         if !self.waits.sessions.is_empty() {
             self.note_late_on_n2(turn, end, came_mangled, now);
         }
-        let mut drive = target.drive().and_then(|drive| self.drives.get_mut(drive));
+        let mut drive = target.drive().map(|drive| self.drives.of_mut(drive));
         match &end.ended {
             Ended::Reply(reply) => {
                 if !says_no_answer(reply) {
@@ -87,8 +83,8 @@ impl Master {
                             drive.late.settled_by(&turn.pdu, now);
                         }
                     }
-                    if let Some(probes) = target.drive().and_then(|drive| self.probes.get_mut(drive)) {
-                        *probes = 0;
+                    if let Some(drive) = target.drive() {
+                        *self.probes.of_mut(drive) = 0;
                     }
                 }
                 self.last_answered = Some((target, turn.pdu.clone()));
@@ -98,7 +94,7 @@ impl Master {
                 self.last_answered = Some((target, turn.pdu.clone()));
             }
             Ended::Silent | Ended::Corrupt(_) if self.bus.image.spec.tells_replies_apart() => {
-                let image = target.drive().and_then(|drive| self.bus.image.drives.get(drive));
+                let image = target.drive().map(|drive| self.bus.image.drives.of(drive));
                 if let Some((drive, image)) = drive.zip(image) {
                     drive.repeated_stops.not_answered(&image.spec.profile, &turn.pdu, now);
                 }
@@ -129,10 +125,9 @@ impl Master {
     /// are due again.
     fn note_late_on_n2(&mut self, turn: &Turn, end: &TurnEnd, came_mangled: bool, now: Instant) {
         let address = match turn.target() {
-            Target::Drive(drive) => self.bus.image.drives.get(drive).map(|image| image.spec.address),
-            Target::Address(address) => Some(address),
+            Target::Drive(drive) => self.bus.image.drives.of(drive).spec.address,
+            Target::Address(address) => address,
         };
-        let Some(address) = address else { return };
         let window = self.n2_window();
         let asked = LateRequest {
             address,
@@ -149,7 +144,7 @@ impl Master {
                 } = self;
                 let drives = &bus.image.drives;
                 schedule.recall(now, |drive, read| {
-                    let address = drives.get(drive).map_or(0, |image| image.spec.address);
+                    let address = drives.of(drive).spec.address;
                     waits.n2_late.blocks_poll(address, read, now).is_none()
                 });
             }
@@ -198,9 +193,7 @@ impl Master {
 
     /// Handles a drive that has restarted: nothing known about it is valid any more.
     pub(super) fn restarted(&mut self, drive: DriveIndex, now: Instant, news: &mut Vec<News>) {
-        if let Some(state) = self.drives.get_mut(drive) {
-            state.restarted();
-        }
+        self.drives.of_mut(drive).restarted();
         self.schedule.read_again(drive, now);
         news.push(News::Restarted(drive));
     }
@@ -234,10 +227,8 @@ impl Master {
             Ended::Silent => Polled::Failed,
             Ended::Corrupt(_) => Polled::Garbled,
         };
-        if poll.probe
-            && matches!(polled, Polled::Failed | Polled::Garbled)
-            && let Some(probes) = self.probes.get_mut(poll.drive)
-        {
+        if poll.probe && matches!(polled, Polled::Failed | Polled::Garbled) {
+            let probes = self.probes.of_mut(poll.drive);
             *probes = probes.saturating_add(1);
         }
         let change = self.schedule.poll_done(poll, polled, took, now);
@@ -274,9 +265,7 @@ impl Master {
 
     /// Handles a drive that no longer replies: all waiting commands are answered, except the stop, which serves as a probe.
     fn went_offline(&mut self, index: DriveIndex, now: Instant, news: &mut Vec<News>) {
-        if let Some(drive) = self.drives.get_mut(index) {
-            drive.went_offline(now);
-        }
+        self.drives.of_mut(index).went_offline(now);
         self.waits.sessions.gone(index);
         let gone = |c: &Command| c.intent.target == index && !c.is_stop();
         self.bus.queue.lock().remove(now, &Outcome::Offline, gone);
@@ -294,11 +283,9 @@ impl Master {
         news: &mut Vec<News>,
     ) {
         let pdu = read.pdu();
-        let Some(drive) = self.drives.get_mut(index) else {
-            return;
-        };
-        let address = self.bus.image.drives.get(index).map(|image| image.spec.address);
-        let asked = address.and_then(|address| self.waits.n2_late.asked_by(address, &pdu, came));
+        let drive = self.drives.of_mut(index);
+        let address = self.bus.image.drives.of(index).spec.address;
+        let asked = self.waits.n2_late.asked_by(address, &pdu, came);
         let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, came));
         drive.late.answered(&pdu, sent, now);
         if let Some(words) = reply.into_words() {
@@ -315,9 +302,7 @@ impl Master {
         at: Instant,
         news: &mut Vec<News>,
     ) {
-        let Some(drive) = self.drives.get_mut(index) else {
-            return;
-        };
+        let drive = self.drives.of_mut(index);
         drive.was_read = true;
         for &(table, address) in drive.commanded.iter().filter(|(table, _)| *table == read.table) {
             let place = address.checked_sub(read.start).map(usize::from);
@@ -343,11 +328,8 @@ impl Master {
         now: Instant,
         news: &mut Vec<News>,
     ) {
-        let of_tool = self
-            .drives
-            .get_mut(index)
-            .and_then(|drive| drive.run(slot))
-            .is_some_and(|run| run.is_of_tool());
+        let run = self.drives.of_mut(index).run(slot);
+        let of_tool = run.is_some_and(|run| run.is_of_tool());
         if of_tool && slot != Urgency::Stop {
             self.schedule.background_owes(Pace::Brisk, end.took);
         }
@@ -372,9 +354,7 @@ impl Master {
             }
         };
         self.schedule.seen(index, now);
-        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
-            return;
-        };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         if !matches!(reply, Reply::Exception(_)) {
             let believed = !drive.late.proves_nothing(&step.pdu, end.began, now);
             drive.late.answered(&step.pdu, end.began, now);
@@ -413,9 +393,7 @@ impl Master {
     ) {
         let online = self.schedule.is_online(index);
         let (retries, response_timeout) = (self.retries_of(index), self.response_timeout_of(index));
-        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
-            return;
-        };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
             // The step was sent, perhaps without success: it is sent again when its reply can be trusted.
             if let Some(run) = drive.run(slot) {
@@ -457,9 +435,7 @@ impl Master {
     /// Registers were written, or may have been: they are read back soon. If an end of the frequency range is among
     /// them, an earlier reading of the range is invalid, and both ends are read again.
     pub(super) fn note_write(&mut self, index: DriveIndex, table: Table, items: &[(u16, u16)], now: Instant) {
-        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
-            return;
-        };
+        let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         let is_end = |address: u16| is_range_end(&image.spec.profile, table, address);
         let range = items.iter().any(|(address, _)| is_end(*address));
         if range {

@@ -121,7 +121,7 @@ impl Shutdown {
     /// Reports the drives that were not stopped, in words.
     pub(super) fn end(&mut self, bus: &BusHandle) {
         let Some(stopping) = self.stopping.take() else { return };
-        let name = |index: DriveIndex| bus.image.drives.get(index).map_or("?", |d| d.spec.name.as_str());
+        let name = |index: DriveIndex| bus.image.drives.of(index).spec.name.as_str();
         let missing = self.stops.iter().filter_map(|stop| {
             let why = match (&stop.state, &stop.last) {
                 (State::Acknowledged, _) => return None,
@@ -195,9 +195,7 @@ fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<
 }
 
 fn order(bus: &BusHandle, drive: DriveIndex, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {
-    let Some(image) = bus.image.drives.get(drive) else {
-        return State::Acknowledged;
-    };
+    let image = bus.image.drives.of(drive);
     let origin = Origin::new(SourceKind::Shutdown, "on_shutdown");
     let reading = image.reading(now, FRESH);
     let expiry = deadline.saturating_duration_since(now);

@@ -41,7 +41,7 @@ impl Waits {
             Target::Drive(drive) if self.sessions.before(drive, Some(Urgency::Read), now).is_some() => {
                 return Some(now + super::LOOK_ROUND);
             }
-            Target::Drive(drive) => drives.get_mut(drive).map(|drive| &mut drive.late),
+            Target::Drive(drive) => Some(&mut drives.of_mut(drive).late),
             Target::Address(address) => self.strangers.get_mut(&address),
         };
         let late = late.and_then(|late| late.blocks(pdu, now));
@@ -57,7 +57,7 @@ impl Waits {
     /// Whether the drives that a passed-on request reaches are ready: none of them has a command in progress.
     pub(super) fn may_pass_on(&mut self, command: &Command, drives: &mut PerDrive<DriveState>, now: Instant) -> Ready {
         let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
-        if command.reach().filter_map(|drive| drives.get(drive)).any(busy) {
+        if command.reach().any(|drive| busy(drives.of(drive))) {
             return Ready::No;
         }
         let Order::Write(pdu) = &command.intent.order else {

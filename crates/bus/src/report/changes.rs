@@ -129,7 +129,7 @@ impl Report {
             let Some(Value::Bool(value)) = sample.good() else {
                 continue;
             };
-            let watched = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place));
+            let watched = self.watched.of_mut(index).get_mut(place);
             let Some(change) = watched.and_then(|watched| watched.read(value, now)) else {
                 continue;
             };

@@ -20,9 +20,7 @@ impl Report {
         fault_code: Option<i64>,
         text: impl FnOnce(&str) -> String,
     ) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+        let drive = self.image.drives.of(index);
         let name = drive.spec.name.clone();
         let text = text(&name);
         self.event(kind, Some(name), fault_code, text);
@@ -51,9 +49,7 @@ impl Report {
             what,
             refusal,
         } = denied;
-        let Some(drive) = self.image.drives.get(*drive) else {
-            return;
-        };
+        let drive = self.image.drives.of(*drive);
         let refused = RefusedCommand {
             client: origin.client(),
             reason: refusal.code(),
@@ -66,9 +62,7 @@ impl Report {
 
     /// Counts a failed action of supervision, and reports it if there is a `text`.
     pub(super) fn action_failed(&self, index: DriveIndex, text: impl FnOnce(&str) -> Option<String>) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+        let drive = self.image.drives.of(index);
         drive.count_supervision_failure();
         if let Some(text) = text(&drive.spec.name) {
             self.drive_event(index, EventKind::SupervisionFailed, None, |_| text);
@@ -77,11 +71,8 @@ impl Report {
 
     /// The action of the lease of a drive, in words.
     pub(super) fn action_of(&self, index: DriveIndex) -> &'static str {
-        let drive = self.image.drives.get(index);
-        match drive
-            .and_then(|drive| drive.spec.supervision.as_ref())
-            .map(|s| &s.action)
-        {
+        let supervision = &self.image.drives.of(index).spec.supervision;
+        match supervision.as_ref().map(|supervision| &supervision.action) {
             Some(LeaseAction::SpeedReference(_)) => "the speed reference",
             _ => "the stop",
         }
@@ -97,11 +88,12 @@ impl Report {
                 ))
             });
         }
-        let Some(drive) = self.image.drives.get(index).filter(|_| late.does_not_run) else {
+        if !late.does_not_run {
             return self.drive_event(index, EventKind::NotConfirmed, None, |name| {
                 format!("drive {name} {}", late.text)
             });
-        };
+        }
+        let drive = self.image.drives.of(index);
         let explanation = explain(&drive.reading(now, RECENT), &self.image, &self.writes);
         let causes = explanation.blocked_by().map(|causes| format!("; blocked by {causes}"));
         self.drive_event(index, EventKind::NotConfirmed, None, |name| {
@@ -110,7 +102,7 @@ impl Report {
     }
 
     pub(super) fn lease_ran_out(&self, index: DriveIndex) {
-        let Some(drive) = self.drive(index) else { return };
+        let drive = self.drive(index);
         let Some(supervision) = &drive.spec.supervision else {
             return;
         };
@@ -127,7 +119,7 @@ impl Report {
     }
 
     pub(super) fn refresh_ended(&self, index: DriveIndex, why: &str) {
-        let name = self.image.drives.get(index).map_or("?", |image| &image.spec.name);
+        let name = &self.image.drives.of(index).spec.name;
         tracing::info!(
             target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %name,
             "what was ordered is no longer written again (refresh): {why}"
@@ -150,7 +142,7 @@ impl Report {
 
     /// Shows a drive as offline for this reason.
     pub(crate) fn gone(&self, index: DriveIndex, why: &str) {
-        if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
+        if goes_offline(self.image.drives.of(index)) {
             self.drive_event(index, EventKind::Offline, None, |name| {
                 format!("drive {name} is offline: {why}")
             });
@@ -164,7 +156,7 @@ impl Report {
     }
 
     pub(super) fn restarted(&self, index: DriveIndex) {
-        let Some(drive) = self.drive(index) else { return };
+        let drive = self.drive(index);
         drive.update(Snapshot::expire_slow_values);
         self.drive_event(index, EventKind::Restarted, None, |name| {
             format!("drive {name} has restarted; it is read again and accepts only commands sent from now on")
@@ -173,7 +165,7 @@ impl Report {
 
     /// Reports a drive of another device type than its profile expects.
     pub(super) fn unlike(&self, index: DriveIndex, device: u8) {
-        let Some(drive) = self.drive(index) else { return };
+        let drive = self.drive(index);
         let profile = &drive.spec.profile;
         self.drive_event(index, EventKind::UnlikeProfile, None, |name| {
             format!(

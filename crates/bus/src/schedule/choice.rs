@@ -118,7 +118,7 @@ impl Schedule {
             .collect();
         waiting.sort();
         waiting.into_iter().find_map(|(_, index)| {
-            let read = self.drives.get(index)?.probe()?;
+            let read = self.drives.of(index).probe()?;
             Some(Poll {
                 drive: index,
                 read,

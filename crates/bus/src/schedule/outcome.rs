@@ -13,9 +13,7 @@ const MOST_GARBLED: u32 = 8;
 impl Schedule {
     pub(super) fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
         let slow = self.cadence.slow;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
+        let drive = self.drives.of_mut(poll.drive);
         drive.failures = 0;
         drive.garbled = 0;
         drive.unanswered = false;
@@ -70,9 +68,7 @@ impl Schedule {
     }
 
     pub(super) fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
+        let drive = self.drives.of_mut(poll.drive);
         let retries = drive.retries;
         if let Presence::Away(_, pause) = drive.presence {
             drive.failures += 1;
@@ -131,15 +127,13 @@ impl Schedule {
         if !self.round.is_empty() {
             return;
         }
-        let items = self.drives.get(index).into_iter().flat_map(|drive| &drive.items);
-        let fast = items.filter(|item| item.is_process_data() && item.due <= now);
+        let fast = self.drives.of(index).items.iter();
+        let fast = fast.filter(|item| item.is_process_data() && item.due <= now);
         self.round.extend(fast.map(|item| (index, item.read)));
     }
 
     pub(super) fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
+        let drive = self.drives.of_mut(poll.drive);
         let retries = drive.retries;
         let counts = drive.shows_presence(&poll.read);
         if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {

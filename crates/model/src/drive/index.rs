@@ -81,7 +81,21 @@ pub struct IndexVec<I, T> {
 }
 
 impl<I: From<usize> + Into<usize>, T> IndexVec<I, T> {
-    /// The element with this index.
+    /// The element with this index, which must be an index of this vector or of another one for the same drives or points:
+    /// all indexes are counted by such a vector, so one that is out of range is a bug, and going on without the element
+    /// would hide it. A method and no `Index`, because the lint refuses brackets wherever they are used.
+    #[allow(clippy::indexing_slicing)]
+    pub fn of(&self, index: I) -> &T {
+        &self.elements[index.into()]
+    }
+
+    /// The element of that index, to be changed; see [`IndexVec::of`].
+    #[allow(clippy::indexing_slicing)]
+    pub fn of_mut(&mut self, index: I) -> &mut T {
+        &mut self.elements[index.into()]
+    }
+
+    /// The element with this index, if there is one.
     pub fn get(&self, index: I) -> Option<&T> {
         self.elements.get(index.into())
     }
