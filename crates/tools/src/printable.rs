@@ -24,6 +24,10 @@ fn is_unsafe(c: char) -> bool {
 /// A line or a part of one, with `\n` and `\u001b` in place of such characters. In a line of JSON these characters
 /// can only be inside strings, where the escapes have the same meaning.
 pub(super) fn line(text: &str) -> String {
+    // Nearly every line of the log is plain.
+    if text.bytes().all(|byte| matches!(byte, b' '..=b'~')) {
+        return text.to_string();
+    }
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
