@@ -180,7 +180,7 @@ impl Trip {
 
 /// Whether the motor runs, or has its run command.
 fn may_run(reading: &Reading<'_>, words: &KnownWords) -> bool {
-    let commanded = || reading.is_set(ModelPoint::Run) || written_run(reading, words) == Some(true);
+    let commanded = || reading.is_set(ModelPoint::Run) || written_run(&reading.spec.profile, words) == Some(true);
     reading.is_set(ModelPoint::Running) || commanded()
 }
 

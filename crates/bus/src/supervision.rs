@@ -19,7 +19,7 @@ use drivegate_core::process_image::{LeaseAction, Reading, Unavailable};
 use drivegate_model::drive::control::ControlItem;
 use drivegate_model::drive::{
     COMMUNICATION_ERROR_REACTION, COMMUNICATION_TIMEOUT, DriveIndex, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass,
-    Quality, Value,
+    Profile, Quality, Value,
 };
 
 /// Time after which an action that was not acknowledged is written again.
@@ -323,7 +323,7 @@ impl Supervision {
         if let Some(set) = run.good().filter(|_| run.at.is_some_and(|at| at > since)) {
             return Some(set.as_bool());
         }
-        Some(written_run(reading, words).unwrap_or(true))
+        Some(written_run(&reading.spec.profile, words).unwrap_or(true))
     }
 
     /// Records the result of the pending action.
@@ -446,12 +446,11 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
     if !in_vain && run.is_some_and(is_read) {
         return None;
     }
-    Some(written_run(reading, words).unwrap_or(false))
+    Some(written_run(&reading.spec.profile, words).unwrap_or(false))
 }
 
 /// The run command in the drive's word, as far as the word is known.
-pub(super) fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
-    let profile = &reading.spec.profile;
+pub(super) fn written_run(profile: &Profile, words: &KnownWords) -> Option<bool> {
     let place = profile.run_place()?;
     let word = words.get(place.table, place.address)?;
     Some(profile.runs_by(place.table, place.address, word).unwrap_or(false))

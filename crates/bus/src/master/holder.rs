@@ -56,7 +56,10 @@ fn stop_at_local(
     writes: &Arc<WriteStats>,
 ) {
     let run = reading.model(ModelPoint::Run).good().map(|run| run.as_bool());
-    if !run.or_else(|| written_run(reading, &drive.words)).unwrap_or(false) {
+    if !run
+        .or_else(|| written_run(&reading.spec.profile, &drive.words))
+        .unwrap_or(false)
+    {
         return;
     }
     let origin = Origin::new(SourceKind::Supervision, Origin::LOCAL);

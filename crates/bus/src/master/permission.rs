@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::Master;
 use crate::command_run::CommandRun;
 use crate::drive_state::{DriveState, NextNeed};
+use crate::supervision::written_run;
 use drivegate_core::order::{Outcome, Urgency};
 use drivegate_core::permit::{Ask, DriveFacts, Facts, LastWritten, Stage, Verdict};
 use drivegate_core::plant::BusHandle;
@@ -21,6 +22,7 @@ const RANGE_AGE: Duration = Duration::from_secs(60);
 pub(super) struct AtTurn {
     images: Vec<Arc<DriveImage>>,
     written: PerDrive<LastWritten>,
+    run: PerDrive<Option<bool>>,
     now: Instant,
 }
 
@@ -29,6 +31,11 @@ impl AtTurn {
         AtTurn {
             images: images.iter().cloned().collect(),
             written: drives.iter().map(|drive| drive.written).collect(),
+            run: drives
+                .iter()
+                .zip(images)
+                .map(|(drive, image)| written_run(&image.spec.profile, &drive.words))
+                .collect(),
             now,
         }
     }
@@ -38,7 +45,8 @@ impl Facts for AtTurn {
     fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.images.get(drive.place())?.reading(self.now, RANGE_AGE);
         let written = self.written.get(drive).copied();
-        Some(DriveFacts { reading, written })
+        let run = self.run.get(drive).copied().flatten();
+        Some(DriveFacts { reading, written, run })
     }
 }
 
@@ -47,7 +55,7 @@ pub(super) fn may_write(
     bus: &BusHandle,
     index: DriveIndex,
     image: &DriveImage,
-    (run, written): (&CommandRun, LastWritten),
+    (run, written, commanded): (&CommandRun, LastWritten, Option<bool>),
     now: Instant,
 ) -> Verdict {
     if run.urgency() != Urgency::Command || !run.may_write_on() {
@@ -59,6 +67,7 @@ pub(super) fn may_write(
     let seen = DriveFacts {
         reading: image.reading(now, RANGE_AGE),
         written: Some(written),
+        run: commanded,
     };
     let ask = Ask {
         stage: Stage::Write,
@@ -84,9 +93,9 @@ pub(super) fn next_need(
         let NextNeed::Step(slot @ Urgency::Command, _) = wanted else {
             return wanted;
         };
-        let written = drive.written;
+        let (written, commanded) = (drive.written, written_run(&image.spec.profile, &drive.words));
         let Some(run) = drive.run(slot) else { return wanted };
-        match may_write(bus, index, image, (run, written), now) {
+        match may_write(bus, index, image, (run, written, commanded), now) {
             Verdict::Go | Verdict::LookFirst => return wanted,
             Verdict::Wait(until) => return NextNeed::Wait(until),
             Verdict::Refuse(outcome) => deny(bus, index, run, outcome),
@@ -112,11 +121,11 @@ impl Master {
     /// Whether a chosen frame of a started command may still be sent.
     pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
         let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
-        let written = drive.written;
+        let (written, commanded) = (drive.written, written_run(&image.spec.profile, &drive.words));
         let Some(run) = drive.run(slot) else { return true };
         // A denied command is refused, or made to wait, at the next choice.
         matches!(
-            may_write(&self.bus, index, image, (run, written), now),
+            may_write(&self.bus, index, image, (run, written, commanded), now),
             Verdict::Go | Verdict::LookFirst
         )
     }

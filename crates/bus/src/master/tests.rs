@@ -21,6 +21,7 @@ mod chosen;
 mod drill;
 mod family_drive;
 mod holder;
+mod interlocks;
 mod late_replies;
 mod pauses;
 mod refreshing;

@@ -7,7 +7,10 @@ use super::reference_limits::LastWritten;
 use super::rules;
 use crate::order::{Asks, Effect, Intent, Order, Origin, Outcome, Refusal};
 use crate::process_image::Reading;
-use drivegate_model::drive::DriveIndex;
+use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
+
+/// Output frequency in Hz below which a motor with its run command on counts as standing or in sleep mode.
+const TURNS: f64 = 0.5;
 
 /// A moment at which an order is judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,6 +55,23 @@ pub struct DriveFacts<'a> {
     pub reading: Reading<'a>,
     /// When reference and frequency range of the drive were last written; set only if the order is about to be sent.
     pub written: Option<LastWritten>,
+    /// Run command in the drive's word as the bus knows it, from reads and acknowledged writes; `None` if unknown.
+    pub run: Option<bool>,
+}
+
+impl DriveFacts<'_> {
+    /// Whether the motor is at standstill and its run command is on. Where nothing shows the run command, it counts as on
+    /// when the order is about to be sent.
+    fn waits_for_a_reference(&self) -> bool {
+        let reading = &self.reading;
+        let stands = match reading.model(ModelPoint::OutputFrequency).good().map(Value::as_f64) {
+            Some(hertz) => hertz.abs() < TURNS,
+            None => !reading.is_set(ModelPoint::Running),
+        };
+        let told = || reading.model(ModelPoint::Run).good().map(Value::as_bool);
+        let may_be_on = || reading.is_set(ModelPoint::Running) || self.written.is_some();
+        stands && self.run.or_else(told).unwrap_or_else(may_be_on)
+    }
 }
 
 /// Access to the state of the drives of a bus.
@@ -93,6 +113,12 @@ impl Ask<'_> {
     /// Rights that the order requires from the hold of the drive.
     pub fn asks(&self) -> Asks {
         Asks::of(&self.intent.order, self.effect())
+    }
+
+    /// Whether the order sets a reference that would turn a motor at standstill whose run command is on.
+    pub(super) fn wakes(&self) -> bool {
+        let effect = self.effect();
+        effect.reference && !effect.stops && self.seen.is_some_and(DriveFacts::waits_for_a_reference)
     }
 
     /// Whether the order is a write, but not a stop.

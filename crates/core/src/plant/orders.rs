@@ -114,7 +114,11 @@ struct AtAccept<'a> {
 impl Facts for AtAccept<'_> {
     fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.image.drives.get(drive)?.reading(self.now, self.stale_after);
-        Some(DriveFacts { reading, written: None })
+        Some(DriveFacts {
+            reading,
+            written: None,
+            run: None,
+        })
     }
 }
 

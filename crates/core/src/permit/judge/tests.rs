@@ -10,6 +10,7 @@ use crate::order::{
 };
 use crate::permit::{DrillLock, Mode, Principal, Rules, Verb};
 use crate::process_image::{DriveImage, RestoreLock};
+use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
 use crate::testkit::{bus_spec, controlled, image, nx, read};
 use drivegate_model::drive::{ModelPoint, PointIndex, Value};
@@ -48,7 +49,11 @@ struct Rig {
 impl Facts for Rig {
     fn seen(&self, _: DriveIndex) -> Option<DriveFacts<'_>> {
         let reading = self.image.reading(self.now, 10 * SECOND);
-        Some(DriveFacts { reading, written: None })
+        Some(DriveFacts {
+            reading,
+            written: None,
+            run: None,
+        })
     }
 }
 
@@ -291,5 +296,38 @@ fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
     ];
     for (why, expected) in table {
         assert_eq!(refused(why), expected, "{why:?}");
+    }
+}
+
+/// Orders over a connection from before a pause of the process, which start no motor.
+#[test]
+fn a_reference_that_turns_the_motor_is_a_start() {
+    // The drive's control word, its output frequency in 0.01 Hz, and the results of a reference at each stage.
+    for (run, hertz, expected) in [
+        (0, 0, "go go go"),
+        (1, 0, "expired expired expired"),
+        (1, 49, "expired expired expired"),
+        (1, 50, "go go go"),
+        (0, 50, "go go go"),
+    ] {
+        let stages = [Stage::Accept, Stage::Turn, Stage::Write].map(|stage| {
+            let mut rig = Rig::new(Why::Nothing);
+            read(&rig.image, 2100, &[3, 0, 0, hertz], rig.asked);
+            let word = |snapshot: &mut crate::process_image::Snapshot| {
+                snapshot.store(drivegate_proto::Table::Holding, 2000, &[run, 0, 0], rig.asked);
+            };
+            rig.image.update(word);
+            let mut command = rig.command("reference", "alice", rig.asked);
+            command.intent.window.arrival = Arrival {
+                pause: Some(Stall::new(rig.asked - 5 * SECOND, rig.asked)),
+                ..Arrival::over(Connection::opened(rig.asked - 9 * SECOND), rig.asked)
+            };
+            let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);
+            match gate.judge(stage, &command, &rig, now) {
+                Verdict::Refuse(outcome) => outcome.code(),
+                _ => "go",
+            }
+        });
+        assert_eq!(stages.join(" "), expected, "control word {run}, {hertz}");
     }
 }

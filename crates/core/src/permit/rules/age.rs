@@ -50,6 +50,8 @@ fn judge(ask: &Ask<'_>, drive: &DriveGate, gate: &Gate) -> Verdict {
         (Order::Read(_), _) => OrderKind::Read,
         (_, Asks::Stop) => OrderKind::Stop,
         (_, Asks::Run) => OrderKind::Start,
+        // A reference that turns a motor at standstill starts it.
+        _ if ask.wakes() => OrderKind::Start,
         (_, Asks::Steer | Asks::Other | Asks::Nothing) => OrderKind::Other,
     };
     let age = Age {
