@@ -19,7 +19,7 @@ use arc_swap::ArcSwap;
 use drivegate_bus::core::Action;
 use drivegate_core::event::Events;
 use drivegate_core::order::{Authority, Order, Origin, SourceKind, WriteStats};
-use drivegate_core::plant::{OrderRequest, Placed, Plant, SharedPlant, follow_names};
+use drivegate_core::plant::{OrderRequest, Placed, Plant, SharedPlant, UnusedNames};
 use drivegate_core::process_image::{LeaseAction, Supervision};
 use drivegate_core::stalls::{Heartbeat, TICK};
 use drivegate_model::drive::profile::Profiles;
@@ -97,6 +97,7 @@ struct World {
     next_incident: Instant,
     reloads: bool,
     wants_reload: bool,
+    unused_names: UnusedNames,
     promised: Promised,
     history: History,
     calm: bool,
@@ -181,6 +182,7 @@ impl World {
             next_incident: now + Duration::from_secs(4),
             reloads: !healthy && dice.chance(0.5),
             wants_reload: false,
+            unused_names: UnusedNames::default(),
             promised: Promised::new(drives),
             history: History::default(),
             calm: false,

@@ -22,7 +22,7 @@ use crate::queue::CommandQueue;
 use drivegate_model::drive::DriveIndex;
 use drivegate_model::drive::why::Explanation;
 
-pub use self::earlier_meanings::{EarlierMeanings, follow_names};
+pub use self::earlier_meanings::{EarlierMeanings, UnusedNames};
 pub use self::exchange::{Exchange, Question};
 pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};
@@ -68,7 +68,6 @@ impl BusHandle {
             if let Some(image) = bus.image.drives.get(place) {
                 drive.take_over(image);
             }
-            self.formerly.take_over(index, &bus.formerly, place);
             let inheritance = bus.queue.lock().gate.inheritance(place);
             self.queue.lock().gate.inherit(index, inheritance);
             // A drive that is only monitored from now on gets no orders.

@@ -32,7 +32,7 @@ use drivegate_core::event::{Event, EventKind, Events};
 use drivegate_core::files::Keeper;
 use drivegate_core::history::RecorderTask;
 use drivegate_core::order::{Outcome, WriteStats};
-use drivegate_core::plant::{BusHandle, Plant, SharedPlant, follow_names};
+use drivegate_core::plant::{BusHandle, Plant, SharedPlant, UnusedNames};
 use drivegate_core::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 use drivegate_core::queue::{CommandQueue, NotStopped};
 use drivegate_core::start_guard::{BusGuards, Guards};
@@ -88,6 +88,8 @@ pub struct Daemon {
     buses: Vec<(BusSettings, BusTask)>,
     /// State of drives that reloads have left out.
     parted: RemovedDrives,
+    /// Names and unit ids that reloads took from their drives.
+    unused_names: UnusedNames,
     events: Events,
     writes: Arc<WriteStats>,
     north: Arc<NorthState>,
@@ -152,6 +154,7 @@ impl Daemon {
             settings: settings.clone(),
             buses: Vec::new(),
             parted: RemovedDrives::default(),
+            unused_names: UnusedNames::default(),
             watcher: tokio::spawn(Watch::of_this_thread().run(events.clone())),
             events,
             writes,
@@ -314,7 +317,7 @@ impl Daemon {
             kept.push((bus, task));
         }
         let begin: Vec<BusHandle> = kept.iter().map(|(_, task)| task.handle().clone()).collect();
-        follow_names(&former, &begin, Instant::now());
+        self.unused_names.follow(&former, &begin, Instant::now());
         self.parted.keep(&leases, &stopped, Instant::now());
         let parted = self.parted.clone();
         tokio::spawn(async move {

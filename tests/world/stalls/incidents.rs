@@ -116,7 +116,8 @@ impl World {
         let plant = self.plant.load_full();
         let before = self.bus.handle.clone();
         self.bus.restart(0, &plant.events, &plant.writes, now);
-        follow_names(&[before], std::slice::from_ref(&self.bus.handle), now);
+        let after = std::slice::from_ref(&self.bus.handle);
+        self.unused_names.follow(&[before], after, now);
         self.plant.store(Arc::new(Plant {
             gateway: plant.gateway.clone(),
             stale_after: plant.stale_after,

@@ -357,11 +357,10 @@ impl Gate {
         (of_drive.priorities, of_drive.holding) = (priorities, holding);
     }
 
-    /// The clients that commanded a drive.
+    /// The clients that commanded a drive, or another machine under its name or unit since which they sent no stop.
     pub(crate) fn clients(&self, drive: DriveIndex) -> Vec<Arc<str>> {
-        self.drives
-            .get(&drive)
-            .map_or_else(Vec::new, |drive| drive.clients.clone())
+        let of = |drive: &DriveGate| drive.clients.iter().chain(&drive.must_stop_first).cloned().collect();
+        self.drives.get(&drive).map_or_else(Vec::new, of)
     }
 
     /// After a reload a drive has a name or unit under which these clients commanded another machine: they must
