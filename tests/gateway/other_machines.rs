@@ -96,11 +96,15 @@ fn reply(stream: &mut impl Read) -> Vec<u8> {
 
 /// The head of a command over HTTP at the local socket; the gateway waits for the body.
 fn begin_over_http(site: &Site, drive: &str, body: &str) -> UnixStream {
+    begin_post(site, &format!("drives/{drive}/commands"), body)
+}
+
+/// The head of any request that changes something.
+fn begin_post(site: &Site, path: &str, body: &str) -> UnixStream {
     let mut stream = local(site.file("socket"));
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let head = format!(
-        "POST /api/v1/drives/{drive}/commands HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\nExpect: \
-         100-continue\r\n\r\n",
+        "POST /api/v1/{path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {}\r\nExpect: 100-continue\r\n\r\n",
         body.len()
     );
     stream.write_all(head.as_bytes()).unwrap();
@@ -159,6 +163,36 @@ fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
     half.write_all(&[6, 0x81, 0, 0, 0]).unwrap();
     reply(&mut half);
     assert_eq!((plant.runs(1), plant.runs(2)), (false, false));
+}
+
+/// The head of a request that is not an order arrives, a reload gives its name to the other machine, and the rest arrives.
+#[test]
+fn a_hold_a_restore_and_a_drill_belong_to_the_machine_that_was_named() {
+    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let mut names = [pair("pump-2", "pump-1"), pair("pump-1", "pump-2")].into_iter().cycle();
+    for (path, body) in [
+        ("drives/pump-1/hold", "{\"action\": \"take\"}"),
+        ("drives/pump-1/params/restore", "{\"action\": \"resume\"}"),
+        ("drills", "{\"drive\": \"pump-1\"}"),
+    ] {
+        let mut begun = begin_post(&plant.site, path, body);
+        plant.reload(&names.next().unwrap());
+        begun.write_all(body.as_bytes()).unwrap();
+        let reply = reply(&mut begun);
+        let text = String::from_utf8_lossy(&reply);
+        assert!(
+            text.starts_with("HTTP/1.1 4") && text.contains("meant another machine"),
+            "{path}: {text}"
+        );
+        plant.reload(&names.next().unwrap());
+    }
+    // A heartbeat renews no lease of another machine.
+    let mut half = plant.modbus();
+    half.write_all(&[0, 1, 0, 0, 0, 6, 11]).unwrap();
+    std::thread::sleep(50 * MS);
+    plant.reload(&swapped_units());
+    half.write_all(&[6, 0x81, 3, 0, 1]).unwrap();
+    assert_eq!(reply(&mut half), [0, 1, 0, 0, 0, 3, 11, 0x86, 0x0A]);
 }
 
 /// A controller keeps run and reset bit set at a unit id; a reload puts another drive there.

@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_core::order::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_core::order::{
+    Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Proof, Refusal, SourceKind, written,
+};
 use drivegate_core::permit::{HoldState, Mode, Principal, Rules, Verb};
 use drivegate_core::plant::{OrderRequest, Placed};
 use drivegate_core::process_image::DriveSpec;
@@ -242,7 +244,12 @@ impl Play {
             place => {
                 let verb = Verb::ALL[place as usize - 8];
                 let handle = self.rig.drive(drive as u8 + 1);
-                let acted = handle.hold(verb, &origin(client), Authority::Write, self.rig.now);
+                let acted = handle.hold(
+                    verb,
+                    &origin(client),
+                    Authority::Write,
+                    (&Arrival::now(self.rig.now), self.rig.now),
+                );
                 self.rig.bus.command_came(self.rig.now);
                 let code = acted.as_ref().map_or_else(Refusal::code, |_| verb.name());
                 *self.results.entry(code).or_default() += 1;
@@ -366,7 +373,12 @@ fn a_reference_does_not_let_a_run_go_on_behind_a_stop() {
     assert!(!play.rig.with_drive(1, |drive, _| drive.state().running));
     let handle = play.rig.drive(1);
     handle
-        .hold(Verb::Take, &origin(0), Authority::Write, play.rig.now)
+        .hold(
+            Verb::Take,
+            &origin(0),
+            Authority::Write,
+            (&Arrival::now(play.rig.now), play.rig.now),
+        )
         .unwrap();
     let mut taken = play.place(0, 0, &run);
     assert!(play.rig.answered(&mut taken).is_ok());

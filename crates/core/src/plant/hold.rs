@@ -4,7 +4,7 @@ use std::time::{Instant, SystemTime};
 
 use super::{BusHandle, DriveHandle, Plant};
 use crate::event::{Event, EventKind, Events};
-use crate::order::{Asks, Authority, Command, Origin, Refusal};
+use crate::order::{Arrival, Asks, Authority, Command, Origin, Refusal};
 use crate::permit::{
     self, Claim, HoldChange, HoldState, HoldView, KeptReservation, Rules, Stage, Unheld, Verb, What, client_access,
 };
@@ -102,13 +102,20 @@ impl DriveHandle {
         self.bus.queue.has_authority()
     }
 
-    /// Applies a client's action to the hold and returns its published state. A refusal is audited, counted and
+    /// Applies a client's action, which arrived so, to the hold and returns its published state. A refusal is audited, counted and
     /// published like that of a command.
     ///
     /// # Errors
     /// If the hold refuses the action; contains the refusal.
-    pub fn hold(&self, verb: Verb, origin: &Origin, authority: Authority, now: Instant) -> Result<HoldView, Refusal> {
-        match self.act(verb, origin, authority, now) {
+    pub fn hold(
+        &self,
+        verb: Verb,
+        origin: &Origin,
+        authority: Authority,
+        (arrival, now): (&Arrival, Instant),
+    ) -> Result<HoldView, Refusal> {
+        let acted = self.is_meant(origin.kind, arrival);
+        match acted.and_then(|()| self.act(verb, origin, authority, now)) {
             Ok(view) => Ok(view),
             Err(refusal) => {
                 self.refuse(&format!("hold={}", verb.name()), refusal.clone(), origin.clone(), now);
@@ -202,9 +209,7 @@ impl DriveHandle {
 
     /// Notes that a client withdrew its run command although nothing is sent for it.
     pub fn said_stop(&self, origin: &Origin) {
-        if self.bus.queue.has_authority() {
-            self.bus.queue.lock().gate.hold_said_stop(self.index, origin);
-        }
+        self.bus.queue.lock().gate.hold_said_stop(self.index, origin);
     }
 
     /// Whether this client may start a restore of parameters; judged once at the start, so that no restore is left

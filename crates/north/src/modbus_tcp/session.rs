@@ -28,7 +28,7 @@ use drivegate_model::drive::{ModelPoint, Value};
 use drivegate_proto::modbus::encode_exception;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
-use request::{answers, has_function, not_readable, read_limit, stop_in, stops_all_only, stops_by};
+use request::{answers, has_function, not_readable, orders_nothing, read_limit, stop_in, stops_all_only, stops_by};
 
 /// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
@@ -244,6 +244,9 @@ impl ClientSession {
             Ok(request) => request,
             Err(code) => return code.into(),
         };
+        if orders_nothing(registers, &request) && drive.is_meant(self.client.origin().kind, arrival).is_err() {
+            return Exception::GATEWAY_PATH.into();
+        }
         if is_default && stops_by(&request, STOP_ALL) {
             return stop_of_default(frame.header, drive, request);
         }

@@ -237,7 +237,10 @@ impl Commands {
             Some(verb) => Ok(verb),
         };
         let done = match done {
-            Ok(verb) => drive.hold(verb, &origin, Authority::Write, now),
+            Ok(verb) => {
+                let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
+                drive.hold(verb, &origin, Authority::Write, (&arrival, now))
+            }
             Err(refusal) => {
                 drive.refuse(&what(), refusal.clone(), origin, now);
                 Err(refusal)

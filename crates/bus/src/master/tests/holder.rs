@@ -1,7 +1,7 @@
 //! The holder of a drive, on the line: no order of another client, and every stop.
 
 use super::*;
-use drivegate_core::order::{Proof, Refusal};
+use drivegate_core::order::{Arrival, Proof, Refusal};
 use drivegate_core::permit::{Mode, Principal, Rules, Verb};
 use drivegate_core::plant::{DriveHandle, OrderRequest, Plant};
 use drivegate_model::drive::DriveIndex;
@@ -143,9 +143,21 @@ fn what_waits_when_a_hold_is_broken_is_not_sent() {
     let from = rig.wire.len();
     let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
     let handle = drive(&plant, 0);
-    let refused = handle.hold(Verb::Break, &who("cloud"), Authority::Write, rig.now);
+    let refused = handle.hold(
+        Verb::Break,
+        &who("cloud"),
+        Authority::Write,
+        (&Arrival::now(rig.now), rig.now),
+    );
     assert!(matches!(refused, Err(Refusal::HeldByOther(_))), "{refused:?}");
-    handle.hold(Verb::Break, &who("op"), Authority::Write, rig.now).unwrap();
+    handle
+        .hold(
+            Verb::Break,
+            &who("op"),
+            Authority::Write,
+            (&Arrival::now(rig.now), rig.now),
+        )
+        .unwrap();
     rig.run(Time::from_millis(300));
     assert_eq!(
         (code(&mut waits), rig.runs(0), writes(&rig, from)),
@@ -170,7 +182,14 @@ fn what_has_begun_goes_no_further_when_a_hold_is_broken() {
         rig.step();
     }
     assert!(!rig.runs(0), "the reference goes first");
-    handle.hold(Verb::Break, &who("op"), Authority::Write, rig.now).unwrap();
+    handle
+        .hold(
+            Verb::Break,
+            &who("op"),
+            Authority::Write,
+            (&Arrival::now(rig.now), rig.now),
+        )
+        .unwrap();
     rig.run(Time::from_millis(300));
     assert_eq!((code(&mut both), rig.runs(0)), ("interrupted", false));
 }
@@ -194,7 +213,12 @@ fn the_turn_is_judged_again() {
 fn an_order_whose_drive_is_free_at_its_turn_takes_it() {
     let (mut rig, plant) = guarded(1, Mode::Exclusive);
     let mut waits = place(&rig, &plant, "plc", ModelPoint::Run, Value::Bool(true));
-    let released = drive(&plant, 0).hold(Verb::Release, &who("plc"), Authority::Write, rig.now);
+    let released = drive(&plant, 0).hold(
+        Verb::Release,
+        &who("plc"),
+        Authority::Write,
+        (&Arrival::now(rig.now), rig.now),
+    );
     assert_eq!(released.unwrap().holder, None);
     rig.run(Time::from_millis(300));
     assert_eq!((code(&mut waits), rig.runs(0)), ("acknowledged", true));

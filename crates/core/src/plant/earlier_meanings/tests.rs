@@ -166,3 +166,17 @@ fn an_order_belongs_to_the_machine_that_it_named_after_any_number_of_reloads() {
         assert_eq!(plant.stopped(), stopped, "{about}");
     }
 }
+
+/// A NULL of BACnet that changes nothing at the drive counts like a stop, also without `[authority]`.
+#[test]
+fn a_client_that_gives_its_run_command_back_may_start_the_machine_that_took_the_place() {
+    let mut plant = Reloads::new(BOTH);
+    let mut run = plant.order(11, true, plant.now);
+    assert_eq!(code(&mut run), "waits");
+    plant.reload(SWAPPED);
+    let drives = Plant::new("g", STALE_AFTER, plant.buses.clone());
+    let drive = drives.drives().find(|drive| drive.image.spec.unit == 11).unwrap();
+    drive.said_stop(&Origin::new(SourceKind::ModbusTcp, "plc"));
+    let mut run = plant.order(11, true, plant.now);
+    assert_eq!(code(&mut run), "waits");
+}

@@ -99,7 +99,7 @@ pub(in crate::http) struct RequestArrival(Arrival, Option<Arc<Reader>>);
 
 impl RequestArrival {
     /// The arrival of the request, after its body was read.
-    fn complete(self) -> Arrival {
+    pub(super) fn complete(self) -> Arrival {
         match self.1 {
             Some(reader) => self.0.completed(&reader.last()),
             None => self.0,

@@ -12,6 +12,7 @@ use super::super::app_state::AppState;
 use super::super::messages::DrillWish;
 use super::super::replies::{Refused, Replied, not_found, refused};
 use super::asker::{Commander, Ordered};
+use super::commands::RequestArrival;
 use drivegate_core::drill::{DrillRefusal, DrillReport, Kind};
 
 /// Handler: all known drills, newest first.
@@ -30,6 +31,7 @@ pub(in crate::http) async fn drill(
 
 /// Arms a drill and answers with status 201.
 pub(in crate::http) async fn arm_drill(
+    asked: RequestArrival,
     State(app): State<Arc<AppState>>,
     Ordered(operator, payload): Ordered,
 ) -> Replied {
@@ -38,6 +40,8 @@ pub(in crate::http) async fn arm_drill(
         refused(StatusCode::UNPROCESSABLE_ENTITY, format!("the body is {form}: {error}"))
     })?;
     let drive = app.drive(&wish.drive)?;
+    let meant = drive.is_meant(operator.origin().kind, &asked.complete());
+    meant.map_err(|refusal| refused(StatusCode::CONFLICT, refusal.to_string()))?;
     let kinds = if wish.kinds.is_empty() {
         &Kind::ALL[..]
     } else {

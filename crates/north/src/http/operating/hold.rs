@@ -12,6 +12,7 @@ use super::super::app_state::AppState;
 use super::super::messages::HoldAct;
 use super::super::replies::{Replied, refused};
 use super::asker::{Ordered, Viewer};
+use super::commands::RequestArrival;
 use crate::command_json::HoldReply;
 use drivegate_core::order::Authority;
 use drivegate_core::permit::Verb;
@@ -34,6 +35,7 @@ pub(in crate::http) async fn hold_of(
 
 /// Takes, renews, releases or breaks the hold of a drive.
 pub(in crate::http) async fn hold(
+    asked: RequestArrival,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     Ordered(operator, payload): Ordered,
@@ -45,7 +47,7 @@ pub(in crate::http) async fn hold(
     })?;
     let drive = app.drive(&name)?;
     let (origin, now) = (operator.origin(), Instant::now());
-    let done = drive.hold(verb, &origin, Authority::Write, now);
+    let done = drive.hold(verb, &origin, Authority::Write, (&asked.complete(), now));
     let status = match &done {
         Ok(_) => StatusCode::OK,
         Err(refusal) if refusal.holder().is_none() && drive.has_authority() => StatusCode::FORBIDDEN,

@@ -11,6 +11,7 @@ use super::super::app_state::AppState;
 use super::super::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, RestoreWish};
 use super::super::replies::{Refused, Replied, refused};
 use super::asker::Ordered;
+use super::commands::RequestArrival;
 use crate::parameter_jobs::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use drivegate_core::order::{Origin, Pace};
 use drivegate_core::parameters::{Id, ParameterFile, Wishes};
@@ -45,13 +46,17 @@ pub(in crate::http) async fn progress(
 
 /// `POST …/params/restore`
 pub(in crate::http) async fn restore(
+    asked: RequestArrival,
     State(app): State<Arc<AppState>>,
     Path(name): Path<String>,
     Ordered(operator, body): Ordered<MAX_BODY>,
 ) -> Replied<Json<Restore>> {
     let act: RestoreAct = understood(&body)?;
     let drive = app.drive(&name)?;
-    act_on(&app, &drive, act, operator.origin()).await.map_err(conflict)?;
+    let origin = operator.origin();
+    let meant = drive.is_meant(origin.kind, &asked.complete());
+    meant.map_err(|refusal| conflict(refusal.to_string()))?;
+    act_on(&app, &drive, act, origin).await.map_err(conflict)?;
     restored(&app, &drive)
 }
 

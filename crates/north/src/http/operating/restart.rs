@@ -30,6 +30,12 @@ pub(super) async fn communication(drive: &DriveHandle, origin: Origin, arrival: 
             Shown::default(),
         );
     }
+    if let Err(refusal) = drive.is_meant(origin.kind, &arrival) {
+        return (
+            drive.refuse(RESTART_COMMUNICATION, refusal, origin, now),
+            Shown::default(),
+        );
+    }
     let question = Question {
         target: Target::Address(spec.address),
         pdu: RequestPdu::Diagnostics {

@@ -6,7 +6,7 @@ use super::{ClientSession, Decision};
 use crate::modbus_tcp::forwarded_request::{BusWork, ForwardedRequest, common};
 use crate::modbus_tcp::frame::Header;
 use crate::register_map::{self, CommandWrite, HEARTBEAT, HOLD};
-use drivegate_core::order::Order;
+use drivegate_core::order::{Arrival, Order};
 use drivegate_core::permit::Verb;
 use drivegate_core::plant::DriveHandle;
 use drivegate_model::drive::State;
@@ -36,7 +36,9 @@ impl ClientSession {
             _ => return Exception::VALUE.into(),
         };
         let origin = self.client.origin();
-        match drive.hold(verb, &origin, self.client.rights.authority(), now) {
+        // Whether the unit meant this drive was checked before.
+        let came = (&Arrival::now(now), now);
+        match drive.hold(verb, &origin, self.client.rights.authority(), came) {
             Ok(_) => {
                 if start == HEARTBEAT {
                     drive.heartbeat(&origin, now);

@@ -1,9 +1,25 @@
 //! What a request covers, and what a family has for it. Pure.
 
+use crate::modbus_tcp::routes::{At, Registers};
+use crate::register_map::HEARTBEAT;
 use drivegate_core::order::{self, Order, Refusal};
 use drivegate_core::plant::DriveHandle;
 use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
+
+/// Whether a write sets only registers by which a client holds a drive or shows that it is there.
+pub(super) fn orders_nothing(registers: Registers, request: &RequestPdu) -> bool {
+    let (start, count) = match request {
+        RequestPdu::WriteRegister { address, .. } => (*address, 1),
+        RequestPdu::WriteRegisters { start, values } => (*start, values.len()),
+        RequestPdu::ReadWrite {
+            write_start, values, ..
+        } => (*write_start, values.len()),
+        _ => return false,
+    };
+    let place = registers.locate(start, u16::try_from(count).unwrap_or(u16::MAX));
+    matches!(place, At::Model(start) if start >= HEARTBEAT)
+}
 
 /// Whether a write to holding registers sets the register to 1.
 pub(super) fn stops_by(request: &RequestPdu, register: u16) -> bool {
