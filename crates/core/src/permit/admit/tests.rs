@@ -329,6 +329,57 @@ fn addresses_and_counts() {
     );
 }
 
+/// A profile whose points share the control word, which its proof refuses.
+const PAST: &str = r#"
+name = "past"
+protocols = ["modbus-rtu"]
+range = [{ table = "holding", first = 0, last = 9, read = 10, write = 2 }]
+[control]
+at = "holding 1"
+own_word = "shadow"
+run = { bit = 0 }
+stop = { bit = 0, is = 0 }
+[[point]]
+name = "running"
+at = "holding 8.0"
+class = "fast"
+[[point]]
+name = "word"
+at = "holding 1"
+class = "never"
+write = true
+[[point]]
+name = "lever"
+at = "holding 1.0"
+class = "never"
+write = true
+[[point]]
+name = "beside"
+at = "holding 2"
+class = "never"
+write = true
+"#;
+
+#[test]
+fn a_point_where_the_drive_is_commanded_is_not_written() {
+    let profile = Arc::new(Profile::parse("past.toml", PAST, false).unwrap());
+    let spec = DriveSpec {
+        access: Access::Control,
+        ..DriveSpec::new("pump-1", "line1", 1, Arc::clone(&profile))
+    };
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    for (name, passes) in [("word", false), ("lever", false), ("beside", true), ("run", true)] {
+        let order = Order::Points(vec![(profile.point_index(name).unwrap(), Value::Number(1.0))]);
+        let reading = image.reading(Instant::now(), Duration::from_secs(1));
+        let refused = admit(order, &reading, Authority::Write).err();
+        assert_eq!(refused.is_none(), passes, "{name}: {refused:?}");
+        if let Some(refused) = refused {
+            assert_eq!(refused.code(), "not_writable", "{name}");
+            assert!(refused.to_string().contains("could start the motor"), "{refused}");
+        }
+    }
+}
+
 /// Limits in Hz, and the percentage of 50 Hz, depend on the drive's maximum frequency, which may be changed at its
 /// panel. Restoring a control word that was read while the motor ran would start the motor.
 #[test]
