@@ -61,6 +61,7 @@ async function theHeaderOfAPhoneIsOneLine(gateway, page) {
   await overview(gateway, page, [390, 844]);
   const header = () => document.querySelector("header").getBoundingClientRect().height;
   assert.ok(await page.eval(header) <= 56, `${await page.eval(header)} px`);
+  assert.ok(await page.eval(() => document.querySelector(".home b").scrollWidth <= document.querySelector(".home b").clientWidth), "the name of the gateway is cut");
   assert.equal(await page.eval(shown, "nav a"), false);
   await page.eval(click, "#menu");
   assert.equal(await page.eval(shown, "nav a[data-entry=events]"), "Events");
@@ -118,6 +119,7 @@ async function colourMeansThatSomebodyIsWanted(gateway, page) {
   assert.deepEqual(badges["recirculation-blower-3"], ["▲ fault", false]);
   assert.deepEqual(badges["feed-pump-house-5"].slice(1), [false]);
   assert.match(badges["feed-pump-house-5"][0], /✕ offline/);
+  assert.equal(await page.eval(() => document.querySelector(".row.offline .second .tag").textContent), "1 min old");
   assert.match(badges["recirculation-blower-7"][0], /▶ running\s+! warning/);
 }
 

@@ -176,7 +176,10 @@ const QUALITY_TITLES = {
 const qualityOf = (point) => (!point ? "absent" : point.contradicted ? "contradicted" : point.quality);
 
 /// The quality of something that is too old, with its age.
-export const old = (ms, quality) => (ms === null || ms === undefined ? t("never read") : t("{quality}, {age} old", { quality: words(quality), age: age(ms) }));
+export function old(ms, quality) {
+  if (ms === null || ms === undefined) return t("never read");
+  return quality ? t("{quality}, {age} old", { quality: words(quality), age: age(ms) }) : t("{age} old", { age: age(ms) });
+}
 
 /// What is said beside a value about its age and quality: nothing of one that is as good and as new as it should be.
 export function noteOf(point) {

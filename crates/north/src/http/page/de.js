@@ -291,6 +291,7 @@ const texts = {
   "{name}: none in the last hour": "{name}: keine in der letzten Stunde",
   "{name}: {total} in the last hour, most {when}: {most}": "{name}: {total} in der letzten Stunde, die meisten {when}: {most}",
   "{quality}, {age} old": "{quality}, {age} alt",
+  "{age} old": "{age} alt",
   "{shown} of {count}": "{shown} von {count}",
   "{shown} of {count} drives": "{shown} von {count} Umrichtern",
   "{shown} of {count} drives are not known to have stopped.": "Bei {shown} von {count} Umrichtern ist der Stillstand nicht nachgewiesen.",

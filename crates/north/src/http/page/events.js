@@ -4,7 +4,7 @@ import { anchor, arrange, faultWithoutText, hide, keyed, make, places, stamp, to
 import { load } from "./gateway.js";
 import { t } from "./texts.js";
 
-export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
+export const EVENT_COLOURS = { fault: "red", offline: "amber", bus_down: "red", warning: "amber", supervision: "amber", supervision_failed: "red", unsupervised: "amber",
   refused_command: "amber", restarted: "amber", unlike_profile: "amber", selection_differs: "amber", not_confirmed: "amber", reload_refused: "amber",
   foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", guarded: "amber", interlock: "amber", slot_void: "amber", paused: "amber" };
 

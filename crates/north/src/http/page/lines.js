@@ -92,7 +92,7 @@ export function busCards(level, address, titles) {
         showFacts(card.facts, bus);
         const own = counts.get(bus.name) ?? new Map();
         const told = Object.keys(STATES).filter((state) => own.has(state));
-        text(card.states, told.map((state) => `${STATES[state][1]} ${own.get(state)} ${words(state)}`).join(" · ") || t("no drives"));
+        text(card.states, told.map((state) => `${STATES[state][1]} ${own.get(state)} ${words(state)}`.replaceAll(" ", "\u00a0")).join(" · ") || t("no drives"));
       });
     },
   };

@@ -131,7 +131,7 @@ export function showDrive(row, drive) {
     if (entry.direction) showDirection(entry, point, drive.points);
     if (entry.bar) fillSpeed(entry.bar, point);
   }
-  text(row.quality, drive.quality === "good" ? "" : old(drive.age_ms, drive.quality));
+  text(row.quality, drive.quality === "good" ? "" : old(drive.age_ms, state === "offline" ? "" : drive.quality));
   hide(row.quality, drive.quality === "good");
 }
 
