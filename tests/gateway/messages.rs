@@ -92,6 +92,40 @@ fn a_broker_without_mqtt_5_is_named_as_such() {
     }
 }
 
+/// A server that is not a broker, or one behind TLS, answers in its own way; the remedy is the scheme of the address.
+#[test]
+fn another_server_at_the_port_leads_to_the_scheme() {
+    let alert = &b"\x15\x03\x03\x00\x02\x02\x46"[..];
+    let http = &b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"[..];
+    let scheme = "check the scheme in mqtt.url: mqtts:// for a port with TLS, usually 8883";
+    for (url, answer, wanted) in [
+        ("mqtt://", alert, "or expects TLS"),
+        ("mqtt://", http, "there is no MQTT at this port"),
+        ("mqtt://", b"", scheme),
+        (
+            "ws://",
+            http,
+            "404 Not Found: there is no MQTT over WebSocket at this port and path",
+        ),
+    ] {
+        let site = Site::of(&[LINE1, &controlled("pump-1", 1, ""), MQTT]);
+        site.change("mqtt://", url);
+        let listener = TcpListener::bind(("127.0.0.1", site.mqtt)).unwrap();
+        std::thread::spawn(move || {
+            for mut stream in listener.incoming().map_while(Result::ok) {
+                let mut first = [0; 1024];
+                let _ = stream.read(&mut first);
+                let _ = stream.write_all(answer);
+            }
+        });
+        let gateway = site.run();
+        gateway.until_printed(wanted);
+        if url == "mqtt://" {
+            gateway.until_printed(scheme);
+        }
+    }
+}
+
 /// A program that reads the port without a lock takes the replies.
 #[test]
 fn another_program_at_the_port_is_named() {

@@ -54,6 +54,8 @@ fn mutual_tls() {
 
     let mut foreign_ca = good.clone();
     foreign_ca.ca = Some(file("other.crt"));
+    let mut no_tls = good.clone();
+    no_tls.tls = false;
     let mut no_certificate = good.clone();
     no_certificate.identity = None;
     let mut missing_file = good.clone();
@@ -65,6 +67,7 @@ fn mutual_tls() {
             foreign_ca,
             "is signed by `ca`, which is not among the certificates of mqtt.ca",
         ),
+        (no_tls, "mqtts:// for a port with TLS, usually 8883"),
         (
             no_certificate,
             "it requires a client certificate (alert CertificateRequired); set mqtt.certificate and mqtt.key",

@@ -74,6 +74,9 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
         let identity = identity.as_ref().filter(|_| place == 0);
         check_certificates(reader, &broker.host, ca.as_deref(), identity);
     }
+    for broker in all() {
+        warn_of_unusual_port(reader, broker);
+    }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
     let wanted = MQTT.topics.get(reader);
@@ -182,6 +185,19 @@ pub(super) fn secret(path: &Path) -> Result<String, Finding> {
             "write one line",
         ),
     })
+}
+
+/// Warns about a scheme at the usual port of the other one: a broker closes such a connection, often without a word.
+fn warn_of_unusual_port(reader: &Reader<'_>, broker: &Broker) {
+    let (kind, remedy) = match (broker.tls, broker.path.is_some(), broker.port) {
+        (false, false, 8883) => ("with TLS", "write mqtts://"),
+        (true, false, 1883) => ("without TLS", "write port 8883, or mqtt:// for a broker without TLS"),
+        (false, true, 443) => ("with TLS", "write wss://"),
+        (true, true, 80) => ("without TLS", "write port 443, or ws:// for a broker without TLS"),
+        _ => return,
+    };
+    let what = format!("port {} of `{}` is usually a port {kind}", broker.port, broker.host);
+    reader.warning(MQTT.url.name, what, remedy);
 }
 
 /// Warns about passwords and commands that others on the way to the broker could read or alter.
@@ -357,6 +373,36 @@ mod tests {
                 matches!(errors.as_slice(), [error] if error.to_string().contains(part)),
                 "{mqtt}: {errors:?}"
             );
+        }
+    }
+
+    #[test]
+    fn a_scheme_at_the_usual_port_of_the_other_is_pointed_out() {
+        for (url, wanted) in [
+            (
+                "mqtt://b:8883",
+                "port 8883 of `b` is usually a port with TLS; a.toml:4, mqtt.url; write mqtts://",
+            ),
+            ("mqtts://b:1883", "usually a port without TLS"),
+            ("ws://b:443/mqtt", "write wss://"),
+            ("wss://b:80/mqtt", "write port 443, or ws://"),
+            ("mqtt://b", ""),
+            ("mqtts://b", ""),
+            ("mqtt://b:443", ""),
+            ("ws://b:8883/mqtt", ""),
+        ] {
+            let source = format!("[gateway]\nname = \"a\"\n[mqtt]\nurl = \"{url}\"\n");
+            let warnings = Settings::parse("a.toml", &source, std::iter::empty()).warnings;
+            let found: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+            let found = found.iter().filter(|warning| warning.contains("usually a port"));
+            let found: Vec<&str> = found.map(String::as_str).collect();
+            match wanted {
+                "" => assert_eq!(found, [""; 0], "{url}"),
+                _ => assert!(
+                    matches!(found.as_slice(), [one] if one.contains(wanted)),
+                    "{url}: {found:?}"
+                ),
+            }
         }
     }
 }

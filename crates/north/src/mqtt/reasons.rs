@@ -9,25 +9,37 @@ use crate::tls_words;
 /// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is not a packet
 /// of MQTT 5, and closes the connection; some close it at once.
 pub(super) fn refusal(error: &ConnectionError) -> String {
+    let is_of_tls = |error: &(dyn std::error::Error + 'static)| tls_words::explain(error, tls_words::BROKER).is_some();
     match error {
-        ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io)))
-            if is_closed(error) && tls_words::explain(io, tls_words::BROKER).is_none() =>
-        {
-            format!("{io}: {SCHEME}")
+        _ if is_of_tls(error) => reason(error),
+        // A port that nobody listens at, a name that is not known.
+        ConnectionError::Io(_) if !is_closed(error) => reason(error),
+        ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io))) if is_of_tls(io) => reason(error),
+        ConnectionError::Io(io)
+        | ConnectionError::MqttState(StateError::Io(io) | StateError::Deserialization(PacketError::Io(io))) => {
+            match is_closed(error) {
+                true => format!("{io}: the broker did not accept the connection; {SCHEME}"),
+                false => format!("there is no MQTT at this port ({io}); {SCHEME}"),
+            }
         }
-        // Errors of the network or of TLS have messages of their own.
-        ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(_))) => reason(error),
+        ConnectionError::Timeout(_) => format!("timed out: the broker did not accept the connection; {SCHEME}"),
         ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
             "the broker closed the connection without accepting it: it does not support MQTT 5, or expects TLS; {MQTT_5}, or \
-             write mqtts:// for TLS"
+             {SCHEME}"
         ),
+        ConnectionError::Websocket(why) => format!("{why}: {WEB}"),
+        ConnectionError::ResponseValidation(why) => format!("{why}: {WEB}"),
         _ => reason(error),
     }
 }
 
-/// Remedy for a broker that closes a connection before it accepts it.
-const SCHEME: &str = "the broker did not accept the connection; check the scheme in mqtt.url: mqtts:// for a port with TLS, \
-                      usually 8883, mqtt:// for one without, usually 1883";
+/// Remedy where the other end does not answer as a broker: often TLS is the cause.
+const SCHEME: &str = "check the scheme in mqtt.url: mqtts:// for a port with TLS, usually 8883, mqtt:// for one without, \
+                      usually 1883";
+
+/// Remedy where the other end does not answer in WebSocket.
+const WEB: &str = "there is no MQTT over WebSocket at this port and path; check mqtt.url: ws:// or wss:// with the port and \
+                   path of the broker's WebSocket, mqtt:// or mqtts:// for a port without";
 
 /// Remedy for a broker of an older version.
 const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
@@ -55,8 +67,8 @@ pub(super) fn reference(disconnect: &Disconnect) -> String {
 
 /// The broker ended the connection before TLS was there, and did not say why.
 const HANDSHAKE_END: &str = "the broker closed the connection during the TLS handshake: perhaps it does not use TLS \
-                             on this port, or refuses the gateway; check the port in mqtt.url, usually 8883, and the \
-                             broker's log";
+                             on this port, or refuses the gateway; check the broker's log, and mqtt.url: mqtts:// for a \
+                             port with TLS, usually 8883, mqtt:// for one without, usually 1883";
 
 /// Whether the other end closed the connection.
 pub(super) fn is_closed(error: &ConnectionError) -> bool {
