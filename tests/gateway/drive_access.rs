@@ -237,8 +237,8 @@ fn directly_and_through_the_gateway() {
     // A scan fails at a taken port, too.
     let ran = drivegate(&["scan", "--port", &line.port(), "--addresses", "1"]);
     assert_eq!(ran.code, 1);
-    let owner = format!("drivegate (pid {}) has the port; ", gateway.pid());
-    assert!(ran.err.contains(&owner), "{}", ran.err);
+    let owner = "the gateway `plant` has the port for its bus `line1`; ";
+    assert!(ran.err.contains(owner), "{}", ran.err);
     drop(gateway);
 }
 

@@ -29,6 +29,9 @@ impl fmt::Display for PortUser {
     }
 }
 
+/// Flags of a socket that listens, in `/proc/net/unix`.
+const LISTENS: &str = "00010000";
+
 /// The name that a gateway has for a file in its refusal.
 const RUNS_WITH: &str = "the gateway runs with ";
 
@@ -106,8 +109,8 @@ pub(super) fn taken(port: &str, why: String) -> String {
     if !why.contains(TAKEN) {
         return why;
     }
-    let owner = owner(port);
-    by_whom(port, owner.as_ref(), &of(port)).unwrap_or(why)
+    let users = of(port);
+    by_whom(port, owner(port, &users).as_ref(), &users).unwrap_or(why)
 }
 
 /// Error and remedy for a port that others have.
@@ -152,10 +155,38 @@ pub(super) fn listed(users: &[PortUser]) -> String {
     all.join(" and ")
 }
 
-/// The gateway of this machine that has a bus at the port, if its socket can be opened.
-fn owner(port: &str) -> Option<Owner> {
+/// The local sockets of a gateway at any path, which its process shows to root and to its own user.
+fn sockets_of(process: &Path) -> Vec<PathBuf> {
+    let directory = process.join("fd");
+    let targets = names(&directory);
+    let targets = targets
+        .iter()
+        .filter_map(|name| fs::read_link(directory.join(name)).ok());
+    let open: Vec<String> = targets.map(|target| target.display().to_string()).collect();
+    let listed = fs::read_to_string(process.join("net/unix")).unwrap_or_default();
+    let paths = listed.lines().filter_map(listening);
+    let paths = paths.filter(|(inode, _)| open.contains(&format!("socket:[{inode}]")));
+    // A path relative to the directory in which the gateway was started becomes an absolute one.
+    let started_in = fs::read_link(process.join("cwd")).unwrap_or_default();
+    paths.map(|(_, path)| started_in.join(path)).collect()
+}
+
+/// Inode and path of a socket that listens, from a line of `/proc/net/unix`. Connections to it have its path, too.
+fn listening(line: &str) -> Option<(&str, &str)> {
+    let mut fields = line.split_ascii_whitespace();
+    let (flags, inode) = (fields.nth(3)?, fields.nth(2)?);
+    let (_, path) = line.split_once(&format!(" {inode} "))?;
+    (flags == LISTENS && !path.starts_with('@')).then_some((inode, path))
+}
+
+/// The gateway of this machine that has a bus at the port, if its socket can be opened. `users` have the port open.
+fn owner(port: &str, users: &[PortUser]) -> Option<Owner> {
     let device = Path::new(port).canonicalize().ok()?;
-    let sockets = SocketPath::Default.of_client(&RuntimeDirectories::of_this_process());
+    let gateways = users.iter().filter(|user| user.name == GATEWAY);
+    let mut sockets: Vec<PathBuf> = gateways
+        .flat_map(|user| sockets_of(&Path::new("/proc").join(user.pid.to_string())))
+        .collect();
+    sockets.extend(SocketPath::Default.of_client(&RuntimeDirectories::of_this_process()));
     let runtime = super::runtime().ok()?;
     sockets.into_iter().filter(|socket| socket.exists()).find_map(|socket| {
         let client = Client::through(Door::Socket(socket.clone()));
@@ -221,6 +252,30 @@ mod tests {
         );
         assert!(taken.contains("end that program (kill 12)"), "{taken}");
         assert_eq!(readers(&port, &[]), None);
+    }
+
+    #[test]
+    fn the_sockets_of_a_gateway_are_found_at_any_path() {
+        let root = tempfile::tempdir().unwrap();
+        let process = root.path();
+        for directory in ["fd", "net"] {
+            fs::create_dir(process.join(directory)).unwrap();
+        }
+        let listed = "Num       RefCount Protocol Flags    Type St Inode Path\n\
+            0000000000000001: 00000002 00000000 00010000 0001 01  4507 /srv/plant a/own.sock\n\
+            0000000000000002: 00000003 00000000 00000000 0001 03  4508 /srv/plant a/own.sock\n\
+            0000000000000003: 00000002 00000000 00010000 0001 01  4509 next.sock\n\
+            0000000000000004: 00000002 00000000 00010000 0001 01 45107 /run/of-another.sock\n\
+            0000000000000005: 00000002 00000000 00010000 0001 01 45108 @abstract\n\
+            0000000000000006: 00000003 00000000 00000000 0001 03 45109\n";
+        fs::write(process.join("net/unix"), listed).unwrap();
+        symlink("/srv/started", process.join("cwd")).unwrap();
+        for (number, inode) in [4507, 4508, 4509, 45108, 45109].iter().enumerate() {
+            let link = process.join("fd").join(number.to_string());
+            symlink(format!("socket:[{inode}]"), link).unwrap();
+        }
+        let wanted = ["/srv/plant a/own.sock", "/srv/started/next.sock"].map(PathBuf::from);
+        assert_eq!(sockets_of(process), wanted);
     }
 
     #[test]
