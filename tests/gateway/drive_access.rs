@@ -397,8 +397,11 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     }
     // A reason that all of its points share is reported once.
     let ran = drivegate(&["read", "--config", &config, "pump-2"]);
-    let wanted = "error: no point of `pump-2` has a value: the drive does not reply\n";
-    assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));
+    let wanted = format!(
+        "error: no point of `pump-2` has a value: the drive does not reply; check power, wiring and address; `drivegate \
+         diagnose line1 --config {config}` shows what is wrong with the line\n"
+    );
+    assert_eq!((ran.code, ran.out.as_str(), ran.err), (1, "", wanted));
     // This point was never requested, so it has no old value.
     let ran = drivegate(&["read", "--json", "--config", &config, "pump-1", "fault_code_id99"]);
     assert!(ran.out.contains("\"bad\""), "{}{}", ran.out, ran.err);

@@ -8,7 +8,11 @@ COUNT = 6000  # more than the gateway keeps
 # As the load of the soak makes them: whether they come from each drive, each bus or the gateway, and their text.
 KINDS = {
     "online": ("drive", "drive {drive} answers"),
-    "offline": ("drive", "drive {drive} is offline: it does not reply; retrying at least every 10 s"),
+    "offline": (
+        "drive",
+        "drive {drive} is offline: it does not reply; check its power, wiring and address (`drivegate diagnose line1`); retrying at least "
+        "every 10 s",
+    ),
     "started": ("drive", "drive {drive} has started: commanded by mqtt drivegate/soak/drive/{drive}/set"),
     "stopped": ("drive", "drive {drive} has stopped: commanded by mqtt drivegate/soak/drive/{drive}/set"),
     "fault": ("drive", "drive {drive} has fault 14: drive overtemperature"),

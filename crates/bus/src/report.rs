@@ -275,7 +275,9 @@ impl Report {
     fn offline(&mut self, index: DriveIndex) {
         self.selections.interrupted(index);
         if goes_offline(self.image.drives.of(index)) {
-            self.offline_event(index, "it does not reply");
+            let bus = &self.image.spec.name;
+            let why = format!("it does not reply; check its power, wiring and address (`drivegate diagnose {bus}`)");
+            self.offline_event(index, &why);
         }
     }
 

@@ -154,7 +154,10 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
         kinds,
         speed: wish.speed,
     };
-    let armed: DrillReport = asked(&client, &GatewayRequest::post("/api/v1/drills", &body)).await?;
+    let armed: Result<DrillReport, String> = asked(&client, &GatewayRequest::post("/api/v1/drills", &body)).await;
+    let take = format!("hold {name} take");
+    let complete = |why: String| why.replace(&format!("drivegate {take}"), &wish.gateway.command(&take));
+    let armed = armed.map_err(complete)?;
     let ways: Vec<&str> = armed.steps.iter().map(|step| step.kind.name()).collect();
     let warning = format!(
         "Drive {} will be started at {} % and stopped by: {}. Time allowed: {} s each.\nType its name to start the \
@@ -177,11 +180,11 @@ async fn drill(name: &str, wish: &Wish) -> Result<DrillReport, String> {
     let lost = "it is unknown whether it started: check the motor, and stop it at the machine";
     let start = GatewayRequest::post(format!("{}/start", path(&armed.id)), &json!({})).if_lost(lost);
     let started: DrillReport = asked(&client, &start).await?;
-    watch(&client, started).await
+    watch(&client, &wish.gateway, started).await
 }
 
 /// Shows the steps of the drill until it ends. Ctrl-C ends the drill.
-async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, String> {
+async fn watch(client: &Client, gateway: &Gateway, started: DrillReport) -> Result<DrillReport, String> {
     let mut told = String::new();
     let mut now = started;
     loop {
@@ -192,8 +195,8 @@ async fn watch(client: &Client, started: DrillReport) -> Result<DrillReport, Str
         if now.state.is_over() {
             let last = now.last_stop.as_deref().unwrap_or_default();
             report::note(&printable::line(&format!(
-                "last stop: {last}; report: drivegate drill report {}",
-                now.id
+                "last stop: {last}; report: {}",
+                gateway.command(&format!("drill report {}", now.id))
             )));
             return Ok(now);
         }

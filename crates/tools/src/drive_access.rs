@@ -44,6 +44,7 @@ impl OneDrive {
 pub(super) struct Target {
     pub(super) drive: String,
     client: Client,
+    gateway: Gateway,
     /// The drive in the configuration; `None` with `--url`: the gateway knows the drive, and there is no line here.
     configured: Option<Box<Configured>>,
 }
@@ -72,6 +73,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> 
         return Ok(Target {
             drive: drive_name,
             client,
+            gateway: gateway.clone(),
             configured: None,
         });
     }
@@ -97,6 +99,7 @@ pub(super) fn target(gateway: &Gateway, drive: &str) -> Result<Target, Failure> 
     Ok(Target {
         drive: drive_name,
         client: Client::for_socket(&settings.socket, Expected::Drive(expected)),
+        gateway: gateway.clone(),
         configured: Some(Box::new(Configured { settings, bus, spec })),
     })
 }
@@ -105,6 +108,19 @@ impl Target {
     /// The profile of the drive; `None` if this command does not know it.
     pub(super) fn profile(&self) -> Option<&Arc<Profile>> {
         self.configured.as_ref().map(|configured| &configured.spec.profile)
+    }
+
+    /// Remedy if the drive does not reply to its gateway.
+    pub(super) fn remedy_for_silence(&self) -> String {
+        let bus = self.configured.as_ref().map(|configured| &configured.bus.spec.name);
+        let diagnose = bus.map_or_else(|| "diagnose".to_string(), |bus| format!("diagnose {bus}"));
+        let command = self.gateway.command(&diagnose);
+        format!("check power, wiring and address; `{command}` shows what is wrong with the line")
+    }
+
+    /// The command that shows the restore of this drive.
+    fn restore_command(&self) -> String {
+        self.gateway.command(&format!("params restore --look {}", self.drive))
     }
 
     /// Path of `what` about this drive in the API.

@@ -4,7 +4,7 @@ use super::client::{GatewayRequest, encoded};
 use super::drive_access::{Needs, OneDrive, Target, point};
 use super::failure::{Failure, Outcome, negative};
 use super::report;
-use drivegate_north::http::messages::{PointValue, Word};
+use drivegate_north::http::messages::{NO_REPLY, PointValue, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]
@@ -34,7 +34,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     if let Some(message) = args.points.iter().find_map(unknown) {
         return Err(Failure::Misused(message));
     }
-    print(args, &rows(&target, &args.points)?)
+    print(args, &target, &rows(&target, &args.points)?)
 }
 
 pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>, String> {
@@ -47,11 +47,15 @@ pub(super) fn rows(target: &Target, points: &[String]) -> Result<Vec<PointValue>
     Ok(reply.accepted(&asked)?)
 }
 
-fn print(args: &Args, rows: &[PointValue]) -> Outcome {
+fn print(args: &Args, target: &Target, rows: &[PointValue]) -> Outcome {
     let all = rows.iter().all(PointValue::is_good);
     let none = !rows.iter().any(PointValue::is_good);
     if let Some(why) = only_reason(rows).filter(|_| !args.json) {
-        return Err(format!("no point of `{}` has a value: {why}", args.drive.name).into());
+        let remedy = match why {
+            NO_REPLY => format!("; {}", target.remedy_for_silence()),
+            _ => String::new(),
+        };
+        return Err(format!("no point of `{}` has a value: {why}{remedy}", args.drive.name).into());
     }
     let printed = report::print(&if args.json { json(rows) } else { table(rows) });
     // Points requested by name must have a value.

@@ -81,6 +81,18 @@ pub(super) fn run(args: &Args) -> Outcome {
     }
 }
 
+/// Words of the command that lists the recordings.
+const LIST: &str = "recordings list";
+
+/// The command that lists the recordings of this directory.
+fn listing(args: &Args) -> String {
+    let command = args.gateway.command(LIST);
+    match &args.dir {
+        Some(dir) => format!("{command} --dir {}", dir.display()),
+        None => command,
+    }
+}
+
 /// The directory of the recordings.
 fn directory(args: &Args) -> Result<PathBuf, Failure> {
     if let Some(dir) = &args.dir {
@@ -132,9 +144,9 @@ fn listed_by(client: &Client) -> Result<Vec<Entry>, Failure> {
 }
 
 /// A recording fetched from a gateway.
-fn fetched(client: &Client, id: &str) -> Result<Recording, Failure> {
+fn fetched(client: &Client, gateway: &Gateway, id: &str) -> Result<Recording, Failure> {
     let path = format!("/api/v1/recordings/{}?format={}", encoded(id), recording::ENDING);
-    let asked = GatewayRequest::get(path).if_refused("choose one from `drivegate recordings list`");
+    let asked = GatewayRequest::get(path).if_refused(format!("choose one from `{}`", gateway.command(LIST)));
     let reply = client.ask_now(&asked)?;
     if !reply.status.is_success() {
         return Err(reply.refusal(&asked).into());
@@ -146,7 +158,7 @@ fn fetched(client: &Client, id: &str) -> Result<Recording, Failure> {
 fn open(args: &Args, id: &str) -> Result<Recording, Failure> {
     let is_file = id.contains('/') || Path::new(id).is_file();
     if let Some(client) = args.gateway.network().filter(|_| !is_file) {
-        return fetched(&client, id);
+        return fetched(&client, &args.gateway, id);
     }
     let path = match is_file {
         true => PathBuf::from(id),
@@ -154,20 +166,20 @@ fn open(args: &Args, id: &str) -> Result<Recording, Failure> {
             let dir = directory(args)?;
             let path = store::path_of(&dir, id);
             if !path.is_file() {
-                return Err(unknown(&dir, id)?.into());
+                return Err(unknown(args, &dir, id)?.into());
             }
             path
         }
     };
-    let unreadable = |error| format!("{error}; choose a recording from `drivegate recordings list`");
+    let unreadable = |error| format!("{error}; choose a recording from `{}`", listing(args));
     Ok(store::read(&path).map_err(unreadable)?)
 }
 
-fn unknown(dir: &Path, id: &str) -> Result<String, Failure> {
+fn unknown(args: &Args, dir: &Path, id: &str) -> Result<String, Failure> {
     let entries = entries(dir)?;
     let remedy = match nearest(id, entries.iter().map(|entry| entry.id.as_str())) {
         Some(near) => format!("did you mean `{near}`?"),
-        None => "`drivegate recordings list` lists them".to_string(),
+        None => format!("`{}` lists them", listing(args)),
     };
     Ok(format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
 }

@@ -146,7 +146,7 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
     let faulty = unused_profiles::faulty(&problems);
     (of_profiles.errors, of_profiles.warnings) =
         unused_profiles::divide(problems, &faulty, &of_profiles.named, &gateway.profiles);
-    let faulty: BTreeSet<String> = faulty.into_values().filter_map(|(name, _)| name).collect();
+    let faulty = unused_profiles::meant(faulty);
     let Gateway {
         name,
         socket,

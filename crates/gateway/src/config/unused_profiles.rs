@@ -34,6 +34,15 @@ pub(super) fn faulty(problems: &[Problem]) -> Faulty {
         .collect()
 }
 
+/// The names under which drives look for the profiles of these files: a file without a name is probably called as its profile.
+pub(super) fn meant(faulty: Faulty) -> BTreeSet<String> {
+    let of_file = |file: &str| Path::new(file).file_stem()?.to_str().map(str::to_string);
+    let names = faulty.into_iter();
+    names
+        .filter_map(|(file, (name, _))| name.or_else(|| of_file(&file)))
+        .collect()
+}
+
 /// Divides the faults of profile files into errors and warnings: warnings are faults of files that give a name which neither a
 /// drive nor, by its base, a profile of a drive uses.
 pub(super) fn divide(
@@ -108,6 +117,9 @@ mod tests {
             errors(&["ours"]).contains(&"meter.toml".to_string()),
             "a base that is faulty"
         );
+        let names = meant(faulty(&problems));
+        let all = ["gateway", "meter", "ours", "vacon-nx"];
+        assert!(all.iter().all(|name| names.contains(*name)), "{names:?}");
         let missing = errors(&["other"]);
         assert!(missing.contains(&"gateway.toml".to_string()), "{missing:?}");
     }

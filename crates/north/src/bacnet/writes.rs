@@ -61,13 +61,13 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
         handle.refuse(&described(job), refusal, origin, now);
         return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
     }
-    let order = |point, origin| {
+    let order = |point, origin, arrival| {
         let request = OrderRequest::new(Order::Points(vec![point]), origin, Authority::Write);
         waits(handle, handle.place(request.within(expiry).arrived(arrival), now), None)
     };
     match (meaning, &job.value) {
         (Meaning::Point(index), Some(value)) => match value_of(value) {
-            Some(value) => order((index, value), origin),
+            Some(value) => order((index, value), origin, arrival),
             None => JobProgress::Answered(Err(Error::INVALID_DATA_TYPE)),
         },
         (Meaning::Reset(_) | Meaning::Slot(..), _) if job.priority == Some(MINIMUM_TIMES) => {
@@ -75,7 +75,7 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
             handle.refuse(&described(job), Refusal::NotAllowed(text.to_string()), origin, now);
             JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED))
         }
-        (Meaning::Reset(index), Some(Datum::Bool(true))) => order((index, Value::Bool(true)), origin),
+        (Meaning::Reset(index), Some(Datum::Bool(true))) => order((index, Value::Bool(true)), origin, arrival),
         (Meaning::Reset(_), _) => JobProgress::Answered(Ok(())),
         (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, (arrival, now)),
         _ => JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)),

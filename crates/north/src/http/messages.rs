@@ -373,6 +373,9 @@ impl Restore {
     }
 }
 
+/// Why the points of a drive that is offline have no good value.
+pub const NO_REPLY: &str = "the drive does not reply";
+
 /// A point with its value.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct PointValue {

@@ -7,7 +7,7 @@ use axum::Json;
 use axum::extract::{Path, RawQuery, State};
 
 use super::app_state::AppState;
-use super::messages::{PointValue, Word};
+use super::messages::{NO_REPLY, PointValue, Word};
 use super::operating::Viewer;
 use super::query;
 use super::replies::{Replied, not_found};
@@ -164,7 +164,7 @@ fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: PointIndex) -
     }
     match reading.snapshot.link {
         Link::Untried => return "the drive has not been polled yet".to_string(),
-        Link::Offline(_) => return "the drive does not reply".to_string(),
+        Link::Offline(_) => return NO_REPLY.to_string(),
         Link::Online(_) => {}
     }
     let profile = &reading.spec.profile;

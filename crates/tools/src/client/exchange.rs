@@ -1,5 +1,6 @@
 //! A request to the gateway and its reply.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::future::poll_fn;
 use std::pin::Pin;
@@ -35,9 +36,9 @@ pub(crate) struct GatewayRequest {
     body: String,
     pub(super) within: Duration,
     /// The remedy if the reply is lost.
-    lost: &'static str,
+    lost: Cow<'static, str>,
     /// Remedy if the request is refused, unless the status already gives one.
-    refused: &'static str,
+    refused: Cow<'static, str>,
 }
 
 impl GatewayRequest {
@@ -55,8 +56,8 @@ impl GatewayRequest {
             path: path.into(),
             body: String::new(),
             within: DONE_WITHIN,
-            lost: "try again",
-            refused: "",
+            lost: "try again".into(),
+            refused: "".into(),
         }
     }
 
@@ -77,13 +78,19 @@ impl GatewayRequest {
     }
 
     /// The remedy if the reply is lost.
-    pub(crate) fn if_lost(self, lost: &'static str) -> GatewayRequest {
-        GatewayRequest { lost, ..self }
+    pub(crate) fn if_lost(self, lost: impl Into<Cow<'static, str>>) -> GatewayRequest {
+        GatewayRequest {
+            lost: lost.into(),
+            ..self
+        }
     }
 
     /// Sets the remedy if the request is refused, unless the status already gives one.
-    pub(crate) fn if_refused(self, refused: &'static str) -> GatewayRequest {
-        GatewayRequest { refused, ..self }
+    pub(crate) fn if_refused(self, refused: impl Into<Cow<'static, str>>) -> GatewayRequest {
+        GatewayRequest {
+            refused: refused.into(),
+            ..self
+        }
     }
 
     /// Whether the request may be sent again without doing anything twice.

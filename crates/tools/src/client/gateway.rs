@@ -41,6 +41,24 @@ impl Gateway {
         self.config.as_deref().or_else(|| crate::config_of_environment())
     }
 
+    /// A command line with the options that this command got, so that it reaches the same gateway.
+    pub(crate) fn command(&self, words: &str) -> String {
+        let path = |path: &Option<PathBuf>| path.as_ref().map(|path| path.display().to_string());
+        let options = [
+            ("--config", path(&self.config)),
+            ("--url", self.url.as_ref().map(ToString::to_string)),
+            ("--ca", path(&self.ca)),
+            ("--token-file", path(&self.token_file)),
+        ];
+        let given = options.into_iter().filter_map(|(name, value)| Some((name, value?)));
+        given.fold(format!("drivegate {words}"), |line, (name, value)| {
+            match value.contains(char::is_whitespace) {
+                true => format!("{line} {name} '{value}'"),
+                false => format!("{line} {name} {value}"),
+            }
+        })
+    }
+
     /// The HTTP server, if selected.
     pub(crate) fn network(&self) -> Option<Client> {
         let network = Network {
@@ -113,7 +131,8 @@ impl Client {
 fn http_of(config: &Path) -> Result<Url, String> {
     let shown = config.display();
     let settings = Settings::load(config, environment()).settings;
-    let settings = settings.ok_or_else(|| format!("the configuration is invalid; {shown}; see `drivegate check`"))?;
+    let settings =
+        settings.ok_or_else(|| format!("the configuration is invalid; {shown}; see `drivegate check {shown}`"))?;
     let http = settings.http.ok_or_else(|| {
         format!(
             "neither the local socket nor [http] is configured, so the gateway cannot be asked; {shown}; \

@@ -37,7 +37,7 @@ fn page(place: &DemoPlace, sides: &Sides) -> String {
         "
 Start a motor from the page
   # 1. Open http://{http}/#/drive/pump-1 and log in: user {}, password {password} (another at each start).
-  # 2. Press Start, and confirm.
+  # 2. Press STOP if it runs by itself. Press Start, and confirm.
   # 3. Press STOP. {GUARDED} may start again 10 s after a stop only; who takes a drive is shown to the others.
   # BACnet/IP: device 100 and a device for each drive behind it, at {bacnet}.
 ",

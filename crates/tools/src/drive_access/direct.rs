@@ -123,11 +123,12 @@ impl Direct {
             let spec = &target.bus.spec;
             return Err(format!(
                 "drive `{}` does not reply at address {}; {} {} on {}; check power, wiring and address, or let \
-                 `drivegate scan` look for it",
+                 `drivegate scan --port {}` look for it",
                 target.spec.name,
                 target.spec.address,
                 spec.protocol.name(),
                 spec.format,
+                spec.port,
                 spec.port
             ));
         }

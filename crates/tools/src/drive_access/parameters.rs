@@ -82,7 +82,10 @@ impl Target {
                 Some(act) => GatewayRequest::post(&path, &act),
                 None => GatewayRequest::get(&path),
             };
-            asked.if_lost("a started restore continues in the gateway: see `drivegate params restore --look DRIVE`")
+            asked.if_lost(format!(
+                "a started restore continues in the gateway: see `{}`",
+                self.restore_command()
+            ))
         };
         let mut asked = request(act);
         let (conversation, mut reply) = Conversation::begin(self, &asked, Needs::Identification).await?;
@@ -105,10 +108,7 @@ impl Target {
             reply = match conversation.ask(&asked).await {
                 Ok(reply) => reply,
                 Err(why) => {
-                    break Err(format!(
-                        "{why}; `drivegate params restore --look {}` shows the restore",
-                        self.drive
-                    ));
+                    break Err(format!("{why}; `{}` shows the restore", self.restore_command()));
                 }
             };
         };

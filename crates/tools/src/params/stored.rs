@@ -71,9 +71,12 @@ fn listed_here(config: &Path, drive: Option<&str>) -> Result<(Vec<StoredReading>
 }
 
 /// The last reading of a drive that a gateway has.
-fn last_of(client: &Client, drive: &str) -> Result<ParameterFile, Failure> {
+fn last_of(client: &Client, gateway: &Gateway, drive: &str) -> Result<ParameterFile, Failure> {
     let path = format!("/api/v1/drives/{}/params?format=file", encoded(drive));
-    let asked = GatewayRequest::get(path).if_refused("read it with `drivegate params read`");
+    let asked = GatewayRequest::get(path).if_refused(format!(
+        "read it with `{}`",
+        gateway.command(&format!("params read {drive}"))
+    ));
     let reply = client.ask_now(&asked)?;
     if !reply.status.is_success() {
         return Err(reply.refusal(&asked).into());
@@ -86,14 +89,15 @@ pub(super) fn show(gateway: &Gateway, of: &str, names: Option<&Path>) -> Outcome
     let names = self::names(names)?;
     let file = match (Path::new(of).is_file(), gateway.network()) {
         (true, _) => read_written(Path::new(of))?,
-        (false, Some(client)) => last_of(&client, of)?,
+        (false, Some(client)) => last_of(&client, gateway, of)?,
         (false, None) => {
             let store = store(gateway.config())?;
             let last = store.latest(of).map_err(|why| format!("{why}; correct or remove it"))?;
             last.ok_or_else(|| {
                 format!(
-                    "no reading of `{of}` is stored; {}; read it with `drivegate params read {of}`",
-                    store.dir().display()
+                    "no reading of `{of}` is stored; {}; read it with `{}`",
+                    store.dir().display(),
+                    gateway.command(&format!("params read {of}"))
                 )
             })?
         }
