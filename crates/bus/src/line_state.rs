@@ -28,6 +28,9 @@ const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
 /// Weight of an early reply that was not accepted and not followed by another: two are enough. If the regular reply
 /// follows, the early one was a duplicate or a late one, as on a real wire: that removes all weight.
 const WEIGHT_OF_DOUBTED: u32 = 40;
+/// Weight of such a reply on a Modbus line while the reply to an earlier request may still arrive: most likely the early
+/// reply is that one, and a drive that is often a little slower than the time limit has a wire all the same.
+const WEIGHT_OF_LATE: u32 = 8;
 /// Weight of any early reply on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
 /// Weight that a regular reply takes back on an N2 line, where a duplicate reply whose successor was lost looks
@@ -323,7 +326,7 @@ impl LineState {
         let early = now < earliest;
         let is_value = matches!(&ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
         let beats = (early && is_value).then(|| self.least_baud(&transaction, now.saturating_duration_since(began)));
-        self.weigh(&ended, early, doubtful || late, &transaction);
+        self.weigh(&ended, early, (doubtful, late), &transaction);
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
         let at = now.min(transaction.deadline());
@@ -357,9 +360,11 @@ impl LineState {
     }
 
     /// Evaluates what the end of a transaction shows about the wire time. `early` means that the reply was faster
-    /// than the wire; `doubtful` that it could belong to another request.
-    fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
+    /// than the wire; `doubtful` that it could be a duplicate or an echo; `late` that the reply to an earlier request could
+    /// arrive.
+    fn weigh(&mut self, ended: &Ended, early: bool, (doubtful, late): (bool, bool), transaction: &Transaction) {
         let believed = self.learned.early_weight >= WITHOUT_WIRE_TIME;
+        let of_another = doubtful || late;
         let weight = match ended {
             Ended::Reply(Reply::Exception(_)) => 0,
             Ended::Reply(_) if !early => {
@@ -371,11 +376,13 @@ impl LineState {
                 self.learned.early_weight = self.learned.early_weight.saturating_sub(taken_back);
                 0
             }
-            Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
-            Ended::Reply(_) if doubtful => 0,
+            Ended::Reply(_) if of_another && believed => WEIGHT_OF_BELIEVED,
+            Ended::Reply(_) if of_another => 0,
             Ended::Reply(_) => self.weight_of(WEIGHT_OF_EARLY),
             // The other bytes may be the rest of the same reply.
-            Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => self.weight_of(WEIGHT_OF_DOUBTED),
+            Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => {
+                self.weight_of(if late { WEIGHT_OF_LATE } else { WEIGHT_OF_DOUBTED })
+            }
             Ended::Silent | Ended::Corrupt(_) => 0,
         };
         self.learned.early_weight = (self.learned.early_weight + weight).min(MOST_WEIGHT);

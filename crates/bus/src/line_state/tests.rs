@@ -8,6 +8,8 @@ struct DoublingLine {
     now: Instant,
     /// Whether replies are timed from the start of the request, as if the request took no time.
     at_once: bool,
+    /// Whether the reply to an earlier request may still arrive.
+    late: bool,
 }
 
 impl DoublingLine {
@@ -24,6 +26,7 @@ impl DoublingLine {
             protocol,
             now,
             at_once: false,
+            late: false,
         }
     }
 
@@ -50,7 +53,7 @@ impl DoublingLine {
             silence: self.line.silence(),
             response_timeout: Duration::from_millis(100),
             could_be_doubled: true,
-            late_may_come: false,
+            late_may_come: self.late,
         };
         self.now += Duration::from_secs(1);
         self.line
@@ -111,6 +114,25 @@ fn the_reply_behind_an_early_one_shows_a_wire() {
         assert!(!rig.believes(EARLY), "the next one was lost");
         assert!(rig.answers(&[(EARLY, &reply), (REGULAR, &reply)]));
     }
+}
+
+/// A drive is a little slower than the time limit twice in a row: the first reply arrives early in the next transaction,
+/// and the second one after it.
+#[test]
+fn late_replies_of_a_slow_drive_are_never_believed() {
+    let mut rig = DoublingLine::new();
+    for _ in 0..100 {
+        rig.late = true;
+        assert!(!rig.believes(EARLY), "it answers the request before");
+        rig.late = false;
+        for _ in 0..8 {
+            assert!(rig.believes(REGULAR));
+        }
+    }
+    // Without a regular reply in between they show a line without wire time all the same.
+    rig.late = true;
+    let doubted = (0..100).take_while(|_| !rig.believes(EARLY)).count();
+    assert_eq!(doubted, 8);
 }
 
 #[test]
