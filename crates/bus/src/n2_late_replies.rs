@@ -4,7 +4,8 @@
 //! the reply may arrive during a later transaction with any drive. So the line remembers which forms may still
 //! arrive, and for how long. Meanwhile no request is sent whose reply has such a form; other requests continue. A
 //! frame of a form that cannot be the reply of the present transaction is the late one, and is no longer expected.
-//! A reply whose form a late one may share by chance, such as a refusal, is not accepted.
+//! A reply whose form a late one may share by chance, such as a refusal, is not accepted. A slow drive answers one request
+//! after the other, so after a late reply the next one may take as long again.
 //!
 //! Two things end the wait early. A drive answers in order: once it has answered a later request whose reply has
 //! another form, no reply to an earlier request can arrive. Process data may be requested again at once if the
@@ -48,6 +49,8 @@ struct Late {
     /// When the first request was sent whose late reply may arrive.
     asked: Instant,
     until: Instant,
+    /// How long the drive may still take after a transaction, or after its previous late reply.
+    window: Duration,
     /// Number of replies that may still arrive: the request was sent that often without success.
     count: u32,
     /// Whether an equal request was answered since, by an unknown one of the replies.
@@ -73,7 +76,7 @@ impl N2LateReplies {
         let Some(form) = form(asked.pdu) else { return };
         let until = now + window;
         if let Some(late) = self.of(asked.address, asked.pdu) {
-            (late.until, late.answered) = (until, false);
+            (late.until, late.window, late.answered) = (until, window, false);
             late.count = late.count.saturating_add(1);
             return;
         }
@@ -87,6 +90,7 @@ impl N2LateReplies {
             device: asked.device,
             asked: asked.at,
             until,
+            window,
             count: 1,
             answered: false,
         });
@@ -170,26 +174,27 @@ impl N2LateReplies {
             Answer::Nak(_) => Taken::Doubtful,
             answer if form(pdu).is_some_and(|form| has_form(form, &answer)) => Taken::Doubtful,
             _ => {
-                self.one_came(index);
+                self.one_came(index, now);
                 Taken::Late(used)
             }
         }
     }
 
-    fn one_came(&mut self, index: usize) {
+    fn one_came(&mut self, index: usize, now: Instant) {
         let Some(late) = self.0.get_mut(index) else { return };
         late.count = late.count.saturating_sub(1);
+        late.until = late.until.max(now + late.window);
         if late.count == 0 {
             self.0.remove(index);
         }
     }
 
-    /// Notes that the frame was a late reply, which is then no longer expected.
-    pub fn has_arrived(&mut self, frame: &[u8]) {
+    /// Notes that the frame, which arrived by `now`, was a late reply; that one is then no longer expected.
+    pub fn has_arrived(&mut self, frame: &[u8], now: Instant) {
         let answer = self::frame(frame).map(|(_, answer)| answer);
         let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
         if let Some(index) = index {
-            self.one_came(index);
+            self.one_came(index, now);
         }
     }
 
@@ -361,6 +366,20 @@ mod tests {
             assert_eq!(late.take(1, &state, b"A4248000092\r", now), Taken::Late(12));
         }
         assert_eq!(late.blocks(&float, now), None);
+    }
+
+    #[test]
+    fn the_second_late_reply_may_come_as_long_after_the_first() {
+        let now = Instant::now();
+        let (float, state) = (read(Table::Input, 0, 2), read(Table::DiscreteInput, 0, 1));
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &float, now), WINDOW, now);
+        late.given_up(asked(1, &float, now), WINDOW, now);
+        let first = now + WINDOW * 9 / 10;
+        assert_eq!(late.take(2, &state, b"A4248000092\r", first), Taken::Late(12));
+        let second = first + WINDOW * 9 / 10;
+        assert_eq!(late.asked_by(1, &float, second), Some(now), "it may be a value of then");
+        assert!(late.may_come(second) && !late.may_come(first + WINDOW));
     }
 
     #[test]

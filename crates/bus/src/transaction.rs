@@ -211,7 +211,7 @@ impl Transaction {
                 && let Some((frame, _)) = self.unless_another.take_if(|_| self.received.contains(&b'\r'))
             {
                 self.foreign += 1;
-                self.late.has_arrived(&frame);
+                self.late.has_arrived(&frame, now);
             }
             match self
                 .late
