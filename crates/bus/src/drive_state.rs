@@ -373,12 +373,21 @@ impl DriveState {
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
             if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
-                if run.is_heard() && run.reached_the_wire() {
-                    self.supervision.renew(now);
-                }
-                run.abandon(Outcome::Offline, Interruption::Offline, now);
+                self.abandon(run, Outcome::Offline, Interruption::Offline, now);
             }
         }
+    }
+
+    /// Ends a started command without its last reply. What a refresh repeats may no longer be what the drive has.
+    fn abandon(&mut self, run: CommandRun, unbegun: Outcome, why: Interruption, now: Instant) {
+        if run.is_heard() && run.reached_the_wire() {
+            self.supervision.renew(now);
+        }
+        let is_command = matches!(run.intent().order, Order::Points(_) | Order::Write(_));
+        if is_command && run.has_begun() {
+            self.end_refresh(End::Unknown);
+        }
+        run.abandon(unbegun, why, now);
     }
 
     /// Notes that the drive may or may not have received these words.
@@ -416,11 +425,8 @@ impl DriveState {
 
     /// Ends all started commands; acknowledged ones stay acknowledged.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
-        for run in self.runs.iter_mut().filter_map(Option::take) {
-            if run.is_heard() && run.reached_the_wire() {
-                self.supervision.renew(now);
-            }
-            run.abandon(unbegun.clone(), why, now);
+        for run in std::mem::take(&mut self.runs).into_iter().flatten() {
+            self.abandon(run, unbegun.clone(), why, now);
         }
         self.confirmations.clear();
         self.words.forget();

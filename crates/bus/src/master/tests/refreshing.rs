@@ -201,6 +201,32 @@ fn what_stands_is_written_again_once_a_period_behind_a_look() {
     }
 }
 
+/// The write of a reference is on the wire when the port is lost: the drive may have it, so the older one is not repeated.
+#[test]
+fn an_order_that_is_cut_off_with_the_port_ends_the_refresh() {
+    for (name, _) in FAMILIES {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        assert!(!plant.refreshes(4).is_empty(), "{name}");
+        let rig = &mut plant.rig;
+        let _answer = rig.order(0, "client", ModelPoint::SpeedReference, Value::Number(20.0));
+        let written = loop {
+            let mut news = Vec::new();
+            match rig.master.next(rig.now, &mut news) {
+                Err(until) => rig.now = until,
+                Ok(turn) if turn.purpose != Purpose::Refresh && turn.pdu.is_write() => break turn,
+                Ok(turn) => rig.carry_out(turn, &mut news),
+            }
+            news.iter().for_each(|one| rig.apply(one));
+        };
+        rig.master.sending(&written, rig.now);
+        rig.drives[0].answer(written.pdu());
+        rig.master.lost(rig.now);
+        rig.master.opened(rig.now);
+        plant.assert_ended("with an order of unknown outcome");
+    }
+}
+
 /// A client that sets references faster than the status is read must not prevent the refresh of the control word.
 #[test]
 fn references_without_end_do_not_hold_up_the_word() {
