@@ -89,6 +89,23 @@ fn what_the_drive_has_already_is_not_written_again() {
     assert_eq!(count(&rig, ">01720305"), 2);
 }
 
+/// A point of the class `once` is not polled again, so a command that has nothing to write there asks for its read.
+#[test]
+fn a_command_that_changes_nothing_is_confirmed() {
+    let mut rig = ready(1);
+    let mut events = rig.plant.events.subscribe();
+    for _ in 0..2 {
+        assert!(rig.set(1, &[("acceleration_time", 7.0)]).is_ok());
+        rig.until("a confirmed command", Duration::from_secs(5), |rig| {
+            rig.bus.core.remains(rig.now).unconfirmed == 0
+        });
+    }
+    rig.run(PATIENCE);
+    let told = std::iter::from_fn(|| events.try_recv().ok());
+    let missing: Vec<_> = told.filter(|event| event.kind == EventKind::NotConfirmed).collect();
+    assert!(missing.is_empty(), "{missing:?}");
+}
+
 #[test]
 fn what_was_changed_at_the_drive_is_written_again() {
     let mut rig = ready(1);

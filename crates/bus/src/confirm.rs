@@ -287,27 +287,35 @@ pub struct Unconfirmed {
 
 /// The acknowledged commands of a drive that may still be confirmed.
 #[derive(Debug, Default)]
-pub struct Confirmations(Vec<Watch>);
+pub struct Confirmations {
+    watches: Vec<Watch>,
+    /// Points that must be read to show the effect of the last commands.
+    to_read: Vec<PointIndex>,
+}
 
 impl Confirmations {
     /// Watches for the effects of a command that was acknowledged at `now`; `reading` is the known state of the
     /// drive at that time. Older commands with the opposite effect are no longer watched.
     pub fn watch(&mut self, effects: Vec<Effect>, receipts: Vec<Receipt>, reading: &Reading<'_>, now: Instant) {
-        self.0.retain(|w| {
+        self.watches.retain(|w| {
             let pointless = |old: &Effect| effects.iter().any(|new| new.same_subject(*old));
             !w.effects.iter().any(|awaited| pointless(&awaited.effect))
         });
         if effects.is_empty() {
             return;
         }
-        if self.0.len() >= WATCHED {
-            self.0.remove(0);
+        if self.watches.len() >= WATCHED {
+            self.watches.remove(0);
         }
+        self.to_read.extend(effects.iter().filter_map(|effect| match effect {
+            Effect::ReadBack(index, _) => Some(*index),
+            Effect::Runs | Effect::Stops | Effect::NoFault => None,
+        }));
         let unread = |effect| Awaited {
             effect,
             was_read: false,
         };
-        self.0.push(Watch {
+        self.watches.push(Watch {
             effects: effects.into_iter().map(unread).collect(),
             since: now,
             within: reading.spec.profile.confirm_within,
@@ -326,7 +334,7 @@ impl Confirmations {
     /// The drive was read: confirms the commands whose effect it shows in time.
     pub fn take_reading(&mut self, reading: &Reading<'_>, now: Instant) {
         let mut index = 0;
-        while let Some(watch) = self.0.get_mut(index) {
+        while let Some(watch) = self.watches.get_mut(index) {
             let since = watch.since;
             watch.note_speed(reading, now);
             if !watch.is_over(now) || watch.is_open(now) {
@@ -344,7 +352,7 @@ impl Confirmations {
                 watch.let_go(now);
             }
             if watch.effects.is_empty() {
-                let receipts = self.0.remove(index).receipts;
+                let receipts = self.watches.remove(index).receipts;
                 receipts.into_iter().for_each(|receipt| receipt.confirm(now));
             } else {
                 index += 1;
@@ -356,7 +364,7 @@ impl Confirmations {
     /// points not read since, nothing is reported yet, but the wait ends.
     pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<Unconfirmed> {
         let mut late = Vec::new();
-        self.0.retain_mut(|watch| {
+        self.watches.retain_mut(|watch| {
             if !watch.is_over(now) {
                 return true;
             }
@@ -380,12 +388,19 @@ impl Confirmations {
 
     /// Ends all waits: acknowledged commands stay acknowledged.
     pub fn clear(&mut self) {
-        self.0.clear();
+        *self = Confirmations::default();
+    }
+
+    /// Points whose next read confirms a command that has just been acknowledged. Polling alone would not read them: they
+    /// may be read only when a drive comes online, and a command that changes nothing writes nothing, or their read may have
+    /// been done between the write and the acknowledgement of the whole command.
+    pub fn take_to_read(&mut self) -> Vec<PointIndex> {
+        std::mem::take(&mut self.to_read)
     }
 
     /// Whether no command is being watched.
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.watches.is_empty()
     }
 }
 

@@ -392,11 +392,19 @@ impl Master {
     /// Checks what time and samples have changed: leases, confirmations, N2 drives that are due for a poll.
     fn check(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master {
-            bus, drives, writes, ..
+            bus,
+            drives,
+            schedule,
+            writes,
+            ..
         } = self;
         let has_authority = bus.queue.has_authority();
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
             if !drive.confirmations.is_empty() {
+                let to_read = drive.confirmations.take_to_read().into_iter();
+                for raw in to_read.filter_map(|point| image.spec.profile.points.get(point)?.raw()) {
+                    schedule.read_soon(index, |read| read.covers(raw.table, raw.address), now);
+                }
                 if std::mem::take(&mut drive.was_read) {
                     drive.confirmations.take_reading(&image.reading(now, drive.fresh), now);
                 }
