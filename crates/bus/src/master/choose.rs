@@ -108,6 +108,11 @@ impl Master {
         {
             return Some(Ok(turn));
         }
+        if self.shutdown.is_none()
+            && let Some(turn) = self.owed_refresh(now)
+        {
+            return Some(Ok(turn));
+        }
         let mut commands = self.commands(now);
         if self.shutdown.is_none()
             && !commands.waits(Urgency::Stop)

@@ -26,7 +26,7 @@ impl Master {
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
             match stall.is_pause() {
                 true => drive.refresh.after_stall(stall.length(), now),
-                false => drive.refresh.others_go_first(&image.spec.profile),
+                false => drive.refresh.others_go_first(false, &image.spec.profile),
             }
             for urgency in [Urgency::Command, Urgency::Read] {
                 if let Some(run) = drive.run(urgency).filter(|_| stall.is_pause()) {

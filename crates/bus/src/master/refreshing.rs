@@ -128,6 +128,14 @@ impl Master {
         })
     }
 
+    /// The write of a round that stops to other drives overtook too often: such a stop waits for this one frame. A stop to the
+    /// drive itself has ended its refresh.
+    pub(super) fn owed_refresh(&mut self, now: Instant) -> Option<Turn> {
+        let is_owed = |(_, drive): &(DriveIndex, &DriveState)| drive.refresh.is_owed_its_write() && !drive.has_runs();
+        let (index, _) = self.drives.enumerate().find(is_owed)?;
+        self.refresh_step(index, now)
+    }
+
     /// Whether a chosen frame of a refresh may still be sent.
     pub(super) fn may_still_refresh(&mut self, index: DriveIndex, now: Instant) -> bool {
         let is_under_way = self.drives.of(index).refresh.is_under_way();
@@ -194,7 +202,8 @@ impl Master {
     pub(super) fn others_before_refresh(&mut self, turn: &Turn) {
         for ((index, drive), image) in self.drives.enumerate_mut().zip(&self.bus.image.drives) {
             if drive.refresh.is_under_way() && turn.purpose != Purpose::Refresh(index) {
-                drive.refresh.others_go_first(&image.spec.profile);
+                let of_another = turn.drive().is_some_and(|drive| drive != index);
+                drive.refresh.others_go_first(of_another, &image.spec.profile);
             }
         }
         if let Purpose::Refresh(index) = turn.purpose

@@ -9,6 +9,10 @@ use drivegate_model::drive::Profile;
 use drivegate_model::drive::control::Control;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
+/// How often stops to other drives may go between the frames of a round before they no longer make it begin its reads again:
+/// clients that stop a drive in a loop must not keep another drive from its refresh.
+const MOST_OVERTAKEN: u32 = 8;
+
 /// A step of a refresh round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
@@ -26,6 +30,8 @@ enum Stage {
 pub(super) struct Round {
     stage: Stage,
     look: StateRead,
+    /// Number of transactions with others that went between its reads.
+    overtaken: u32,
 }
 
 /// Whether the values in the drive are those that were written.
@@ -50,12 +56,22 @@ impl Refresh {
         self.round.is_some()
     }
 
-    /// Lets another transaction go first: the round must then repeat its reads.
-    pub(crate) fn others_go_first(&mut self, profile: &Profile) {
+    /// Lets another transaction go first: the round must then repeat its reads, unless transactions with other drives did
+    /// that too often.
+    pub(crate) fn others_go_first(&mut self, of_another: bool, profile: &Profile) {
         if let Some(round) = self.round.as_mut().filter(|round| round.stage != Stage::Reference) {
-            round.stage = first_read(profile);
-            round.look.begin_again();
+            round.overtaken = round.overtaken.saturating_add(1);
+            if !of_another || round.overtaken <= MOST_OVERTAKEN {
+                round.stage = first_read(profile);
+                round.look.begin_again();
+            }
         }
+    }
+
+    /// Whether the round was overtaken so often that its write follows its last read even before a stop to another drive.
+    pub(crate) fn is_owed_its_write(&self) -> bool {
+        let round = self.round.as_ref();
+        round.is_some_and(|round| round.stage == Stage::Write && round.overtaken > MOST_OVERTAKEN)
     }
 
     /// The request of the present step of the round. Begins a round if none is in progress.
@@ -66,6 +82,7 @@ impl Refresh {
             self.round = Some(Round {
                 stage: apart.map_or(first_read(profile), |_| Stage::Reference),
                 look: StateRead::at_motor(profile)?,
+                overtaken: 0,
             });
         }
         let round = self.round.as_ref()?;
