@@ -148,7 +148,7 @@ impl Play {
             // Each file of the guards is written at once and successfully.
             let guards = self.rig.bus.guards.clone();
             if let Some((generation, _)) = guards.to_write(self.rig.now, self.time()) {
-                guards.wrote(generation, Ok(()));
+                guards.wrote(generation, Ok(()), self.rig.now);
             }
         }
     }

@@ -1,21 +1,26 @@
 //! Guards of starts with clients that do not know about them, on a line that loses and damages frames, with offline
-//! drives, reloads, and a process that is killed at any moment: no start by an order on the wire breaks a rule, and
-//! stops come as soon as without guards.
+//! drives, reloads, a disk that hangs, is full or cannot be read, and a process that is killed at any moment: no start by
+//! an order on the wire breaks a rule, none is made while the starts of earlier runs are unknown, and stops come as soon as
+//! without guards. What could not be written is written as soon as the disk takes it, unasked.
+
+mod state_file;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate_core::order::{Authority, Order, Origin, Outcome, Proof, Refusal, SourceKind, written};
+use drivegate_core::order::{Authority, Order, Origin, Outcome, Proof, Reason, Refusal, SourceKind, written};
 use drivegate_core::permit::{Mode, Principal, Rules};
 use drivegate_core::plant::{OrderRequest, Placed};
 use drivegate_core::process_image::DriveSpec;
-use drivegate_core::start_guard::{Guard, Guards, Interlock, Saved};
+use drivegate_core::start_guard::{Guard, Guards, Interlock};
 use drivegate_model::drive::{ModelPoint, State, Value};
 use drivegate_proto::{Protocol, RequestPdu, Table};
 use drivegate_sim::faults::FaultPlan;
 use drivegate_sim::random::Random;
+use drivegate_sim::simulated_drive::Command;
 
+use self::state_file::{Disk, StateFile};
 use super::bus::Seen;
 use super::rig::{PATIENCE, Rig, line, write};
 use super::scenario::Line;
@@ -52,13 +57,6 @@ fn works(family: &'static str) -> Line {
     }
 }
 
-/// The file of starts on a disk that is slow, and sometimes fails.
-struct Disk {
-    holds: Saved,
-    writing: Option<(u64, Saved, Instant)>,
-    fails: bool,
-}
-
 /// What the drives really did.
 #[derive(Default)]
 struct Truth {
@@ -73,7 +71,7 @@ struct Truth {
 struct Play {
     rig: Rig,
     dice: Random,
-    disk: Disk,
+    file: StateFile,
     truth: Truth,
     began: Instant,
     stops: Vec<(Placed, Instant)>,
@@ -85,23 +83,18 @@ struct Play {
 impl Play {
     fn new(family: &'static str, seed: u64) -> Play {
         let rig = Rig::new(&works(family), super::bus::Parts::of(0, &works(family), seed));
-        let play = Play {
+        let mut play = Play {
             began: rig.now,
             rig,
             dice: Random::new(seed ^ 0x57A7),
-            disk: Disk {
-                holds: Saved::default(),
-                writing: None,
-                fails: false,
-            },
+            file: StateFile::default(),
             truth: Truth::default(),
             stops: Vec::new(),
             orders: Vec::new(),
             results: BTreeMap::new(),
             longest_stop: Duration::ZERO,
         };
-        let (now, time) = (play.rig.now, play.time());
-        play.rig.bus.guards.keep(&play.disk.holds, now, time);
+        play.file.begin(&play.rig.bus.guards, Duration::ZERO, play.rig.now);
         play
     }
 
@@ -142,6 +135,11 @@ impl Play {
             return;
         }
         let known = |address| self.rig.good(address, ModelPoint::Running).map(Value::as_bool);
+        let guarded = self.rig.drive(address).image.spec.guard.is_some();
+        assert!(
+            self.file.is_read() || !guarded || known(address) != Some(false),
+            "a start of drive {address} on the wire while nobody knows how often it was started"
+        );
         if address == 1 && known(1) == Some(false) && !self.rig.drive(1).image.spec.interlocks.is_empty() {
             assert_eq!(known(4), Some(true), "a start on the wire without its interlock");
         }
@@ -161,9 +159,10 @@ impl Play {
             }
         }
         let mut results = Vec::new();
+        let may_refuse = self.file.may_refuse(now);
         self.orders.retain_mut(|placed| match placed.answer() {
             Some(answer) => {
-                results.push(answer.outcome.code());
+                results.push(result_of(&answer.outcome, may_refuse));
                 false
             }
             None => true,
@@ -213,32 +212,16 @@ impl Play {
 
     fn work_the_disk(&mut self) {
         let (now, time) = (self.rig.now, self.time());
-        let guards = self.rig.bus.guards.clone();
-        match self.disk.writing.take_if(|(.., due)| *due <= now) {
-            Some((generation, _, _)) if self.disk.fails => guards.wrote(generation, Err("no space".to_string())),
-            Some((generation, saved, _)) => {
-                self.disk.holds = saved;
-                guards.wrote(generation, Ok(()));
-            }
-            None => {}
-        }
-        if self.disk.writing.is_none()
-            && let Some((generation, saved)) = guards.to_write(now, time)
-        {
-            let takes = Duration::from_millis(self.dice.within(0..=60));
-            self.disk.writing = Some((generation, saved, now + takes));
-        }
+        let takes = Duration::from_millis(self.dice.within(0..=60));
+        self.file.advance(&self.rig.bus.guards, takes, now, time);
     }
 
     /// Kills the process. State that was being written may or may not be on disk.
     fn kill(&mut self) {
-        if let Some((_, saved, _)) = self.disk.writing.take()
-            && self.dice.chance(0.5)
-        {
-            self.disk.holds = saved;
-        }
-        let (guards, now, time) = (Guards::default(), self.rig.now, self.time());
-        guards.keep(&self.disk.holds, now, time);
+        self.file.kill(self.dice.chance(0.5));
+        let (guards, now) = (Guards::default(), self.rig.now);
+        let takes = Duration::from_millis(self.dice.within(0..=60));
+        self.file.begin(&guards, takes, now);
         let (events, writes) = (self.rig.plant.events.clone(), self.rig.plant.writes.clone());
         self.rig.bus.kill(guards, &events, &writes, now);
         self.rig.plant.buses = vec![self.rig.bus.handle.clone()];
@@ -277,12 +260,15 @@ impl Play {
     }
 
     fn incident(&mut self) {
-        match self.dice.within(0..=9) {
+        match self.dice.within(0..=10) {
             0 | 1 => self.kill(),
             2 | 3 => {
                 self.rig.restart_now();
             }
-            4 => self.disk.fails = !self.disk.fails,
+            4 | 10 => {
+                let ill = Disk::ILL[self.dice.within(0..=2) as usize];
+                self.file.becomes(if self.file.is_sound() { ill } else { Disk::Sound });
+            }
             5 | 6 => {
                 let address = self.dice.within(1..=4) as u8;
                 self.rig.set_alive(address, false);
@@ -310,6 +296,64 @@ impl Play {
     }
 }
 
+/// The result of an order to start; a refusal for the file names it, and comes only while the file is not as it should be.
+fn result_of(outcome: &Outcome, may_refuse: bool) -> &'static str {
+    match outcome {
+        Outcome::Refused(Refusal::Guarded(guarded)) if guarded.reason == Reason::StateFile => {
+            assert!(StateFile::is_named(&guarded.why), "{}", guarded.why);
+            assert!(may_refuse, "the file is as it should be: {}", guarded.why);
+            guarded.reason.name()
+        }
+        outcome => outcome.code(),
+    }
+}
+
+impl Play {
+    /// Ends every fault, and lets all motors stand; then a person starts one at its drive while the disk is ill. After that
+    /// has ended, the start is on disk without another order, and starts are commanded as ever.
+    fn heal(&mut self, disk: Disk) {
+        self.rig.set_faults(FaultPlan::default());
+        self.file.becomes(Disk::Sound);
+        self.run(15 * SECOND);
+        assert!(self.stops.is_empty(), "a stop without an answer");
+        assert!(self.file.is_read() && !self.file.may_refuse(self.rig.now));
+        for address in 1..=4 {
+            assert!(self.rig.set(address, &[("run", 0.0)]).is_ok());
+        }
+        self.run(30 * SECOND);
+        assert_eq!(self.rig.good(2, ModelPoint::Running), Some(Value::Bool(false)));
+        self.file.becomes(disk);
+        let (time, by_hand) = (
+            self.time(),
+            Command {
+                run: true,
+                reverse: false,
+                reference: 2_000,
+            },
+        );
+        self.rig.with_drive(2, |drive, _| drive.command(by_hand));
+        let ill = Duration::from_millis(self.dice.within(3_000..=20_000));
+        self.run(ill);
+        assert_eq!(self.rig.state(2), State::Running);
+        assert!(!self.file.has_start(2, time), "on a disk that is {disk:?}");
+        self.file.becomes(Disk::Sound);
+        self.run(2 * SECOND);
+        assert!(
+            self.file.has_start(2, time),
+            "not written though the disk is {disk:?} no more"
+        );
+        self.run(2 * SECOND);
+        for address in [2, 3] {
+            assert!(self.rig.set(address, &[("run", 0.0)]).is_ok());
+            let order = self.rig.points(address, &[("run", 1.0)]);
+            let placed = self.rig.place(address, order);
+            self.orders.push(placed);
+        }
+        self.run(5 * SECOND);
+        assert!(self.orders.is_empty(), "an order without an answer");
+    }
+}
+
 #[test]
 fn no_start_of_an_order_breaks_a_guard() {
     let mut results: BTreeMap<&str, u32> = BTreeMap::new();
@@ -326,6 +370,7 @@ fn no_start_of_an_order_breaks_a_guard() {
                 play.incident();
             }
         }
+        play.heal(Disk::ILL[seed as usize % 3]);
         starts += play.truth.starts.values().map(Vec::len).sum::<usize>();
         for (result, count) in play.results {
             *results.entry(result).or_default() += count;
@@ -334,6 +379,7 @@ fn no_start_of_an_order_breaks_a_guard() {
     let count = |result: &str| results.get(result).copied().unwrap_or_default();
     assert!(starts > 80, "{starts} starts: {results:?}");
     assert!(count("guarded") > 200 && count("interlocked") > 20, "{results:?}");
+    assert!(count("state_file") > 20, "{results:?}");
 }
 
 /// Equal clients, line and time, with guards and without: the longest delay of a stop is equal.
@@ -351,7 +397,7 @@ fn stops_come_as_soon_as_without_guards() {
             play.began = play.rig.now;
         }
         // The disk hangs permanently: it delays starts only.
-        play.disk.writing = Some((0, Saved::default(), play.rig.now + HOUR));
+        play.file.becomes(Disk::Hangs);
         play.run(5 * SECOND);
         for _ in 0..300 {
             play.order();

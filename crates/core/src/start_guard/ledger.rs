@@ -15,6 +15,8 @@ use crate::process_image::{DriveImage, Machine};
 
 /// Longest wait of a start for the disk.
 pub(super) const DISK: Duration = Duration::from_secs(1);
+/// Time after which a failed write of the file, or a failed read, is tried again.
+pub(super) const AGAIN: Duration = Duration::from_secs(1);
 
 /// The starts of the whole gateway, shared by its buses and kept over every reload.
 #[derive(Debug, Default)]
@@ -47,15 +49,23 @@ enum Disk {
     /// Starts are kept in memory only.
     #[default]
     None,
-    /// Starts will be kept in a file that is not read yet.
-    Unread(PathBuf),
+    /// Starts will be kept in a file that is not read yet; with the reason if reading it failed.
+    Unread(PathBuf, Option<String>),
     /// Starts are kept in a file.
     File {
         /// Newest generation that is in the file.
         written: u64,
-        /// Newest one that could not be written, and why.
-        failed: Option<(u64, String)>,
+        /// The last write, if it failed.
+        failed: Option<FailedWrite>,
     },
+}
+
+/// A write of the file that failed.
+#[derive(Debug)]
+struct FailedWrite {
+    generation: u64,
+    why: String,
+    at: Instant,
 }
 
 /// Whether a cleared start is on disk.
@@ -99,7 +109,14 @@ impl Guards {
 
     /// Announces that starts will be saved in this file; until [`Guards::keep`] has its content, no start is allowed.
     pub fn await_file(&self, path: &Path) {
-        self.lock().disk = Disk::Unread(path.to_path_buf());
+        self.lock().disk = Disk::Unread(path.to_path_buf(), None);
+    }
+
+    /// Notes that the file could not be read, for this reason.
+    pub fn not_read(&self, why: String) {
+        if let Disk::Unread(_, reason) = &mut self.lock().disk {
+            *reason = Some(why);
+        }
     }
 
     /// Saves starts in a file from now on: no start is written to a drive before [`Guards::wrote`] reports that it
@@ -123,26 +140,34 @@ impl Guards {
         self.notify_change();
     }
 
-    /// The state to save, with its generation; `None` if it is already saved, or if saving failed.
+    /// The state to save, with its generation; `None` if it is already saved, or if saving has just failed.
     pub fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
         self.lock().to_write(now, time)
     }
 
     /// Waits for a state to save, for at most `most`; returns `None` if there is none.
     pub(super) fn wait_to_write(&self, most: Duration) -> Option<(u64, Saved)> {
-        let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind();
+        let is_up_to_date = |ledger: &mut Ledger| !ledger.is_behind(Instant::now());
         let waited = self.changed.wait_timeout_while(self.lock(), most, is_up_to_date);
         let (ledger, _) = waited.unwrap_or_else(PoisonError::into_inner);
         ledger.to_write(Instant::now(), SystemTime::now())
     }
 
-    /// Notes the result of a write to disk.
-    pub fn wrote(&self, generation: u64, done: Result<(), String>) {
+    /// The state that is not on disk yet, for a last try, however recently another one failed.
+    pub(super) fn last_to_write(&self) -> Option<(u64, Saved)> {
+        let ledger = self.lock();
+        ledger
+            .is_unwritten()
+            .then(|| ledger.saved(Instant::now(), SystemTime::now()))
+    }
+
+    /// Notes the result of a write to disk that ended at `at`.
+    pub fn wrote(&self, generation: u64, done: Result<(), String>, at: Instant) {
         let mut ledger = self.lock();
         if let Disk::File { written, failed } = &mut ledger.disk {
             match done {
                 Ok(()) => (*written, *failed) = (generation.max(*written), None),
-                Err(why) => *failed = Some((generation, why)),
+                Err(why) => *failed = Some(FailedWrite { generation, why, at }),
             }
         }
     }
@@ -259,19 +284,21 @@ impl Ledger {
     pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> SaveProgress {
         match &self.disk {
             Disk::None => SaveProgress::Yes,
-            Disk::Unread(path) if now >= reserved.at + DISK => SaveProgress::Failed(format!(
+            Disk::Unread(path, Some(why)) => {
+                SaveProgress::Failed(format!("{}: it cannot be read: {why}", path.display()))
+            }
+            Disk::Unread(path, None) if now >= reserved.at + DISK => SaveProgress::Failed(format!(
                 "{}: it is not read yet: the disk does not answer",
                 path.display()
             )),
             Disk::File { written, .. } if *written >= reserved.generation => SaveProgress::Yes,
             Disk::File {
-                failed: Some((generation, why)),
-                ..
-            } if *generation >= reserved.generation => SaveProgress::Failed(why.clone()),
+                failed: Some(failed), ..
+            } if failed.generation >= reserved.generation => SaveProgress::Failed(failed.why.clone()),
             Disk::File { .. } if now >= reserved.at + DISK => {
                 SaveProgress::Failed(format!("the disk did not take them within {}", shown(DISK)))
             }
-            Disk::Unread(_) | Disk::File { .. } => SaveProgress::NotYet,
+            Disk::Unread(..) | Disk::File { .. } => SaveProgress::NotYet,
         }
     }
 
@@ -303,20 +330,28 @@ impl Ledger {
             .unwrap_or_default()
     }
 
-    fn is_behind(&self) -> bool {
+    /// Whether something is to be written now. A state that could not be written is tried again after a while, also if nothing
+    /// changed since.
+    fn is_behind(&self, now: Instant) -> bool {
         match &self.disk {
-            Disk::None | Disk::Unread(_) => false,
-            Disk::File { written, failed } => {
-                let tried = failed.as_ref().map_or(0, |(generation, _)| *generation);
-                self.generation > tried.max(*written)
-            }
+            Disk::None | Disk::Unread(..) => false,
+            Disk::File {
+                failed: Some(failed), ..
+            } => self.generation > failed.generation || now >= failed.at + AGAIN,
+            Disk::File { failed: None, .. } => self.is_unwritten(),
         }
     }
 
+    fn is_unwritten(&self) -> bool {
+        matches!(&self.disk, Disk::File { written, .. } if self.generation > *written)
+    }
+
     fn to_write(&self, now: Instant, time: SystemTime) -> Option<(u64, Saved)> {
-        if !self.is_behind() {
-            return None;
-        }
+        self.is_behind(now).then(|| self.saved(now, time))
+    }
+
+    /// The state with its generation.
+    fn saved(&self, now: Instant, time: SystemTime) -> (u64, Saved) {
         let at = |at: Instant| match at.checked_duration_since(now) {
             Some(later) => time + later,
             None => time
@@ -328,6 +363,6 @@ impl Ledger {
             let starts = entry.motor.starts_to_keep().filter(|start| *start + HOUR > now);
             (machine.clone(), starts.map(at).collect())
         });
-        Some((self.generation, Saved::new(motors)))
+        (self.generation, Saved::new(motors))
     }
 }

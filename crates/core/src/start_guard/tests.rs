@@ -388,7 +388,7 @@ fn a_start_waits_until_it_is_on_disk() {
     assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
     let (generation, saved) = rig.shared.to_write(rig.at(1.0), time).unwrap();
     assert_eq!(reason(rig.clear(&[0], 1, 1.1)), "wait");
-    rig.shared.wrote(generation, Ok(()));
+    rig.shared.wrote(generation, Ok(()), rig.at(1.1));
     assert_eq!(rig.clear(&[0], 1, 1.2), Verdict::Go);
     assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
     // If the gateway is killed before it has written the word, the next run knows of the start.
@@ -434,7 +434,7 @@ fn a_start_waits_a_second_for_a_file_that_is_not_read_and_is_refused_then() {
     rig.shared.keep(&Saved::default(), rig.at(3.0), SystemTime::now());
     assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "wait");
     let (generation, _) = rig.shared.to_write(rig.at(3.0), SystemTime::now()).unwrap();
-    rig.shared.wrote(generation, Ok(()));
+    rig.shared.wrote(generation, Ok(()), rig.at(3.0));
     assert_eq!(rig.clear(&[0], 2, 3.1), Verdict::Go);
 }
 
@@ -446,7 +446,8 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     rig.read(0, false, 0.0);
     assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
     let (generation, _) = rig.shared.to_write(rig.at(1.0), time).unwrap();
-    rig.shared.wrote(generation, Err("starts.json: no space".to_string()));
+    rig.shared
+        .wrote(generation, Err("starts.json: no space".to_string()), rig.at(1.0));
     let refused = rig.clear(&[0], 1, 1.1);
     let Verdict::Refuse(refusal) = &refused else {
         unreachable!("{refused:?}")
@@ -458,11 +459,67 @@ fn a_start_that_cannot_be_counted_is_refused_and_is_none() {
     assert_eq!(reason(rig.clear(&[0], 2, 3.0)), "state_file");
     // The disk works again from here on.
     let (generation, _) = rig.shared.to_write(rig.at(4.0), time).unwrap();
-    rig.shared.wrote(generation, Ok(()));
+    rig.shared.wrote(generation, Ok(()), rig.at(4.0));
     assert_eq!(reason(rig.clear(&[0], 3, 5.0)), "wait");
     let (generation, _) = rig.shared.to_write(rig.at(5.0), time).unwrap();
-    rig.shared.wrote(generation, Ok(()));
+    rig.shared.wrote(generation, Ok(()), rig.at(5.0));
     assert_eq!(rig.clear(&[0], 3, 5.1), Verdict::Go);
+}
+
+#[test]
+fn what_a_full_disk_refused_is_written_again_unasked() {
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    let time = SystemTime::now();
+    rig.shared.keep(&Saved::default(), rig.start, time);
+    rig.read(0, false, 0.0);
+    // A person starts the motor at its panel: that counts, and nothing of it waits for the disk.
+    rig.read(0, true, 1.0);
+    let full = || Err("starts.json: no space".to_string());
+    let (generation, saved) = rig.shared.to_write(rig.at(1.0), time).unwrap();
+    rig.shared.wrote(generation, full(), rig.at(1.1));
+    assert_eq!(rig.shared.to_write(rig.at(2.0), time), None, "too early");
+    assert_eq!(
+        rig.shared.to_write(rig.at(2.1), time + 11 * SECOND / 10),
+        Some((generation, saved))
+    );
+    rig.shared.wrote(generation, full(), rig.at(2.1));
+    assert!(
+        rig.shared.last_to_write().is_some(),
+        "the last try at the end waits for nothing"
+    );
+    let (generation, _) = rig.shared.to_write(rig.at(3.1), time).unwrap();
+    rig.shared.wrote(generation, Ok(()), rig.at(3.1));
+    assert_eq!(rig.shared.to_write(rig.at(9.0), time), None);
+    assert_eq!(rig.shared.last_to_write(), None);
+}
+
+#[test]
+fn a_file_that_cannot_be_read_is_read_later_and_stays_as_it_is() {
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    rig.read(0, false, 0.0);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("starts.json");
+    // A folder of this name cannot be read as a file.
+    std::fs::create_dir(&path).unwrap();
+    let (keeper, read) = keep(folder.path(), rig.shared.clone()).unwrap();
+    let begun = Instant::now();
+    let refusal = loop {
+        match rig.clear(&[0], 1, 1.0) {
+            Verdict::Refuse(refusal) => break refusal.to_string(),
+            _ => assert!(begun.elapsed() < 60 * SECOND, "it waits"),
+        }
+        std::thread::sleep(SECOND / 100);
+    };
+    assert!(refusal.contains("starts.json: it cannot be read"), "{refusal}");
+    assert!(path.is_dir() && !folder.path().join("starts.damaged").exists());
+    std::fs::remove_dir(&path).unwrap();
+    // The channel closes when the file has been read.
+    let _ = read.blocking_recv();
+    while !path.is_file() {
+        assert!(begun.elapsed() < 60 * SECOND, "it is not written");
+        std::thread::sleep(SECOND / 100);
+    }
+    drop(keeper);
 }
 
 #[test]
