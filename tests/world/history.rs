@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 /// Entries kept, of single orders and commands; and where one seed is run again, of all that was on the lines.
-const KEPT: [usize; 2] = [160, 4_000];
+const KEPT: [usize; 2] = [160, 40_000];
 
 pub struct History {
     long: bool,

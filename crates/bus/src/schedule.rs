@@ -548,6 +548,13 @@ impl Schedule {
         (self.drives.iter().filter(|drive| !online(drive)).count(), held.count())
     }
 
+    /// Parts of reads of drives that answer, which are joined again later.
+    pub(crate) fn parts(&self) -> usize {
+        let online = self.drives.iter().filter(|drive| drive.presence == Presence::Online);
+        let items = online.flat_map(|drive| &drive.items);
+        items.filter(|item| item.whole_again.is_some()).count()
+    }
+
     /// The port was lost: every drive must be found again.
     pub fn reset(&mut self, now: Instant) {
         self.round.clear();

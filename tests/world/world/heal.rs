@@ -15,6 +15,8 @@ const MUTE: Duration = Duration::from_secs(4);
 const COMMANDED: Duration = Duration::from_secs(11);
 /// Longest pause between two stops of a flood to a drive that does not answer.
 const FLOODED: Duration = Duration::from_secs(2);
+/// Time after which a read is whole again that a fault let the gateway read in parts.
+const WHOLE_AGAIN: Duration = Duration::from_secs(60);
 /// Granularity of the measurements.
 const STEP: Duration = Duration::from_millis(10);
 
@@ -49,10 +51,26 @@ impl World {
             .unwrap_or_default();
         let away = PROBED + longest + COMMANDED.max(slow);
         self.look_until(self.now + away, |_| {});
+        self.look_until_whole(longest + slow);
         let all: Vec<_> = self.drives_that_answer().collect();
         self.check_back(&all, true, "every drive is back");
         self.check_remains();
         self.check_as_good_as_new();
+    }
+
+    /// Waits for reads in parts to be joined, and then as long as the line needs to be as before: an exception names no
+    /// request, so the late exception to one request looks like the refusal of the next read.
+    fn look_until_whole(&mut self, settles: Duration) {
+        let since = self.healing.map_or(self.now, |healing| healing.since);
+        let last = since + WHOLE_AGAIN + settles;
+        let in_parts = |world: &World| world.buses.iter().any(|bus| bus.core.remains(world.now).parts > 0);
+        if !in_parts(self) {
+            return;
+        }
+        while self.now < last && in_parts(self) {
+            self.look_until(last.min(self.now + Duration::from_secs(1)), |_| {});
+        }
+        self.look_until(self.now + settles, |_| {});
     }
 
     /// Time after which a drive that answers is as before: late replies, repeated requests, three rounds.

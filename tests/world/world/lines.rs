@@ -95,8 +95,11 @@ impl World {
                 }
             }
         }
+        // No order has this reference, so the write shows no client, not even one whose answer over MQTT still waits for the
+        // confirmation.
         if self.is_reference_of_supervision(bus, drive, pdu) {
             self.supervision_acts(bus, drive, pdu);
+            return self.check_unique(bus, drive, pdu);
         }
         let truth = &mut self.truths[bus][drive];
         let repeated = truth.repeated_until.is_some_and(|until| now < until);

@@ -1,6 +1,7 @@
 //! Refreshes for a drive's own timeout: only ordered values, and only while the order is in force.
 
 use super::*;
+use crate::orders::is_counted;
 
 /// What a drive showed this long ago is no longer known: the reads right before a refresh are behind it.
 const SHOWN: Duration = Duration::from_millis(500);
@@ -138,7 +139,8 @@ impl World {
         }
         let runs = run_command(&profile, &asked.pdu);
         let by_reference = profile.repeats().is_ok_and(|repeats| !repeats.word);
-        if runs == Some(true) || (asked.is_refresh && by_reference) {
+        // The reference of a client's order feeds the timeout as its refresh does, and puts that off.
+        if runs == Some(true) || (by_reference && is_counted(&profile, &asked.pdu)) {
             truth.fed = Some(now);
         }
         match runs {

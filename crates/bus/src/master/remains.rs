@@ -27,6 +27,8 @@ pub struct Remains {
     pub away: usize,
     /// Number of reads that wait after failures: a read was not answered, or a command requested it and it is not done.
     pub held_reads: usize,
+    /// Parts of reads that a drive refused or left unanswered as a whole, and that are joined again later.
+    pub parts: usize,
 }
 
 impl Master {
@@ -49,6 +51,7 @@ impl Master {
             owed_actions: sum(|drive| drive.supervision.owes_action()),
             away,
             held_reads,
+            parts: self.schedule.parts(),
         }
     }
 }
