@@ -15,8 +15,9 @@ const SYSTEM_DIRECTORY: &str = "/run/drivegate";
 const MAX_GATEWAYS: usize = 16;
 /// Owner and group may read and write, which both take to connect.
 const MODE: u32 = 0o660;
-/// Maximum number of clients that wait to be accepted.
-const BACKLOG: u32 = 16;
+/// Maximum number of clients that wait to be accepted. A client beyond them gets an error at once, whatever it has to
+/// say, so a crowd of programs must fit while a busy machine delays the gateway.
+const BACKLOG: u32 = 1024;
 /// Tries to lock the directory, while another gateway starts, and the time between them.
 const LOCK_TRIES: u32 = 50;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
@@ -249,6 +250,18 @@ mod tests {
         assert!(path.exists(), "what is not its own stays");
         let refused = bind_first(&paths).await.unwrap_err();
         assert!(refused.to_string().contains("not a socket"), "{refused}");
+    }
+
+    #[tokio::test]
+    async fn a_crowd_connects_before_any_client_is_accepted() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("own.sock");
+        let _bound = bind(&path).await.unwrap();
+        let mut crowd = Vec::new();
+        for number in 0..200 {
+            let client = UnixStream::connect(&path).await;
+            crowd.push(client.unwrap_or_else(|error| panic!("client {number}: {error}")));
+        }
     }
 
     #[tokio::test]
