@@ -130,15 +130,24 @@ fn a_fault_makes_a_recording_and_a_directory_that_cannot_be_written_costs_that_o
     fs::write(site.file("state/recordings"), "in the way").unwrap();
     let trip = |code| assert!(line.with_drive(1, |drive, _| drive.trip(code)).is_some());
     trip(1);
-    gateway.until_printed("is lost: cannot write");
+    gateway.until_printed("cannot write the recording of pump-1");
     fs::remove_file(site.file("state/recordings")).unwrap();
+    let unasked = until("the recording that could not be written", || {
+        listed(&site).first().cloned()
+    });
+    assert!(
+        unasked["summary"].as_str().unwrap().starts_with("fault 1: "),
+        "{unasked}"
+    );
     line.with_drive(1, |drive, _| drive.set_reset(true));
     until("the end of the fault", || {
         (point(site.http, "pump-1", "fault") == false).then_some(())
     });
     line.with_drive(1, |drive, _| drive.set_reset(false));
     trip(2);
-    let entry = until("the recording", || listed(&site).first().cloned());
+    let entry = until("the recording", || {
+        listed(&site).into_iter().find(|entry| *entry != unasked)
+    });
     assert_eq!(entry["trigger"], "fault");
     let summary = entry["summary"].as_str().unwrap();
     assert!(summary.starts_with("fault 2: "), "{summary}");

@@ -197,7 +197,9 @@ impl Store {
     /// If the file cannot be written, or alone exceeds the limit for all recordings; no part of it remains.
     pub fn write(&mut self, recording: &mut Recording, now: SystemTime) -> io::Result<Arc<Entry>> {
         let time = humantime::parse_rfc3339(&recording.header.time).unwrap_or(SystemTime::UNIX_EPOCH);
-        recording.header.first = self.storm.is_first(time);
+        // A recording that the disk refuses is written again later, and counts once.
+        let mut storm = self.storm;
+        recording.header.first = storm.is_first(time);
         let id = recording.header.id.clone();
         let taken = |id: &str| self.entries.iter().any(|entry| entry.id == id);
         // An id is taken twice only after the clock was set back.
@@ -216,6 +218,7 @@ impl Store {
         }
         let path = path_of(&self.dir, &recording.header.id);
         files::replace(&path, &bytes)?;
+        self.storm = storm;
         let entry = Arc::new(Entry::new(&recording.header, size));
         let at = self
             .entries

@@ -1,7 +1,7 @@
 //! The running recorder: one thread takes the tapes of the buses, for recordings and trends, and one writes files. A
 //! slow disk delays neither the buses nor the rings.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -23,6 +23,10 @@ use crate::process_image::BusImage;
 const TICK: Duration = Duration::from_millis(100);
 /// Recordings that wait for the disk at most.
 const WAITING: usize = 64;
+/// Recordings that are kept in memory while the disk refuses them, at most.
+const REFUSED: usize = 4;
+/// Interval at which a refused recording is written again.
+const AGAIN: Duration = Duration::from_secs(10);
 /// Characters of a text of a client that are kept.
 const MOST_TEXT: usize = 300;
 
@@ -166,6 +170,7 @@ impl RecorderTask {
                     recordings,
                     number,
                     events,
+                    refused: VecDeque::new(),
                     failing: false,
                 };
                 writer.show(|_| {});
@@ -353,7 +358,9 @@ struct Writer {
     /// Number of the recorder, which changes with each reload.
     number: u64,
     events: Events,
-    /// The last one could not be written.
+    /// Recordings that the disk refused, oldest first.
+    refused: VecDeque<Recording>,
+    /// The disk refused the last one, which was reported.
     failing: bool,
 }
 
@@ -368,39 +375,87 @@ impl Writer {
     }
 
     fn run(mut self, waiting: &Receiver<Capture>) {
-        while let Ok(capture) = waiting.recv() {
-            let mut recording = assemble(&capture);
-            let written = self.store.write(&mut recording, SystemTime::now());
-            let header = &recording.header;
-            let (bus, drive) = (header.bus.name.clone(), header.drive.name.clone());
-            match written {
-                Ok(entry) => {
-                    self.failing = false;
-                    self.show(|shared| *shared.made.entry(entry.trigger).or_default() += 1);
-                    let text = match entry.trigger.has_event() {
-                        true => format!("recording {}", entry.id),
-                        false => format!("recording {}: {}", entry.id, entry.summary),
-                    };
-                    let made = RecordingMade {
-                        id: entry.id.clone(),
-                        trigger: entry.trigger.name().into(),
-                        summary: entry.summary.clone(),
-                    };
-                    publish(&self.events, bus, Some(drive), text, Some(made));
-                }
-                // The failure is reported once: the disk stays faulty until an operator acts.
-                Err(_) if self.failing => {}
-                Err(error) => {
-                    self.failing = true;
-                    let text = format!(
-                        "the recording of {drive} is lost: cannot write {}: {error}; so are further ones until there \
-                         is space and permission; everything else continues",
-                        store::path_of(self.store.dir(), &header.id).display()
-                    );
-                    publish(&self.events, bus, Some(drive), text, None);
-                }
+        loop {
+            let next = match self.refused.is_empty() {
+                true => waiting.recv().map_err(|_| RecvTimeoutError::Disconnected),
+                false => waiting.recv_timeout(AGAIN),
+            };
+            match next {
+                Ok(capture) => self.take(assemble(&capture)),
+                Err(RecvTimeoutError::Timeout) => self.write_refused(),
+                Err(RecvTimeoutError::Disconnected) => return self.write_refused(),
             }
         }
+    }
+
+    /// Writes a recording after those that the disk refused before.
+    fn take(&mut self, recording: Recording) {
+        self.write_refused();
+        let is_first = self.refused.is_empty();
+        if self.refused.len() >= REFUSED {
+            let text = format!("{REFUSED} recordings wait for the disk");
+            self.lost(&recording, &text);
+            return;
+        }
+        self.refused.push_back(recording);
+        if is_first {
+            self.write_refused();
+        }
+    }
+
+    /// Writes the recordings that wait, until the disk refuses one.
+    fn write_refused(&mut self) {
+        while let Some(mut recording) = self.refused.pop_front() {
+            let error = match self.store.write(&mut recording, SystemTime::now()) {
+                Ok(entry) => {
+                    self.failing = false;
+                    self.written(&recording, &entry);
+                    continue;
+                }
+                Err(error) => error,
+            };
+            if error.kind() == std::io::ErrorKind::FileTooLarge {
+                self.lost(&recording, &error.to_string());
+                continue;
+            }
+            if !std::mem::replace(&mut self.failing, true) {
+                let header = &recording.header;
+                let text = format!(
+                    "cannot write the recording of {}, {}: {error}; it is written as soon as there is space and \
+                     permission, as are {REFUSED} at most; everything else continues",
+                    header.drive.name,
+                    store::path_of(self.store.dir(), &header.id).display()
+                );
+                self.publish(&recording, text, None);
+            }
+            self.refused.push_front(recording);
+            return;
+        }
+    }
+
+    fn written(&self, recording: &Recording, entry: &Entry) {
+        self.show(|shared| *shared.made.entry(entry.trigger).or_default() += 1);
+        let text = match entry.trigger.has_event() {
+            true => format!("recording {}", entry.id),
+            false => format!("recording {}: {}", entry.id, entry.summary),
+        };
+        let made = RecordingMade {
+            id: entry.id.clone(),
+            trigger: entry.trigger.name().into(),
+            summary: entry.summary.clone(),
+        };
+        self.publish(recording, text, Some(made));
+    }
+
+    fn lost(&self, recording: &Recording, why: &str) {
+        let text = format!("the recording of {} is lost: {why}", recording.header.drive.name);
+        self.publish(recording, text, None);
+    }
+
+    fn publish(&self, recording: &Recording, text: String, made: Option<RecordingMade>) {
+        let header = &recording.header;
+        let (bus, drive) = (header.bus.name.clone(), header.drive.name.clone());
+        publish(&self.events, bus, Some(drive), text, made);
     }
 }
 
