@@ -9,7 +9,7 @@ use std::time::Duration;
 use drivegate_sim::statistics::Direction;
 use drivegate_sim::wire::SimulatedBus;
 
-use crate::support::process::{PATIENCE, Running, api, local, until};
+use crate::support::process::{PATIENCE, Running, api, free_port, local, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
 
 const MS: Duration = Duration::from_millis(1);
@@ -193,6 +193,128 @@ fn a_hold_a_restore_and_a_drill_belong_to_the_machine_that_was_named() {
     plant.reload(&swapped_units());
     half.write_all(&[6, 0x81, 3, 0, 1]).unwrap();
     assert_eq!(reply(&mut half), [0, 1, 0, 0, 0, 3, 11, 0x86, 0x0A]);
+}
+
+/// Sections of two drives, and a listener whose units 0 and 255 are the drive `default`.
+fn with_default(drives: String, port: u16, default: &str) -> String {
+    drives + &format!("[[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:{port}\"]\ndefault_drive = \"{default}\"\n")
+}
+
+/// The first bytes of a write to 0x8100 of this unit; the gateway has read them.
+fn half_a_write(port: u16, unit: u8) -> TcpStream {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(&[0, 1, 0, 0, 0, 6, unit, 6, 0x81]).unwrap();
+    std::thread::sleep(50 * MS);
+    stream
+}
+
+/// Units 0 and 255 mean a drive by its name, whatever the units of the drives are.
+#[test]
+fn an_order_to_the_default_drive_belongs_to_the_machine_that_had_its_name() {
+    let port = free_port();
+    let with = |drives: String, default: &str| with_default(drives, port, default);
+    let before = with(pair("pump-1", "pump-2"), "pump-1");
+    let changes = [
+        (with(pair("pump-2", "pump-1"), "pump-1"), ["pump-1", "pump-2"], false),
+        (with(swapped_units(), "pump-1"), ["pump-1", "pump-2"], true),
+        (with(pair("pump-1", "pump-2"), "pump-2"), ["pump-1", "pump-2"], false),
+        (with(pair("pump-3", "pump-2"), "pump-2"), ["pump-3", "pump-2"], false),
+    ];
+    for (after, names, is_same) in changes {
+        let mut plant = Plant::new(&before);
+        let mut start = half_a_write(port, 0);
+        plant.reload(&after);
+        // A bus that was started anew reads its drives before it starts one.
+        names.iter().for_each(|name| plant.site.until_state(name, "ready"));
+        start.write_all(&[0, 0, 1]).unwrap();
+        let answer = reply(&mut start);
+        assert_eq!(answer[7] == 6, is_same, "{after}: {answer:?}");
+        let begun = if is_same { vec![1] } else { vec![] };
+        assert_eq!((plant.words(1), plant.words(2)), (begun, vec![]), "{after}");
+        drop(plant);
+        let mut plant = Plant::new(&before);
+        let mut plc = plant.modbus();
+        for unit in [11, 12] {
+            assert_eq!(write(&mut plc, unit, 1)[7], 6, "unit {unit}");
+        }
+        let mut stop = half_a_write(port, 0);
+        plant.reload(&after);
+        stop.write_all(&[0, 0, 0]).unwrap();
+        reply(&mut stop);
+        assert_eq!((plant.runs(1), plant.runs(2)), (false, true), "{after}");
+    }
+}
+
+/// No drive has the name and the unit id any more that the stop names, or one that is only monitored has them.
+#[test]
+fn a_stop_reaches_its_machine_whatever_became_of_the_name() {
+    let renamed = controlled("pump-3", 1, "unit = 13") + &controlled("pump-2", 2, "unit = 12");
+    let monitored = controlled("pump-2", 1, "unit = 12")
+        + &controlled("pump-1", 2, "unit = 11").replace("\"control\"", "\"monitor\"");
+    for after in [renamed, monitored] {
+        for over_http in [false, true] {
+            let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+            assert_eq!(write(&mut plant.modbus(), 11, 1)[7], 6);
+            let body = "{\"run\": false}";
+            let mut http = begin_over_http(&plant.site, "pump-1", body);
+            let mut half = half_a_write(plant.site.modbus, 11);
+            plant.reload(&after);
+            if over_http {
+                http.write_all(body.as_bytes()).unwrap();
+                reply(&mut http);
+            } else {
+                half.write_all(&[0, 0, 0]).unwrap();
+                reply(&mut half);
+            }
+            assert!(!plant.runs(1), "HTTP {over_http}: {after}");
+        }
+    }
+}
+
+/// Two lines with a listener each, on which the same unit id is another drive.
+#[test]
+fn a_reload_changes_no_unit_id_that_another_listener_uses_too() {
+    let (second, other) = (free_port(), Site::new());
+    let line2 = format!(
+        "[[bus]]\nname = \"line2\"\nport = \"{}\"\nbaud = 38400\n",
+        other.path("line1")
+    );
+    let listener = |port: u16, bus: &str| {
+        format!(
+            "[[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:{port}\"]\nbuses = [\"{bus}\"]\n\
+             write = [\"127.0.0.1/32\"]\n"
+        )
+    };
+    let site = Site::new();
+    let listeners = listener(site.modbus, "line1") + &listener(second, "line2");
+    let (pump, fan) = (controlled("pump-1", 1, "unit = 1"), controlled("fan-1", 1, "unit = 1"));
+    site.configure(&[LINE1, &pump, &line2, &fan, &listeners, HTTP]);
+    let (_pumps, fans) = (site.line(&[1]), other.line(&[1]));
+    let gateway = site.run_ready();
+    for name in ["pump-1", "fan-1"] {
+        site.until_state(name, "ready");
+    }
+    let mut plant = Plant {
+        site,
+        line: fans,
+        gateway,
+        reloads: 0,
+    };
+    for port in [plant.site.modbus, second] {
+        let mut plc = TcpStream::connect(("127.0.0.1", port)).unwrap();
+        assert_eq!(write(&mut plc, 1, 1)[7], 6, "port {port}");
+    }
+    let mut half = half_a_write(second, 1);
+    plant
+        .site
+        .change("response_timeout = \"2s\"", "response_timeout = \"1900ms\"");
+    plant.reload_file();
+    half.write_all(&[0, 0, 0]).unwrap();
+    assert_eq!(reply(&mut half)[7], 6, "the stop of the fan");
+    assert!(!plant.runs(1));
+    assert_eq!(write(&mut half, 1, 1)[7], 6, "the fan is the drive that it was");
+    plant.site.until_point("pump-1", "running", true);
 }
 
 /// A controller keeps run and reset bit set at a unit id; a reload puts another drive there.

@@ -22,7 +22,7 @@ use crate::queue::CommandQueue;
 use drivegate_model::drive::DriveIndex;
 use drivegate_model::drive::why::Explanation;
 
-pub use self::earlier_meanings::{EarlierMeanings, UnusedNames};
+pub use self::earlier_meanings::{DriveKey, EarlierMeanings, FormerMachine, NamedBy, UnusedNames};
 pub use self::exchange::{Exchange, Question};
 pub use self::orders::{OrderRequest, turn_away};
 pub use self::placed::{Placed, Shown};

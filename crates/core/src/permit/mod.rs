@@ -31,4 +31,4 @@ pub use judge::{Ask, DriveFacts, Facts, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
 pub use rules::access::{access, client_access};
-pub(crate) use rules::machine::refusal as meant_another;
+pub use rules::machine::refusal as meant_another;

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use super::{BusHandle, DriveHandle};
+use super::{BusHandle, DriveHandle, Plant};
 use crate::order::{Arrival, Order, Parts, Refusal, SourceKind};
 use crate::permit::meant_another;
 use crate::process_image::{BusImage, DriveImage, DriveSpec, Machine};
@@ -22,19 +22,30 @@ const MOST_UNUSED: usize = 4096;
 
 /// How an order names its drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum By {
+pub enum NamedBy {
     /// The order uses the name of the drive.
     Name,
-    /// By the unit id, or by the BACnet device number derived from it.
+    /// NamedBy the unit id, or by the BACnet device number derived from it.
     Unit,
 }
 
-impl By {
+/// The name or the unit id of a drive.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DriveKey {
+    /// The name of a drive.
+    Name(String),
+    /// The Modbus TCP unit id of a drive.
+    Unit(u8),
+}
+
+impl NamedBy {
     /// How orders of this kind name their drive; `None` if they use the address on the line.
-    fn of(kind: SourceKind) -> Option<By> {
+    fn of(kind: SourceKind) -> Option<NamedBy> {
         match kind {
-            SourceKind::ModbusTcp | SourceKind::Bacnet => Some(By::Unit),
-            SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Http | SourceKind::LocalSocket => Some(By::Name),
+            SourceKind::ModbusTcp | SourceKind::Bacnet => Some(NamedBy::Unit),
+            SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Http | SourceKind::LocalSocket => {
+                Some(NamedBy::Name)
+            }
             SourceKind::CommandLine
             | SourceKind::Slot
             | SourceKind::OtherMaster
@@ -66,46 +77,64 @@ struct EarlierMeaning {
 
 /// The machine that an order meant, if its name means another machine now.
 #[derive(Debug)]
-pub(super) enum FormerMachine {
+pub enum FormerMachine {
     /// The machine is served under another name.
     There(Box<DriveHandle>),
     /// No bus serves that machine any more, or there was none.
     Gone,
 }
 
-/// Earlier meanings of the names and units of the drives of a bus, oldest first.
+/// A name or unit id that a drive had from `after` to `until`, and that no drive has now.
+#[derive(Debug)]
+struct DroppedKey {
+    drive: DriveIndex,
+    key: DriveKey,
+    /// `None` if the drive had it from the start.
+    after: Option<Instant>,
+    until: Instant,
+}
+
 #[derive(Debug, Default)]
-pub struct EarlierMeanings(Mutex<BTreeMap<(DriveIndex, By), Vec<EarlierMeaning>>>);
+struct OfBus {
+    /// Earlier meanings of names and unit ids, oldest first.
+    meanings: BTreeMap<(DriveIndex, NamedBy), Vec<EarlierMeaning>>,
+    dropped: Vec<DroppedKey>,
+}
+
+/// Earlier meanings of the names and units of the drives of a bus.
+#[derive(Debug, Default)]
+pub struct EarlierMeanings(Mutex<OfBus>);
 
 impl EarlierMeanings {
-    fn lock(&self) -> MutexGuard<'_, BTreeMap<(DriveIndex, By), Vec<EarlierMeaning>>> {
+    fn lock(&self) -> MutexGuard<'_, OfBus> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn of(&self, drive: DriveIndex, by: By) -> Vec<EarlierMeaning> {
-        self.lock().get(&(drive, by)).cloned().unwrap_or_default()
+    fn of(&self, drive: DriveIndex, by: NamedBy) -> Vec<EarlierMeaning> {
+        self.lock().meanings.get(&(drive, by)).cloned().unwrap_or_default()
     }
 
     /// What the name or unit id of the drive meant at `asked`: the record of the first change after that time.
-    fn meaning_at(&self, drive: DriveIndex, by: By, asked: Instant) -> Option<EarlierMeaning> {
+    fn meaning_at(&self, drive: DriveIndex, by: NamedBy, asked: Instant) -> Option<EarlierMeaning> {
         let all = self.lock();
-        let mut of_drive = all.get(&(drive, by))?.iter();
+        let mut of_drive = all.meanings.get(&(drive, by))?.iter();
         of_drive.find(|former| asked <= former.until).cloned()
+    }
+
+    /// The drive that had this name or unit id at `asked`, if a reload has taken it from every drive since.
+    fn had_at(&self, key: &DriveKey, asked: Instant) -> Option<DriveIndex> {
+        let had = |dropped: &&DroppedKey| {
+            dropped.key == *key && asked <= dropped.until && dropped.after.is_none_or(|after| after < asked)
+        };
+        self.lock().dropped.iter().find(had).map(|dropped| dropped.drive)
     }
 }
 
-/// A name or unit id of drives.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-enum Key {
-    Name(String),
-    Unit(u8),
-}
-
-impl Key {
-    fn of(by: By, drive: &DriveSpec) -> Key {
+impl DriveKey {
+    fn of(by: NamedBy, drive: &DriveSpec) -> DriveKey {
         match by {
-            By::Name => Key::Name(drive.name.clone()),
-            By::Unit => Key::Unit(drive.unit),
+            NamedBy::Name => DriveKey::Name(drive.name.clone()),
+            NamedBy::Unit => DriveKey::Unit(drive.unit),
         }
     }
 }
@@ -125,21 +154,33 @@ struct Meaning {
 /// Names and unit ids that no drive has any more: a drive that gets one of them later is another machine to the clients
 /// that commanded under it.
 #[derive(Debug, Default)]
-pub struct UnusedNames(BTreeMap<Key, Meaning>);
+pub struct UnusedNames(BTreeMap<DriveKey, Meaning>);
 
 impl UnusedNames {
     /// After a reload: records what the names and units of drives meant until now, and makes clients that commanded
     /// under them take the drive before they start its motor. `before` are all buses before the reload, `after` all
     /// buses now; buses that continue are in both.
     pub fn follow(&mut self, before: &[BusHandle], after: &[BusHandle], now: Instant) {
-        let former: BTreeMap<Key, Meaning> = before.iter().flat_map(meanings).collect();
-        let mut used: BTreeSet<Key> = BTreeSet::new();
+        let mut former: BTreeMap<DriveKey, Vec<(&str, Meaning)>> = BTreeMap::new();
+        for bus in before {
+            for (key, meaning) in meanings(bus) {
+                former.entry(key).or_default().push((&bus.image.spec.name, meaning));
+            }
+        }
+        let mut used: BTreeSet<DriveKey> = BTreeSet::new();
         for bus in after {
             for (index, drive) in bus.image.drives.enumerate() {
-                for by in [By::Name, By::Unit] {
-                    let key = Key::of(by, &drive.spec);
-                    let was = former.get(&key).cloned().or_else(|| self.0.remove(&key));
+                for by in [NamedBy::Name, NamedBy::Unit] {
+                    let key = DriveKey::of(by, &drive.spec);
                     let machine = bus.image.spec.machine(&drive.spec);
+                    // Unit ids may repeat on buses of different listeners: the machine itself is meant first, then a
+                    // drive of the same bus.
+                    let distance = |(of, meaning): &&(&str, Meaning)| {
+                        (meaning.machine != machine, *of != bus.image.spec.name.as_str())
+                    };
+                    let had = former.get(&key).and_then(|all| all.iter().min_by_key(distance));
+                    let was = had.map(|(_, meaning)| meaning.clone());
+                    let was = was.or_else(|| self.0.remove(&key));
                     bus.give_meaning((index, by), &machine, was, after, now);
                     used.insert(key);
                 }
@@ -150,7 +191,8 @@ impl UnusedNames {
             ..meaning
         };
         let gone = former.into_iter().filter(|(key, _)| !used.contains(key));
-        self.0.extend(gone.map(|(key, meaning)| (key, ended(meaning))));
+        let gone = gone.filter_map(|(key, all)| Some((key, ended(all.into_iter().next()?.1))));
+        self.0.extend(gone);
         while self.0.len() > MOST_UNUSED {
             let oldest = self.0.iter().min_by_key(|(_, meaning)| meaning.ended);
             let Some(oldest) = oldest.map(|(key, _)| key.clone()) else {
@@ -158,21 +200,52 @@ impl UnusedNames {
             };
             self.0.remove(&oldest);
         }
+        for bus in after {
+            bus.formerly.lock().dropped = self.dropped_of(bus, now);
+        }
+    }
+
+    /// The names and unit ids that drives of this bus had before no drive had them any more.
+    fn dropped_of(&self, bus: &BusHandle, now: Instant) -> Vec<DroppedKey> {
+        let mut dropped = Vec::new();
+        for (key, meaning) in &self.0 {
+            let Some(ended) = meaning.ended.filter(|ended| now < *ended + REMEMBERED) else {
+                continue;
+            };
+            let earlier = meaning
+                .earlier
+                .iter()
+                .map(|former| (former.until, former.machine.as_ref()));
+            let mut after = None;
+            for (until, machine) in earlier.chain([(ended, Some(&meaning.machine))]) {
+                if let Some(drive) = machine.and_then(|machine| bus.place_of(machine)) {
+                    let key = key.clone();
+                    dropped.push(DroppedKey {
+                        drive,
+                        key,
+                        after,
+                        until,
+                    });
+                }
+                after = Some(until);
+            }
+        }
+        dropped
     }
 }
 
 /// What the names and unit ids of a bus mean.
-fn meanings(bus: &BusHandle) -> Vec<(Key, Meaning)> {
+fn meanings(bus: &BusHandle) -> Vec<(DriveKey, Meaning)> {
     let of_drive = |(index, drive): (DriveIndex, &Arc<DriveImage>)| {
         let clients = bus.queue.lock().gate.clients(index);
-        [By::Name, By::Unit].map(|by| {
+        [NamedBy::Name, NamedBy::Unit].map(|by| {
             let meaning = Meaning {
                 machine: bus.image.spec.machine(&drive.spec),
                 earlier: bus.formerly.of(index, by),
                 clients: clients.clone(),
                 ended: None,
             };
-            (Key::of(by, &drive.spec), meaning)
+            (DriveKey::of(by, &drive.spec), meaning)
         })
     };
     bus.image.drives.enumerate().flat_map(of_drive).collect()
@@ -182,7 +255,7 @@ impl BusHandle {
     /// A drive has its name or unit id since the reload at `now`, or had it before.
     fn give_meaning(
         &self,
-        (index, by): (DriveIndex, By),
+        (index, by): (DriveIndex, NamedBy),
         machine: &Machine,
         was: Option<Meaning>,
         after: &[BusHandle],
@@ -211,23 +284,33 @@ impl BusHandle {
             let machine = former.machine.as_ref();
             former.served = machine.and_then(|machine| after.iter().find_map(|bus| bus.serves(machine)));
         }
-        self.formerly.lock().insert((index, by), all);
+        self.formerly.lock().meanings.insert((index, by), all);
         if !is_same {
             self.queue.lock().gate.stop_first(index, clients);
         }
     }
 
+    fn place_of(&self, machine: &Machine) -> Option<DriveIndex> {
+        let drives = &self.image.drives;
+        drives.position(|drive| self.image.spec.machine(&drive.spec) == *machine)
+    }
+
     fn serves(&self, machine: &Machine) -> Option<Served> {
-        let place = self
-            .image
-            .drives
-            .position(|drive| self.image.spec.machine(&drive.spec) == *machine)?;
+        let place = self.place_of(machine)?;
         Some(Served {
             image: Arc::downgrade(&self.image),
             queue: Arc::downgrade(&self.queue),
             formerly: Arc::downgrade(&self.formerly),
             place,
         })
+    }
+}
+
+impl Plant {
+    /// The drive that had this name or unit id at `asked`, if a reload has taken it from every drive since.
+    pub fn drive_formerly(&self, key: &DriveKey, asked: Instant) -> Option<DriveHandle> {
+        let mut drives = self.drives();
+        drives.find(|drive| drive.bus.formerly.had_at(key, asked) == Some(drive.index))
     }
 }
 
@@ -242,28 +325,36 @@ impl DriveHandle {
 
     /// The machine that an order of this kind meant when it arrived, if its name means another machine now.
     pub(super) fn meant(&self, kind: SourceKind, arrival: &Arrival) -> Option<FormerMachine> {
-        let former = self.bus.formerly.meaning_at(self.index, By::of(kind)?, arrival.asked)?;
-        let there = former.served.and_then(|served| {
-            let bus = BusHandle {
-                image: served.image.upgrade()?,
-                queue: served.queue.upgrade()?,
-                formerly: served.formerly.upgrade()?,
-            };
-            let index = served.place;
-            let image = bus.image.drives.get(index)?.clone();
-            Some(DriveHandle {
-                bus,
-                index,
-                image,
-                ..self.clone()
-            })
-        });
+        self.former(NamedBy::of(kind)?, arrival.asked)
+    }
+
+    /// The machine that the name or unit id of this drive meant at `asked`, if it meant another machine.
+    pub fn former(&self, by: NamedBy, asked: Instant) -> Option<FormerMachine> {
+        let former = self.bus.formerly.meaning_at(self.index, by, asked)?;
+        let there = former.served.and_then(|served| self.at(&served));
         Some(there.map_or(FormerMachine::Gone, |there| FormerMachine::There(Box::new(there))))
+    }
+
+    /// Access to this machine, if its bus still exists.
+    fn at(&self, served: &Served) -> Option<DriveHandle> {
+        let bus = BusHandle {
+            image: served.image.upgrade()?,
+            queue: served.queue.upgrade()?,
+            formerly: served.formerly.upgrade()?,
+        };
+        let index = served.place;
+        let image = bus.image.drives.get(index)?.clone();
+        Some(DriveHandle {
+            bus,
+            index,
+            image,
+            ..self.clone()
+        })
     }
 
     /// The stop for this machine in an order that was parsed for the drive that has its name now; `None` if the
     /// order does not stop.
-    pub(super) fn stop_meant(&self, order: &Order, read_for: &DriveHandle) -> Option<Order> {
+    pub fn stop_meant(&self, order: &Order, read_for: &DriveHandle) -> Option<Order> {
         let stops = match order {
             Order::Points(_) => is_stop(order.clone(), read_for),
             Order::Write(_) => is_stop(order.clone(), self),

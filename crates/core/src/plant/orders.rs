@@ -32,6 +32,7 @@ pub struct OrderRequest {
     slot: Option<SlotWrite>,
     waits: bool,
     at_once: bool,
+    is_resolved: bool,
 }
 
 impl OrderRequest {
@@ -47,6 +48,7 @@ impl OrderRequest {
             slot: None,
             waits: false,
             at_once: false,
+            is_resolved: false,
         }
     }
 
@@ -87,6 +89,15 @@ impl OrderRequest {
     #[must_use]
     pub fn waiting(self, waits: bool) -> OrderRequest {
         OrderRequest { waits, ..self }
+    }
+
+    /// Marks the order as meant for this machine: the caller knows what its name or unit id meant when it arrived.
+    #[must_use]
+    pub fn resolved(self) -> OrderRequest {
+        OrderRequest {
+            is_resolved: true,
+            ..self
+        }
     }
 
     /// Excludes a delay of the stop by a guard.
@@ -251,7 +262,8 @@ impl DriveHandle {
     /// it named then: a stop in it is carried out there, and the rest is carried out nowhere.
     pub fn place(&self, request: OrderRequest, now: Instant) -> Placed {
         let arrival = request.arrival.clone().unwrap_or_else(|| Arrival::now(now));
-        let Some(meant) = self.meant(request.origin.kind, &arrival) else {
+        let former = (!request.is_resolved).then(|| self.meant(request.origin.kind, &arrival));
+        let Some(meant) = former.flatten() else {
             return self.place_here(request, now);
         };
         let refusal = meant_another();

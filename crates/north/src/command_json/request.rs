@@ -11,7 +11,7 @@ use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
 use drivegate_core::order::{Answer, Arrival, Authority, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, stop_of};
-use drivegate_core::permit::sets_twice;
+use drivegate_core::permit::{meant_another, sets_twice};
 use drivegate_core::plant::{DriveHandle, OrderRequest, Placed, Plant};
 use drivegate_model::document::nearest;
 use drivegate_model::drive::model::Kind;
@@ -148,6 +148,21 @@ impl ParsedCommand {
             }
             None => Err(drive.refuse(what, refusal, origin, now)),
         }
+    }
+
+    /// Gives `former` the stop of a command, `what`, whose drive name meant this machine when the command arrived and
+    /// means no drive now; `None` if the command does not stop.
+    pub(crate) fn place_at_former(
+        self,
+        former: &DriveHandle,
+        what: &str,
+        origin: Origin,
+        (arrival, now): (Arrival, Instant),
+    ) -> Option<Placed> {
+        let stop = stop_of(&self.points, &former.image.spec.profile)?;
+        let request = OrderRequest::new(Order::Points(stop), origin, Authority::Write).within(self.expiry);
+        let request = request.without_rest(what, meant_another()).arrived(arrival);
+        Some(former.place(request.resolved(), now))
     }
 }
 

@@ -155,7 +155,7 @@ impl ForwardedRequest {
             BusWork::Stop(stop, refusal) => {
                 let what = describe::request(&forwarded.request);
                 let request = OrderRequest::new(stop, client.origin(), client.rights.authority());
-                let request = request.without_rest(&what, refusal).arrived(arrival);
+                let request = request.without_rest(&what, refusal).arrived(arrival).resolved();
                 let placed = forwarded.drive.place(request, now);
                 Progress::Pending(PendingRequest::Forwarded(Some(forwarded), placed))
             }
@@ -184,7 +184,7 @@ impl ForwardedRequest {
         now: Instant,
     ) -> Progress {
         let request = OrderRequest::new(order, client.origin(), authority);
-        let placed = self.drive.place(request.arrived(arrival), now);
+        let placed = self.drive.place(request.arrived(arrival).resolved(), now);
         Progress::Pending(PendingRequest::Forwarded(Some(self), placed))
     }
 

@@ -6,7 +6,7 @@ use std::time::Instant;
 use arc_swap::ArcSwap;
 
 use crate::register_map::{FIRST, GATEWAY_UNIT, STOP_ALL};
-use drivegate_core::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use drivegate_core::plant::{BusHandle, DriveHandle, DriveKey, FormerMachine, NamedBy, Plant, SharedPlant};
 use drivegate_core::stop_all::{Scope, StopAll};
 
 /// The part of the plant that the clients of one listener can see.
@@ -121,11 +121,31 @@ impl Registers {
     }
 }
 
-/// A view, and the time since clients have it; no time for the first view.
+/// A view, and the last one under which a unit id or an address meant something else.
 #[derive(Debug)]
 struct Shown {
     view: View,
+    before: Option<EarlierView>,
+}
+
+/// A view that clients had until `until`.
+#[derive(Debug, Clone)]
+struct EarlierView {
+    view: View,
+    /// Since when clients had it; `None` if it was the first one.
     since: Option<Instant>,
+    until: Instant,
+}
+
+/// What a unit id meant when a request began, if a reload has changed that or the place of the registers since.
+#[derive(Debug)]
+pub(super) struct EarlierUnit {
+    /// The machine, if a bus still serves it.
+    pub(super) drive: Option<DriveHandle>,
+    /// Where the registers were.
+    pub(super) registers: Registers,
+    /// Whether the unit id meant the drive as that of `default_drive`.
+    pub(super) is_default: bool,
 }
 
 /// The part of the plant that the clients of one listener can see.
@@ -139,7 +159,7 @@ pub(super) struct PlantView {
 
 impl PlantView {
     pub(super) fn new(plant: SharedPlant, stop_all: Arc<StopAll>, view: View) -> PlantView {
-        let shown = Arc::new(Shown { view, since: None });
+        let shown = Arc::new(Shown { view, before: None });
         let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), stop_all.clone(), shown.clone()));
         PlantView {
             plant,
@@ -156,8 +176,15 @@ impl PlantView {
             return;
         }
         let moved = (&before.view.default_drive, before.view.registers) != (&view.default_drive, view.registers);
-        let since = if moved { Some(now) } else { before.since };
-        self.shown.store(Arc::new(Shown { view, since }));
+        let earlier = match moved {
+            true => Some(EarlierView {
+                view: before.view.clone(),
+                since: before.before.as_ref().map(|earlier| earlier.until),
+                until: now,
+            }),
+            false => before.before.clone(),
+        };
+        self.shown.store(Arc::new(Shown { view, before: earlier }));
     }
 
     /// Whether a bus is visible.
@@ -247,10 +274,41 @@ impl Routes {
         self.shown.view.default_drive.is_some()
     }
 
-    /// Whether a request from that time may have meant another drive or register, because a reload has since given
-    /// the unit id or the address another meaning.
-    pub(super) fn is_older(&self, asked: Instant) -> bool {
-        self.shown.since.is_some_and(|since| asked < since)
+    /// What the unit id meant at `asked`; `None` if it means now what it meant then.
+    pub(super) fn meaning_at(&self, unit: u8, asked: Instant) -> Option<EarlierUnit> {
+        let earlier = self.shown.before.as_ref().filter(|earlier| asked < earlier.until);
+        let view = earlier.map_or(&self.shown.view, |earlier| &earlier.view);
+        let of_default = [0, GATEWAY_UNIT].contains(&unit);
+        let default = view.default_drive.as_ref().filter(|_| of_default);
+        let (key, by) = match default {
+            Some(name) => (DriveKey::Name(name.clone()), NamedBy::Name),
+            None => (DriveKey::Unit(unit), NamedBy::Unit),
+        };
+        let now = match default {
+            Some(name) => self.plant.drive(name),
+            None => self.drives.iter().find(|drive| drive.image.spec.unit == unit).cloned(),
+        };
+        let drive = match now {
+            Some(drive) => match drive.former(by, asked) {
+                None if earlier.is_none() => return None,
+                None => Some(drive),
+                Some(FormerMachine::There(there)) => Some(*there),
+                Some(FormerMachine::Gone) => None,
+            },
+            None => match self.plant.drive_formerly(&key, asked) {
+                None if earlier.is_none() => return None,
+                had => had,
+            },
+        };
+        // Two changes of the view since the request began leave its meaning unknown.
+        let is_known = earlier
+            .and_then(|earlier| earlier.since)
+            .is_none_or(|since| since <= asked);
+        Some(EarlierUnit {
+            drive: drive.filter(|_| is_known),
+            registers: view.registers,
+            is_default: default.is_some(),
+        })
     }
 
     pub(super) fn drives(&self) -> &[DriveHandle] {

@@ -16,19 +16,20 @@ use super::forwarded_request::{
 };
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::routes::{At, PlantView, Registers, Routes};
+use super::routes::{At, EarlierUnit, PlantView, Registers, Routes};
 use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::log_throttle::LogThrottle;
 use crate::register_map::{self, GATEWAY_UNIT, STOP_ALL};
 use drivegate_core::order::{Arrival, Authority, Order, Outcome};
+use drivegate_core::permit::meant_another;
 use drivegate_core::plant::DriveHandle;
 use drivegate_core::process_image::{Access, Unavailable};
 use drivegate_model::drive::{ModelPoint, Value};
 use drivegate_proto::modbus::encode_exception;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
-use request::{answers, has_function, not_readable, orders_nothing, read_limit, stop_in, stops_all_only, stops_by};
+use request::{answers, has_function, not_readable, read_limit, stop_in, stops_all_only, stops_by};
 
 /// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
@@ -209,6 +210,14 @@ impl ClientSession {
 
     fn decide(&self, frame: &Frame<'_>, arrival: &Arrival, now: Instant) -> Decision {
         let unit = frame.header.unit;
+        let writes = WRITES.contains(&frame.function);
+        // A reload since the first byte may have given the unit id or the address to another drive or register.
+        if writes && let Some(earlier) = self.routes.meaning_at(unit, arrival.asked) {
+            return match unit == GATEWAY_UNIT && !earlier.is_default {
+                true => self.gateway(frame, now).unwrap_or_else(Decision::from),
+                false => self.to_former(frame, &earlier),
+            };
+        }
         let is_default = self.routes.has_default_drive() && [0, GATEWAY_UNIT].contains(&unit);
         if unit == GATEWAY_UNIT && !is_default {
             return self.gateway(frame, now).unwrap_or_else(Decision::from);
@@ -218,12 +227,8 @@ impl ClientSession {
         };
         let profile = &drive.image.spec.profile;
         let decoded = RequestPdu::decode(frame.pdu);
-        // A reload since the first byte may have given the unit id or the address to another drive or register.
-        if WRITES.contains(&frame.function) && self.routes.is_older(arrival.asked) {
-            return Exception::GATEWAY_PATH.into();
-        }
         // Authority is checked before anything else that could be wrong with the request.
-        if WRITES.contains(&frame.function) && !self.may_write(drive) {
+        if writes && !self.may_write(drive) {
             return match decoded {
                 Ok(request) => forwarded(
                     frame.header,
@@ -244,9 +249,6 @@ impl ClientSession {
             Ok(request) => request,
             Err(code) => return code.into(),
         };
-        if orders_nothing(registers, &request) && drive.is_meant(self.client.origin().kind, arrival).is_err() {
-            return Exception::GATEWAY_PATH.into();
-        }
         if is_default && stops_by(&request, STOP_ALL) {
             return stop_of_default(frame.header, drive, request);
         }
@@ -293,6 +295,20 @@ impl ClientSession {
             ),
             _ => Exception::FUNCTION.into(),
         }
+    }
+
+    /// A write that began when its unit id or its address meant something else: a stop in it is carried out on the
+    /// machine that it named, the rest nowhere.
+    fn to_former(&self, frame: &Frame<'_>, earlier: &EarlierUnit) -> Decision {
+        let may_write = self.client.rights.authority() == Authority::Write;
+        let (Some(drive), Ok(request), true) = (&earlier.drive, RequestPdu::decode(frame.pdu), may_write) else {
+            return Exception::GATEWAY_PATH.into();
+        };
+        let work = match earlier.stop(drive, &request) {
+            Some(stop) => BusWork::Stop(stop, meant_another()),
+            None => BusWork::Refused(meant_another()),
+        };
+        forwarded(frame.header, drive, request, work)
     }
 
     /// A write of registers: to the command block, or to the drive.

@@ -7,7 +7,7 @@
 use crate::order::Refusal;
 
 /// The refusal of all orders except stops.
-pub(crate) fn refusal() -> Refusal {
+pub fn refusal() -> Refusal {
     Refusal::UnknownDrive(
         "the name meant another machine when this request began; nothing was written; send it again".to_string(),
     )

@@ -21,7 +21,7 @@ use super::state::{Operating, Operator};
 use crate::command_json::{self, CommandResult, Id, Repetition, Taken, excerpt, find_id};
 use crate::reading::Reader;
 use drivegate_core::order::{Answer, Arrival, Origin, Outcome, Refusal, SourceKind};
-use drivegate_core::plant::{DriveHandle, Placed, Plant, Shown};
+use drivegate_core::plant::{DriveHandle, DriveKey, Placed, Plant, Shown};
 use drivegate_core::process_image::Access;
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{ModelPoint, Point, PointIndex, Profile, RESTART_COMMUNICATION, Value};
@@ -229,6 +229,18 @@ impl Operating {
         let reply =
             |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, Shown::default(), time));
         let Some(drive) = plant.drive(name) else {
+            if let Some(former) = plant.drive_formerly(&DriveKey::Name(name.to_string()), arrival.asked)
+                && let Ok(asked) = command_json::order(payload, &former.image.spec.profile)
+                && let Some(placed) = asked.place_at_former(&former, &what, origin.clone(), (arrival, now))
+            {
+                return Progress::Placed(Box::new(Waiting {
+                    placed,
+                    drive: former,
+                    runs: false,
+                    shared: None,
+                    id,
+                }));
+            }
             let answer = command_json::refuse_unknown(plant, name, &what, origin, now);
             return reply(&answer);
         };

@@ -1,25 +1,11 @@
 //! What a request covers, and what a family has for it. Pure.
 
-use crate::modbus_tcp::routes::{At, Registers};
-use crate::register_map::HEARTBEAT;
+use crate::modbus_tcp::routes::{At, EarlierUnit};
+use crate::register_map::{self, STOP_ALL};
 use drivegate_core::order::{self, Order, Refusal};
 use drivegate_core::plant::DriveHandle;
 use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
-
-/// Whether a write sets only registers by which a client holds a drive or shows that it is there.
-pub(super) fn orders_nothing(registers: Registers, request: &RequestPdu) -> bool {
-    let (start, count) = match request {
-        RequestPdu::WriteRegister { address, .. } => (*address, 1),
-        RequestPdu::WriteRegisters { start, values } => (*start, values.len()),
-        RequestPdu::ReadWrite {
-            write_start, values, ..
-        } => (*write_start, values.len()),
-        _ => return false,
-    };
-    let place = registers.locate(start, u16::try_from(count).unwrap_or(u16::MAX));
-    matches!(place, At::Model(start) if start >= HEARTBEAT)
-}
 
 /// Whether a write to holding registers sets the register to 1.
 pub(super) fn stops_by(request: &RequestPdu, register: u16) -> bool {
@@ -30,6 +16,41 @@ pub(super) fn stops_by(request: &RequestPdu, register: u16) -> bool {
         request => order::written(request),
     };
     items.is_some_and(|(table, items)| table == Table::Holding && items.contains(&(register, 1)))
+}
+
+impl EarlierUnit {
+    /// The stop that a write contains by the meaning that its registers had.
+    pub(super) fn stop(&self, drive: &DriveHandle, request: &RequestPdu) -> Option<Order> {
+        let profile = &drive.image.spec.profile;
+        let run = profile.model_index(ModelPoint::Run)?;
+        let stop = Order::Points(vec![(run, Value::Bool(false))]);
+        let write = match request {
+            RequestPdu::ReadWrite {
+                write_start, values, ..
+            } => RequestPdu::write_registers(*write_start, values),
+            request => request.clone(),
+        };
+        if self.is_default && stops_by(&write, STOP_ALL) {
+            return Some(stop);
+        }
+        let (start, values) = match &write {
+            RequestPdu::WriteRegister { address, value } => (*address, vec![*value]),
+            RequestPdu::WriteRegisters { start, values } => (*start, values.clone()),
+            _ => return drive.stop_meant(&Order::Write(write), drive),
+        };
+        let count = u16::try_from(values.len()).ok()?;
+        let start = match self.registers.locate(start, count) {
+            At::Drive => return drive.stop_meant(&Order::Write(write), drive),
+            At::Model(start) => start,
+            At::Nowhere => self.registers.around_the_command_word(start, count)?,
+        };
+        let before = register_map::CommandContext {
+            word: None,
+            fault: false,
+        };
+        let command = register_map::command(profile, start, &values, before).ok()?;
+        command.points.contains(&(run, Value::Bool(false))).then_some(stop)
+    }
 }
 
 /// The refusal of the values next to a stop that is carried out.
