@@ -174,7 +174,7 @@ impl Daemon {
             stopper: stop_all(shared.clone(), north.stop_all.clone()),
             driller: drills::watch(shared.clone(), north.drills.clone(), drills_file.clone()),
             drills: drills_file,
-            reserver: reservations::keep(shared, reservations.clone()),
+            reserver: reservations::keep(shared, reservations.clone(), north.awaited.clone()),
             reservations,
             pulse: BusHeartbeats::default(),
             control,
@@ -187,9 +187,9 @@ impl Daemon {
         let buses = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
         daemon.apply(&settings, buses, PreparedServers::default()).await;
-        reservations::restore(&daemon.reservations, &daemon.north.patience, &daemon.plant.load_full()).await;
+        reservations::restore(&daemon.reservations, &daemon.north, &daemon.plant).await;
+        daemon.expect_kept_slots(&settings).await;
         daemon.apply_mqtt(&settings).await?;
-        daemon.discard_kept_slots(&settings).await;
         // The servers that report readiness start last.
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -408,7 +408,8 @@ impl Daemon {
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
         let guards = BusGuards::of(&self.guards, &bus.spec, &bus.drives);
-        let queue = Arc::new(CommandQueue::new().map_err(failed)?.guarded(guards));
+        let queue = CommandQueue::new().map_err(failed)?.guarded(guards);
+        let queue = Arc::new(queue.awaiting(self.north.awaited.clone()));
         BusTask::prepare(
             BusHandle {
                 formerly: std::sync::Arc::default(),

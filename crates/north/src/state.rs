@@ -12,6 +12,7 @@ use drivegate_core::drill::Drills;
 use drivegate_core::files::Patience;
 use drivegate_core::history::{History, Recordings};
 use drivegate_core::parameters::Vault;
+use drivegate_core::permit::AwaitedFiles;
 use drivegate_core::stop_all::StopAll;
 
 /// State that the servers share and that survives a reload, which replaces servers: counters, recent commands, and
@@ -20,6 +21,8 @@ use drivegate_core::stop_all::StopAll;
 pub struct NorthState {
     /// Time that starts and reloads wait for the disk.
     pub patience: Patience,
+    /// Files that may forbid starts and are not read yet.
+    pub awaited: Arc<AwaitedFiles>,
     /// The recordings on disk and in progress.
     pub recordings: Arc<Recordings>,
     /// Readings and restores of parameters.

@@ -11,6 +11,7 @@ use std::time::Instant;
 
 use self::holds::HoldNews;
 pub use self::holds::Unheld;
+use super::awaited_files::AwaitedFiles;
 use super::holder::{Claim, Holding, Rules};
 use super::judge::{self, Ask, Facts, Stage, Verdict};
 use super::priorities::Priorities;
@@ -66,6 +67,8 @@ pub struct Gate {
     pub(super) paused: Option<Stall>,
     /// The guards of motor starts on the bus.
     pub(super) starts: Option<Arc<BusGuards>>,
+    /// Files that may forbid starts and are not read yet.
+    pub(super) awaited: Arc<AwaitedFiles>,
     /// Commands in progress whose starts were cleared, with the drives that they start.
     cleared: Vec<(u64, Vec<DriveIndex>)>,
     hold_news: HoldNews,
@@ -319,6 +322,11 @@ impl Gate {
     /// Sets the start guards of the bus.
     pub(crate) fn set_starts(&mut self, starts: Option<Arc<BusGuards>>) {
         self.starts = starts;
+    }
+
+    /// Sets the files that may forbid starts until they are read.
+    pub(crate) fn set_awaited(&mut self, awaited: Arc<AwaitedFiles>) {
+        self.awaited = awaited;
     }
 
     /// State of the drive for the bus that replaces this one.

@@ -138,10 +138,11 @@ pub(super) struct Rule {
 }
 
 /// All rules in their order of evaluation.
-const RULES: [Rule; 9] = [
+const RULES: [Rule; 10] = [
     rules::access::RULE,
     rules::age::RULE,
     rules::restore_lock::RULE,
+    rules::awaited_file::RULE,
     rules::holder::RULE,
     rules::priorities::RULE,
     rules::drill::RULE,

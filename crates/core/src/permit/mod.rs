@@ -11,10 +11,12 @@
 //!   under a changed frequency range.
 //! - `holder`: principals and who holds a drive. `priorities`: the slots of BACnet. The starts of motors are counted in
 //!   [`crate::start_guard`].
+//! - `awaited_files`: what the disk has not returned yet after a start.
 //! - `gate`: what is known of the drives of a bus that decides about orders.
 //! - `judge`: the list. `rules`: the rules.
 
 mod admit;
+mod awaited_files;
 mod gate;
 mod holder;
 mod judge;
@@ -23,6 +25,7 @@ mod reference_limits;
 mod rules;
 
 pub use admit::{admit, authority, converted, may_restore, sets_twice};
+pub use awaited_files::{AwaitedFile, AwaitedFiles};
 pub use gate::{DrillLock, Gate, Unheld};
 pub use holder::{
     Claim, Denial, HoldChange, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Verb, What,

@@ -12,7 +12,7 @@ use tokio::sync::oneshot;
 
 use super::{Background, NotStopped, Pending, Stopping};
 use crate::order::{BackgroundRequest, Command, Outcome, Refusal};
-use crate::permit::{DrillLock, Facts, Rules};
+use crate::permit::{AwaitedFiles, DrillLock, Facts, Rules};
 use crate::start_guard::BusGuards;
 use drivegate_model::drive::DriveIndex;
 
@@ -51,6 +51,13 @@ impl CommandQueue {
     pub fn guarded(mut self, guards: Option<Arc<BusGuards>>) -> CommandQueue {
         self.lock().gate.set_starts(guards.clone());
         self.guards = guards;
+        self
+    }
+
+    /// Sets the files that may forbid starts until they are read.
+    #[must_use]
+    pub fn awaiting(self, files: Arc<AwaitedFiles>) -> CommandQueue {
+        self.lock().gate.set_awaited(files);
         self
     }
 

@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
+use drivegate_core::files;
 use drivegate_core::files::names::RESERVATIONS;
-use drivegate_core::files::{self, Patience};
-use drivegate_core::permit::KeptReservation;
-use drivegate_core::plant::{Plant, SharedPlant};
+use drivegate_core::permit::{AwaitedFiles, KeptReservation};
+use drivegate_core::plant::SharedPlant;
+use drivegate_north::NorthState;
 
 /// Interval of the checks for changed reservations.
 const CHECK: Duration = Duration::from_millis(50);
@@ -29,19 +30,37 @@ pub(super) fn keep_in(file: &ReservationsFile, state_dir: Option<&Path>) {
     *file.lock().unwrap_or_else(PoisonError::into_inner) = path;
 }
 
-/// Continues with the reservations from before the start.
-pub(super) async fn restore(file: &ReservationsFile, patience: &Patience, plant: &Plant) {
+/// Continues with the reservations from before the start. On a disk that hangs this happens later, and until then
+/// no motor is started.
+pub(super) async fn restore(file: &ReservationsFile, north: &NorthState, plant: &SharedPlant) {
     let Some(path) = path(file) else { return };
-    let found = patience.read({
+    let (awaited, plant) = (north.awaited.clone(), plant.clone());
+    awaited.reservations.begin(path.clone());
+    let read = tokio::task::spawn_blocking({
         let path = path.clone();
         move || load(&path)
     });
-    match found.await.and_then(|found| found) {
-        Ok(kept) => plant.restore_reservations(&kept, Instant::now(), SystemTime::now()),
-        Err(why) => tracing::error!(
+    let taken_up = {
+        let path = path.clone();
+        async move {
+            let found = read.await.map_err(|error| error.to_string()).and_then(|found| found);
+            match found {
+                Ok(kept) => plant
+                    .load()
+                    .restore_reservations(&kept, Instant::now(), SystemTime::now()),
+                Err(why) => tracing::error!(
+                    target: "drivegate::daemon",
+                    "cannot read {}: {why}; drives stopped just before the restart are no longer reserved", path.display()
+                ),
+            }
+            awaited.reservations.end();
+        }
+    };
+    if north.patience.wait(taken_up).await.is_none() {
+        tracing::error!(
             target: "drivegate::daemon",
-            "cannot read {}: {why}; drives stopped just before the restart are no longer reserved", path.display()
-        ),
+            "cannot read {}: {}; no motor is started until it is read; check the disk of state_dir", path.display(), files::late()
+        );
     }
 }
 
@@ -57,13 +76,21 @@ fn load(path: &Path) -> Result<Vec<KeptReservation>, String> {
 }
 
 /// Writes the reservations whenever they change.
-pub(super) fn keep(plant: SharedPlant, file: ReservationsFile) -> tokio::task::JoinHandle<()> {
+pub(super) fn keep(
+    plant: SharedPlant,
+    file: ReservationsFile,
+    awaited: Arc<AwaitedFiles>,
+) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
         let mut seen = SavedReservations::new();
         let mut told = false;
         loop {
             let has_authority = plant.load().has_authority();
             tokio::time::sleep(if has_authority { CHECK } else { CHECK_AUTHORITY }).await;
+            // A file that was not read is not overwritten.
+            if awaited.reservations.path().is_some() {
+                continue;
+            }
             let kept = plant.load().reservations(Instant::now(), SystemTime::now());
             let now: SavedReservations = kept
                 .iter()

@@ -24,11 +24,12 @@ impl Daemon {
         self.parted.buses().iter().for_each(|bus| bus.void_slots(None, time));
     }
 
-    /// Discards the slots of an earlier run if the gateway does not save slots.
-    pub(super) async fn discard_kept_slots(&self, settings: &Settings) {
-        let keeps = settings.bacnet.as_ref().is_some_and(|options| options.keep_priorities);
-        if !keeps {
-            bacnet::discard_kept_slots(&self.north, &settings.state_dir, &self.events).await;
+    /// Expects the slots of an earlier run, or discards them if the gateway does not save slots. Must be called before
+    /// any interface accepts orders.
+    pub(super) async fn expect_kept_slots(&self, settings: &Settings) {
+        match &settings.bacnet {
+            Some(options) if options.keep_priorities => bacnet::expect_kept_slots(&self.north, &options.state_dir),
+            _ => bacnet::discard_kept_slots(&self.north, &settings.state_dir, &self.events).await,
         }
     }
 

@@ -118,6 +118,11 @@ fn remove(path: &Path) -> Result<(), String> {
     }
 }
 
+/// Notes that a server is about to load the slots of an earlier run: until then no motor is started.
+pub fn expect(stats: &NorthState, state_dir: &Path) {
+    stats.awaited.slots.begin(state_dir.join(FILE));
+}
+
 /// Discards the slots of an earlier run, at the start of a gateway that does not save slots. No later configuration
 /// revives them.
 pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {

@@ -3,6 +3,7 @@
 use std::collections::{BTreeSet, HashMap};
 use std::future::Future;
 use std::net::{SocketAddr, SocketAddrV4};
+use std::path::PathBuf;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,13 +14,14 @@ use drivegate_bacnet::To;
 use futures_util::stream::FuturesUnordered;
 use futures_util::{FutureExt as _, StreamExt as _};
 use tokio::net::UdpSocket;
-use tokio::sync::{Notify, mpsc};
+use tokio::sync::oneshot::error::TryRecvError;
+use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::desk::{Desk, Ended};
-use super::kept::{self, KeptFile};
+use super::kept::{self, KeptFile, KeptSlot};
 use super::rights::HostRights;
 use super::sockets::Sockets;
 use super::writes::Waiting;
@@ -69,6 +71,8 @@ pub(super) struct Task {
     /// The last snapshot of each drive with subscriptions.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: KeptFile,
+    /// The slots from before the start while they are read, with the path of their file.
+    reading: Option<(PathBuf, oneshot::Receiver<Result<Vec<KeptSlot>, String>>)>,
     /// Devices with a slot from before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,
@@ -98,6 +102,7 @@ impl Task {
             news: Arc::default(),
             seen: HashMap::new(),
             kept: KeptFile::default(),
+            reading: None,
             watched: BTreeSet::new(),
             resolved: None,
             lookup: None,
@@ -140,8 +145,14 @@ impl Task {
             self.take_up_jobs();
         }
         self.answer_what_was_begun().await;
-        let (path, plant) = (self.keep_file(), self.desk.newest_plant());
-        self.kept.finish(path, &plant).await;
+        // A file that was not read is not overwritten.
+        match self.reading.take() {
+            Some(_) => self.stats.awaited.slots.end(),
+            None => {
+                let (path, plant) = (self.keep_file(), self.desk.newest_plant());
+                self.kept.finish(path, &plant).await;
+            }
+        }
         self.stats.bacnet.set(None);
     }
 
@@ -216,8 +227,11 @@ impl Task {
         }));
         self.find_bbmd(now);
         self.take_bbmd(now);
-        let path = self.keep_file();
-        self.kept.keep(path, &self.desk.view.plant, now);
+        self.take_up_kept();
+        if self.reading.is_none() {
+            let path = self.keep_file();
+            self.kept.keep(path, &self.desk.view.plant, now);
+        }
     }
 
     /// Shows a new plant, or the present plant with new options.
@@ -259,20 +273,52 @@ impl Task {
         keeps.then(|| self.options.state_dir.join(kept::FILE))
     }
 
-    /// Loads the slots saved before the start. A server that a reload starts loads none: they were void before.
+    /// Loads the slots saved before the start; a disk that hangs is not waited for. A server that a reload starts
+    /// loads none: they were void before.
     async fn load(&mut self) {
-        let Some(path) = self.keep_file() else { return };
+        let Some(path) = self.keep_file() else {
+            self.stats.awaited.slots.end();
+            return;
+        };
         if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {
             return;
         }
-        let found = self.stats.patience.read({
+        let (found, reading) = oneshot::channel();
+        let load = {
             let path = path.clone();
-            move || kept::load(&path)
-        });
-        match found.await {
-            Ok(Ok(slots)) => {
-                let view = &self.desk.view;
-                kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
+            // A server that has ended takes nothing up any more.
+            move || drop(found.send(kept::load(&path)))
+        };
+        if self
+            .stats
+            .patience
+            .wait(tokio::task::spawn_blocking(load))
+            .await
+            .is_none()
+        {
+            tracing::error!(
+                target: "drivegate::bacnet",
+                "cannot read {}: {}; no motor is started until it is read; check the disk", path.display(), files::late()
+            );
+        }
+        self.reading = Some((path, reading));
+        self.take_up_kept();
+    }
+
+    /// Restores the slots from before the start once their file is read.
+    fn take_up_kept(&mut self) {
+        let found = match self.reading.as_mut().map(|(_, reading)| reading.try_recv()) {
+            None | Some(Err(TryRecvError::Empty)) => return,
+            Some(Ok(found)) => found,
+            Some(Err(TryRecvError::Closed)) => Err("the thread that reads it has panicked".to_string()),
+        };
+        let Some((path, _)) = self.reading.take() else { return };
+        match found {
+            Ok(slots) => {
+                if self.keep_file().is_some() {
+                    let view = &self.desk.view;
+                    kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
+                }
                 self.kept.read(path, slots);
                 let protected = |device: &u32| {
                     let drive = self.desk.view.drives.get(device);
@@ -280,12 +326,7 @@ impl Task {
                 };
                 self.watched = self.desk.view.drives.keys().copied().filter(protected).collect();
             }
-            Err(why) => tracing::error!(
-                target: "drivegate::bacnet",
-                "cannot read {}: {why}; the slots from before the restart are lost, write them again; check the disk",
-                path.display()
-            ),
-            Ok(Err(why)) => {
+            Err(why) => {
                 let aside = files::set_aside(&path, &path.with_extension("damaged"));
                 tracing::error!(
                     target: "drivegate::bacnet",
@@ -294,6 +335,7 @@ impl Task {
                 );
             }
         }
+        self.stats.awaited.slots.end();
     }
 
     /// Raises an event if a motor runs against a slot from before the restart.

@@ -8,7 +8,7 @@ use super::*;
 use crate::order::{
     Admitted, Arrival, Command, Commanded, Connection, Entry, Proof, Right, SourceKind, Ticket, Urgency, Window,
 };
-use crate::permit::{DrillLock, Mode, Principal, Rules, Verb};
+use crate::permit::{AwaitedFiles, DrillLock, Mode, Principal, Rules, Verb};
 use crate::process_image::{DriveImage, RestoreLock};
 use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
@@ -27,6 +27,7 @@ enum Why {
     StoppedSince,
     Expired,
     Restoring,
+    FileAwaited,
     Held,
     Protected,
     Drill,
@@ -125,6 +126,11 @@ impl Rig {
         match why {
             Why::Nothing | Why::Expired | Why::Restoring | Why::Interlock => {}
             Why::RightLost => rig.right.store(false, Ordering::Release),
+            Why::FileAwaited => {
+                let files = AwaitedFiles::default();
+                files.slots.begin("state/slots.json".into());
+                rig.gate.set_awaited(Arc::new(files));
+            }
             Why::StoppedSince => {
                 let stop = rig.command("stop", "bob", asked + Duration::from_millis(5));
                 rig.gate.accepted(&stop, asked + Duration::from_millis(5));
@@ -238,7 +244,7 @@ fn refused(why: Why) -> Vec<String> {
 
 #[test]
 fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
-    let table: [(Why, &[&str]); 10] = [
+    let table: [(Why, &[&str]); 11] = [
         (Why::Nothing, &[]),
         (
             Why::RightLost,
@@ -282,6 +288,7 @@ fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
                 "reset: held_by_other held_by_other held_by_other",
             ],
         ),
+        (Why::FileAwaited, &["start: held_by_other - -"]),
         (Why::Protected, &["start: held_by_other held_by_other held_by_other"]),
         (
             Why::Drill,
@@ -329,5 +336,29 @@ fn a_reference_that_turns_the_motor_is_a_start() {
             }
         });
         assert_eq!(stages.join(" "), expected, "control word {run}, {hertz}");
+    }
+}
+
+#[test]
+fn a_reservation_that_is_not_read_yet_forbids_starts_where_drives_are_held() {
+    for (has_authority, expected) in [(false, &[][..]), (true, &["start: held_by_other - -"][..])] {
+        let row = |what: &&str| {
+            let told = [Stage::Accept, Stage::Turn, Stage::Write].map(|stage| {
+                let mut rig = Rig::new(Why::Nothing);
+                let files = AwaitedFiles::default();
+                files.reservations.begin("state/reservations.json".into());
+                rig.gate.set_awaited(Arc::new(files));
+                rig.gate.set_rules(has_authority.then(|| Arc::new(rules())));
+                let command = rig.command(what, "alice", rig.asked);
+                let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);
+                match gate.judge(stage, &command, &rig, now) {
+                    Verdict::Refuse(outcome) => outcome.code().to_string(),
+                    _ => "-".to_string(),
+                }
+            });
+            format!("{what}: {}", told.join(" "))
+        };
+        let refused: Vec<String> = ORDERS.iter().map(row).filter(|row| !row.ends_with(": - - -")).collect();
+        assert_eq!(refused, expected, "authority {has_authority}");
     }
 }

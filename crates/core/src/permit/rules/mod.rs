@@ -3,6 +3,7 @@
 
 pub(super) mod access;
 pub(super) mod age;
+pub(super) mod awaited_file;
 pub(super) mod drill;
 pub(super) mod guard;
 pub(super) mod holder;
