@@ -6,14 +6,15 @@
 
 mod cadence;
 mod faster;
+mod refreshes;
 
 pub use cadence::carried;
 pub use faster::faster_points;
+pub use refreshes::LateRefreshes;
 
 use std::fmt;
 use std::time::Duration;
 
-use super::refresh;
 use super::schedule::{SLOW_SHARE, slow_share};
 use drivegate_core::process_image::{BusSpec, DriveSpec};
 use drivegate_model::document::{Finding, format_duration};
@@ -61,6 +62,8 @@ pub struct Prediction {
     pub load: f64,
     /// Share of the line that the refreshes of all drives take while all are active.
     pub refreshes: f64,
+    /// Refreshes that come less often than configured while all are active.
+    pub late_refreshes: Option<LateRefreshes>,
     /// Cadences that the line cannot carry.
     pub shortage: Option<Shortage>,
 }
@@ -126,6 +129,7 @@ pub fn predict(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Predic
         slow_cycle: present(total.slow, slow),
         demand: fast_share + slow_share + total.refreshes,
         load: (total.fast / fast + total.slow / slow + total.refreshes).min(1.0),
+        late_refreshes: line.late_refreshes(),
         shortage: None,
     };
     prediction.shortage = line.shortage(&prediction, &total);
@@ -233,15 +237,6 @@ impl<'a> Line<'a> {
             rounds
         };
         self.drives.iter().map(of).collect()
-    }
-
-    /// Share of the line that the refresh of a drive takes.
-    fn refresh_share(&self, format: &LineFormat, drive: &DriveSpec) -> f64 {
-        let Some(every) = drive.refresh else { return 0.0 };
-        let silence = self.silence_around(format, drive);
-        let wire = |pdu| WireTime::of(self.spec.protocol, format, &pdu).total(drive.turnaround, silence);
-        let round: Duration = refresh::requests(&drive.profile).into_iter().map(wire).sum();
-        round.as_secs_f64() / every.as_secs_f64().max(1e-3)
     }
 
     /// Rounds of all drives at that baud.

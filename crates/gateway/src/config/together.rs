@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::keys::{DRIVE, ROOT};
-use super::{bacnet, bus, http, interlocks, modbus_tcp, unique};
+use super::{bacnet, bus, drive, http, interlocks, modbus_tcp, unique};
 use drivegate_core::process_image::{Access, LeaseAction};
 use drivegate_model::document::{Finding, Place, Reader};
 use drivegate_north::mqtt as mqtt_client;
@@ -112,6 +112,12 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found]) {
             let (fast, slow) = &found.cadence;
             let place = if shortage.fast.is_some() { fast } else { slow };
             let Finding { what, remedy } = shortage.finding();
+            reader.document().warning(place, what, remedy);
+        }
+        if let Some(refreshes) = &prediction.late_refreshes {
+            let first = refreshes.drives.first().and_then(|place| found.drives.get(*place));
+            let place = first.map_or(&found.cadence.0, refresh_place);
+            let Finding { what, remedy } = refreshes.finding();
             reader.document().warning(place, what, remedy);
         }
         warn_of_fault_time(reader, found, prediction.fast_cycle);
@@ -244,15 +250,20 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     }
 }
 
+/// Where the file turns the refresh of this drive on or off.
+fn refresh_place(drive: &drive::Found) -> &Place {
+    let lease = drive.refresh.as_ref().or(drive.lease.as_ref());
+    lease.unwrap_or(&drive.access.1)
+}
+
 /// Warns about refreshes that end because of other settings, and about drives that need a refresh and have none.
 fn warn_of_refreshes(reader: &Reader<'_>, buses: &[bus::Found]) {
     let key = DRIVE.refresh.name;
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
-        let (Some(spec), (Access::Control, access)) = (&drive.spec, &drive.access) else {
+        let (Some(spec), (Access::Control, _)) = (&drive.spec, &drive.access) else {
             continue;
         };
-        let name = &spec.name;
-        let place = drive.refresh.as_ref().or(drive.lease.as_ref()).unwrap_or(access);
+        let (name, place) = (&spec.name, refresh_place(drive));
         let needs = spec.profile.control.as_ref().and_then(|control| control.refresh);
         match (spec.refresh, &spec.supervision) {
             (None, lease) if needs.is_some() && spec.profile.repeats().is_ok() => {
