@@ -12,7 +12,7 @@ use super::supervision::Supervision;
 use super::unanswered_stops::VainStops;
 use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Receipt, Urgency};
 use drivegate_core::permit::LastWritten;
-use drivegate_core::process_image::{DriveImage, DriveSpec, Reading};
+use drivegate_core::process_image::{Access, DriveImage, DriveSpec, Reading};
 use drivegate_model::drive::control::Control;
 use drivegate_model::drive::{ModelPoint, Point, Profile};
 use drivegate_proto::{Reply, Table};
@@ -83,9 +83,11 @@ fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
     written.chain(word).collect()
 }
 
-/// How often what was ordered is written again: never without a lease, which ends that when the client falls silent.
+/// How often what was ordered is written again: never to a drive that is only monitored, nor without a lease, which ends that
+/// when the client falls silent.
 fn refresh_of(spec: &DriveSpec) -> Option<Duration> {
-    spec.refresh.filter(|_| spec.supervision.is_some())
+    spec.refresh
+        .filter(|_| spec.access == Access::Control && spec.supervision.is_some())
 }
 
 impl DriveState {

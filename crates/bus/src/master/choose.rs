@@ -121,8 +121,7 @@ impl Master {
             self.turns.served(Urgency::Command, commands.waits(Urgency::Read));
             return Some(Ok(self.turn(ready, now)));
         }
-        if self.shutdown.is_none()
-            && !commands.waits(Urgency::Stop)
+        if !commands.waits(Urgency::Stop)
             && let Some(turn) = self.refresh_goes_on(now)
         {
             return Some(Ok(turn));

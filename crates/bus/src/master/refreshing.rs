@@ -9,7 +9,7 @@ use crate::news::News;
 use crate::refresh::{Around, End};
 use crate::transaction::Ended;
 use drivegate_core::order::{Arrival, Effect, Effects, Intent, Order, Origin, Outcome, SourceKind, Touched, Window};
-use drivegate_core::permit::{Ask, Facts, Stage, Verdict};
+use drivegate_core::permit::{Ask, Facts, Stage, Verdict, broken_limit};
 use drivegate_model::drive::{DriveIndex, PlannedRead, PollClass};
 use drivegate_proto::{Reply, RequestPdu, Table};
 
@@ -56,6 +56,9 @@ impl Master {
     /// The next step of a refresh round that has done its reads: only stops, and orders to this drive, go between
     /// its frames.
     pub(super) fn refresh_goes_on(&mut self, now: Instant) -> Option<Turn> {
+        if self.refreshes_cease() {
+            return None;
+        }
         let under_way = |(_, drive): &(DriveIndex, &DriveState)| drive.refresh.is_under_way() && !drive.has_runs();
         let (index, _) = self.drives.enumerate().find(under_way)?;
         self.refresh_step(index, now)
@@ -70,7 +73,7 @@ impl Master {
         let mut due: Vec<(Instant, DriveIndex)> = self.due_refreshes().filter(|(due, _)| *due <= now).collect();
         due.sort_unstable();
         due.into_iter()
-            .find_map(|(_, index)| match self.may_refresh(index, Stage::Turn, now) {
+            .find_map(|(_, index)| match self.may_begin_refresh(index, now) {
                 May::Yes => self.refresh_step(index, now),
                 May::NotNow => None,
                 May::No(why) => {
@@ -86,6 +89,11 @@ impl Master {
         self.due_refreshes().map(|(due, _)| at(due)).min()
     }
 
+    /// Whether nothing is repeated any more because the gateway stops.
+    fn refreshes_cease(&self) -> bool {
+        self.shutdown.is_some()
+    }
+
     /// Whether nothing may be sent to this drive because of a drill that tests the drive's own timeout.
     fn is_quiet(&self, index: DriveIndex) -> bool {
         self.waits.quiet.is_some_and(|(quiet, _)| quiet == index)
@@ -93,7 +101,7 @@ impl Master {
 
     fn due_refreshes(&self) -> impl Iterator<Item = (Instant, DriveIndex)> + '_ {
         let may = |index: DriveIndex, drive: &DriveState| {
-            !drive.has_runs() && !self.is_quiet(index) && self.shutdown.is_none() && self.schedule.is_online(index)
+            !drive.has_runs() && !self.is_quiet(index) && !self.refreshes_cease() && self.schedule.is_online(index)
         };
         let due = move |(index, drive): (DriveIndex, &DriveState)| {
             let due = drive.refresh.due().filter(|_| may(index, drive))?;
@@ -142,11 +150,22 @@ impl Master {
         is_under_way && matches!(self.may_refresh(index, Stage::Write, now), May::Yes)
     }
 
+    /// Judges a round before its first step: a reload may have changed the limits since the order.
+    fn may_begin_refresh(&self, index: DriveIndex, now: Instant) -> May {
+        let (drive, image) = (self.drives.of(index), self.bus.image.drives.of(index));
+        let pdu = drive.refresh.writes(&image.spec.profile);
+        let broken = pdu.and_then(|pdu| broken_limit(&image.reading(now, drive.fresh), &pdu));
+        match broken {
+            Some(refusal) => May::No(End::Refused(refusal.to_string())),
+            None => self.may_refresh(index, Stage::Turn, now),
+        }
+    }
+
     /// Judges a refresh by the rules as an order of the gateway: the order in force is repeated, regardless of
     /// which client holds the drive now.
     fn may_refresh(&self, index: DriveIndex, stage: Stage, now: Instant) -> May {
         let (drive, image) = (self.drives.of(index), self.bus.image.drives.of(index));
-        if self.shutdown.is_some() || drive.has_runs() || self.is_quiet(index) {
+        if self.refreshes_cease() || drive.has_runs() || self.is_quiet(index) {
             return May::NotNow;
         }
         let (runs, pdu) = (drive.refresh.runs(), drive.refresh.writes(&image.spec.profile));

@@ -3,6 +3,7 @@
 
 mod raw_write;
 
+pub use self::raw_write::broken_limit;
 use self::raw_write::{raw_write, stops};
 use super::reference_limits::keeps_limits;
 use crate::order::{

@@ -24,7 +24,7 @@ mod priorities;
 mod reference_limits;
 mod rules;
 
-pub use admit::{admit, authority, converted, may_restore, sets_twice};
+pub use admit::{admit, authority, broken_limit, converted, may_restore, sets_twice};
 pub use awaited_files::{AwaitedFile, AwaitedFiles};
 pub use gate::{DrillLock, Gate, Unheld};
 pub use holder::{

@@ -3,6 +3,7 @@
 use super::{checked, related_limits};
 use crate::order::{FrequencyRange, Refusal, rests_on, written};
 use crate::process_image::Reading;
+use drivegate_model::drive::Value;
 use drivegate_model::drive::control::ControlItem;
 use drivegate_model::drive::model::Kind;
 use drivegate_proto::n2::Object;
@@ -136,6 +137,29 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
         }
     }
     Ok(ranges)
+}
+
+/// The limit that a reference would break which was admitted before, perhaps under other limits. Registers hold rounded
+/// values: one that is off by no more than a step keeps its limit. A limit that cannot be checked now is not broken.
+pub fn broken_limit(drive: &Reading<'_>, pdu: &RequestPdu) -> Option<Refusal> {
+    let (profile, (table, items)) = (&drive.spec.profile, written(pdu)?);
+    let word = |address: u16| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
+    let mut broken = profile.points.enumerate().filter_map(|(index, point)| {
+        let raw = point.raw().filter(|raw| raw.table == table)?;
+        if point.kind() == Kind::Bool || !raw.addresses().all(|at| profile.is_repeated_reference(at)) {
+            return None;
+        }
+        let words: Option<Vec<u16>> = raw.addresses().map(word).collect();
+        let value = raw.decode(&words?, Kind::Number)?.as_f64();
+        let refusal = |value: f64| {
+            let value = checked(drive, index, point, Value::Number(value));
+            let judged = value.and_then(|value| related_limits(drive, index, index, value));
+            judged.err().filter(|refusal| matches!(refusal, Refusal::BadValue(_)))
+        };
+        let is_near = || refusal(value + raw.scale).is_none() || refusal(value - raw.scale).is_none();
+        refusal(value).filter(|_| !is_near())
+    });
+    broken.next()
 }
 
 /// Whether a raw write takes the run command away and does nothing else. A write of several items counts like any

@@ -90,6 +90,30 @@ fn limits_are_told_never_clamped() {
     assert!(try_order(write(2002, 8000)).is_ok());
 }
 
+/// The limits are 0 to 80 %, and those of the frequency follow from the band of 10 to 50 Hz.
+#[test]
+fn a_reference_of_before_breaks_a_limit_by_more_than_a_step_of_its_register() {
+    let mut image = drive(Access::Control);
+    let broken = |image: &DriveImage, word: u16| {
+        let reading = image.reading(Instant::now(), Duration::from_secs(1));
+        let pdu = RequestPdu::WriteRegisters {
+            start: 2000,
+            values: vec![1, 0, word],
+        };
+        broken_limit(&reading, &pdu).map(|refusal| refusal.to_string())
+    };
+    assert_eq!(broken(&image, 8000), None);
+    assert_eq!(broken(&image, 8001), None, "80 %, rounded up");
+    let why = broken(&image, 8002).unwrap();
+    assert!(why.contains("outside the limits 0 to 80 %"), "{why}");
+    image.spec.limits = BTreeMap::from([("frequency_reference".to_string(), 0.0..=30.0)]);
+    assert_eq!(broken(&image, 5000), None, "30 Hz");
+    let why = broken(&image, 5100).unwrap();
+    assert!(why.contains("`frequency_reference` would be 30.4 Hz"), "{why}");
+    let unread = DriveImage::new(image.spec.clone(), Duration::from_secs(1));
+    assert_eq!(broken(&unread, 5100), None, "the band is not known");
+}
+
 #[test]
 fn frequency_becomes_percent_of_the_band() {
     let admitted = set(&[("frequency_reference", 30.0)]).unwrap();
