@@ -168,7 +168,7 @@ fn an_order_belongs_to_the_machine_that_its_first_byte_named() {
 /// The head of a request that is not an order arrives, a reload gives its name to the other machine, and the rest arrives.
 #[test]
 fn a_hold_a_restore_and_a_drill_belong_to_the_machine_that_was_named() {
-    let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+    let plant = Plant::new(&pair("pump-1", "pump-2"));
     let mut names = [pair("pump-2", "pump-1"), pair("pump-1", "pump-2")].into_iter().cycle();
     for (path, body) in [
         ("drives/pump-1/hold", "{\"action\": \"take\"}"),
@@ -222,7 +222,7 @@ fn an_order_to_the_default_drive_belongs_to_the_machine_that_had_its_name() {
         (with(pair("pump-3", "pump-2"), "pump-2"), ["pump-3", "pump-2"], false),
     ];
     for (after, names, is_same) in changes {
-        let mut plant = Plant::new(&before);
+        let plant = Plant::new(&before);
         let mut start = half_a_write(port, 0);
         plant.reload(&after);
         // A bus that was started anew reads its drives before it starts one.
@@ -233,7 +233,7 @@ fn an_order_to_the_default_drive_belongs_to_the_machine_that_had_its_name() {
         let begun = if is_same { vec![1] } else { vec![] };
         assert_eq!((plant.words(1), plant.words(2)), (begun, vec![]), "{after}");
         drop(plant);
-        let mut plant = Plant::new(&before);
+        let plant = Plant::new(&before);
         let mut plc = plant.modbus();
         for unit in [11, 12] {
             assert_eq!(write(&mut plc, unit, 1)[7], 6, "unit {unit}");
@@ -254,7 +254,7 @@ fn a_stop_reaches_its_machine_whatever_became_of_the_name() {
         + &controlled("pump-1", 2, "unit = 11").replace("\"control\"", "\"monitor\"");
     for after in [renamed, monitored] {
         for over_http in [false, true] {
-            let mut plant = Plant::new(&pair("pump-1", "pump-2"));
+            let plant = Plant::new(&pair("pump-1", "pump-2"));
             assert_eq!(write(&mut plant.modbus(), 11, 1)[7], 6);
             let body = "{\"run\": false}";
             let mut http = begin_over_http(&plant.site, "pump-1", body);
@@ -295,11 +295,10 @@ fn a_reload_changes_no_unit_id_that_another_listener_uses_too() {
     for name in ["pump-1", "fan-1"] {
         site.until_state(name, "ready");
     }
-    let mut plant = Plant {
+    let plant = Plant {
         site,
         line: fans,
         gateway,
-        reloads: 0,
     };
     for port in [plant.site.modbus, second] {
         let mut plc = TcpStream::connect(("127.0.0.1", port)).unwrap();
@@ -309,7 +308,7 @@ fn a_reload_changes_no_unit_id_that_another_listener_uses_too() {
     plant
         .site
         .change("response_timeout = \"2s\"", "response_timeout = \"1900ms\"");
-    plant.reload_file();
+    plant.gateway.reload();
     half.write_all(&[0, 0, 0]).unwrap();
     assert_eq!(reply(&mut half)[7], 6, "the stop of the fan");
     assert!(!plant.runs(1));

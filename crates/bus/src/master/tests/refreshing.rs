@@ -214,7 +214,7 @@ fn an_order_that_is_cut_off_with_the_port_ends_the_refresh() {
             let mut news = Vec::new();
             match rig.master.next(rig.now, &mut news) {
                 Err(until) => rig.now = until,
-                Ok(turn) if turn.purpose != Purpose::Refresh && turn.pdu.is_write() => break turn,
+                Ok(turn) if !matches!(turn.purpose, Purpose::Refresh(_)) && turn.pdu.is_write() => break turn,
                 Ok(turn) => rig.carry_out(turn, &mut news),
             }
             news.iter().for_each(|one| rig.apply(one));
