@@ -19,7 +19,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate_core::event::{Event, EventKind};
 use drivegate_core::plant::SharedPlant;
-use drivegate_north::mqtt::{self, History, Options, Telemetry};
+use drivegate_mqtt::{History, Options, Telemetry};
 use drivegate_north::{NorthState, Server as _};
 use rumqttc::mqttbytes::QoS;
 use rumqttc::{AsyncClient, MqttOptions, Packet};
@@ -67,7 +67,7 @@ struct Gateway {
     plant: SharedPlant,
     stats: Arc<NorthState>,
     cancel: CancellationToken,
-    mqtt: mqtt::Mqtt,
+    mqtt: drivegate_mqtt::Mqtt,
 }
 
 impl Gateway {
@@ -86,7 +86,7 @@ impl Gateway {
         let stats = Arc::<NorthState>::default();
         let cancel = CancellationToken::new();
         let guard = runtime.enter();
-        let mqtt = mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());
+        let mqtt = drivegate_mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());
         drop(guard);
         let deadline = Instant::now() + Duration::from_secs(10);
         while !stats.mqtt.connected.load(Ordering::Relaxed) {

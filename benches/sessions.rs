@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
-use drivegate_north::mqtt::{self, Options, sparkplug};
+use drivegate_mqtt::{Options, sparkplug};
 use drivegate_north::{NorthState, Server as _};
 use tokio_util::sync::CancellationToken;
 
@@ -49,7 +49,7 @@ fn run() -> Result<(), Box<dyn Error>> {
         let shared = Arc::new(ArcSwap::from(plant.clone()));
         let stats = Arc::<NorthState>::default();
         all.push((
-            mqtt::start(options(&name)?, shared, stats.clone(), cancel.clone()),
+            drivegate_mqtt::start(options(&name)?, shared, stats.clone(), cancel.clone()),
             stats,
         ));
         plants.push(plant);

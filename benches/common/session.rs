@@ -9,7 +9,7 @@ use drivegate_core::plant::{BusHandle, Plant};
 use drivegate_core::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, Link};
 use drivegate_core::queue::CommandQueue;
 use drivegate_model::drive::profile::Profiles;
-use drivegate_north::mqtt::{Broker, History, Options, Qos, Telemetry};
+use drivegate_mqtt::{Broker, History, Options, Qos, Telemetry};
 use drivegate_proto::{LineFormat, Protocol, Table};
 
 /// States and events as by default, without TLS, commands and Sparkplug.

@@ -5,7 +5,7 @@
 use std::sync::{Arc, LazyLock};
 
 use arc_swap::ArcSwap;
-use drivegate_north::http::Loopback;
+use drivegate_http::Loopback;
 use drivegate_core::plant::Plant;
 
 static SERVER: LazyLock<Loopback> = LazyLock::new(|| {

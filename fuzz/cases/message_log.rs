@@ -2,7 +2,7 @@
 //!
 //! Input: the journal file.
 
-use drivegate_north::mqtt::whole_records;
+use drivegate_mqtt::whole_records;
 
 pub(crate) fn run(data: &[u8]) {
     let (records, bytes) = whole_records(data);

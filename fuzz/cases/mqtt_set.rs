@@ -10,7 +10,7 @@ use drivegate_proto::{Reply, Table};
 use drivegate_core::order::{Order, Outcome, Urgency};
 use drivegate_core::queue::{Ready, CommandQueue};
 use drivegate_gateway::config::Settings;
-use drivegate_north::mqtt::{Incoming, Loopback};
+use drivegate_mqtt::{Incoming, Loopback};
 use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
 use drivegate_core::process_image::{BusImage, DriveImage, Link};
 

@@ -5,7 +5,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use drivegate_north::http::basic_authorization;
+use drivegate_http::basic_authorization;
 use drivegate_proto::rtu;
 use drivegate_sim::wire::SimulatedBus;
 

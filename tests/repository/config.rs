@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use drivegate_gateway::config::{Loaded, Settings};
 use drivegate_model::drive::Profile;
-use drivegate_north::mqtt::{Password, Secret};
+use drivegate_mqtt::{Password, Secret};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 

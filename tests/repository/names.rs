@@ -19,7 +19,7 @@ const RESERVED: [(&str, &str, &[&str]); 3] = [
         &[
             "core/src/plant/hold.rs",
             "north/src/command_json/hold.rs",
-            "north/src/http/operating/hold.rs",
+            "http/src/operating/hold.rs",
         ],
     ),
     (

@@ -7,10 +7,10 @@ use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_core::order::Authority;
 use drivegate_core::plant::{Placed, SharedPlant};
+use drivegate_mqtt::Incoming;
+use drivegate_north::NorthState;
 use drivegate_north::modbus_tcp::{self, Uncached};
-use drivegate_north::mqtt::Incoming;
 use drivegate_north::reading::Watch;
-use drivegate_north::{NorthState, mqtt};
 
 use super::scenario::Habit;
 
@@ -31,7 +31,7 @@ pub enum Way {
     /// Orders given by the function that all north sides use.
     Plain(Vec<Waiting>),
     /// Over MQTT; the id in the result identifies the order.
-    Mqtt(Box<mqtt::Loopback>, Broker),
+    Mqtt(Box<drivegate_mqtt::Loopback>, Broker),
     /// Over Modbus TCP; the id of the transaction identifies the order.
     ModbusTcp(Box<modbus_tcp::Loopback>, BTreeMap<u16, usize>, u16),
 }
@@ -120,7 +120,7 @@ impl Servers {
     pub fn client(&self, index: usize, habit: Habit, now: Instant) -> Client {
         let way = match habit {
             Habit::Mqtt => {
-                let gateway = mqtt::Loopback::new("b", self.plant.clone(), now, SystemTime::UNIX_EPOCH);
+                let gateway = drivegate_mqtt::Loopback::new("b", self.plant.clone(), now, SystemTime::UNIX_EPOCH);
                 Way::Mqtt(Box::new(gateway), Broker::default())
             }
             Habit::ModbusTcp | Habit::StopsInALoop | Habit::Shares => {

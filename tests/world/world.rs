@@ -23,7 +23,7 @@ use drivegate_core::order::{Authority, CAPACITY, Order, Origin, Outcome, SourceK
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_core::process_image::{LeaseAction, OnShutdown};
 use drivegate_model::drive::{ModelPoint, Quality, RawWrites, Value};
-use drivegate_north::mqtt::Incoming;
+use drivegate_mqtt::Incoming;
 use drivegate_proto::{Protocol, Reply, RequestPdu};
 use drivegate_sim::random::Random;
 use tokio::sync::broadcast;

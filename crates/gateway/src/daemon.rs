@@ -37,10 +37,11 @@ use drivegate_core::process_image::{Access, BusImage, DriveImage, DriveSpec, Mac
 use drivegate_core::queue::{CommandQueue, NotStopped};
 use drivegate_core::start_guard::{BusGuards, Guards};
 use drivegate_core::stop_all::{LOOK, StopAll};
+use drivegate_http::local;
+use drivegate_http::local::Control;
 use drivegate_model::drive::DriveIndex;
-use drivegate_north::local::Control;
 use drivegate_north::reading::Watch;
-use drivegate_north::{NorthState, ServerError, bacnet, http, local, modbus_tcp, mqtt, slot};
+use drivegate_north::{NorthState, ServerError, bacnet, modbus_tcp, slot};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -94,8 +95,8 @@ pub struct Daemon {
     writes: Arc<WriteStats>,
     north: Arc<NorthState>,
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
-    mqtt: ServerSlot<mqtt::Mqtt>,
-    http: ServerSlot<http::Http>,
+    mqtt: ServerSlot<drivegate_mqtt::Mqtt>,
+    http: ServerSlot<drivegate_http::Http>,
     slots: ServerSlot<slot::Server>,
     bacnet: ServerSlot<bacnet::Server>,
     local: ServerSlot<local::Local>,
@@ -183,7 +184,7 @@ impl Daemon {
         daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // MQTT starts after the buses; subscribing now lets its first messages include their events.
-        daemon.north.mqtt_left.leave_events(daemon.events.subscribe());
+        drivegate_mqtt::Handover::of(&daemon.north).leave_events(daemon.events.subscribe());
         let buses = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
         daemon.apply(&settings, buses, PreparedServers::default()).await;
@@ -204,7 +205,7 @@ impl Daemon {
 
     /// The address that the HTTP server listens on.
     pub fn http_address(&self) -> Option<SocketAddr> {
-        self.http.server().and_then(http::Http::address)
+        self.http.server().and_then(drivegate_http::Http::address)
     }
 
     /// The addresses that the Modbus TCP server listens on without TLS.

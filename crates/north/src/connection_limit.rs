@@ -17,17 +17,17 @@ const MAX_CLOSING: usize = 32;
 
 /// How many connections a server may have open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Limits {
+pub struct Limits {
     /// Maximum number of connections of all clients in total.
-    pub(super) total: usize,
+    pub total: usize,
     /// How many of all connections are kept for clients that may write.
-    pub(super) reserved: usize,
-    pub(super) per_address: usize,
+    pub reserved: usize,
+    pub per_address: usize,
 }
 
 impl Limits {
     /// `total` connections, at most `per_address` from one address.
-    pub(super) fn new(total: usize, per_address: usize) -> Limits {
+    pub fn new(total: usize, per_address: usize) -> Limits {
         Limits {
             total,
             reserved: 0,
@@ -41,12 +41,12 @@ impl Limits {
     }
 
     /// Maximum number of connections that have a file descriptor.
-    pub(super) fn files(&self) -> usize {
+    pub fn files(&self) -> usize {
         self.total + self.closing()
     }
 
     /// Reserves an eighth of the connections, at least one of two, for clients that may write.
-    pub(super) fn with_reserve(self) -> Limits {
+    pub fn with_reserve(self) -> Limits {
         let reserved = if self.total < 2 { 0 } else { (self.total / 8).max(1) };
         Limits { reserved, ..self }
     }
@@ -74,7 +74,7 @@ enum Decision {
 
 /// The limit that keeps a connection out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum LimitReached {
+pub enum LimitReached {
     /// The limit for all clients together.
     Total(usize),
     /// The limit for the address of this client.
@@ -133,7 +133,7 @@ where
 
 /// The rights of a client; a reload can change them while the client is connected.
 #[derive(Debug, Clone)]
-pub(super) struct Rights(Arc<AtomicBool>);
+pub struct Rights(Arc<AtomicBool>);
 
 impl Rights {
     /// The present authority of the client.
@@ -145,7 +145,7 @@ impl Rights {
     }
 
     /// Changes the rights of the client from now on.
-    pub(super) fn set(&self, authority: Authority) {
+    pub fn set(&self, authority: Authority) {
         self.0.store(authority == Authority::Write, Ordering::Relaxed);
     }
 }
@@ -158,7 +158,7 @@ impl From<Authority> for Rights {
 
 /// Why the gateway closes a connection that works.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum CloseReason {
+pub enum CloseReason {
     /// A newer connection took the place; see [`decide`].
     #[error("closed in favour of another client, because the maximum number of connections is reached")]
     Displaced,
@@ -172,7 +172,7 @@ pub(super) enum CloseReason {
 
 /// The place that one connection has under a limit.
 #[derive(Debug)]
-pub(super) struct ConnectionPlace {
+pub struct ConnectionPlace {
     address: IpAddr,
     /// The listener that accepted the connection.
     listener: usize,
@@ -192,18 +192,18 @@ impl ConnectionPlace {
     }
 
     /// The rights of the client.
-    pub(super) fn rights(&self) -> &Rights {
+    pub fn rights(&self) -> &Rights {
         &self.rights
     }
 
     /// Token that is cancelled when the connection must end: its place is needed, [`ConnectionPlace::close`] was
     /// called, or its server stops.
-    pub(super) fn closing(&self) -> &CancellationToken {
+    pub fn closing(&self) -> &CancellationToken {
         &self.closing
     }
 
     /// Why the connection must end; `None` if only its server stops.
-    pub(super) fn close_reason(&self) -> Option<CloseReason> {
+    pub fn close_reason(&self) -> Option<CloseReason> {
         self.why.get().copied()
     }
 
@@ -218,7 +218,7 @@ impl ConnectionPlace {
     }
 
     /// Notes that the connection was used at `now`, and whether it counts as `in_use` from then on.
-    pub(super) fn use_at(&self, now: Instant, in_use: bool) {
+    pub fn use_at(&self, now: Instant, in_use: bool) {
         let used = now.saturating_duration_since(self.start).as_millis();
         self.used
             .store(u64::try_from(used).unwrap_or(u64::MAX), Ordering::Relaxed);
@@ -226,7 +226,7 @@ impl ConnectionPlace {
     }
 
     /// Whether the connection is in use.
-    pub(super) fn is_in_use(&self) -> bool {
+    pub fn is_in_use(&self) -> bool {
         self.in_use.load(Ordering::Relaxed)
     }
 
@@ -242,7 +242,7 @@ impl ConnectionPlace {
 
 /// The limits of a server, and the connections that count against them.
 #[derive(Debug)]
-pub(super) struct ConnectionLimit {
+pub struct ConnectionLimit {
     start: Instant,
     table: Mutex<Table>,
 }
@@ -257,31 +257,31 @@ struct Table {
 
 /// A connection that counts against the limit until this is dropped.
 #[derive(Debug)]
-pub(super) struct ConnectionPermit {
+pub struct ConnectionPermit {
     limit: Arc<ConnectionLimit>,
     place: Arc<ConnectionPlace>,
 }
 
 impl ConnectionPermit {
-    pub(super) fn place(&self) -> &Arc<ConnectionPlace> {
+    pub fn place(&self) -> &Arc<ConnectionPlace> {
         &self.place
     }
 }
 
 /// A new connection that asks for a connection place.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Newcomer<'c> {
+pub struct Newcomer<'c> {
     /// Address of the client.
-    pub(super) address: IpAddr,
+    pub address: IpAddr,
     /// The listener that accepted the connection, for [`ConnectionLimit::review`].
-    pub(super) listener: usize,
+    pub listener: usize,
     /// Ends the connection together with its server.
-    pub(super) cancel: &'c CancellationToken,
+    pub cancel: &'c CancellationToken,
 }
 
 /// Why a connection is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum NoPlace {
+pub enum NoPlace {
     /// The client may not connect at all.
     NotAllowed,
     /// A limit is reached and no other connection yields.
@@ -289,7 +289,7 @@ pub(super) enum NoPlace {
 }
 
 impl ConnectionLimit {
-    pub(super) fn new(limits: Limits) -> Arc<ConnectionLimit> {
+    pub fn new(limits: Limits) -> Arc<ConnectionLimit> {
         let table = Table {
             limits,
             open: Vec::new(),
@@ -302,7 +302,7 @@ impl ConnectionLimit {
     }
 
     /// Applies other limits to newcomers; open connections stay.
-    pub(super) fn set_limits(&self, limits: Limits) {
+    pub fn set_limits(&self, limits: Limits) {
         self.lock().limits = limits;
     }
 
@@ -312,7 +312,7 @@ impl ConnectionLimit {
     ///
     /// # Errors
     /// If the connection gets no place; contains the reason.
-    pub(super) fn acquire(
+    pub fn acquire(
         self: &Arc<Self>,
         newcomer: Newcomer<'_>,
         now: Instant,

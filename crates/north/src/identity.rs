@@ -177,10 +177,7 @@ impl ServerIdentity {
     ///
     /// # Errors
     /// If certificate and key cannot be used.
-    pub(super) fn server_config(
-        &self,
-        clients: Option<Arc<dyn ClientCertVerifier>>,
-    ) -> Result<ServerConfig, IdentityFault> {
+    pub fn server_config(&self, clients: Option<Arc<dyn ClientCertVerifier>>) -> Result<ServerConfig, IdentityFault> {
         let unusable = |error: rustls::Error| unusable(&error, &self.chain);
         let builder = ServerConfig::builder_with_provider(provider())
             .with_safe_default_protocol_versions()
@@ -196,7 +193,7 @@ impl ServerIdentity {
 }
 
 /// Why a certificate chain and a key cannot be used together, in words for the user.
-pub(super) fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> IdentityFault {
+pub fn unusable(error: &rustls::Error, chain: &[CertificateDer<'_>]) -> IdentityFault {
     let own = chain.first().and_then(|own| Kind::of(own));
     let Some(Kind { name, is_old, key, .. }) = own else {
         return TlsFile::Certificate.fault(FileProblem::Unusable(error.to_string()));
@@ -221,7 +218,7 @@ pub(super) fn provider() -> Arc<CryptoProvider> {
 
 /// Why there are no CA certificates for verifying a server, and the remedy.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum RootsError {
+pub enum RootsError {
     #[error(transparent)]
     Pem(#[from] PemError),
     #[error("{file} contains data that is not a certificate; specify the PEM file of the CA")]
@@ -256,7 +253,7 @@ pub(super) fn trusted_servers(ca: Option<&Path>) -> Result<ServerTrust, RootsErr
 }
 
 /// A builder for the TLS of a client that trusts such servers.
-pub(super) fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientConfig, WantsClientCert>, RootsError> {
+pub fn client_builder(ca: Option<&Path>) -> Result<ConfigBuilder<ClientConfig, WantsClientCert>, RootsError> {
     let builder = ClientConfig::builder_with_provider(provider())
         .with_safe_default_protocol_versions()
         .map_err(RootsError::Protocol)?;

@@ -1,33 +1,32 @@
-//! The north sides: Modbus TCP, MQTT, HTTP, BACnet/IP, the local socket and the tool slots. They read the process image and
-//! queue commands; they never name the bus.
+//! What all servers share, and three of them: Modbus TCP, BACnet/IP and the tool slots. Servers read the process image and
+//! queue commands; they never name the bus. MQTT and HTTP have crates of their own, which this one does not know.
 
 mod arrivals;
 pub mod bacnet;
 mod certificate;
 mod certificate_kind;
-mod command_json;
-mod connection_limit;
-pub mod http;
-mod identity;
-mod listener;
-pub mod local;
-mod log_throttle;
+pub mod command_json;
+pub mod connection_limit;
+pub mod identity;
+mod kept;
+mod link_status;
+pub mod listener;
+pub mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
-pub mod mqtt;
 pub mod parameter_jobs;
-mod pem;
-mod readiness;
+pub mod pem;
+pub mod readiness;
 pub mod reading;
-mod refusals;
+pub mod refusals;
 pub mod register_map;
 mod server;
 mod server_trust;
 pub mod slot;
 mod state;
 mod stats;
-mod tcp_server;
-mod tls_words;
+pub mod tcp_server;
+pub mod tls_words;
 
 use std::io;
 use std::net::SocketAddr;
@@ -35,6 +34,7 @@ use std::path::PathBuf;
 
 pub use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
+pub use link_status::{LinkState, LinkStatus};
 pub use listener::ListenerStates;
 pub use pem::unreadable;
 pub use server::{Reconfigure, Server};

@@ -26,7 +26,7 @@ pub(crate) use self::state::ListenerState;
 pub use self::state::ListenerStates;
 
 /// Handles the connections to one of a server's listeners.
-pub(crate) trait ConnectionHandler: Send + Sync + 'static {
+pub trait ConnectionHandler: Send + Sync + 'static {
     /// The place of a connection; dropping it frees the place.
     type Permit: Send;
 
@@ -48,11 +48,11 @@ pub(crate) trait ConnectionHandler: Send + Sync + 'static {
 
 /// A listener as configured.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct ListenerSpec {
-    pub(super) address: SocketAddr,
-    pub(super) tls: bool,
+pub struct ListenerSpec {
+    pub address: SocketAddr,
+    pub tls: bool,
     /// Section of the configuration, in brackets.
-    pub(super) section: String,
+    pub section: String,
 }
 
 impl ListenerSpec {
@@ -70,7 +70,7 @@ impl ListenerSpec {
 
 /// The listeners of one server.
 #[derive(Debug)]
-pub(crate) struct Listeners<H> {
+pub struct Listeners<H> {
     server: ServerKind,
     stats: Arc<NorthState>,
     /// Tracker of the tasks for listeners and connections.
@@ -114,7 +114,7 @@ impl Socket {
 
 /// Sockets for a new configuration, bound but not accepting yet.
 #[derive(Debug, Default)]
-pub(crate) struct NewSockets {
+pub struct NewSockets {
     /// The listeners in the order of the configuration.
     wanted: Vec<(ListenerSpec, Socket)>,
     /// Indices of open listeners whose sockets were closed because a new one overlaps them.
@@ -233,7 +233,7 @@ impl<H: ConnectionHandler> Listeners<H> {
     /// Lets the new sockets accept connections and closes those that are no longer configured, with their
     /// connections. `handler` gives the handler of a listener and its runtime: the handler of the open listener,
     /// adapted to the new configuration, or a new one whose connections end with the token.
-    pub(super) fn commit(
+    pub fn commit(
         &mut self,
         new: NewSockets,
         mut handler: impl FnMut(&ListenerSpec, Option<&Arc<H>>, &CancellationToken) -> (Arc<H>, Handle),

@@ -8,7 +8,7 @@ const INTERVAL: Duration = Duration::from_secs(10);
 
 /// Lets one log line of a kind pass in each interval and counts the others.
 #[derive(Debug)]
-pub(super) struct LogThrottle {
+pub struct LogThrottle {
     interval: Duration,
     state: Mutex<Throttled>,
 }
@@ -27,7 +27,7 @@ impl Default for LogThrottle {
 
 impl LogThrottle {
     /// A throttle with at least `interval` between two lines.
-    pub(super) fn every(interval: Duration) -> LogThrottle {
+    pub fn every(interval: Duration) -> LogThrottle {
         LogThrottle {
             interval,
             state: Mutex::default(),
@@ -35,7 +35,7 @@ impl LogThrottle {
     }
 
     /// `None` if the line must not be logged now, otherwise the number of lines suppressed since the last one.
-    pub(super) fn permit(&self, now: Instant) -> Option<u64> {
+    pub fn permit(&self, now: Instant) -> Option<u64> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let too_soon = |last| now.saturating_duration_since(last) < self.interval;
         if state.last.is_some_and(too_soon) {

@@ -9,7 +9,7 @@ use rustls_pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyD
 
 /// Why a PEM file cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum PemError {
+pub enum PemError {
     #[error("{what}; {remedy}")]
     Unreadable { what: String, remedy: String },
     #[error("{file} contains no {expected}{}; {}", found.what(expected), found.remedy(file, expected))]
@@ -28,7 +28,7 @@ pub(super) enum PemError {
 
 /// The content of a file instead of the expected one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Found {
+pub enum Found {
     /// A private key that needs a passphrase.
     EncryptedKey,
     /// A private key in the form of OpenSSH.
@@ -129,7 +129,7 @@ fn is_sequence(bytes: &[u8]) -> bool {
 }
 
 /// All certificates of a file; an error if there is none.
-pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemError> {
+pub fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemError> {
     let bytes = content(file)?;
     let read: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
     let certificates = read.map_err(|error| pem_error(file, CERTIFICATE, &bytes, &error))?;
@@ -140,7 +140,7 @@ pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, 
 }
 
 /// The first private key of a file.
-pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
+pub fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
     let bytes = content(file)?;
     PrivateKeyDer::from_pem_slice(&bytes).map_err(|error| match Found::of(&bytes) {
         // An encrypted key in the old form would otherwise pass for a broken key.

@@ -4,7 +4,7 @@ use super::NorthState;
 use drivegate_core::plant::Plant;
 
 /// Why the gateway is not ready; empty if it is ready.
-pub(crate) fn reasons(plant: &Plant, stats: &NorthState) -> Vec<String> {
+pub fn reasons(plant: &Plant, stats: &NorthState) -> Vec<String> {
     let mut reasons = Vec::new();
     for bus in &plant.buses {
         let name = &bus.image.spec.name;

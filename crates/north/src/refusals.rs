@@ -12,14 +12,14 @@ use drivegate_core::order::Authority;
 
 /// Counts the refused connections of one server.
 #[derive(Debug)]
-pub(super) struct Refusals {
+pub struct Refusals {
     server: ServerKind,
     stats: Arc<NorthState>,
     logs: [LogThrottle; ConnectionRefusal::ALL.len()],
 }
 
 impl Refusals {
-    pub(super) fn new(server: ServerKind, stats: Arc<NorthState>) -> Refusals {
+    pub fn new(server: ServerKind, stats: Arc<NorthState>) -> Refusals {
         Refusals {
             server,
             stats,
@@ -29,7 +29,7 @@ impl Refusals {
 
     /// Asks for a place under `limit` for a connection that `judge` allows. Every connection that is refused or
     /// displaced is counted and logged, with the remedy for the limit that was reached.
-    pub(super) fn acquire(
+    pub fn acquire(
         &self,
         limit: &Arc<ConnectionLimit>,
         newcomer: Newcomer<'_>,
@@ -66,7 +66,7 @@ impl Refusals {
     }
 
     /// Counts a refused connection and logs it.
-    pub(super) fn report(&self, why: ConnectionRefusal, client: IpAddr, text: &dyn Display) {
+    pub fn report(&self, why: ConnectionRefusal, client: IpAddr, text: &dyn Display) {
         self.stats.refused.add(self.server, why);
         let log = self.logs.get(why as usize);
         if let Some(suppressed) = log.and_then(|log| log.permit(Instant::now())) {

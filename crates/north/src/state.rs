@@ -3,10 +3,8 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use super::command_json::SharedMemory;
-use super::http::SharedReply;
+use super::kept::Kept;
 use super::listener::ListenerStates;
-use super::mqtt::{BrokerRights, Handover};
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
 use drivegate_core::drill::Drills;
 use drivegate_core::files::Patience;
@@ -47,20 +45,14 @@ pub struct NorthState {
     pub listeners: Arc<ListenerStates>,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
-    /// Recent commands, to recognise repetitions.
-    pub(super) commands: RememberedCommands,
     /// Whether the slots that BACnet clients had before the start were loaded or made void: after that, none is restored.
     pub(super) kept_slots_read: AtomicBool,
-    /// State that an MQTT client leaves to the next one.
-    pub mqtt_left: Handover,
-    /// Rights of clients that publish to the broker.
-    pub(super) broker_rights: BrokerRights,
+    kept: Kept,
 }
 
-/// The recent commands of all interfaces that recognise repetitions. They outlive the servers that a reload replaces.
-#[derive(Debug, Default)]
-pub(super) struct RememberedCommands {
-    /// Commands that came from the broker.
-    pub(super) mqtt: SharedMemory,
-    pub(super) http: SharedMemory<SharedReply>,
+impl NorthState {
+    /// The state of this type that a server keeps for its successors; it begins with the default.
+    pub fn kept<T: Default + Send + Sync + 'static>(&self) -> Arc<T> {
+        self.kept.get()
+    }
 }

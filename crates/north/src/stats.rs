@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
 
-use crate::mqtt::LinkStatus;
+use crate::link_status::LinkStatus;
 
 /// How the last reload ended; the start of the gateway counts as a reload.
 #[derive(Debug)]
@@ -348,7 +348,7 @@ impl MqttKind {
 
 impl MqttStats {
     /// Adds to the count of lost messages.
-    pub(crate) fn lost(&self, kind: MqttKind, count: u64) {
+    pub fn lost(&self, kind: MqttKind, count: u64) {
         if let Some(counter) = self.lost.get(kind as usize) {
             counter.fetch_add(count, Ordering::Relaxed);
         }

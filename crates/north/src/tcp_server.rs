@@ -14,7 +14,7 @@ use super::{NorthState, ServerError, ServerKind};
 use drivegate_core::plant::SharedPlant;
 
 /// Differences of one TCP server from the others.
-pub(crate) trait TcpService<Options>: Debug + Sized {
+pub trait TcpService<Options>: Debug + Sized {
     /// Name of the server in messages.
     const NAME: &'static str;
     /// The server's kind in metrics.
@@ -60,7 +60,6 @@ pub(crate) trait TcpService<Options>: Debug + Sized {
 
 /// A running TCP server.
 #[derive(Debug)]
-#[expect(private_bounds, reason = "its services are those of this crate")]
 pub struct TcpServer<S: TcpService<O>, O> {
     service: S,
     listeners: Listeners<S::Handler>,
@@ -69,14 +68,12 @@ pub struct TcpServer<S: TcpService<O>, O> {
 
 /// A prepared change of options for [`Reconfigure::commit`]: everything that can fail is done.
 #[derive(Debug)]
-#[expect(private_bounds, reason = "its services are those of this crate")]
 pub struct Change<S: TcpService<O>, O> {
     options: O,
     sockets: NewSockets,
     prepared: S::Prepared,
 }
 
-#[expect(private_bounds, reason = "its services are those of this crate")]
 impl<S: TcpService<O>, O> TcpServer<S, O> {
     /// The first address, with TLS or without.
     pub fn address(&self) -> Option<SocketAddr> {

@@ -23,7 +23,7 @@ pub enum Peer {
     Client,
 }
 
-pub(super) const BROKER: Peer = Peer::Server {
+pub const BROKER: Peer = Peer::Server {
     ca: "mqtt.ca",
     own: "mqtt.certificate and mqtt.key",
 };
@@ -57,7 +57,7 @@ pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
 }
 
 /// Whether a server closed the connection in the middle of the handshake.
-pub(crate) fn is_handshake_end(error: &(dyn StdError + 'static)) -> bool {
+pub fn is_handshake_end(error: &(dyn StdError + 'static)) -> bool {
     use io::ErrorKind::{BrokenPipe, ConnectionAborted, ConnectionReset, UnexpectedEof};
     let mut next = Some(error);
     while let Some(error) = next {

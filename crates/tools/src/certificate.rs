@@ -11,7 +11,7 @@ use ring::digest::{SHA256, digest};
 
 use super::failure::Outcome;
 use super::{printable, report};
-use drivegate_north::http::is_host;
+use drivegate_http::is_host;
 
 const DAY: Duration = Duration::from_secs(86_400);
 /// Name of the certificate file.

@@ -23,7 +23,7 @@ use self::exchange::Opened;
 pub(crate) use self::exchange::{GatewayRequest, Reply};
 pub(crate) use self::gateway::Gateway;
 pub(crate) use self::url::Url;
-use drivegate_north::http::messages::{ErrorReply, Expected};
+use drivegate_http::messages::{ErrorReply, Expected};
 
 /// Time limit for connecting.
 const CONNECT: Duration = Duration::from_secs(10);

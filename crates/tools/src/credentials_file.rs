@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use drivegate_north::http::{Credential, Credentials};
+use drivegate_http::{Credential, Credentials};
 
 /// Time that another program may take to change the file.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -211,7 +211,7 @@ fn replaced(text: &str, name: &str, by: Option<&str>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use drivegate_north::http::Token;
+    use drivegate_http::Token;
 
     fn file(path: &Path) -> CredentialsFile<Token> {
         CredentialsFile {

@@ -12,7 +12,7 @@ use super::client::{Client, Gateway, GatewayRequest, encoded};
 use super::failure::{Failure, Outcome, documented};
 use super::{printable, report};
 use drivegate_core::drill::{DrillReport, DrillState, Kind};
-use drivegate_north::http::messages::DrillWish;
+use drivegate_http::messages::DrillWish;
 
 /// Time between two looks at a running drill.
 const LOOK: Duration = Duration::from_millis(500);

@@ -17,10 +17,10 @@ use super::failure::Failure;
 use super::report;
 use drivegate_core::process_image::DriveSpec;
 use drivegate_gateway::config::{BusSettings, Settings};
+use drivegate_http::local::SocketPath;
+use drivegate_http::messages::{Expected, ExpectedDrive};
 use drivegate_model::document::{candidates, nearest};
 use drivegate_model::drive::{PointIndex, Profile};
-use drivegate_north::http::messages::{Expected, ExpectedDrive};
-use drivegate_north::local::SocketPath;
 
 // The options that select the drive of a command.
 #[derive(Debug, clap::Args)]

@@ -3,8 +3,8 @@
 use std::process::ExitCode;
 
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use drivegate_http::messages::ErrorReply;
 use drivegate_model::document::Problem;
-use drivegate_north::http::messages::ErrorReply;
 
 /// How a command ends: an exit code, or why it failed.
 pub(super) type Outcome = Result<ExitCode, Failure>;

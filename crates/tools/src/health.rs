@@ -5,7 +5,7 @@ use hyper::StatusCode;
 use super::client::{Gateway, GatewayRequest};
 use super::failure::{Outcome, negative};
 use super::report;
-use drivegate_north::http::messages::Health;
+use drivegate_http::messages::Health;
 
 /// Reports whether the running gateway is ready, for containers and scripts.
 ///

@@ -6,7 +6,7 @@ use serde_json::Value as Json;
 use super::client::{Gateway, GatewayRequest, encoded};
 use super::failure::{Outcome, documented};
 use super::{printable, report};
-use drivegate_north::http::messages::HoldAct;
+use drivegate_http::messages::HoldAct;
 
 /// Prints who holds a drive: holder, rank and seconds left; or takes, renews, releases or breaks the hold.
 ///

@@ -14,7 +14,7 @@ use super::failure::{Failure, Outcome, documented, negative};
 use super::report;
 use drivegate_core::files;
 use drivegate_core::parameters::{Names, ParameterFile, differences, read as read_file};
-use drivegate_north::http::messages::{ParameterReading, ReadParameters};
+use drivegate_http::messages::{ParameterReading, ReadParameters};
 
 /// Reads, compares, restores and shows the parameters of drives.
 ///

@@ -9,9 +9,9 @@ use serde::Deserialize;
 
 use super::client::{Client, ClientError, Door, GatewayRequest};
 use drivegate_gateway::config::{Settings, environment};
+use drivegate_http::local::{RuntimeDirectories, SocketPath};
+use drivegate_http::messages::Expected;
 use drivegate_line::TAKEN;
-use drivegate_north::http::messages::Expected;
-use drivegate_north::local::{RuntimeDirectories, SocketPath};
 
 /// The name of a gateway's process.
 const GATEWAY: &str = "drivegate";

@@ -4,7 +4,7 @@ use super::client::{GatewayRequest, encoded};
 use super::drive_access::{Needs, OneDrive, Target, point};
 use super::failure::{Failure, Outcome, negative};
 use super::report;
-use drivegate_north::http::messages::{NO_REPLY, PointValue, Word};
+use drivegate_http::messages::{NO_REPLY, PointValue, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]

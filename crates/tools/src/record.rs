@@ -4,7 +4,7 @@ use super::client::GatewayRequest;
 use super::drive_access::OneDrive;
 use super::failure::Outcome;
 use super::report;
-use drivegate_north::http::messages::Recorded;
+use drivegate_http::messages::Recorded;
 
 /// Makes the running gateway record a drive: the time just before and after.
 ///

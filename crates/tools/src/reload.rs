@@ -8,8 +8,8 @@ use super::client::{Client, GatewayRequest};
 use super::failure::{Failure, Outcome};
 use super::{ConfigFile, EXIT_CONFIG, report};
 use drivegate_gateway::config::{Settings, environment};
-use drivegate_north::http::messages::ReloadOutcome;
-use drivegate_north::local::SocketPath;
+use drivegate_http::local::SocketPath;
+use drivegate_http::messages::ReloadOutcome;
 
 /// Makes the running gateway reload its configuration, and waits for the result.
 ///

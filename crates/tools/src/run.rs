@@ -20,7 +20,7 @@ use super::log::LogHandle;
 use super::{EXIT_CONFIG, VERSION, report};
 use drivegate_gateway::config::{Loaded, Settings};
 use drivegate_gateway::daemon::Daemon;
-use drivegate_north::local::Control;
+use drivegate_http::local::Control;
 use drivegate_north::reading::watched_runtime;
 
 /// Time for files that are being written when the gateway has stopped.

@@ -4,7 +4,7 @@ use super::client::{Gateway, GatewayRequest};
 use super::failure::{Outcome, documented, negative};
 use super::{printable, report};
 use drivegate_core::stop_all::{StopReport, Stopped};
-use drivegate_north::http::messages::StopBody;
+use drivegate_http::messages::StopBody;
 
 /// Stops every controlled drive through the running gateway, and waits up to 10 s for them to stop.
 ///

@@ -3,7 +3,7 @@
 use super::credentials_file::{CredentialsFile, Filed};
 use super::failure::Outcome;
 use super::report;
-use drivegate_north::http::{Scope, Token};
+use drivegate_http::{Scope, Token};
 
 /// Adds, lists and removes access tokens of the HTTP server
 ///

@@ -8,7 +8,7 @@ use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr
 use super::credentials_file::{CredentialsFile, Filed};
 use super::failure::Outcome;
 use super::report;
-use drivegate_north::http::{MAX_PASSWORD, User};
+use drivegate_http::{MAX_PASSWORD, User};
 
 /// Adds, lists and removes the users who may command over HTTP
 ///

@@ -6,8 +6,8 @@ use std::time::SystemTime;
 use super::drive_access::{OneDrive, Target};
 use super::failure::Outcome;
 use super::{printable, profiles, read, report};
+use drivegate_http::messages::PointValue;
 use drivegate_model::drive::{ModelPoint, Profile};
-use drivegate_north::http::messages::PointValue;
 
 /// Prints a form for confirming a drive's profile on hardware: what the gateway reads, next to what the panel shows.
 #[derive(Debug, clap::Args)]

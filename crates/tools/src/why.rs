@@ -7,7 +7,7 @@ use super::client::GatewayRequest;
 use super::drive_access::{Needs, OneDrive, Target};
 use super::failure::Outcome;
 use super::{printable, report};
-use drivegate_north::http::messages::Why;
+use drivegate_http::messages::Why;
 
 /// Shows why a drive does not run: each cause with evidence, age and remedy.
 #[derive(Debug, clap::Args)]

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::SystemTime;
 
+use drivegate_http::{Options, Scope, Token, Tokens};
 use drivegate_north::ServerIdentity;
-use drivegate_north::http::{Options, Scope, Token, Tokens};
 
 use tokio::net::TcpStream;
 use tokio::time::timeout;

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_core::process_image::Link;
+use drivegate_http::Options;
 use drivegate_north::Server as _;
-use drivegate_north::http::{self, Options};
 use drivegate_proto::Exception;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -474,7 +474,7 @@ async fn an_address_in_use_is_told() {
     let server = Server::of(plant::mixed()).await;
     let shared = Arc::new(ArcSwap::from_pointee(plant::mixed()));
     let options = Options::listening_on(server.address);
-    let error = http::Http::start(options, shared, plant::stats(), CancellationToken::new())
+    let error = drivegate_http::Http::start(options, shared, plant::stats(), CancellationToken::new())
         .await
         .unwrap_err();
     let text = error.to_string();

@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-use drivegate_north::http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Options};
+use drivegate_http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Options};
 use drivegate_north::{ConnectionRefusal, ServerKind};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};

@@ -12,9 +12,9 @@ use drivegate_core::event::{Event, EventKind};
 use drivegate_core::order;
 use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
 use drivegate_core::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
+use drivegate_http::{Http, Options};
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{ModelPoint, Profile};
-use drivegate_north::http::{self, Http, Options};
 use drivegate_north::{NorthState, SlotOutcome};
 use drivegate_north::{Reconfigure as _, Server as _};
 use drivegate_proto::{Exception, Table};
@@ -229,7 +229,7 @@ impl Server {
     async fn start(plant: Plant, stats: Arc<NorthState>, options: Options) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
-        let http = http::Http::start(options, shared.clone(), stats.clone(), cancel.clone())
+        let http = drivegate_http::Http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");
         Server {

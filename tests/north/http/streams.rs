@@ -4,7 +4,7 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use drivegate_core::event::EventKind;
 use drivegate_core::process_image::{Direction, FrameRecord};
-use drivegate_north::http::MAX_LISTENERS_PER_ADDRESS;
+use drivegate_http::MAX_LISTENERS_PER_ADDRESS;
 use serde_json::json;
 use tokio::time::timeout;
 

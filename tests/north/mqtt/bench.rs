@@ -15,7 +15,7 @@ use drivegate_core::order::{Order, Outcome};
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_core::process_image::Access;
 use drivegate_model::drive::{PointIndex, Value};
-use drivegate_north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
+use drivegate_mqtt::{History, Mqtt, Options, Qos, Telemetry};
 use drivegate_north::{NorthState, Server as _};
 use drivegate_proto::Reply;
 use drivegate_testkit::{bus, bus_spec, controlled, image, nx, read_nx, take_next, up};
@@ -370,7 +370,7 @@ impl Gateway {
         let stats = Arc::new(NorthState::default());
         let cancel = CancellationToken::new();
         let guard = runtime.enter();
-        let mqtt = mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());
+        let mqtt = drivegate_mqtt::start(options, plant.clone(), stats.clone(), cancel.clone());
         drop(guard);
         let orders: Arc<Mutex<Vec<Ordered>>> = Arc::default();
         runtime.spawn(stand_in(plant.clone(), orders.clone()));
@@ -451,7 +451,7 @@ impl Gateway {
         meanwhile(&self);
         self.cancel = CancellationToken::new();
         let guard = self.runtime.enter();
-        self.mqtt = mqtt::start(options, self.plant.clone(), self.stats.clone(), self.cancel.clone());
+        self.mqtt = drivegate_mqtt::start(options, self.plant.clone(), self.stats.clone(), self.cancel.clone());
         drop(guard);
         self
     }
@@ -512,8 +512,8 @@ pub(crate) fn plant(drives: &[&str]) -> Plant {
 }
 
 /// A broker of this machine.
-pub(crate) fn at(port: u16) -> mqtt::Broker {
-    mqtt::Broker {
+pub(crate) fn at(port: u16) -> drivegate_mqtt::Broker {
+    drivegate_mqtt::Broker {
         host: "127.0.0.1".to_string(),
         port,
         path: None,

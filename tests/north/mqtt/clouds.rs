@@ -6,7 +6,7 @@ use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use drivegate_north::mqtt::Password;
+use drivegate_mqtt::Password;
 
 use super::bench::*;
 

@@ -3,7 +3,7 @@
 use std::time::{Duration, SystemTime};
 
 use drivegate_core::event::EventKind;
-use drivegate_north::mqtt::{Buffer, History};
+use drivegate_mqtt::{Buffer, History};
 use tempfile::TempDir;
 
 use super::bench::*;

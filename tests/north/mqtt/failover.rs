@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use drivegate_north::mqtt::{self, Options, sparkplug};
+use drivegate_mqtt::{Options, sparkplug};
 use serde_json::json;
 use tempfile::TempDir;
 
@@ -223,7 +223,7 @@ fn a_reload_keeps_the_broker_that_works() {
     first.up();
     let on_first = all_of(&first);
     on_second.clear();
-    let without = mqtt::Options {
+    let without = drivegate_mqtt::Options {
         commands: false,
         ..options
     };

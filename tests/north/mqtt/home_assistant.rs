@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use drivegate_north::mqtt::{Buffer, Options};
+use drivegate_mqtt::{Buffer, Options};
 use serde_json::Value;
 use tempfile::TempDir;
 

@@ -318,7 +318,7 @@ fn odd_brokers_are_served() {
     for (name, manners) in cases {
         let broker = Hostile::start(manners);
         let mut options = options(broker.port);
-        options.telemetry_qos = drivegate_north::mqtt::Qos::AtLeastOnce;
+        options.telemetry_qos = drivegate_mqtt::Qos::AtLeastOnce;
         let gateway = Gateway::start(options, plant(&["p1"]));
         serves(&broker, &gateway, 40);
         for value in 0..10 {

@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime};
 
 use drivegate_core::process_image::Link;
 use drivegate_model::drive::Value;
-use drivegate_north::mqtt::{self, sparkplug};
+use drivegate_mqtt::sparkplug;
 use serde_json::{Value as Json, json};
 
 use super::bench::{Broker, CutLine, Gateway, Watcher, plant, wait_for};
@@ -19,8 +19,8 @@ const NODE: &str = "spBv1.0/plant/NCMD/pump-house";
 const P1: &str = "spBv1.0/plant/DCMD/pump-house/p1";
 const STATE: &str = "spBv1.0/STATE/scada";
 
-fn options(port: u16, state_dir: &Path) -> mqtt::Options {
-    mqtt::Options {
+fn options(port: u16, state_dir: &Path) -> drivegate_mqtt::Options {
+    drivegate_mqtt::Options {
         sparkplug: Some(sparkplug::Options {
             group: "plant".to_string(),
             node: "pump-house".to_string(),
@@ -320,7 +320,7 @@ fn a_device_command_is_an_order_like_any_other() {
 fn without_commands_nothing_is_commanded() {
     let (broker, state) = (Broker::start(), tempfile::tempdir().unwrap());
     let watcher = watcher(&broker);
-    let options = mqtt::Options {
+    let options = drivegate_mqtt::Options {
         commands: false,
         ..options(broker.port, state.path())
     };

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use drivegate_core::event::{Event, EventKind};
 use drivegate_core::process_image::Link;
-use drivegate_north::mqtt::{Buffer, Qos};
+use drivegate_mqtt::{Buffer, Qos};
 use tempfile::TempDir;
 
 use super::bench::*;
@@ -64,7 +64,7 @@ fn all_topics_are_there_retained() {
 #[test]
 fn nothing_is_retained_where_that_is_not_wanted() {
     let broker = Broker::start();
-    let options = drivegate_north::mqtt::Options {
+    let options = drivegate_mqtt::Options {
         retain: false,
         ..options(broker.port)
     };

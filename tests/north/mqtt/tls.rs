@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use drivegate_core::event::EventKind;
-use drivegate_north::mqtt::{Password, Secret};
+use drivegate_mqtt::{Password, Secret};
 use tempfile::TempDir;
 
 use super::bench::*;

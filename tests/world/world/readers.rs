@@ -5,8 +5,8 @@ use std::time::SystemTime;
 
 use drivegate_core::plant::DriveHandle;
 use drivegate_model::drive::{Point, PointIndex, PollClass, Profile, Source};
+use drivegate_north::NorthState;
 use drivegate_north::metrics::{self, Format};
-use drivegate_north::{NorthState, http};
 use serde_json::Value as Json;
 
 use super::*;
@@ -25,7 +25,7 @@ impl World {
         let count = plant.drives().count();
         let drive = plant.drives().nth(reading % count).unwrap();
         let wall = SystemTime::UNIX_EPOCH + (self.now - self.began);
-        let json = http::drive_json(&drive, &Default::default(), self.now, wall).unwrap();
+        let json = drivegate_http::drive_json(&drive, &Default::default(), self.now, wall).unwrap();
         check_json(&drive, &plant, &json, self.now);
         if reading.is_multiple_of(EVERY.1) {
             let text = metrics::encode(&plant, &NorthState::default(), self.now, Format::Prometheus).unwrap();

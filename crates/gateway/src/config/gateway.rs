@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use super::keys::GATEWAY;
 use super::{stale, values};
+use drivegate_http::local::SocketPath;
 use drivegate_model::document::{Problem, Reader};
 use drivegate_model::drive::profile::Profiles;
-use drivegate_north::local::SocketPath;
 
 /// The default state directory.
 const STATE_DIR: &str = "/var/lib/drivegate";

@@ -6,8 +6,8 @@ use std::time::SystemTime;
 
 use super::keys::HTTP;
 use super::{files, values};
+use drivegate_http::{Credential, Credentials, Tokens, Users};
 use drivegate_model::document::{Finding, Place, Reader};
-use drivegate_north::http::{self, Credential, Credentials, Tokens, Users};
 use drivegate_north::{ServerIdentity, TlsFile};
 
 /// An address on which a server listens, with its place in the file.
@@ -15,7 +15,7 @@ pub(super) type Listener = (SocketAddr, Place);
 
 /// The valid settings of `[http]`.
 pub(super) struct Http {
-    pub(super) options: Option<http::Options>,
+    pub(super) options: Option<drivegate_http::Options>,
     pub(super) listener: Option<Listener>,
     /// Whether the configuration asks for commands.
     pub(super) commands: bool,
@@ -39,13 +39,13 @@ pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> Http {
         && (users.is_some() || !reader.has(HTTP.users_file.name))
         && (identity.is_some() || !reader.has(HTTP.certificate.name))
         && may_command;
-    let options = listen.filter(|_| usable).map(|listen| http::Options {
+    let options = listen.filter(|_| usable).map(|listen| drivegate_http::Options {
         listen,
         hosts,
         tokens,
         users: users.filter(|_| commands),
         identity,
-        max_connections: http::MAX_CONNECTIONS,
+        max_connections: drivegate_http::MAX_CONNECTIONS,
     });
     Http {
         options,

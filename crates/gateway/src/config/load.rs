@@ -13,9 +13,9 @@ use super::{
 };
 use drivegate_bus::proof;
 use drivegate_core::process_image::Access;
+use drivegate_http::local::SocketPath;
 use drivegate_model::document::{self, Document, Finding, Problem, Reader};
 use drivegate_model::drive::Profile;
-use drivegate_north::local::SocketPath;
 use drivegate_north::slot as slot_server;
 
 /// The outcome of loading a configuration file.

@@ -10,7 +10,7 @@ use super::keys::{
 };
 use super::{files, values};
 use drivegate_model::document::{Finding, FromNode, Reader, format_duration};
-use drivegate_north::mqtt::{self, Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
+use drivegate_mqtt::{Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
 use drivegate_north::{ServerIdentity, TlsFile};
 
 /// Maximum number of brokers: with three attempts per second, all of them are tried within 10 s.
@@ -106,7 +106,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, stat
     }
     let sparkplug = read_sparkplug(reader, gateway, state_dir);
     reader.finish();
-    let at = |Broker { host, port, path, .. }| mqtt::Broker { host, port, path };
+    let at = |Broker { host, port, path, .. }| drivegate_mqtt::Broker { host, port, path };
     Some(Options {
         brokers: brokers?.into_iter().map(at).collect(),
         tls,

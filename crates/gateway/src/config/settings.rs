@@ -14,12 +14,9 @@ use drivegate_core::history::RecorderOptions;
 use drivegate_core::order::AuditFileOptions;
 use drivegate_core::permit::Rules;
 use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_http::local::SocketPath;
 use drivegate_model::drive::profile::Profiles;
-use drivegate_north::local::SocketPath;
-use drivegate_north::{
-    bacnet as bacnet_server, http as http_server, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client,
-    slot as slot_server,
-};
+use drivegate_north::{bacnet as bacnet_server, modbus_tcp as modbus_tcp_server, slot as slot_server};
 
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(super) const ENVIRONMENT: &str = "DRIVEGATE";
@@ -53,9 +50,9 @@ pub struct Settings {
     /// Options of Modbus TCP; absent if it is off.
     pub modbus_tcp: Option<modbus_tcp_server::Options>,
     /// Options of MQTT; absent if it is off.
-    pub mqtt: Option<mqtt_client::Options>,
+    pub mqtt: Option<drivegate_mqtt::Options>,
     /// Options of HTTP; absent if it is off.
-    pub http: Option<http_server::Options>,
+    pub http: Option<drivegate_http::Options>,
     /// Options of BACnet; absent if it is off.
     pub bacnet: Option<bacnet_server::Options>,
     /// Rules for the holders of drives; absent: off.

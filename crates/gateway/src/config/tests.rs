@@ -11,7 +11,6 @@ use drivegate_core::process_image::{Access, TriggerLimit};
 use drivegate_model::document::Problem;
 use drivegate_model::drive::profile::Profiles;
 use drivegate_model::drive::{ModelPoint, Profile};
-use drivegate_north::mqtt as mqtt_client;
 
 mod certificates;
 mod files;
@@ -356,8 +355,8 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     assert_eq!(all.modbus_tcp.unwrap().listeners[0].listen.len(), 2);
     assert_eq!(all.log.level, "debug");
     let mqtt = all.mqtt.unwrap();
-    let secret = drivegate_north::mqtt::Secret("12345".to_string());
-    assert_eq!(mqtt.password, Some(drivegate_north::mqtt::Password::Fixed(secret)));
+    let secret = drivegate_mqtt::Secret("12345".to_string());
+    assert_eq!(mqtt.password, Some(drivegate_mqtt::Password::Fixed(secret)));
     assert!(!format!("{mqtt:?}").contains("12345"));
 
     let loaded = load(&[
@@ -437,9 +436,9 @@ fn what_mqtt_publishes_and_accepts() {
     let (options, ..) = mqtt("");
     let options = options.unwrap();
     assert!(options.telemetry.state && options.telemetry.points && !options.require_id);
-    assert_eq!(options.telemetry.history, mqtt_client::History::Off);
-    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtMostOnce);
-    assert_eq!(options.event_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(options.telemetry.history, drivegate_mqtt::History::Off);
+    assert_eq!(options.telemetry_qos, drivegate_mqtt::Qos::AtMostOnce);
+    assert_eq!(options.event_qos, drivegate_mqtt::Qos::AtLeastOnce);
     assert_eq!(options.expiry, Some(Duration::from_secs(300)));
     let (options, ..) = mqtt(
         "topics = [\"state\"]\nqos = { telemetry = 1, events = 0 }\nexpiry = \"0s\"\nhistory = \"all\"\n\
@@ -447,10 +446,10 @@ fn what_mqtt_publishes_and_accepts() {
     );
     let options = options.unwrap();
     assert!(options.telemetry.state && !options.telemetry.points && options.require_id);
-    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(options.telemetry_qos, drivegate_mqtt::Qos::AtLeastOnce);
     assert_eq!(
         (options.event_qos, options.expiry),
-        (mqtt_client::Qos::AtMostOnce, None)
+        (drivegate_mqtt::Qos::AtMostOnce, None)
     );
     assert_eq!(options.response_topics, ["drivegate/answers/#"]);
     for (key, why) in [

@@ -6,12 +6,11 @@ use super::keys::{DRIVE, ROOT};
 use super::{bacnet, bus, drive, http, interlocks, modbus_tcp, unique};
 use drivegate_core::process_image::{Access, LeaseAction};
 use drivegate_model::document::{Finding, Place, Reader};
-use drivegate_north::mqtt as mqtt_client;
 
 /// The sections by which clients reach the drives.
 pub(super) struct Clients<'c> {
     pub(super) modbus_tcp: Option<&'c modbus_tcp::ModbusTcp>,
-    pub(super) mqtt: Option<&'c Option<mqtt_client::Options>>,
+    pub(super) mqtt: Option<&'c Option<drivegate_mqtt::Options>>,
     pub(super) http: Option<&'c http::Http>,
     pub(super) bacnet: Option<&'c bacnet::Bacnet>,
 }

@@ -4,7 +4,7 @@
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::config::Settings;
-use drivegate_north::{bacnet, http, modbus_tcp, slot};
+use drivegate_north::{bacnet, modbus_tcp, slot};
 
 /// Files that the process itself has open: logs, runtimes, queues, the configuration, MQTT with its buffer, local clients.
 const OWN_FILES: usize = 64;
@@ -59,7 +59,7 @@ struct FileDemand {
     /// Connections of the tool slots and BACnet.
     slots: usize,
     modbus_tcp: Option<modbus_tcp::Options>,
-    http: Option<http::Options>,
+    http: Option<drivegate_http::Options>,
 }
 
 impl FileDemand {
@@ -75,7 +75,7 @@ impl FileDemand {
 
     fn files(&self) -> usize {
         let modbus_tcp = self.modbus_tcp.as_ref().map_or(0, modbus_tcp::Options::files);
-        let http = self.http.as_ref().map_or(0, http::Options::files);
+        let http = self.http.as_ref().map_or(0, drivegate_http::Options::files);
         OWN_FILES + BUS_FILES * self.buses + self.slots + modbus_tcp + http
     }
 
@@ -129,9 +129,9 @@ mod tests {
                 idle_timeout: None,
                 uncached: modbus_tcp::Uncached::Forward,
             }),
-            http: Some(http::Options {
+            http: Some(drivegate_http::Options {
                 max_connections: http,
-                ..http::Options::listening_on(([127, 0, 0, 1], 9488).into())
+                ..drivegate_http::Options::listening_on(([127, 0, 0, 1], 9488).into())
             }),
         }
     }

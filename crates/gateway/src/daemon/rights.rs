@@ -4,7 +4,8 @@ use std::time::SystemTime;
 
 use super::Daemon;
 use crate::config::Settings;
-use drivegate_north::{bacnet, local};
+use drivegate_http::local;
+use drivegate_north::bacnet;
 
 impl Daemon {
     /// Ends the rights that clients of the broker and of the local socket lose, before anything else changes; by

@@ -3,7 +3,7 @@
 use super::Daemon;
 use super::server::Prepared;
 use crate::config::Settings;
-use drivegate_north::{ServerError, bacnet, http, modbus_tcp, slot};
+use drivegate_north::{ServerError, bacnet, modbus_tcp, slot};
 
 /// The servers that listen on the network, prepared.
 #[derive(Default)]
@@ -11,7 +11,7 @@ pub(super) struct PreparedServers {
     modbus_tcp: Prepared<modbus_tcp::Server>,
     slots: Prepared<slot::Server>,
     bacnet: Prepared<bacnet::Server>,
-    http: Prepared<http::Http>,
+    http: Prepared<drivegate_http::Http>,
 }
 
 impl Daemon {
@@ -58,7 +58,7 @@ impl Daemon {
         }
         let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await;
         // Events that occurred while no client was configured are not published later.
-        self.north.mqtt_left.discard();
+        drivegate_mqtt::Handover::of(&self.north).discard();
         applied
     }
 

@@ -8,7 +8,7 @@ use drivegate_core::permit::HoldView;
 
 /// The holder of a drive, and the result of an action on the hold.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
-pub(crate) struct HoldReply<'r> {
+pub struct HoldReply<'r> {
     drive: &'r str,
     #[serde(skip_serializing_if = "Option::is_none")]
     ok: Option<bool>,
@@ -25,12 +25,12 @@ pub(crate) struct HoldReply<'r> {
 
 /// The fields of the hold in the JSON of a drive. Comparison ignores the remaining time, which changes by itself.
 #[derive(Debug, Clone, Default, Serialize, utoipa::ToSchema)]
-pub(crate) struct HoldFields {
+pub struct HoldFields {
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) hold: Option<&'static str>,
-    pub(crate) holder: Option<String>,
-    pub(crate) holder_rank: Option<String>,
-    pub(crate) hold_left_s: Option<u64>,
+    pub hold: Option<&'static str>,
+    pub holder: Option<String>,
+    pub holder_rank: Option<String>,
+    pub hold_left_s: Option<u64>,
 }
 
 impl PartialEq for HoldFields {
@@ -53,7 +53,7 @@ impl From<HoldView> for HoldFields {
 
 impl<'r> HoldReply<'r> {
     /// The published state of a drive's hold.
-    pub(crate) fn of(drive: &'r str, view: HoldView) -> HoldReply<'r> {
+    pub fn of(drive: &'r str, view: HoldView) -> HoldReply<'r> {
         HoldReply {
             drive,
             ok: None,
@@ -65,7 +65,7 @@ impl<'r> HoldReply<'r> {
     }
 
     /// The result of an action on the hold; `seen` is the state of the hold if the action was refused.
-    pub(crate) fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
+    pub fn new(drive: &'r str, done: Result<HoldView, Refusal>, seen: Option<HoldView>) -> HoldReply<'r> {
         let (hold, refusal) = match done {
             Ok(view) => (Some(view), None),
             Err(refusal) => (seen, Some(refusal)),
@@ -83,7 +83,7 @@ impl<'r> HoldReply<'r> {
         }
     }
 
-    pub(crate) fn own(mut self, own: bool) -> HoldReply<'r> {
+    pub fn own(mut self, own: bool) -> HoldReply<'r> {
         self.own = Some(own);
         self
     }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 /// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
 const RECENT: usize = 1024;
 /// Minimum time for which a command with an `id` is remembered.
-pub(crate) const REMEMBERED: Duration = Duration::from_secs(600);
+pub const REMEMBERED: Duration = Duration::from_secs(600);
 /// Longest time that a command is remembered, whatever the expiry of its message.
 const LONGEST: Duration = Duration::from_secs(86_400);
 /// Maximum number of commands with an `id` that are remembered.
@@ -16,24 +16,24 @@ const MOST_COMMANDS: usize = 1 << 18;
 
 /// The parts of a command by which its repetition is recognised.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Taken<'t> {
+pub struct Taken<'t> {
     /// Where the command arrived: its topic, or the user and the drive.
-    pub(crate) topic: &'t str,
+    pub topic: &'t str,
     /// Payload of the command.
-    pub(crate) payload: &'t [u8],
+    pub payload: &'t [u8],
     /// Where the command's result is sent: response topic and correlation data.
-    pub(crate) answer_to: (Option<&'t str>, Option<&'t [u8]>),
+    pub answer_to: (Option<&'t str>, Option<&'t [u8]>),
     /// Whether the broker marks the command as a repetition.
-    pub(crate) dup: bool,
+    pub dup: bool,
     /// MQTT packet id, which identifies a repetition.
-    pub(crate) packet: u16,
+    pub packet: u16,
     /// Remaining life of the command's message, s.
-    pub(crate) expiry: Option<u32>,
+    pub expiry: Option<u32>,
 }
 
 /// The commands taken so far, and their results `R`.
 #[derive(Debug)]
-pub(crate) struct Memory<R> {
+pub struct Memory<R> {
     hasher: RandomState,
     /// Recent commands, oldest first.
     recent: VecDeque<Recent<R>>,
@@ -54,7 +54,7 @@ pub(crate) struct Memory<R> {
 /// Memory shared by the clients of one broker, or by the connections of the HTTP server, also across reloads: a
 /// repeated command may arrive over a new connection. Results sent through a broker are payloads.
 #[derive(Debug)]
-pub(crate) struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
+pub struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
 
 impl<R> Clone for SharedMemory<R> {
     fn clone(&self) -> SharedMemory<R> {
@@ -69,7 +69,7 @@ impl<R> Default for SharedMemory<R> {
 }
 
 impl<R> SharedMemory<R> {
-    pub(crate) fn lock(&self) -> MutexGuard<'_, Memory<R>> {
+    pub fn lock(&self) -> MutexGuard<'_, Memory<R>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -111,7 +111,7 @@ struct RememberedCommand {
 
 /// The fingerprint of a message.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Fingerprint {
+pub struct Fingerprint {
     /// Fingerprint of everything except the packet id.
     whole: u64,
     /// Hash of topic and `id`, if the command has an `id`; and hash with the payload.
@@ -121,7 +121,7 @@ pub(crate) struct Fingerprint {
 
 /// Whether and how a message repeats a command.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Repetition<R> {
+pub enum Repetition<R> {
     /// A command whose result is already known.
     Answered(R),
     /// A command whose result is pending and goes to the same address.
@@ -132,7 +132,7 @@ pub(crate) enum Repetition<R> {
 
 impl<R: Clone> Memory<R> {
     /// The fingerprint that identifies a command with this `id`.
-    pub(crate) fn fingerprint(&self, taken: &Taken<'_>, id: Option<&str>) -> Fingerprint {
+    pub fn fingerprint(&self, taken: &Taken<'_>, id: Option<&str>) -> Fingerprint {
         let Taken { topic, payload, .. } = taken;
         let answer_to = self.hasher.hash_one(taken.answer_to);
         let identity = id.map(|id| self.hasher.hash_one((topic, id)));
@@ -145,7 +145,7 @@ impl<R: Clone> Memory<R> {
 
     /// The earlier command that a message repeats: the broker marks the message as repeated, or the message has the
     /// topic, payload and `id` of the earlier one. `stops` is the present number of stops of the drive.
-    pub(crate) fn repeated(
+    pub fn repeated(
         &mut self,
         taken: &Taken<'_>,
         print: Fingerprint,
@@ -190,7 +190,7 @@ impl<R: Clone> Memory<R> {
     }
 
     /// Whether another command with an `id` can be remembered.
-    pub(crate) fn has_room(&mut self, now: Instant) -> bool {
+    pub fn has_room(&mut self, now: Instant) -> bool {
         self.forget(now);
         self.known.len() < MOST_COMMANDS
     }
@@ -206,7 +206,7 @@ impl<R: Clone> Memory<R> {
     }
 
     /// Remembers a command taken at `now`; returns the command's number.
-    pub(crate) fn remember(&mut self, taken: &Taken<'_>, print: Fingerprint, stops: u64, now: Instant) -> u64 {
+    pub fn remember(&mut self, taken: &Taken<'_>, print: Fingerprint, stops: u64, now: Instant) -> u64 {
         self.taken += 1;
         let number = self.taken;
         if self.recent.len() == RECENT {
@@ -237,12 +237,12 @@ impl<R: Clone> Memory<R> {
     }
 
     /// Notes that pending results are no longer awaited by anyone and will not come.
-    pub(crate) fn abandon(&mut self) {
+    pub fn abandon(&mut self) {
         self.abandoned = self.taken;
     }
 
     /// Stores the result of a command.
-    pub(crate) fn finished(&mut self, number: u64, result: &R) {
+    pub fn finished(&mut self, number: u64, result: &R) {
         // The numbers are consecutive.
         let first = self.recent.front().map_or(0, |recent| recent.number);
         let place = number.checked_sub(first).and_then(|place| usize::try_from(place).ok());

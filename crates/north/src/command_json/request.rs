@@ -18,9 +18,9 @@ use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{PointIndex, Profile, Value};
 
 /// Maximum size of a command, bytes.
-pub(crate) const MAX_PAYLOAD: usize = 64 * 1024;
+pub const MAX_PAYLOAD: usize = 64 * 1024;
 /// Maximum length of an `id`, bytes.
-pub(crate) const MAX_ID: usize = 256;
+pub const MAX_ID: usize = 256;
 /// Maximum of `expires_ms`.
 const MAX_EXPIRY_MS: u64 = 60_000;
 /// Maximum length of a name that is compared with the known ones, bytes.
@@ -32,11 +32,11 @@ pub(crate) type Points = Vec<(PointIndex, Value)>;
 /// The `id` of a command: a number or a string, returned as it was written.
 #[derive(Debug, Clone, Serialize)]
 #[serde(transparent)]
-pub(crate) struct Id(Box<RawValue>);
+pub struct Id(Box<RawValue>);
 
 impl Id {
     /// The `id` exactly as the client wrote it.
-    pub(crate) fn text(&self) -> &str {
+    pub fn text(&self) -> &str {
         self.0.get()
     }
 
@@ -58,7 +58,7 @@ impl PartialEq for Id {
 }
 
 /// The payload for messages: printable and short.
-pub(crate) fn excerpt(payload: &[u8]) -> String {
+pub fn excerpt(payload: &[u8]) -> String {
     let text = String::from_utf8_lossy(payload.get(..payload.len().min(200)).unwrap_or_default());
     let mut short = String::new();
     for c in text.chars().take(80) {
@@ -74,20 +74,20 @@ pub(crate) fn excerpt(payload: &[u8]) -> String {
 
 /// The `id` of an object, read before the rest, so that a client can match the result to its request even if the
 /// rest is invalid. `None` if the payload is not JSON or contains several ids.
-pub(crate) fn find_id(payload: &[u8]) -> Option<Id> {
+pub fn find_id(payload: &[u8]) -> Option<Id> {
     let OnlyId(id) = serde_json::from_slice(payload).ok()?;
     Id::of(id?)
 }
 
 /// The parsed content of a command.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct ParsedCommand {
-    pub(crate) points: Points,
-    pub(crate) expiry: Duration,
+pub struct ParsedCommand {
+    pub points: Points,
+    pub expiry: Duration,
     /// Why everything except a stop is refused; `points` then holds the points of the stop.
-    pub(crate) refused: Option<Refusal>,
+    pub refused: Option<Refusal>,
     /// Whether a start that must wait does wait.
-    pub(crate) wait: bool,
+    pub wait: bool,
 }
 
 impl ParsedCommand {
@@ -95,7 +95,7 @@ impl ParsedCommand {
     ///
     /// # Errors
     /// If the request is refused: contains the refusal. A request with a stop is never refused.
-    pub(crate) fn new(
+    pub fn new(
         points: Points,
         expiry: Duration,
         refused: Option<Refusal>,
@@ -114,12 +114,12 @@ impl ParsedCommand {
     }
 
     /// Whether the command contains a stop, which is executed whatever happens to the rest.
-    pub(crate) fn stops(&self, profile: &Profile) -> bool {
+    pub fn stops(&self, profile: &Profile) -> bool {
         stop_of(&self.points, profile).is_some()
     }
 
     /// Whether the command contains more than a stop, so that a repetition of it is not executed.
-    pub(crate) fn does_more(&self, profile: &Profile) -> bool {
+    pub fn does_more(&self, profile: &Profile) -> bool {
         let whole = || matches!(Parts::of(Order::Points(self.points.clone()), profile), Parts::One(_));
         self.refused.is_none() && !(self.stops(profile) && whole())
     }
@@ -129,7 +129,7 @@ impl ParsedCommand {
     ///
     /// # Errors
     /// If the whole command is refused; contains the answer.
-    pub(crate) fn place(
+    pub fn place(
         self,
         drive: &DriveHandle,
         what: &str,
@@ -152,7 +152,7 @@ impl ParsedCommand {
 
     /// Gives `former` the stop of a command, `what`, whose drive name meant this machine when the command arrived and
     /// means no drive now; `None` if the command does not stop.
-    pub(crate) fn place_at_former(
+    pub fn place_at_former(
         self,
         former: &DriveHandle,
         what: &str,
@@ -170,7 +170,7 @@ impl ParsedCommand {
 ///
 /// # Errors
 /// If nothing of the command may be executed; contains the refusal.
-pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<ParsedCommand, Refusal> {
+pub fn order(payload: &[u8], profile: &Profile) -> Result<ParsedCommand, Refusal> {
     let (fields, refused) = object(payload)?;
     points_of(fields, refused, profile)
 }
@@ -179,7 +179,7 @@ pub(crate) fn order(payload: &[u8], profile: &Profile) -> Result<ParsedCommand, 
 ///
 /// # Errors
 /// If the payload is longer than [`MAX_PAYLOAD`].
-pub(crate) fn check_size(size: usize) -> Result<(), Refusal> {
+pub fn check_size(size: usize) -> Result<(), Refusal> {
     match size > MAX_PAYLOAD {
         true => Err(Refusal::BadValue(format!(
             "the payload has {size} bytes, at most {MAX_PAYLOAD} are allowed"
@@ -234,7 +234,7 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
 }
 
 /// The point with this name, and its value. Limits are checked later with the command.
-pub(crate) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(PointIndex, Value), Refusal> {
+pub fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(PointIndex, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
         let writable = || {
             profile
@@ -422,7 +422,7 @@ fn unknown_drive(name: &str, plant: &Plant) -> String {
 }
 
 /// The answer to a command for an unknown drive, which is also audited.
-pub(crate) fn refuse_unknown(plant: &Plant, name: &str, what: &str, origin: Origin, now: Instant) -> Answer {
+pub fn refuse_unknown(plant: &Plant, name: &str, what: &str, origin: Origin, now: Instant) -> Answer {
     let shown = excerpt(name.as_bytes());
     plant.refuse_unknown(shown.trim_matches('`'), what, unknown_drive(name, plant), origin, now)
 }

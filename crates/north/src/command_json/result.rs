@@ -10,7 +10,7 @@ use drivegate_core::plant::Shown;
 
 /// The only result of a command: `confirmed` if a read showed the effect in time, otherwise the answer of the bus.
 #[derive(Debug, Clone, Serialize, utoipa::ToSchema)]
-pub(crate) struct CommandResult<'r> {
+pub struct CommandResult<'r> {
     #[schema(value_type = serde_json::Value)]
     id: Option<&'r Id>,
     drive: &'r str,
@@ -77,7 +77,7 @@ fn kept_by(outcome: &Outcome) -> Option<KeptBy> {
 
 impl<'r> CommandResult<'r> {
     /// The result at `time` of the command with this `id`, as far as reads have confirmed it so far.
-    pub(crate) fn new(
+    pub fn new(
         id: Option<&'r Id>,
         drive: &'r str,
         answer: &Answer,
@@ -112,7 +112,7 @@ impl<'r> CommandResult<'r> {
     }
 
     /// The result as the JSON that the client receives.
-    pub(crate) fn to_json(&self) -> Vec<u8> {
+    pub fn to_json(&self) -> Vec<u8> {
         // Strings, numbers and previous JSON can always be serialized.
         serde_json::to_vec(self).unwrap_or_default()
     }

@@ -27,7 +27,7 @@ pub struct StopBody {
 ///
 /// # Errors
 /// If the request does not specify the drives clearly.
-pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
+pub fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
     let unclear = |why: String| {
         let shown = excerpt(payload);
         Refusal::BadValue(format!(
@@ -57,7 +57,7 @@ pub(crate) fn stop_all(payload: &[u8]) -> Result<(Scope, Duration), Refusal> {
 }
 
 /// Refuses a stop of several drives: audited, counted and published as an event. The words for the client.
-pub(crate) fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, now: Instant) -> String {
+pub fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, now: Instant) -> String {
     let why = refusal.to_string();
     let refused = RefusedCommand {
         client: origin.client(),
@@ -73,7 +73,7 @@ pub(crate) fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, 
 }
 
 /// The reason why nothing is stopped, as a refusal.
-pub(crate) fn nothing_to_stop(why: &NothingToStop) -> Refusal {
+pub fn nothing_to_stop(why: &NothingToStop) -> Refusal {
     match why {
         NothingToStop::NotControlled => Refusal::NotAllowed(why.to_string()),
         NothingToStop::Unknown { .. } => Refusal::BadValue(why.to_string()),

@@ -48,7 +48,7 @@ const TYPES: [(Format, &str, &str); 3] = [
 impl Format {
     /// The format for an `Accept` header, and its content type: OpenMetrics if the client prefers it, with a known
     /// version or without one.
-    pub(crate) fn accepted(accept: &str) -> (Format, &'static str) {
+    pub fn accepted(accept: &str) -> (Format, &'static str) {
         let weight_of = |format: Format, version: &str| {
             let wanted: &[&str] = match format {
                 Format::OpenMetrics => &["application/openmetrics-text"],

@@ -78,7 +78,7 @@ impl Policy {
 
 /// Admits the clients of one listener.
 #[derive(Debug)]
-pub(crate) struct Admission {
+pub struct Admission {
     /// Number of the listener, unique in the server.
     listener: usize,
     policy: ArcSwap<Policy>,

@@ -139,7 +139,7 @@ impl Identity {
 
 /// The requirements for client certificates.
 #[derive(Debug)]
-pub(crate) struct Requirements {
+pub struct Requirements {
     config: Arc<ServerConfig>,
     verifier: Arc<dyn ClientCertVerifier>,
     roles: BTreeMap<String, Role>,

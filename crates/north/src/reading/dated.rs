@@ -15,7 +15,7 @@ use tokio::net::{TcpStream, UnixStream};
 use super::Reader;
 
 /// Properties of a stream besides its bytes.
-pub(crate) trait Source {
+pub trait Source {
     /// Whether the source has bytes to read.
     fn is_readable(&self) -> bool;
 
@@ -32,7 +32,7 @@ fn shows(source: &impl AsFd, flags: PollFlags) -> bool {
 }
 
 /// Whether the source has something to read or accept.
-pub(crate) fn is_readable(source: &impl AsFd) -> bool {
+pub fn is_readable(source: &impl AsFd) -> bool {
     shows(source, PollFlags::IN)
 }
 
@@ -77,21 +77,21 @@ impl Source for DuplexStream {
 
 /// A stream with the reader that dates its bytes.
 #[derive(Debug)]
-pub(crate) struct Dated<S> {
+pub struct Dated<S> {
     stream: S,
     reader: Arc<Reader>,
 }
 
 impl<S> Dated<S> {
-    pub(crate) fn new(stream: S, reader: Arc<Reader>) -> Dated<S> {
+    pub fn new(stream: S, reader: Arc<Reader>) -> Dated<S> {
         Dated { stream, reader }
     }
 
-    pub(crate) fn reader(&self) -> &Arc<Reader> {
+    pub fn reader(&self) -> &Arc<Reader> {
         &self.reader
     }
 
-    pub(crate) fn stream(&self) -> &S {
+    pub fn stream(&self) -> &S {
         &self.stream
     }
 }

@@ -4,6 +4,6 @@ mod dated;
 mod reader;
 mod watch;
 
-pub(crate) use dated::{Dated, Source, is_readable};
-pub(crate) use reader::Reader;
+pub use dated::{Dated, Source, is_readable};
+pub use reader::Reader;
 pub use watch::{Watch, watched_runtime};

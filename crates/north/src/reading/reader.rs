@@ -9,7 +9,7 @@ use drivegate_core::stalls::Dated;
 
 /// The reader of a connection.
 #[derive(Debug)]
-pub(crate) struct Reader {
+pub struct Reader {
     watch: Arc<Watch>,
     connection: Connection,
     state: Mutex<State>,
@@ -51,12 +51,12 @@ impl Reader {
     }
 
     /// A reader on the runtime of this thread, for a connection opened now.
-    pub(crate) fn here() -> Reader {
+    pub fn here() -> Reader {
         Reader::new(Watch::of_this_thread(), Instant::now())
     }
 
     /// The reader of a connection that this one accepted last.
-    pub(crate) fn accepted(&self) -> Reader {
+    pub fn accepted(&self) -> Reader {
         Reader::new(self.watch.clone(), self.state().last.earliest)
     }
 
@@ -66,7 +66,7 @@ impl Reader {
 
     /// Notes that the reader found nothing to read at `now` and waits. The runtime may not have checked the socket
     /// since a stall; `is_there` then returns whether there are bytes.
-    pub(crate) fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
+    pub fn nothing(&self, now: Instant, is_there: impl FnOnce() -> bool) {
         let matters = self.watch.turn(now, None);
         let left = matters && self.watch.just_stalled(now) && is_there();
         let mut state = self.state();
@@ -77,13 +77,13 @@ impl Reader {
     }
 
     /// Notes that the reader does not read for some time, whatever arrives.
-    pub(crate) fn ceased(&self) {
+    pub fn ceased(&self) {
         self.state().waited = false;
     }
 
     /// The reader read bytes at `now`; `all`: and nothing is left. `has_gone` returns whether the client has closed or
     /// reset the connection since.
-    pub(crate) fn note_read(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
+    pub fn note_read(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
         let mut state = self.state();
         let boot = state.waited.then(|| self.watch.since_boot());
         let dated = match self.watch.turn(now, boot) {
@@ -111,12 +111,12 @@ impl Reader {
     }
 
     /// How the bytes that were read last arrived.
-    pub(crate) fn last(&self) -> Arrival {
+    pub fn last(&self) -> Arrival {
         self.arrival(self.state().last)
     }
 
     /// The earliest arrival among all bytes that were read and not taken yet.
-    pub(crate) fn first(&self) -> Arrival {
+    pub fn first(&self) -> Arrival {
         self.arrival(self.state().first)
     }
 

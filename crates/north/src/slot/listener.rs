@@ -36,7 +36,7 @@ impl Served {
 
 /// The handler of one address.
 #[derive(Debug)]
-pub(crate) struct SlotListener {
+pub struct SlotListener {
     number: usize,
     served: ArcSwapOption<Served>,
     limit: Arc<ConnectionLimit>,

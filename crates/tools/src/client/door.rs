@@ -12,7 +12,7 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::{ClientError, Url};
-use drivegate_north::http::{InProcess, basic_authorization};
+use drivegate_http::{InProcess, basic_authorization};
 use drivegate_north::{GATEWAY, client_tls, explain};
 
 /// Remedy for a failed TLS handshake whose error suggests none.

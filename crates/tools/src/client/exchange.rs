@@ -17,7 +17,7 @@ use tokio::time::timeout;
 
 use super::ClientError;
 use super::door::{Door, Stream};
-use drivegate_north::http::messages::{EXPECT, ErrorReply, Expected};
+use drivegate_http::messages::{EXPECT, ErrorReply, Expected};
 
 /// Largest reply, bytes: enough for some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;

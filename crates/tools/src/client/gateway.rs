@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use super::door::Network;
 use super::{Client, Door, Url};
 use drivegate_gateway::config::{Settings, environment};
-use drivegate_north::http::messages::Expected;
-use drivegate_north::local::{RuntimeDirectories, SocketPath, absolute};
+use drivegate_http::local::{RuntimeDirectories, SocketPath, absolute};
+use drivegate_http::messages::Expected;
 
 /// Address where `[http]` listens by default.
 const USUAL: &str = "http://127.0.0.1:9488";

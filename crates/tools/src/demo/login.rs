@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::super::credentials_file::CredentialsFile;
-use drivegate_north::http::{Scope, Token, User};
+use drivegate_http::{Scope, Token, User};
 
 /// Number of characters of the password.
 const LENGTH: usize = 12;

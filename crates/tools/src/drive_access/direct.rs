@@ -9,10 +9,10 @@ use drivegate_core::plant::DriveHandle;
 use drivegate_core::process_image::{OnShutdown, Reading};
 use drivegate_gateway::config::{BusSettings, ParamsSettings, Settings};
 use drivegate_gateway::daemon::Daemon;
+use drivegate_http::InProcess;
+use drivegate_http::local::SocketPath;
+use drivegate_http::messages::Word;
 use drivegate_model::drive::{Point, PointIndex, PollClass, Profile, Quality, Source};
-use drivegate_north::http::InProcess;
-use drivegate_north::http::messages::Word;
-use drivegate_north::local::SocketPath;
 
 /// Time to open the port, on a machine however busy; and how long one that cannot be opened is tried.
 const OPEN: Duration = Duration::from_secs(10);

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::{Conversation, Needs, Target};
 use crate::client::GatewayRequest;
-use drivegate_north::http::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, Stage};
+use drivegate_http::messages::{ParameterReading, PreparedRestore, ReadParameters, Restore, RestoreAct, Stage};
 
 /// Time between two looks at the progress.
 const LOOK: Duration = Duration::from_millis(250);

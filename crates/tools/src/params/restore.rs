@@ -10,7 +10,7 @@ use super::super::failure::{Failure, Outcome, negative};
 use super::super::{EXIT_FAILED, EXIT_USAGE, report};
 use super::{StatusLine, read_from_drive, read_written};
 use drivegate_core::parameters::{Entry, Id, ParameterFile};
-use drivegate_north::http::messages::{ReadParameters, Restore, RestoreAct, RestoreWish, Stage};
+use drivegate_http::messages::{ReadParameters, Restore, RestoreAct, RestoreWish, Stage};
 
 #[derive(Debug, clap::Args)]
 pub(super) struct RestoreArgs {

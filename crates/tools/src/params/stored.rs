@@ -8,8 +8,8 @@ use super::super::failure::{Failure, Outcome};
 use super::super::{printable, report, settings};
 use super::{built_in, names, read_written};
 use drivegate_core::parameters::{ParameterFile, Store};
+use drivegate_http::messages::StoredReading;
 use drivegate_model::drive::parameters::RawValue;
-use drivegate_north::http::messages::StoredReading;
 
 /// The parameter store of the configuration.
 fn store(config: &Path) -> Result<Store, Failure> {

@@ -6,9 +6,9 @@ use crate::loading::{Loads, NotLoaded};
 use crate::log::LogHandle;
 use drivegate_gateway::config::Loaded;
 use drivegate_gateway::daemon::Daemon;
+use drivegate_http::local::ReloadOrder;
+use drivegate_http::messages::ReloadOutcome;
 use drivegate_model::document::Problem;
-use drivegate_north::http::messages::ReloadOutcome;
-use drivegate_north::local::ReloadOrder;
 
 use super::watch::Watch;
 

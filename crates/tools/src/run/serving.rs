@@ -9,7 +9,7 @@ use super::reloads::{Reloads, apply};
 use super::watch::Watch;
 use crate::log::LogHandle;
 use drivegate_gateway::daemon::Daemon;
-use drivegate_north::local::ReloadOrder;
+use drivegate_http::local::ReloadOrder;
 
 /// Serves until the daemon is to stop.
 pub(super) async fn until_stopped(

@@ -12,8 +12,8 @@ use crate::printable;
 use drivegate_core::event::{Event, EventKind};
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_gateway::daemon::{BusHeartbeats, Daemon};
+use drivegate_http::messages::ReloadOutcome;
 use drivegate_north::NorthState;
-use drivegate_north::http::messages::ReloadOutcome;
 
 /// Longest status in characters, for one line of `systemctl status`.
 const LONGEST_STATUS: usize = 300;

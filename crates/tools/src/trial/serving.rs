@@ -13,9 +13,8 @@ use crate::{EXIT_FAILED, demo, report};
 use drivegate_core::plant::SharedPlant;
 use drivegate_gateway::config::{LogFormat, LogSettings, Settings};
 use drivegate_gateway::daemon::Daemon;
+use drivegate_http::local::SocketPath;
 use drivegate_model::drive::{ModelPoint, State};
-use drivegate_north::http;
-use drivegate_north::local::SocketPath;
 
 /// Preferred port of the status page.
 const HTTP: u16 = 9488;
@@ -61,7 +60,7 @@ async fn start(mut settings: Settings) -> Result<Daemon, String> {
     let mut port = HTTP;
     loop {
         let address = demo::free_port("the status page", port)?;
-        settings.http = Some(http::Options::listening_on(address));
+        settings.http = Some(drivegate_http::Options::listening_on(address));
         match Daemon::start(settings.clone()).await {
             // Another program has taken the port since it was found free.
             Err(error) if error.address_in_use().is_some() => port = address.port().saturating_add(1),

@@ -82,7 +82,7 @@ mod tests {
             };
             let of_drive = lines("below `name = \"drive-1\"`:\n", "     and below");
             let of_http = lines("and below [http]:\n", "  2. ");
-            let user = drivegate_north::http::User::new("alice", "a long password").unwrap();
+            let user = drivegate_http::User::new("alice", "a long password").unwrap();
             let users = crate::credentials_file::CredentialsFile::open(&folder.path().join("users"));
             users.put(&user, true).unwrap();
             let text = text

@@ -4,7 +4,7 @@ const fs = require("node:fs");
 const http = require("node:http");
 const path = require("node:path");
 
-const FILES = path.join(__dirname, "../../../../crates/north/src/http/page");
+const FILES = path.join(__dirname, "../../../../crates/http/src/page");
 const TYPES = { ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml" };
 const POLICY = /SECURITY_POLICY: &str = "((?:[^"\\]|\\\s)*)"/.exec(fs.readFileSync(path.join(FILES, "mod.rs"), "utf8"))[1].replace(/\\\s+/g, "");
 

@@ -64,7 +64,14 @@ impl Reloads {
     fn stopped(&self) -> Option<u8> {
         let stop = take_next(&self.buses[0].queue, self.now)?;
         assert!(stop.is_stop());
-        Some(self.buses[0].image.drives.get(stop.intent.target.drive().unwrap())?.spec.address)
+        Some(
+            self.buses[0]
+                .image
+                .drives
+                .get(stop.intent.target.drive().unwrap())?
+                .spec
+                .address,
+        )
     }
 }
 

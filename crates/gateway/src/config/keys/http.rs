@@ -1,7 +1,6 @@
 //! `[http]`.
 
 use super::forms::*;
-use drivegate_north::http;
 
 const HOSTS: List<String> = List {
     parse: parse_host,
@@ -34,7 +33,7 @@ keys! {
 }
 
 fn parse_host(text: &str) -> Result<String, Finding> {
-    match http::is_host(text) {
+    match drivegate_http::is_host(text) {
         true => Ok(text.to_string()),
         false => Err(Finding::new(
             format!("`{text}` is not a host name or an address"),

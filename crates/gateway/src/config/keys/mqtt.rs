@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 
 use super::forms::*;
-use drivegate_north::mqtt::History;
+use drivegate_mqtt::History;
 
 /// Longest client id, base or id of Sparkplug, bytes: MQTT allows 65,535 for a whole topic, in which names of drives and points
 /// follow, and for a client id, to which `-sparkplug` is added.

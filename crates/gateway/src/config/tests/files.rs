@@ -187,7 +187,7 @@ fn secrets_that_everybody_can_read() {
 fn users_are_read_and_pointed_out() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("users");
-    let alice = drivegate_north::http::User::new("alice", "correct horse").unwrap();
+    let alice = drivegate_http::User::new("alice", "correct horse").unwrap();
     let said = |text: &str, mode, commands: bool| {
         std::fs::write(&file, text).unwrap();
         set_permissions(&file, Permissions::from_mode(mode)).unwrap();

@@ -1,0 +1,80 @@
+//! State that a client leaves to the client that replaces it at a reload.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use tokio::sync::broadcast::Receiver;
+
+use super::Broker;
+use super::commands::OrdersLeft;
+use super::rights::BrokerRights;
+use super::sparkplug::NodeOrdersLeft;
+use drivegate_core::event::Event;
+use drivegate_north::NorthState;
+use drivegate_north::command_json::SharedMemory;
+
+/// State of the clients of a gateway that outlives them.
+#[derive(Debug, Default)]
+pub struct Handover {
+    /// State that the last clients left, until the next clients take it over.
+    left: Mutex<Left>,
+    /// Rights of clients that publish to the broker.
+    pub(super) rights: BrokerRights,
+    /// Recent commands that came from the broker, to recognise repetitions.
+    pub(super) commands: SharedMemory,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Left {
+    /// The retained topics of the client that runs.
+    pub(super) retained: Vec<String>,
+    /// The events that were not published yet.
+    pub(super) unread: Option<Receiver<Arc<Event>>>,
+    /// State of the client with the topics of drivegate.
+    pub(super) client: ClientLeft<OrdersLeft>,
+    /// State of the Sparkplug edge node.
+    pub(super) node: ClientLeft<NodeOrdersLeft>,
+}
+
+/// State that one of the clients left.
+#[derive(Debug)]
+pub(super) struct ClientLeft<Orders> {
+    /// The commands whose results are not yet published.
+    pub(super) orders: Option<Orders>,
+    /// The broker that was in use.
+    pub(super) broker: Option<Broker>,
+}
+
+impl<Orders> Default for ClientLeft<Orders> {
+    fn default() -> Self {
+        ClientLeft {
+            orders: None,
+            broker: None,
+        }
+    }
+}
+
+impl Handover {
+    /// The state of this gateway's clients.
+    pub fn of(north: &NorthState) -> Arc<Handover> {
+        north.kept()
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Left> {
+        self.left.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Leaves these events to the next client.
+    pub fn leave_events(&self, events: Receiver<Arc<Event>>) {
+        self.lock().unread = Some(events);
+    }
+
+    /// Discards the state of the last clients if no client takes it over; the retained topics still have to be cleared.
+    pub fn discard(&self) {
+        let mut left = self.lock();
+        let retained = std::mem::take(&mut left.retained);
+        *left = Left {
+            retained,
+            ..Left::default()
+        };
+    }
+}
