@@ -37,6 +37,7 @@ mod orders;
 mod parameters;
 mod prediction;
 mod recorder;
+mod refreshing;
 mod restore;
 mod rig;
 mod scenario;

@@ -120,7 +120,7 @@ impl TcpService<Options> for HttpService {
             stopping: cancel,
             terms: Arc::new(ArcSwap::from_pointee(Terms::new(options)?)),
             plant,
-            operating: Arc::new(Operating::new(stats.clone())),
+            operating: Arc::new(Operating::new(&stats)),
             stats,
         })
     }

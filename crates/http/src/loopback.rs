@@ -1,5 +1,6 @@
 //! The routes without a socket, for the fuzzer.
 
+use drivegate_north::NorthState;
 use std::sync::Arc;
 use std::{fmt, io};
 
@@ -39,7 +40,7 @@ impl Loopback {
         let router = routes::router(
             plant,
             Default::default(),
-            Arc::new(Operating::new(Arc::default())),
+            Arc::new(Operating::new(&NorthState::default())),
             CancellationToken::new(),
         );
         let service = TowerToHyperService::new(router);

@@ -61,16 +61,19 @@ impl World {
     /// Waits for reads in parts to be joined, and then as long as the line needs to be as before: an exception names no
     /// request, so the late exception to one request looks like the refusal of the next read.
     fn look_until_whole(&mut self, settles: Duration) {
-        let since = self.healing.map_or(self.now, |healing| healing.since);
-        let last = since + WHOLE_AGAIN + settles;
-        let in_parts = |world: &World| world.buses.iter().any(|bus| bus.core.remains(world.now).parts > 0);
-        if !in_parts(self) {
+        if !self.reads_in_parts() {
             return;
         }
-        while self.now < last && in_parts(self) {
+        let since = self.healing.map_or(self.now, |healing| healing.since);
+        let last = since + WHOLE_AGAIN + settles;
+        while self.now < last && self.reads_in_parts() {
             self.look_until(last.min(self.now + Duration::from_secs(1)), |_| {});
         }
         self.look_until(self.now + settles, |_| {});
+    }
+
+    fn reads_in_parts(&self) -> bool {
+        self.buses.iter().any(|bus| bus.core.remains(self.now).parts > 0)
     }
 
     /// Time after which a drive that answers is as before: late replies, repeated requests, three rounds.

@@ -49,7 +49,6 @@ pub(crate) struct Operating {
     key: Option<hmac::Key>,
     /// Recent commands, to recognise repetitions.
     pub(super) commands: Arc<SharedMemory<SharedReply>>,
-    pub(super) north: Arc<NorthState>,
     pub(super) in_progress: Arc<Semaphore>,
     /// Limits the log of failed logins.
     pub(super) failures: LogThrottle,
@@ -149,7 +148,7 @@ pub(crate) struct Credentials {
 }
 
 impl Operating {
-    pub(crate) fn new(north: Arc<NorthState>) -> Operating {
+    pub(crate) fn new(north: &NorthState) -> Operating {
         Operating {
             users: Arc::default(),
             state: Mutex::default(),
@@ -157,7 +156,6 @@ impl Operating {
             hasher: RandomState::default(),
             key: hmac::Key::generate(hmac::HMAC_SHA256, &SystemRandom::new()).ok(),
             commands: north.kept(),
-            north,
             in_progress: Arc::new(Semaphore::new(IN_PROGRESS)),
             failures: LogThrottle::default(),
         }

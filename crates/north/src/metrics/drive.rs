@@ -14,9 +14,9 @@ use drivegate_core::start_guard::Reason;
 use drivegate_model::drive::{ModelPoint, PointIndex, State, Value};
 
 /// A drive, read once for all families.
-pub(super) struct Look<'a> {
+pub(super) struct DriveFigures<'a> {
     pub(super) labels: Labels,
-    drive: &'a DriveHandle,
+    handle: &'a DriveHandle,
     image: &'a DriveImage,
     reading: Reading<'a>,
     /// Good numbers of the public points with their names, in their order.
@@ -29,30 +29,31 @@ pub(super) struct Look<'a> {
     totals: Option<Totals>,
 }
 
-impl<'a> Look<'a> {
-    pub(super) fn of(drive: &'a DriveHandle, north: &NorthState, now: Instant) -> Look<'a> {
-        let image = &*drive.image;
-        let (reading, profile) = (drive.reading(now), &image.spec.profile);
+impl<'a> DriveFigures<'a> {
+    pub(super) fn of(handle: &'a DriveHandle, north: &NorthState, now: Instant) -> DriveFigures<'a> {
+        let image = &*handle.image;
+        let (reading, profile) = (handle.reading(now), &image.spec.profile);
         let good = |index| {
             let value = reading.sample(index).good().and_then(Value::exact_f64);
             value.filter(|value| value.is_finite())
         };
         let points = public_points(profile).into_iter();
         let drills = north.drills.options().is_some();
-        let hold = drive.hold_view(None, now);
-        let unheld = || drive.bus.queue.lock().gate.unheld(drive.index);
+        let hold = handle.hold_view(None, now);
+        let unheld = || handle.bus.queue.lock().gate.unheld(handle.index);
         let counts_runs = profile.model_index(ModelPoint::Running).is_some();
-        Look {
+        DriveFigures {
             labels: labels(image),
             values: points
                 .filter_map(|(index, name)| Some((index, name, good(index)?)))
                 .collect(),
-            proofs: drills
-                .then(|| north.drills.proofs(&drive.machine()))
-                .unwrap_or_default(),
+            proofs: match drills {
+                true => north.drills.proofs(&handle.machine()),
+                false => Vec::new(),
+            },
             hold: hold.map(|(view, _)| (view, unheld())),
             totals: counts_runs.then(|| north.history.totals(&image.spec.name)),
-            drive,
+            handle,
             image,
             reading,
         }
@@ -82,7 +83,7 @@ pub(super) fn labels(image: &DriveImage) -> Labels {
 }
 
 /// All families of drives, in the order of the output.
-pub(super) fn families<'a>() -> Vec<Row<Look<'a>>> {
+pub(super) fn families<'a>() -> Vec<Row<DriveFigures<'a>>> {
     let tables = [
         state_families(),
         model::families(),
@@ -92,55 +93,55 @@ pub(super) fn families<'a>() -> Vec<Row<Look<'a>>> {
     tables.into_iter().flatten().collect()
 }
 
-fn state_families<'a>() -> Vec<Row<Look<'a>>> {
-    rows! { Look<'a>;
+fn state_families<'a>() -> Vec<Row<DriveFigures<'a>>> {
+    rows! { DriveFigures<'a>;
         Gauge "drivegate_drive_up" "Whether the drive replies: 1, else 0 (also before its first reply)."
-            => |look, series| series.add(look.reading.snapshot.link.is_online());
+            => |drive, series| series.add(drive.reading.snapshot.link.is_online());
         Gauge "drivegate_drive_state"
             "State of the drive: 1 for the state it is in, 0 for the others; absent while it is unknown."
-            => |look, series| if let Some(current) = look.reading.state() {
+            => |drive, series| if let Some(current) = drive.reading.state() {
                 for one in State::ALL {
                     series.with("state", one.name(), one == current);
                 }
             };
         Gauge "drivegate_drive_blocked" "Why the motor does not run: 1 for each cause; absent while it runs."
-            => |look, series| for cause in look.drive.why(&look.reading).names() {
+            => |drive, series| for cause in drive.handle.why(&drive.reading).names() {
                 series.with("reason", cause, true);
             };
         Gauge "drivegate_drive_fault_info" "Text of the active fault: 1; absent without a fault."
-            => |look, series| {
-                let text = look.reading.fault_text();
-                if look.reading.is_set(ModelPoint::Fault) && !text.is_empty() {
+            => |drive, series| {
+                let text = drive.reading.fault_text();
+                if drive.reading.is_set(ModelPoint::Fault) && !text.is_empty() {
                     series.with("text", text, true);
                 }
             };
         Gauge "drivegate_drive_sample_age_seconds" "Age of the drive's process data; absent while it was never read."
-            => |look, series| series.add_some(look.reading.age().map(|age| age.as_secs_f64()));
+            => |drive, series| series.add_some(drive.reading.age().map(|age| age.as_secs_f64()));
     }
 }
 
-fn counted_families<'a>() -> Vec<Row<Look<'a>>> {
-    rows! { Look<'a>;
+fn counted_families<'a>() -> Vec<Row<DriveFigures<'a>>> {
+    rows! { DriveFigures<'a>;
         Gauge "drivegate_point_value" "Points of a drive that have no metric of their own, in their unit; true is 1."
-            => |look, series| for (point, unit, value) in look.others() {
+            => |drive, series| for (point, unit, value) in drive.others() {
                 series.with_both(("point", point.to_string().into()), ("unit", unit.to_string().into()), value);
             };
         Counter "drivegate_drive_transactions_total" "Transactions with the drive by outcome."
-            => |look, series| for outcome in Outcome::ALL {
-                series.with("outcome", outcome.name(), look.image.counted(outcome));
+            => |drive, series| for outcome in Outcome::ALL {
+                series.with("outcome", outcome.name(), drive.image.counted(outcome));
             };
         Gauge "drivegate_drive_turnaround_seconds"
             "Time from the end of the last request to the start of the drive's reply."
-            => |look, series| series.add_some(look.image.turnaround().map(|time| time.as_secs_f64()));
+            => |drive, series| series.add_some(drive.image.turnaround().map(|time| time.as_secs_f64()));
     }
 }
 
-fn permit_families<'a>() -> Vec<Row<Look<'a>>> {
-    rows! { Look<'a>;
+fn permit_families<'a>() -> Vec<Row<DriveFigures<'a>>> {
+    rows! { DriveFigures<'a>;
         Counter "drivegate_starts_refused_total" "Starts of a guarded drive that were refused, by reason."
-            => |look, series| {
-                let guards = look.drive.bus.queue.guards().filter(|guards| guards.guards(look.drive.index));
-                if let Some(counted) = guards.map(|guards| guards.refused(look.drive.index)) {
+            => |drive, series| {
+                let guards = drive.handle.bus.queue.guards().filter(|guards| guards.guards(drive.handle.index));
+                if let Some(counted) = guards.map(|guards| guards.refused(drive.handle.index)) {
                     for reason in Reason::ALL {
                         series.with("reason", reason.name(), counted.get(&reason).copied().unwrap_or_default());
                     }
@@ -148,41 +149,41 @@ fn permit_families<'a>() -> Vec<Row<Look<'a>>> {
             };
         Counter "drivegate_supervision_actions_total"
             "Leases that expired while the drive ran or had its run command set."
-            => |look, series| series.add(look.image.supervisions());
+            => |drive, series| series.add(drive.image.supervisions());
         Counter "drivegate_supervision_failed_total"
             "Failed attempts at the action of a lease, or at the stop at shutdown."
-            => |look, series| series.add(look.image.supervision_failures());
+            => |drive, series| series.add(drive.image.supervision_failures());
         Gauge "drivegate_drive_unsupervised" "1 if a drive with supervision runs without a lease, else 0."
-            => |look, series| if look.image.spec.supervision.is_some() {
-                series.add(look.image.is_unsupervised());
+            => |drive, series| if drive.image.spec.supervision.is_some() {
+                series.add(drive.image.is_unsupervised());
             };
         Counter "drivegate_refresh_writes_total"
             "Write requests by which what was ordered is written again for the drive's own timeout."
-            => |look, series| if look.image.spec.refresh.is_some() {
-                series.add(look.image.refresh_writes());
+            => |drive, series| if drive.image.spec.refresh.is_some() {
+                series.add(drive.image.refresh_writes());
             };
         Gauge "drivegate_drive_held" "1 for the rank of the client that holds the drive; no series while nobody does."
-            => |look, series| if let Some((view, _)) = &look.hold
+            => |drive, series| if let Some((view, _)) = &drive.hold
                 && let (HoldState::Held, Some(rank)) = (view.state, &view.rank)
             {
                 series.with("rank", rank.to_string(), true);
             };
         Counter "drivegate_orders_unheld_total"
             "Commands from clients that did not hold the drive, executed in advisory mode."
-            => |look, series| series.add_some(look.hold.as_ref().map(|(_, unheld)| *unheld));
+            => |drive, series| series.add_some(drive.hold.as_ref().map(|(_, unheld)| *unheld));
         Gauge "drivegate_drill_age_seconds"
             "Time since the last completed drill of that kind; no series before the first."
-            => |look, series| for proof in &look.proofs {
+            => |drive, series| for proof in &drive.proofs {
                 series.with("kind", proof.kind.name(), proof.age(SystemTime::now()).as_secs_f64());
             };
         Gauge "drivegate_drill_passed" "1 if the motor stopped in time in that drill."
-            => |look, series| for proof in &look.proofs {
+            => |drive, series| for proof in &drive.proofs {
                 series.with("kind", proof.kind.name(), proof.passed);
             };
         Counter "drivegate_drive_starts_total" "Observed starts of the motor; kept across restarts of the gateway."
-            => |look, series| series.add_some(look.totals.map(|totals| totals.starts));
+            => |drive, series| series.add_some(drive.totals.map(|totals| totals.starts));
         Counter "drivegate_drive_running_seconds_total"
             "Observed run time of the motor; kept across restarts of the gateway."
-            => |look, series| series.add_some(look.totals.map(|totals| SeriesValue::Total(totals.running_seconds)));
+            => |drive, series| series.add_some(drive.totals.map(|totals| SeriesValue::Total(totals.running_seconds)));
     }
 }

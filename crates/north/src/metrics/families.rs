@@ -5,7 +5,7 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::drive::{self, Look};
+use super::drive::{self, DriveFigures};
 use super::process::{self, ProcessStats};
 use super::series::{Families, Labels, Row, SeriesValue, rows};
 use crate::stats::BacnetFigures;
@@ -20,8 +20,8 @@ use drivegate_model::drive::PollClass;
 pub(super) fn collect(plant: &Plant, north: &NorthState, now: Instant) -> Families {
     let mut all = Families::default();
     let drives: Vec<_> = plant.drives().collect();
-    let drives = drives.iter().map(|drive| Look::of(drive, north, now));
-    all.fill(&drive::families(), drives.map(|look| (look.labels.clone(), look)));
+    let drives = drives.iter().map(|drive| DriveFigures::of(drive, north, now));
+    all.fill(&drive::families(), drives.map(|drive| (drive.labels.clone(), drive)));
     let buses = plant.buses.iter().map(|handle| Bus {
         handle,
         health: handle.image.health(),

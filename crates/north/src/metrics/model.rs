@@ -1,6 +1,6 @@
 //! Metrics of the common drive model.
 
-use super::drive::Look;
+use super::drive::DriveFigures;
 use super::series::{Row, rows};
 use drivegate_model::drive::ModelPoint;
 
@@ -10,8 +10,8 @@ macro_rules! gauges {
         /// Points of the model that have a metric of their own.
         pub(super) const MODEL: &[ModelPoint] = &[$(ModelPoint::$point),*];
 
-        pub(super) fn families<'a>() -> Vec<Row<Look<'a>>> {
-            rows! { Look<'a>; $(Gauge $metric $help => |look, series| series.add_some(look.model(ModelPoint::$point));)* }
+        pub(super) fn families<'a>() -> Vec<Row<DriveFigures<'a>>> {
+            rows! { DriveFigures<'a>; $(Gauge $metric $help => |drive, series| series.add_some(drive.model(ModelPoint::$point));)* }
         }
     };
 }

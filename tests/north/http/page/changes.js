@@ -288,6 +288,8 @@ async function brokersSayWhyTheyAreAway(gateway, page) {
   gateway.mqtt = { links: [link(), link({ client: "sparkplug" })], waiting: 0, published: 17, lost: 0 };
   for (const address of ["#/", "#/lines"]) {
     await page.open(`${gateway.url}#/events`);
+    // The cards of the view before are not those that are awaited.
+    await page.until(() => document.querySelector(".view.events"));
     await page.open(`${gateway.url}${address}`);
     await page.until(() => document.querySelectorAll(".brokers .card").length === 2);
     const [plain, node] = await page.eval(said);

@@ -1,3 +1,4 @@
+use drivegate_north::NorthState;
 use std::time::Duration;
 
 use drivegate_testkit::next_command;
@@ -32,7 +33,7 @@ impl OperatedPlant {
             drivegate_testkit::read_nx(&plant, drive, 0b11, 0, now);
         }
         OperatedPlant {
-            operating: Operating::new(Arc::default()),
+            operating: Operating::new(&NorthState::default()),
             plant,
             now,
         }
@@ -121,11 +122,12 @@ fn a_repetition_is_recognised_by_user_drive_and_content() {
 
 #[test]
 fn a_repetition_is_known_to_the_server_that_a_reload_starts() {
-    let mut rig = OperatedPlant::new();
+    let (mut rig, north) = (OperatedPlant::new(), NorthState::default());
     let alice = operator("alice", "alice#1");
     let body = "{\"id\": 1, \"speed_reference\": 10}";
+    rig.operating = Operating::new(&north);
     let _first = rig.take(&alice, "p1", body);
-    rig.operating = Operating::new(rig.operating.north.clone());
+    rig.operating = Operating::new(&north);
     assert!(matches!(rig.take(&alice, "p1", body), Progress::Repeated(_)));
 }
 

@@ -1,4 +1,5 @@
 use axum::http::HeaderValue;
+use drivegate_north::NorthState;
 
 use super::super::paths::is_operating;
 use super::*;
@@ -113,7 +114,7 @@ fn paths_of_commands() {
 #[tokio::test]
 async fn users_come_and_go() {
     let made = User::new("alice", "correct horse").unwrap();
-    let operating = Operating::new(Arc::default());
+    let operating = Operating::new(&NorthState::default());
     operating.set_users(Some(Users::default()));
     let given = Credentials {
         user: "alice".to_string(),
@@ -160,7 +161,7 @@ async fn the_right_of_a_user_is_that_of_the_file_of_now() {
         ("commands are off", None, false),
     ];
     for (what, then, stays) in table {
-        let operating = Operating::new(Arc::default());
+        let operating = Operating::new(&NorthState::default());
         operating.set_users(users(&[&alice, &bob]));
         let basic = basic_authorization("alice:correct horse");
         let cookies = Cookies::of("hall", false);
@@ -193,7 +194,7 @@ async fn the_right_of_a_user_is_that_of_the_file_of_now() {
 
 #[tokio::test]
 async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
-    let operating = Operating::new(Arc::default());
+    let operating = Operating::new(&NorthState::default());
     let user = User::new("alice", "correct horse").unwrap();
     operating.set_users(Some(Users::parse(&user.to_string()).unwrap()));
     let given = |password: &str| Credentials {
@@ -233,7 +234,7 @@ async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
 
 #[test]
 fn who_did_something_keeps_its_places() {
-    let operating = Operating::new(Arc::default());
+    let operating = Operating::new(&NorthState::default());
     let user = User::new("alice", "correct horse").unwrap();
     let users = Users::parse(&user.to_string()).unwrap();
     operating.set_users(Some(users.clone()));
