@@ -41,10 +41,13 @@ pub enum Cut {
 /// A piece of the received bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
+    /// The content of the piece.
     pub cut: Cut,
+    /// The bytes of the piece, as received.
     pub bytes: Vec<u8>,
-    /// Start of its first and end of its last character on the wire, estimated from the arrival of the bytes.
+    /// Start of its first character on the wire, estimated from the arrival of the bytes.
     pub began: Instant,
+    /// End of its last character on the wire, estimated from the arrival of the bytes.
     pub ended: Instant,
 }
 

@@ -10,22 +10,31 @@ use super::{Finding, Node, Raw};
 /// Why a value is invalid: contains the value or its type, and the correction.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ValueError {
+    /// A number or a truth value in quotes: the text, and the expected type.
     #[error("`\"{0}\"` is a string")]
     Quoted(String, &'static str),
+    /// Another text: the text, and the expected type.
     #[error("`{0}` is not {1}")]
     Text(String, &'static str),
+    /// One text instead of a list: the text, and the expected type.
     #[error("`{0}` is not a list")]
     NotAList(String, String),
+    /// A number with a decimal point instead of a whole one: the number, and the expected type.
     #[error("`{0:?}` has a decimal point")]
     Fraction(f64, &'static str),
+    /// A value of another type: that type, and the expected one.
     #[error("wrong type: {0}")]
     Type(&'static str, String),
+    /// A whole number out of the range of its type: the number, and the expected type.
     #[error("{0} is out of range")]
     OutOfRange(i64, &'static str),
+    /// Infinity or NaN: the number, and the expected type.
     #[error("{0} is not a finite number")]
     NotFinite(f64, &'static str),
+    /// A text that is no duration with its unit, such as `10ms` or `2min`.
     #[error("`{0}` is not a duration")]
     Duration(String),
+    /// A text that is no whole number of `B`, `KiB`, `MiB` or `GiB`.
     #[error("`{0}` is not a size")]
     Size(String),
 }
