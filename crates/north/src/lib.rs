@@ -15,6 +15,7 @@ pub mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod parameter_jobs;
+pub mod patience;
 pub mod pem;
 pub mod readiness;
 pub mod reading;

@@ -5,9 +5,9 @@ use std::sync::atomic::AtomicBool;
 
 use super::kept::Kept;
 use super::listener::ListenerStates;
+use super::patience::Patience;
 use super::stats::{BacnetStats, ModbusTcpStats, MqttStats, RefusalStats, ReloadStats, SlotStats};
 use drivegate_core::drill::Drills;
-use drivegate_core::files::Patience;
 use drivegate_core::history::{History, Recordings};
 use drivegate_core::parameters::Vault;
 use drivegate_core::permit::AwaitedFiles;

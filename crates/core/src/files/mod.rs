@@ -2,11 +2,9 @@
 //!
 //! - [`rotated`]: a file of lines with its older files, bounded together.
 //! - [`Keeper`]: the thread that writes some of these files.
-//! - [`Patience`]: how long a start or a reload waits for the disk.
 //! - [`names`]: the names of the gateway's files.
 //! - [`read`]: the content of one of them. [`replace`]: writes new content completely or not at all.
 
-mod disk_timeout;
 mod keeper;
 pub mod names;
 pub mod rotated;
@@ -15,7 +13,6 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::Path;
 
-pub use disk_timeout::{DISK, Patience, late};
 pub use keeper::Keeper;
 pub use rotated::Rotated;
 

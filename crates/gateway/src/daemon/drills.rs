@@ -5,10 +5,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_core::drill::{DrillState, Drills, LOOK, SavedDrills};
+use drivegate_core::files;
 use drivegate_core::files::names::DRILLS;
-use drivegate_core::files::{self, Patience};
 use drivegate_core::order::{Origin, SourceKind};
 use drivegate_core::plant::SharedPlant;
+use drivegate_north::patience::Patience;
 
 /// Interval of the looks at an armed drill.
 const IDLE: Duration = Duration::from_millis(500);

@@ -5,12 +5,13 @@ use std::sync::Arc;
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
 use crate::config::Settings;
-use drivegate_core::files::{self, Keeper};
+use drivegate_core::files::Keeper;
 use drivegate_core::history::{self, RecorderTask};
 use drivegate_core::order::AuditFile;
 use drivegate_core::parameters::Store;
 use drivegate_core::start_guard;
 use drivegate_north::parameter_jobs::{hold_unfinished, keep_reading};
+use drivegate_north::patience::late;
 
 impl Daemon {
     /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are on
@@ -35,7 +36,7 @@ impl Daemon {
         if patience.wait(opened).await.is_none() {
             tracing::error!(
                 target: "drivegate::daemon", "cannot list the recordings of earlier runs: {}; they are listed as soon as it answers; \
-                                              check the disk of recordings.dir", files::late()
+                                              check the disk of recordings.dir", late()
             );
         }
         Ok(())
@@ -85,7 +86,7 @@ impl Daemon {
                     None => tracing::error!(
                         target: "drivegate::daemon",
                         "cannot read the events of earlier runs in {}: {}; they are not shown, and counting goes on \
-                         from the file as soon as it answers; check the disk of state_dir", settings.state_dir.display(), files::late()
+                         from the file as soon as it answers; check the disk of state_dir", settings.state_dir.display(), late()
                     ),
                 }
             }
@@ -113,7 +114,7 @@ impl Daemon {
                     tracing::error!(
                         target: "drivegate::daemon",
                         "cannot read the starts of earlier runs in {}: {}; drives with a guard are not started until it answers; \
-                         check the disk of state_dir", settings.state_dir.display(), files::late()
+                         check the disk of state_dir", settings.state_dir.display(), late()
                     );
                 }
             }

@@ -59,7 +59,7 @@ pub(super) async fn restore(file: &ReservationsFile, north: &NorthState, plant: 
     if north.patience.wait(taken_up).await.is_none() {
         tracing::error!(
             target: "drivegate::daemon",
-            "cannot read {}: {}; no motor is started until it is read; check the disk of state_dir", path.display(), files::late()
+            "cannot read {}: {}; no motor is started until it is read; check the disk of state_dir", path.display(), drivegate_north::patience::late()
         );
     }
 }

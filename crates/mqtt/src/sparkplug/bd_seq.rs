@@ -5,8 +5,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use drivegate_core::files::Patience;
 use drivegate_core::files::names::SPARKPLUG;
+use drivegate_north::patience::Patience;
 
 /// Longest wait for writing the file.
 const WRITE: Duration = Duration::from_secs(1);

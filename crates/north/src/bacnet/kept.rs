@@ -12,8 +12,9 @@ use tokio::task::JoinHandle;
 
 use super::rights::HostRights;
 use crate::NorthState;
+use crate::patience::DISK;
 use drivegate_core::event::{Event, EventKind, Events};
-use drivegate_core::files::{self, DISK};
+use drivegate_core::files;
 use drivegate_core::order::{Commanded, Entry, Origin, SourceKind};
 use drivegate_core::permit::PROTECTING;
 use drivegate_core::plant::{BusHandle, Plant};

@@ -26,6 +26,7 @@ use super::rights::HostRights;
 use super::sockets::Sockets;
 use super::writes::Waiting;
 use super::{NorthState, Options};
+use crate::patience;
 use crate::reading::{Reader, is_readable};
 use crate::stats::BacnetFigures;
 use drivegate_core::event::{Event, EventKind};
@@ -298,7 +299,7 @@ impl Task {
         {
             tracing::error!(
                 target: "drivegate::bacnet",
-                "cannot read {}: {}; no motor is started until it is read; check the disk", path.display(), files::late()
+                "cannot read {}: {}; no motor is started until it is read; check the disk", path.display(), patience::late()
             );
         }
         self.reading = Some((path, reading));

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::restore::blocking;
+use crate::patience::Patience;
 use drivegate_core::event::{Event, EventKind, Events};
-use drivegate_core::files::Patience;
 use drivegate_core::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
 use drivegate_core::plant::{DriveHandle, SharedPlant};
 use drivegate_core::process_image::{Access, BusSpec, DriveSpec, Machine};
