@@ -133,7 +133,7 @@ fn a_reservation_holds_from_the_start_on_however_late_the_disk_returns_it() {
     let file = site.file("state/reservations.json");
     let _line = site.line(&[1, 2]);
     let mut gateway = site.run_ready();
-    assert_eq!(start(&site, "pump-1")["ok"], true);
+    site.until_state("pump-1", "ready");
     let stop = |drive: &str| {
         let (status, answer) = site.curl(
             "alice",

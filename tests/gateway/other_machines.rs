@@ -172,7 +172,7 @@ fn a_hold_a_restore_and_a_drill_belong_to_the_machine_that_was_named() {
     let mut names = [pair("pump-2", "pump-1"), pair("pump-1", "pump-2")].into_iter().cycle();
     for (path, body) in [
         ("drives/pump-1/hold", "{\"action\": \"take\"}"),
-        ("drives/pump-1/params/restore", "{\"action\": \"resume\"}"),
+        ("drives/pump-1/params/restore", "\"resume\""),
         ("drills", "{\"drive\": \"pump-1\"}"),
     ] {
         let mut begun = begin_post(&plant.site, path, body);
