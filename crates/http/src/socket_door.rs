@@ -36,7 +36,7 @@ pub(crate) struct SocketDoor {
 
 impl SocketDoor {
     pub(crate) fn new(plant: &SharedPlant, stats: &Arc<NorthState>, cancel: CancellationToken) -> SocketDoor {
-        let operating = Arc::new(Operating::new(&stats));
+        let operating = Arc::new(Operating::new(stats));
         SocketDoor {
             router: routes::router(plant.clone(), stats.clone(), operating, cancel),
         }

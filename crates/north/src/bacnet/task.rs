@@ -58,6 +58,9 @@ pub(super) enum ToTask {
 
 type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 
+/// The slots from before the start, once their file is read.
+type SlotsRead = oneshot::Receiver<Result<Vec<KeptSlot>, String>>;
+
 pub(super) struct Task {
     options: Arc<Options>,
     sockets: Sockets,
@@ -73,7 +76,7 @@ pub(super) struct Task {
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: KeptFile,
     /// The slots from before the start while they are read, with the path of their file.
-    reading: Option<(PathBuf, oneshot::Receiver<Result<Vec<KeptSlot>, String>>)>,
+    reading: Option<(PathBuf, SlotsRead)>,
     /// Devices with a slot from before the restart against which the motor may run.
     watched: BTreeSet<u32>,
     resolved: Option<Instant>,

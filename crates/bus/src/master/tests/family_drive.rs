@@ -11,7 +11,10 @@ use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
 pub(super) struct FamilyDrive {
     profile: Arc<Profile>,
+    /// Registers that show states; one may share its address with the control word.
     items: BTreeMap<(Table, u16), u16>,
+    /// What was written.
+    written: BTreeMap<(Table, u16), u16>,
     pub(super) runs: bool,
     /// Function 16 is unknown to the drive.
     pub(super) only_06: bool,
@@ -23,6 +26,7 @@ impl FamilyDrive {
         let mut drive = FamilyDrive {
             profile: profile.clone(),
             items: BTreeMap::new(),
+            written: BTreeMap::new(),
             runs: false,
             only_06: false,
         };
@@ -100,7 +104,7 @@ impl FamilyDrive {
 
     pub(super) fn word(&self) -> u16 {
         let at = self.control().at;
-        self.items.get(&(at.table, at.address)).copied().unwrap_or(0)
+        self.written.get(&(at.table, at.address)).copied().unwrap_or(0)
     }
 
     /// Writes the control word as another master.
@@ -111,7 +115,7 @@ impl FamilyDrive {
 
     fn takes(&mut self, table: Table, address: u16, word: u16) {
         let (control, place) = (self.control(), ControlItem { table, address });
-        self.items.insert((table, address), word);
+        self.written.insert((table, address), word);
         let word = if place == control.at {
             control.without_reset(word)
         } else {
@@ -137,9 +141,17 @@ impl FamilyDrive {
         if let RequestPdu::Read { table, start, count } = pdu {
             let shadow = !self.control().is_read();
             let at = self.control().at;
-            let word = |address: u16| match (*table, address) == (at.table, at.address) && shadow {
-                true => 0x5555,
-                false => self.items.get(&(*table, address)).copied().unwrap_or(0),
+            let word = |address: u16| {
+                let place = (*table, address);
+                let hidden = shadow && place == (at.table, at.address);
+                let written = || {
+                    if hidden {
+                        Some(&0x5555)
+                    } else {
+                        self.written.get(&place)
+                    }
+                };
+                self.items.get(&place).or_else(written).copied().unwrap_or(0)
             };
             let words: Vec<u16> = (*start..start.saturating_add(*count)).map(word).collect();
             return match table {

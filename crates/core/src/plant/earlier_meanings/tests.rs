@@ -126,7 +126,8 @@ fn a_run_command_that_is_repeated_starts_no_machine_that_took_the_place() {
 /// start, and the address of the machine that a stop reaches.
 #[test]
 fn an_order_belongs_to_the_machine_that_it_named_after_any_number_of_reloads() {
-    let table: [(&str, &[&[Named]], &str, Option<u8>); 8] = [
+    type Row = (&'static str, &'static [&'static [Named]], &'static str, Option<u8>);
+    let table: [Row; 8] = [
         (
             "another drive renamed",
             &[&[("pump-1", 11, 1), ("fan", 13, 2)]],
