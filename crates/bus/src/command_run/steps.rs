@@ -164,7 +164,7 @@ pub(super) fn names_run(profile: &Profile, values: &[(PointIndex, Value)]) -> bo
         return false;
     };
     let place = control.run_place();
-    let bits = control.runs().iter().fold(0, |bits, run| bits | run.mask);
+    let bits = control.each_run().fold(0, |bits, run| bits | run.mask);
     let is_run = |raw: &Raw| (raw.table, raw.address) != (place.table, place.address) || bits_of(raw) & bits != 0;
     values.iter().any(|(index, value)| {
         let raw = profile.points.get(*index).and_then(|point| point.raw());

@@ -348,7 +348,8 @@ impl Taker {
 }
 
 fn shortened(text: &str) -> String {
-    text.chars().take(MOST_TEXT).collect()
+    let end = text.char_indices().nth(MOST_TEXT).map_or(text.len(), |(end, _)| end);
+    text.get(..end).unwrap_or_default().to_string()
 }
 
 /// The thread that writes recordings to disk.

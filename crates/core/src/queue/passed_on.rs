@@ -12,7 +12,7 @@ impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
     /// that cannot be sent because its drive is offline does not delay requests that also reach other drives.
     pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
-        if self.waiting.iter().all(|c| c.as_passed_on().is_none()) {
+        if !self.has_passed_on() {
             return Vec::new();
         }
         let stops = self.waiting.iter().filter(|c| c.is_stop());
@@ -28,10 +28,17 @@ impl Pending {
         all
     }
 
+    fn has_passed_on(&self) -> bool {
+        self.waiting.iter().any(|command| command.as_passed_on().is_some())
+    }
+
     /// Passed-on requests that must be sent like commands because a command waits for them.
     pub(super) fn pressed(&self) -> Vec<u64> {
-        let mut waits: Vec<DriveIndex> = Vec::new();
         let mut pressed = Vec::new();
+        if !self.has_passed_on() {
+            return pressed;
+        }
+        let mut waits: Vec<DriveIndex> = Vec::new();
         for command in self.waiting.iter().rev().filter(|c| c.is_command()) {
             let presses = command.reach().any(|drive| waits.contains(&drive));
             let is_passed_on = command.as_passed_on().is_some();

@@ -204,11 +204,17 @@ pub struct Reset {
 impl Control {
     /// Every setting that starts the motor; for a sequence, its last word.
     pub fn runs(&self) -> Vec<Setting> {
-        match &self.run {
-            Run::One(setting) => vec![*setting],
-            Run::Pair { forward, reverse } => vec![*forward, *reverse],
-            Run::Steps(steps) => steps.last().map(|step| step.write).into_iter().collect(),
-        }
+        self.each_run().copied().collect()
+    }
+
+    /// The settings of [`Control::runs`], where no list of them is needed.
+    pub fn each_run(&self) -> impl Iterator<Item = &Setting> {
+        let (first, second) = match &self.run {
+            Run::One(setting) => (Some(setting), None),
+            Run::Pair { forward, reverse } => (Some(forward), Some(reverse)),
+            Run::Steps(steps) => (steps.last().map(|step| &step.write), None),
+        };
+        first.into_iter().chain(second)
     }
 
     /// Whether the word, written to this register, stops the motor.
@@ -229,7 +235,7 @@ impl Control {
     /// Whether the word, written to this register, starts the motor or keeps it running.
     pub fn is_run(&self, place: ControlItem, word: u16) -> bool {
         let of = |setting: &Setting| setting.place.unwrap_or(self.at) == place && self.holds_run(setting, word);
-        !self.is_stop(place, word) && self.runs().iter().any(of)
+        !self.is_stop(place, word) && self.each_run().any(of)
     }
 
     /// Whether a client may write this word here unchanged: to the control register only words that clearly stop or
@@ -329,7 +335,7 @@ impl Control {
 
     /// The place to which `run` is written.
     pub fn run_place(&self) -> ControlItem {
-        let first = self.runs().first().and_then(|setting| setting.place);
+        let first = self.each_run().next().and_then(|setting| setting.place);
         first.unwrap_or(self.at)
     }
 

@@ -18,6 +18,8 @@ use crate::printable;
 const INTERVAL: Duration = Duration::from_secs(60);
 /// Maximum number of kinds of lines that are distinguished; they are places in the source code, so this is never reached.
 const KINDS: usize = 1024;
+/// Bytes that hold a usual line, so that its text need not grow step by step.
+const USUAL: usize = 512;
 /// Start of the targets of our own log lines.
 const OWN: &str = "drivegate";
 
@@ -65,7 +67,7 @@ where
             return Ok(());
         };
         drop(libraries);
-        let mut text = String::new();
+        let mut text = String::with_capacity(USUAL);
         match self.form {
             Form::Json => {
                 self.json.format_event(context, Writer::new(&mut text), event)?;
