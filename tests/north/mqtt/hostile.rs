@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::io::Write;
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use drivegate_core::event::EventKind;
 use drivegate_testkit::mqtt as packets;
@@ -34,6 +35,8 @@ struct Manners {
     no_will: bool,
     /// Whether the broker refuses filters with wildcards.
     no_wildcards: bool,
+    /// Whether the broker takes 6 s to accept a client.
+    slow: bool,
 }
 
 /// A broker whose CONNACK has these properties.
@@ -159,6 +162,9 @@ impl Session {
                     return None;
                 }
                 1 => {
+                    if self.manners.slow {
+                        std::thread::sleep(Duration::from_secs(6));
+                    }
                     let properties = self.manners.properties.clone();
                     let body = [&[0, 0, u8::try_from(properties.len()).unwrap()][..], &properties].concat();
                     self.send(0x20, &body)?;
@@ -375,6 +381,18 @@ fn a_broker_that_falls_silent_is_told_goodbye() {
     wait_for("the next connection", || {
         (broker.seen.lock().unwrap().connections > 1).then_some(())
     });
+    gateway.stop();
+}
+
+/// A broker that looks up its clients in a database is given ten seconds.
+#[test]
+fn a_broker_that_accepts_after_six_seconds_is_waited_for() {
+    let broker = Hostile::start(Manners {
+        slow: true,
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_for("the connection", || gateway.connected().then_some(()));
     gateway.stop();
 }
 
