@@ -153,6 +153,9 @@ fn a_reservation_holds_from_the_start_on_however_late_the_disk_returns_it() {
     std::fs::remove_file(&file).unwrap();
     hang(&file);
     let _gateway = site.run_ready();
+    for drive in ["pump-1", "fan-2"] {
+        site.until_state(drive, "ready");
+    }
     let by_bob = || {
         let (_, answer) = site.curl("bob", "drives/pump-1/commands", &["-d", "{\"run\": true}"]);
         assert_eq!(answer["result"], "held_by_other", "{answer}");
