@@ -132,3 +132,16 @@ fn a_lease_goes_on_when_a_reload_brings_its_drive_back() {
         );
     }
 }
+
+#[test]
+fn a_bus_that_a_reload_stopped_is_freed_after_two_minutes() {
+    let (removed, now) = (RemovedDrives::default(), Instant::now());
+    let plant = drivegate_testkit::nx_plant(&["p1"]);
+    let image = Arc::downgrade(&plant.buses[0].image);
+    removed.keep(&Leases::default(), &plant.buses, now);
+    drop(plant);
+    for (after, is_known) in [(RETURN, true), (RETURN + Duration::from_secs(1), false)] {
+        removed.forget(now + after);
+        assert_eq!(image.strong_count() > 0, is_known, "{after:?}");
+    }
+}
