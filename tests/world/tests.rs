@@ -59,6 +59,8 @@ use self::world::{Figures, World};
 
 /// Seeds of every test run.
 const FIXED: u64 = 400;
+/// Seeds of every test run that found a fault which the fixed ones do not meet.
+const FOUND: [u64; 6] = [508, 816, 4816, 4843, 3485, 5889];
 /// Seeds of every test run in which clients flood without a pause.
 const FLOODED: Range<u64> = 0..16;
 
@@ -127,6 +129,13 @@ fn fixed_seeds() {
             run_all(first..first + count);
         }
         (None, None) => run_all(0..FIXED),
+    }
+}
+
+#[test]
+fn seeds_that_found_a_fault() {
+    for seed in FOUND {
+        run(seed);
     }
 }
 
