@@ -19,7 +19,8 @@
 //!
 //! - A safety function: leases and stops are conveniences; emergency stop and safe torque off are wired.
 //! - Writes without a command: none at start, at reconnect or at reload. The gateway itself writes only the action of a lease
-//!   and the stop at shutdown, where they are configured, and repeats (`refresh`) what a client has ordered.
+//!   and stops (of interlocks, at local control, at shutdown), where they are configured, and repeats (`refresh`) what a
+//!   client has ordered.
 //! - Values without quality, and old values served as good ones.
 //! - A database, and plug-ins: profiles are data.
 //! - The async runtime on the line: 3.5 characters are shorter than its timer's step.

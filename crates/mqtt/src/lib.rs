@@ -5,7 +5,7 @@
 //! events, history ──▶ store ────▶ │ outbox │ ──▶ (rumqttc, a task  │ broker │
 //! results ──────────────────────▶ └────────┘     of its own) ────▶ └────────┘
 //!                       │ ▲                                            │
-//!               journal (a thread, on disk)                            │
+//!               message log (a thread, on disk)                        │
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
