@@ -15,6 +15,7 @@
     reason = "a test may panic, its helpers too"
 )]
 
+mod another_master;
 mod bacnet;
 mod bus;
 mod clients;

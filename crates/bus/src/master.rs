@@ -155,7 +155,7 @@ pub struct TurnEnd {
 }
 
 /// State of a drive that continues over a reload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct CarriedState {
     /// Lease of the drive at the handover.
     pub lease: Lease,

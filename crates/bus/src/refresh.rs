@@ -7,12 +7,14 @@
 
 mod end;
 mod ordered;
+mod pace;
 mod round;
 
 use std::time::{Duration, Instant};
 
 pub(crate) use self::end::End;
 use self::ordered::{InForce, Ordered, in_force, reference_of};
+use self::pace::Pace;
 use self::round::Round;
 pub(super) use self::round::requests;
 use drivegate_core::order::written;
@@ -36,7 +38,7 @@ enum Beginner {
 }
 
 /// The state of a refresh in progress.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Going {
     does: InForce,
     /// When the order that started it ended: earlier reads are not valid.
@@ -46,14 +48,16 @@ struct Going {
     due: Instant,
     /// Whether the motor was seen to run by its run command, or to stand by its stop.
     seen: bool,
-    /// Since when the drive has not answered.
+    /// Since when the drive has not answered, or its motor has slowed down without an order.
     lost: Option<Instant>,
+    /// Speed of the motor in relation to its reference, where the word of the drive cannot be read.
+    pace: Pace,
     /// Origin of the order that started the refresh.
     by: Beginner,
 }
 
 /// A refresh as it is handed over to the bus that replaces this one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Repeated {
     ordered: Ordered,
     going: Option<Going>,
@@ -173,6 +177,14 @@ impl Refresh {
             }
         }
         if let Some(reference) = reference_of(&of_reference) {
+            if let Some(going) = self
+                .repeated
+                .going
+                .as_mut()
+                .filter(|_| ordered.reference != Some(reference))
+            {
+                going.pace = Pace::Free;
+            }
             ordered.reference = Some(reference);
             (ordered.referred, ordered.tells_reference) = (Some(now), false);
             if by_reference {
@@ -234,6 +246,7 @@ impl Refresh {
             due,
             seen: false,
             lost: None,
+            pace: Pace::Free,
             by,
         };
         let going = before.map(|going| Going {
@@ -276,7 +289,7 @@ impl Refresh {
             .lost
             .is_some_and(|lost| now.saturating_duration_since(lost) > PERIODS * every)
         {
-            Some(End::Silent)
+            Some(going.silence())
         } else if reading.restore_lock.and_then(RestoreLock::reason).is_some() {
             Some(End::Restore)
         } else if going.does == InForce::Run && around.stops != going.stops && !around.delayed {
@@ -312,6 +325,14 @@ impl Refresh {
 }
 
 impl Going {
+    /// Why a refresh ends that could not be written for three periods.
+    fn silence(&self) -> End {
+        match self.pace {
+            Pace::Falls(_) => End::Slows,
+            _ => End::Silent,
+        }
+    }
+
     /// Checks the samples since the order for a contradiction.
     fn is_contradicted(&mut self, reading: &Reading<'_>) -> Option<End> {
         let shown = |point: ModelPoint| {

@@ -39,11 +39,11 @@ impl StateBits {
     }
 
     fn value(&self, words: &BTreeMap<(Table, u16), u16>) -> Option<bool> {
-        let part = |(raw, kind): &(Raw, Kind)| {
-            let of = raw.addresses().map(|address| words.get(&(raw.table, address)).copied());
-            raw.decode(&of.collect::<Option<Vec<u16>>>()?, *kind)
-        };
-        let values = self.parts.iter().map(part).collect::<Option<Vec<Value>>>()?;
+        let values = self
+            .parts
+            .iter()
+            .map(|part| decoded(part, words))
+            .collect::<Option<Vec<Value>>>()?;
         match &self.derived {
             Some(derived) => derived.value(values, None).map(Value::as_bool),
             None => values.first().copied().map(Value::as_bool),
@@ -57,6 +57,8 @@ pub(crate) struct StateRead {
     running: StateBits,
     fault: Option<StateBits>,
     remote: Option<StateBits>,
+    /// The speed of the motor, where it is read.
+    speed: Option<(Raw, Kind)>,
     first: RequestPdu,
     more: Vec<RequestPdu>,
     /// Number of answered requests in this series.
@@ -67,22 +69,34 @@ pub(crate) struct StateRead {
 impl StateRead {
     /// Reads that show whether the motor runs; `None` if the family does not report that.
     pub(super) fn at_running(profile: &Profile) -> Option<StateRead> {
-        StateRead::of(profile, &[])
+        StateRead::of(profile, &[], None)
     }
 
     /// Reads that show whether the motor runs by a command from the bus: a faulted drive may still show the motor
     /// state from before the fault, and a drive under panel control does not run by a word of the gateway.
     pub(crate) fn at_motor(profile: &Profile) -> Option<StateRead> {
-        StateRead::of(profile, &[ModelPoint::Fault, ModelPoint::Remote])
+        StateRead::at_refresh(profile, None)
+    }
+
+    /// Reads as before a word, and of this point, which shows the speed of the motor.
+    pub(crate) fn at_refresh(profile: &Profile, speed: Option<ModelPoint>) -> Option<StateRead> {
+        StateRead::of(profile, &[ModelPoint::Fault, ModelPoint::Remote], speed)
     }
 
     /// Reads of these points and of the running bit, which is read last so that it is the newest.
-    fn of(profile: &Profile, more: &[ModelPoint]) -> Option<StateRead> {
+    fn of(profile: &Profile, more: &[ModelPoint], speed: Option<ModelPoint>) -> Option<StateRead> {
         let shown = |point: ModelPoint| more.contains(&point).then(|| StateBits::of(profile, point)).flatten();
         let running = StateBits::of(profile, ModelPoint::Running)?;
         let (fault, remote) = (shown(ModelPoint::Fault), shown(ModelPoint::Remote));
         let all = [&fault, &remote].into_iter().flatten().chain([&running]);
+        let speed = speed.and_then(|point| {
+            let point = profile.points.get(profile.model_index(point)?)?;
+            Some((point.raw()?.clone(), point.kind()))
+        });
         let mut more = Vec::new();
+        if let Some((raw, _)) = &speed {
+            read_with(&mut more, profile, raw);
+        }
         for (raw, _) in all.flat_map(|shown| &shown.parts) {
             read_with(&mut more, profile, raw);
         }
@@ -94,6 +108,7 @@ impl StateRead {
             running,
             fault,
             remote,
+            speed,
             first,
             more,
             answered: 0,
@@ -132,6 +147,11 @@ impl StateRead {
     /// Whether the motor runs; `None` if the replies do not show it.
     pub(super) fn runs(&self) -> Option<bool> {
         self.running.value(&self.words)
+    }
+
+    /// Speed of the motor; `None` if it is not read, or the replies do not show it.
+    pub(crate) fn speed(&self) -> Option<f64> {
+        decoded(self.speed.as_ref()?, &self.words).map(Value::as_f64)
     }
 
     /// State of the motor in relation to the gateway's word.
@@ -226,6 +246,12 @@ impl CommandRun {
     pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
         self.next_start.map(|_| standstill::AT_NEXT_START)
     }
+}
+
+/// The value of a point in these words.
+fn decoded((raw, kind): &(Raw, Kind), words: &BTreeMap<(Table, u16), u16>) -> Option<Value> {
+    let of = raw.addresses().map(|address| words.get(&(raw.table, address)).copied());
+    raw.decode(&of.collect::<Option<Vec<u16>>>()?, *kind)
 }
 
 /// Adds the read of a raw value, joined with the previous read if one request can read both.

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::ordered::{Ordered, Reference, reference_of};
+use super::pace::{self, Pace};
 use super::{End, InForce, Refresh};
 use crate::command_run::{Motor, StateRead};
 use drivegate_model::drive::Profile;
@@ -81,7 +82,7 @@ impl Refresh {
             let apart = self.reference_apart(profile, control);
             self.round = Some(Round {
                 stage: apart.map_or(first_read(profile), |_| Stage::Reference),
-                look: StateRead::at_motor(profile)?,
+                look: look(profile)?,
                 overtaken: 0,
             });
         }
@@ -197,7 +198,8 @@ impl Refresh {
                 if !round.look.take_reply(reply) {
                     return Ok(());
                 }
-                let motor = round.look.motor();
+                let (motor, speed) = (round.look.motor(), round.look.speed());
+                self.note_speed(profile, speed);
                 match self.judge_motor(motor) {
                     Ok(true) => Stage::Write,
                     Ok(false) => {
@@ -240,6 +242,18 @@ impl Refresh {
         }
     }
 
+    /// Notes the speed that the drive showed in this round.
+    fn note_speed(&mut self, profile: &Profile, speed: Option<f64>) {
+        let reference = self
+            .repeated
+            .ordered
+            .reference
+            .and_then(|reference| pace::value(profile, reference));
+        if let (Some(going), Some(speed), Some(reference)) = (&mut self.repeated.going, speed, reference) {
+            going.pace = going.pace.after(speed, reference);
+        }
+    }
+
     /// Whether the motor is in the state that the word requires: only then is the word written.
     fn judge_motor(&mut self, motor: Motor) -> Result<bool, End> {
         let Some(going) = &mut self.repeated.going else {
@@ -250,7 +264,8 @@ impl Refresh {
             (_, Motor::NotShown) => Ok(false),
             (InForce::Run, Motor::Runs) => {
                 going.seen = true;
-                Ok(true)
+                // A motor that another master stops by its ramp still runs.
+                Ok(!matches!(going.pace, Pace::Falls(_)))
             }
             (InForce::Run, Motor::Stands) => Err(End::Stands),
             (InForce::Stop, Motor::Runs) if going.seen => Err(End::Starts),
@@ -281,6 +296,13 @@ impl Refresh {
             going.lost.get_or_insert(now.checked_sub(time).unwrap_or(now));
         }
     }
+}
+
+/// The reads that show the motor; with its speed where the drive's word, which is repeated, cannot be read.
+fn look(profile: &Profile) -> Option<StateRead> {
+    let is_hidden = first_read(profile) == Stage::Look && profile.repeats().is_ok_and(|repeats| repeats.word);
+    let speed = pace::compared(profile).filter(|_| is_hidden);
+    StateRead::at_refresh(profile, speed.map(|[_, shown]| shown))
 }
 
 /// The first read of a refresh round.
@@ -318,7 +340,7 @@ pub(crate) fn requests(profile: &Profile) -> Vec<RequestPdu> {
     };
     let apart = refresh.reference_apart(profile, control);
     let own = (first_read(profile) == Stage::Own).then(|| refresh.read_own(profile, control));
-    let looks = StateRead::at_motor(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
+    let looks = look(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
     apart
         .map(|r| write(profile, r.start, r.words()))
         .into_iter()
