@@ -82,7 +82,7 @@ impl Refresh {
             let apart = self.reference_apart(profile, control);
             self.round = Some(Round {
                 stage: apart.map_or(first_read(profile), |_| Stage::Reference),
-                look: look(profile)?,
+                look: reads_of_motor(profile)?,
                 overtaken: 0,
             });
         }
@@ -299,7 +299,7 @@ impl Refresh {
 }
 
 /// The reads that show the motor; with its speed where the drive's word, which is repeated, cannot be read.
-fn look(profile: &Profile) -> Option<StateRead> {
+fn reads_of_motor(profile: &Profile) -> Option<StateRead> {
     let is_hidden = first_read(profile) == Stage::Look && profile.repeats().is_ok_and(|repeats| repeats.word);
     let speed = pace::compared(profile).filter(|_| is_hidden);
     StateRead::at_refresh(profile, speed.map(|[_, shown]| shown))
@@ -340,7 +340,7 @@ pub(crate) fn requests(profile: &Profile) -> Vec<RequestPdu> {
     };
     let apart = refresh.reference_apart(profile, control);
     let own = (first_read(profile) == Stage::Own).then(|| refresh.read_own(profile, control));
-    let looks = look(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
+    let looks = reads_of_motor(profile).map(|look| look.requests().cloned().collect::<Vec<_>>());
     apart
         .map(|r| write(profile, r.start, r.words()))
         .into_iter()
