@@ -190,7 +190,7 @@ impl Daemon {
         daemon.apply(&settings, buses, PreparedServers::default()).await;
         reservations::restore(&daemon.reservations, &daemon.north, &daemon.plant).await;
         daemon.expect_kept_slots(&settings).await;
-        daemon.apply_mqtt(&settings).await?;
+        daemon.apply_mqtt(&settings).await;
         // The servers that report readiness start last.
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -232,19 +232,17 @@ impl Daemon {
     /// Applies a new configuration and returns what changed. Unchanged parts keep running without a lost cycle.
     ///
     /// # Errors
-    /// If a bus or a server cannot start: everything runs as before. If a changed recorder cannot start: everything
-    /// else runs as before, without a recorder.
+    /// If a bus or a server cannot start: everything runs as before.
     pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
         // All steps that can fail come before any running part is stopped or changed.
         let buses = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
         if let Err(error) = self.apply_recorder(&settings).await {
-            self.abort_servers(servers).await;
-            return Err(error);
+            tracing::error!(target: "drivegate::daemon", "{error}; the new configuration applies, without recordings; reload it again");
         }
         self.apply(&settings, buses, servers).await;
-        self.apply_mqtt(&settings).await?;
+        self.apply_mqtt(&settings).await;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
         self.apply_keeper(&settings).await;

@@ -1,4 +1,4 @@
-//! Earlier meanings of the name or the unit id of a drive: an order belongs to the machine that it named when its
+//! Earlier meanings of the name, the unit id or the address of a drive: an order belongs to the machine that it named when its
 //! first byte arrived. Pure: time is an argument.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -25,29 +25,45 @@ const MOST_UNUSED: usize = 4096;
 pub enum NamedBy {
     /// The order uses the name of the drive.
     Name,
-    /// NamedBy the unit id, or by the BACnet device number derived from it.
+    /// The order uses the unit id, or the BACnet device number derived from it.
     Unit,
+    /// The order uses the address on the line of a bus, as those of the tools at a slot do.
+    Address,
 }
 
-/// The name or the unit id of a drive.
+/// The name, the unit id or the address of a drive.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DriveKey {
     /// The name of a drive.
     Name(String),
     /// The Modbus TCP unit id of a drive.
     Unit(u8),
+    /// The name of a bus, and the address of a drive on its line.
+    Address(String, u8),
 }
 
 impl NamedBy {
-    /// How orders of this kind name their drive; `None` if they use the address on the line.
+    /// Those of the clients of a drive that may name it in this way.
+    fn those_of(self, clients: &[Arc<str>]) -> Vec<Arc<str>> {
+        let is_tool = |client: &&Arc<str>| client.starts_with(SourceKind::Slot.name());
+        match self {
+            NamedBy::Address => clients.iter().filter(is_tool).cloned().collect(),
+            NamedBy::Name | NamedBy::Unit => clients.to_vec(),
+        }
+    }
+
+    /// Every way to name a drive.
+    const ALL: [NamedBy; 3] = [NamedBy::Name, NamedBy::Unit, NamedBy::Address];
+
+    /// How orders of this kind name their drive; `None` if no request of a client names it.
     fn of(kind: SourceKind) -> Option<NamedBy> {
         match kind {
             SourceKind::ModbusTcp | SourceKind::Bacnet => Some(NamedBy::Unit),
             SourceKind::Mqtt | SourceKind::Sparkplug | SourceKind::Http | SourceKind::LocalSocket => {
                 Some(NamedBy::Name)
             }
+            SourceKind::Slot => Some(NamedBy::Address),
             SourceKind::CommandLine
-            | SourceKind::Slot
             | SourceKind::OtherMaster
             | SourceKind::Schedule
             | SourceKind::Supervision
@@ -66,7 +82,7 @@ struct Served {
     place: DriveIndex,
 }
 
-/// An earlier meaning: until `until` the name or unit id meant another machine, or none.
+/// An earlier meaning: until `until` the name, unit id or address meant another machine, or none.
 #[derive(Debug, Clone)]
 struct EarlierMeaning {
     until: Instant,
@@ -135,6 +151,7 @@ impl DriveKey {
         match by {
             NamedBy::Name => DriveKey::Name(drive.name.clone()),
             NamedBy::Unit => DriveKey::Unit(drive.unit),
+            NamedBy::Address => DriveKey::Address(drive.bus.clone(), drive.address),
         }
     }
 }
@@ -170,7 +187,7 @@ impl UnusedNames {
         let mut used: BTreeSet<DriveKey> = BTreeSet::new();
         for bus in after {
             for (index, drive) in bus.image.drives.enumerate() {
-                for by in [NamedBy::Name, NamedBy::Unit] {
+                for by in NamedBy::ALL {
                     let key = DriveKey::of(by, &drive.spec);
                     let machine = bus.image.spec.machine(&drive.spec);
                     // Unit ids may repeat on buses of different listeners: the machine itself is meant first, then a
@@ -238,11 +255,11 @@ impl UnusedNames {
 fn meanings(bus: &BusHandle) -> Vec<(DriveKey, Meaning)> {
     let of_drive = |(index, drive): (DriveIndex, &Arc<DriveImage>)| {
         let clients = bus.queue.lock().gate.clients(index);
-        [NamedBy::Name, NamedBy::Unit].map(|by| {
+        NamedBy::ALL.map(|by| {
             let meaning = Meaning {
                 machine: bus.image.spec.machine(&drive.spec),
                 earlier: bus.formerly.of(index, by),
-                clients: clients.clone(),
+                clients: by.those_of(&clients),
                 ended: None,
             };
             (DriveKey::of(by, &drive.spec), meaning)

@@ -51,15 +51,18 @@ impl Daemon {
         self.http.commit(prepared.http).await;
     }
 
-    pub(super) async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
+    /// Starts, replaces or stops the MQTT client. If it cannot start, the gateway runs without it, and the next reload tries
+    /// again.
+    pub(super) async fn apply_mqtt(&mut self, settings: &Settings) {
         // The name of the gateway is part of all topics.
         if settings.gateway != self.settings.gateway {
             self.mqtt.stop().await;
         }
-        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await;
+        if let Err(error) = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.north).await {
+            tracing::error!(target: "drivegate::daemon", "{error}; the gateway runs without MQTT; reload the configuration to try again");
+        }
         // Events that occurred while no client was configured are not published later.
         drivegate_mqtt::Handover::of(&self.north).discard();
-        applied
     }
 
     /// Opens the local socket if one is configured. If it cannot be opened, the gateway runs without it, and the

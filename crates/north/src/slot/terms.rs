@@ -12,9 +12,9 @@ use super::rights::ToolRights;
 use super::{Options, Slot, SlotAccess};
 use crate::{NorthState, SlotOutcome};
 use drivegate_core::order::{Arrival, Authority, Order, Origin, Outcome, Parts, Proof, Refusal, SourceKind, Urgency};
-use drivegate_core::permit::{self, Stage, client_access};
+use drivegate_core::permit::{self, Stage, client_access, meant_another};
 use drivegate_core::plant::{
-    BusHandle, DriveHandle, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
+    BusHandle, DriveHandle, DriveKey, Exchange, OrderRequest, Placed, Plant, Question, SharedPlant, Target, turn_away,
 };
 use drivegate_core::process_image::Access;
 use drivegate_model::drive::plan::WireTime;
@@ -217,9 +217,40 @@ impl Tool {
                 None => Decision::Silent,
             },
             Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
+                if let Some(placed) = self.stop_at_former(&case, request, &drives, pdu) {
+                    return Decision::Wait(Work::Command(placed));
+                }
                 self.raw(&case, request, &drives, pdu)
             }
         }
+    }
+
+    /// Gives the stop in a write to the machine that had the address when the request began, where no drive has the address
+    /// any more; `None` if there is no such machine or stop.
+    fn stop_at_former(
+        &self,
+        case: &Case<'_>,
+        request: &ToolRequest,
+        drives: &[DriveHandle],
+        pdu: &RequestPdu,
+    ) -> Option<Placed> {
+        if !drives.is_empty() || !self.writes() {
+            return None;
+        }
+        let key = DriveKey::Address(self.terms.slot.bus.clone(), request.address);
+        let former = case.plant.drive_formerly(&key, case.arrival.asked)?;
+        let stop = former.stop_meant(&Order::Write(pdu.clone()), &former)?;
+        let what = describe::request_on(self.protocol(), pdu);
+        let order = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
+        let order = order.without_rest(&what, meant_another()).arrived(case.arrival.clone());
+        Some(former.place(order.resolved(), case.now))
+    }
+
+    /// Whether a reload has given the line, or an address on it, to another machine since the request began.
+    fn meant_another_line(&self, case: &Case<'_>) -> bool {
+        let of_bus = |drive: &DriveHandle| drive.image.spec.bus == self.terms.slot.bus;
+        let is_moved = |drive: DriveHandle| drive.is_meant(SourceKind::Slot, &case.arrival).is_err();
+        case.plant.drives().filter(of_bus).any(is_moved)
     }
 
     /// Orders a write to a configured drive, after the checks that a Modbus TCP client must pass.
@@ -271,6 +302,9 @@ impl Tool {
                 let request = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
                 drop(drive.place(request.arrived(case.arrival.clone()), now));
             }
+        }
+        if self.meant_another_line(case) {
+            return self.refuse_any(case, request, drives, pdu, meant_another());
         }
         for drive in drives {
             let whole = Order::Write(pdu.clone());

@@ -188,3 +188,46 @@ fn a_client_that_gives_its_run_command_back_may_start_the_machine_that_took_the_
     let mut run = plant.order(11, true, plant.now);
     assert_eq!(code(&mut run), "waits");
 }
+
+/// A request of a tool at a slot to address 1 began before two buses swapped their ports: its stop reaches the machine that had
+/// the address, and a start none.
+#[test]
+fn a_request_at_a_slot_belongs_to_the_line_that_it_named() {
+    let started = Instant::now();
+    let (begun, now) = (started + SECOND, started + 2 * SECOND);
+    let plant = |ports: [&str; 2]| {
+        let one = |(name, port): (&str, &str)| {
+            let image = crate::testkit::image(controlled(&format!("{name}-1"), name, 1, &nx()));
+            read(&image, 2100, &[0x41, 0, 0, 0], now);
+            let mut spec = bus_spec(name);
+            spec.port = port.to_string();
+            up(bus(spec, vec![image]))
+        };
+        ["line1", "line2"].into_iter().zip(ports).map(one).collect::<Vec<_>>()
+    };
+    let (before, after) = (plant(["A", "B"]), plant(["B", "A"]));
+    let mut unused = UnusedNames::default();
+    unused.follow(&[], &before, started);
+    for bus in &after {
+        bus.take_over(&before, now);
+    }
+    unused.follow(&before, &after, now);
+    let plant = Plant::new("g", STALE_AFTER, after.clone());
+    let of_line1 = plant.drives().find(|drive| drive.image.spec.bus == "line1").unwrap();
+    let place = |run: bool, asked: Instant| {
+        let index = of_line1.image.spec.profile.model_index(ModelPoint::Run).unwrap();
+        let order = Order::Points(vec![(index, Value::Bool(run))]);
+        let arrival = Arrival {
+            asked,
+            ..Arrival::now(now)
+        };
+        let request = OrderRequest::new(order, Origin::new(SourceKind::Slot, "tool"), Authority::Write);
+        of_line1.place(request.within(60 * SECOND).arrived(arrival), now)
+    };
+    assert_eq!(code(&mut place(true, begun)), "unknown_drive");
+    assert_eq!(code(&mut place(false, begun)), "waits");
+    assert!(take_next(&after[0].queue, now).is_none(), "a stop for the other line");
+    assert!(take_next(&after[1].queue, now).is_some_and(|stop| stop.is_stop()));
+    assert_eq!(code(&mut place(false, now + SECOND)), "waits");
+    assert!(take_next(&after[0].queue, now + SECOND).is_some_and(|stop| stop.is_stop()));
+}
