@@ -297,6 +297,7 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
+    use drivegate_core::permit::HoldState;
     use drivegate_core::process_image::{DriveImage, DriveSpec, Link};
     use drivegate_proto::Table;
 
@@ -476,5 +477,47 @@ mod tests {
         object.drive = None;
         let (to, _) = event(&topics, &object, &plant);
         assert_eq!(to, ["drivegate/hall/drive/p1/event", "drivegate/hall/drive/p2/event"]);
+    }
+
+    #[test]
+    fn no_point_has_the_name_of_a_key_of_the_state() {
+        let source = |name: &str| {
+            format!(
+                "name = \"m\"\nprotocols = [\"modbus-rtu\"]\nverified = false\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
+                 [[point]]\nname = \"{name}\"\nat = \"holding 1\"\n"
+            )
+        };
+        let profile = Profile::parse("m.toml", &source("level"), false).unwrap();
+        let shown = StateContent {
+            hold: Some(HoldFields::from(HoldView {
+                state: HoldState::Free,
+                holder: None,
+                rank: None,
+                left_s: Some(0),
+            })),
+            state: Some(State::NotReady),
+            quality: Quality::Good,
+            blocked_by: Vec::new(),
+            stop_waits: Some(1),
+            refreshing: Some(true),
+            points: vec![(Some(Value::Integer(1)), Quality::Stale)],
+        };
+        let object = StateObject {
+            shown: &shown,
+            names: &["level".to_string()],
+            indices: &[PointIndex::new(0)],
+            profile: &profile,
+            fault_text: String::new(),
+            age: None,
+            wall: SystemTime::UNIX_EPOCH,
+            historical: true,
+            omitted: 1,
+        };
+        let keys = serde_json::to_value(&object).unwrap();
+        let keys: Vec<&String> = keys.as_object().unwrap().keys().collect();
+        assert!(keys.len() > 15, "{keys:?}");
+        for key in keys.into_iter().filter(|key| *key != "level") {
+            assert!(Profile::parse("m.toml", &source(key), false).is_err(), "{key}");
+        }
     }
 }

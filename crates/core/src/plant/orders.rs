@@ -12,7 +12,7 @@ use crate::order::{
     Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
     Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
 };
-use crate::permit::{DriveFacts, Facts, Stage, Verdict, admit, meant_another};
+use crate::permit::{DriveFacts, Facts, Stage, Verdict, admit, client_access, meant_another};
 use crate::process_image::{BusImage, Reading};
 use drivegate_model::drive::parameters::RawValue;
 use drivegate_model::drive::{DriveIndex, ModelPoint, PointIndex, Value};
@@ -271,7 +271,16 @@ impl DriveHandle {
         if let FormerMachine::There(there) = &meant
             && let Some(stop) = there.stop_meant(&request.order, self)
         {
-            let order = OrderRequest { order: stop, ..request };
+            // The client needs the right where it named the machine, on whatever bus the machine is now.
+            let origin = match client_access(Stage::Accept, true, &request.origin, &self.image.spec.bus) {
+                Ok(()) => request.origin.lasting(),
+                Err(_) => request.origin,
+            };
+            let order = OrderRequest {
+                order: stop,
+                origin,
+                ..request
+            };
             return there.place_here(order.without_rest(&what, refusal), now);
         }
         let write = !matches!(request.order, Order::Read(_));

@@ -6,10 +6,10 @@
 //! counts from that moment, and is not written before it is on disk ([`keep`]). Stops are not checked here, except
 //! those that `min_run` delays.
 //!
-//! - `motor`: the state of one motor. `passage`: its last start by an order. `ledger`: all motors, and the data to
+//! - `motor`: the state of one motor. `start_attempt`: its last start by an order. `ledger`: all motors, and the data to
 //!   save.
-//! - `interlock`: whether the points that a start needs have the required values. `around`: the drives that have
-//!   these points. `view`: the results of the guards of one bus.
+//! - `interlock`: whether the points that a start needs have the required values. `drives_by_name`: the drives that
+//!   have these points. `view`: the results of the guards of one bus.
 //! - `file`: the file format. `keeper`: the thread that writes the file; the only part with I/O and a clock.
 
 mod drives_by_name;

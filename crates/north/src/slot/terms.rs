@@ -241,7 +241,10 @@ impl Tool {
         let former = case.plant.drive_formerly(&key, case.arrival.asked)?;
         let stop = former.stop_meant(&Order::Write(pdu.clone()), &former)?;
         let what = describe::request_on(self.protocol(), pdu);
-        let order = OrderRequest::new(stop, self.origin.clone(), Authority::Write).within(EXPIRY);
+        let may = client_access(Stage::Accept, true, &self.origin, &self.terms.slot.bus).is_ok();
+        let origin = self.origin.clone();
+        let origin = if may { origin.lasting() } else { origin };
+        let order = OrderRequest::new(stop, origin, Authority::Write).within(EXPIRY);
         let order = order.without_rest(&what, meant_another()).arrived(case.arrival.clone());
         Some(former.place(order.resolved(), case.now))
     }

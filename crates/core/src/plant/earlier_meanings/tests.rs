@@ -2,7 +2,7 @@
 //! a client that goes on commanding starts no machine that it did not know.
 
 use super::*;
-use crate::order::{Authority, Origin};
+use crate::order::{Authority, Grants, Origin, Right};
 use crate::plant::{OrderRequest, Placed, Plant};
 use crate::testkit::{STALE_AFTER, bus, bus_spec, controlled, nx, read, take_next, up};
 
@@ -189,6 +189,15 @@ fn a_client_that_gives_its_run_command_back_may_start_the_machine_that_took_the_
     assert_eq!(code(&mut run), "waits");
 }
 
+#[derive(Debug)]
+struct On(&'static str);
+
+impl Grants for On {
+    fn may_write(&self, bus: &str) -> bool {
+        bus == self.0
+    }
+}
+
 /// A request of a tool at a slot to address 1 began before two buses swapped their ports: its stop reaches the machine that had
 /// the address, and a start none.
 #[test]
@@ -221,7 +230,10 @@ fn a_request_at_a_slot_belongs_to_the_line_that_it_named() {
             asked,
             ..Arrival::now(now)
         };
-        let request = OrderRequest::new(order, Origin::new(SourceKind::Slot, "tool"), Authority::Write);
+        // A slot gives a right on its own bus.
+        let right = Right::of(Arc::new(On("line1")));
+        let origin = Origin::new(SourceKind::Slot, "tool").with_right(right);
+        let request = OrderRequest::new(order, origin, Authority::Write);
         of_line1.place(request.within(60 * SECOND).arrived(arrival), now)
     };
     assert_eq!(code(&mut place(true, begun)), "unknown_drive");

@@ -16,7 +16,7 @@ use drivegate_proto::Table;
 
 /// Names that are keys of states and commands, or have their own metrics: a point with such a name could not be
 /// distinguished from them.
-const TAKEN: [&str; 13] = [
+const TAKEN: [&str; 20] = [
     "age_ms",
     "blocked_by",
     "command_error",
@@ -24,11 +24,18 @@ const TAKEN: [&str; 13] = [
     "expires_ms",
     "fault_text",
     "historical",
+    "hold",
+    "hold_left_s",
+    "holder",
+    "holder_rank",
     "id",
     "omitted",
     "point_quality",
+    "profile_verified",
     "quality",
+    "refreshing",
     "state",
+    "stop_waits_ms",
     "time",
 ];
 /// Address of ADI 1 of N2 in the table of input registers.
