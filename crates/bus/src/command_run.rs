@@ -8,7 +8,6 @@ mod known_words;
 mod next;
 mod parameter;
 mod replies;
-mod standstill;
 mod state_read;
 mod steps;
 
@@ -17,17 +16,19 @@ use std::time::{Duration, Instant};
 
 pub use self::control::read_place;
 pub use self::known_words::KnownWords;
-pub(crate) use self::standstill::Motor;
 pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
 
 use self::parameter::ParameterRun;
-use self::steps::{Action, Check, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change};
+use self::steps::{
+    Action, Check, Permit, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change,
+};
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use drivegate_core::order::{
-    Command, Intent, Interruption, Order, Origin, Outcome, Refusal, SourceKind, Ticket, Urgency, Work, written,
+    Command, Intent, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Work, written,
 };
+use drivegate_core::permit::{Repeats, Verdict, running_unknown};
 use drivegate_model::drive::control::Run;
 use drivegate_model::drive::{ModelPoint, Profile};
 use drivegate_proto::{Reply, Table};
@@ -43,6 +44,14 @@ pub enum Next {
     /// Nothing is sent before this time.
     Wait(Instant),
     Done,
+}
+
+/// What is needed of a command, or of the commands of a drive.
+#[derive(Debug)]
+pub(crate) enum Need<T> {
+    Next(T),
+    /// The gate first judges what the next word of the command would repeat ([`CommandRun::judged`]).
+    Judge(Repeats),
 }
 
 /// The parts of the command that decide its steps.
@@ -175,6 +184,7 @@ impl CommandRun {
             running: true,
             masks: false,
             motor: None,
+            permit: None,
         };
         let turns = starts_or_sets_direction(profile, &order);
         let at_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
@@ -185,7 +195,7 @@ impl CommandRun {
         let unsendable = match &order {
             Order::Points(values) => unsendable(profile, values),
             Order::Write(_) | Order::Read(_) => None,
-            Order::Parameter(_) => parameter.is_none().then(|| running_unknown(profile)),
+            Order::Parameter(_) => parameter.is_none().then(|| running_unknown(&profile.name)),
         };
         let actions = match order {
             Order::Parameter(_) => parameter
@@ -317,6 +327,21 @@ impl CommandRun {
     /// Whether all parts of the command come from supervision.
     pub fn is_of_supervision(&self) -> bool {
         self.tickets.iter().all(|ticket| ticket.origin().is_lease())
+    }
+
+    /// Whether the rules judge the frames of the command: stops and the ends of pulses are always sent.
+    pub fn is_judged(&self) -> bool {
+        self.urgency == Urgency::Command && self.may_write_on()
+    }
+
+    /// Takes the verdict about what the next word would repeat. With [`Verdict::LookFirst`], the next step reads the motor.
+    pub(crate) fn judged(&mut self, repeats: Repeats, verdict: Verdict) {
+        match verdict {
+            Verdict::Go => self.known.permit = Some(Permit::Write(repeats)),
+            Verdict::LookFirst => self.known.permit = Some(Permit::Look(repeats)),
+            Verdict::Refuse(outcome) => self.give_up(self.unless_in_doubt(outcome)),
+            Verdict::Wait(_) => {}
+        }
     }
 
     /// Whether the command may write more than the end of a pulse.
@@ -507,14 +532,6 @@ fn starts_or_sets_direction(profile: &Profile, order: &Order) -> bool {
         }
         Order::Read(_) | Order::Parameter(_) => false,
     }
-}
-
-/// The refusal of a parameter write because the family does not report whether the motor is stopped.
-fn running_unknown(profile: &Profile) -> Refusal {
-    Refusal::NotWritable(format!(
-        "profile `{}` does not say where the drive reports whether its motor runs; no parameter is written",
-        profile.name
-    ))
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::command_run::{CommandRun, KnownWords, Next, Step, read_place};
+use super::command_run::{CommandRun, KnownWords, Need, Next, Step, read_place};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
@@ -151,7 +151,7 @@ impl DriveState {
     }
 
     /// The next need of the started commands at `now`, highest rank first. Commands that have ended get their result.
-    pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> NextNeed {
+    pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Need<NextNeed> {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
@@ -168,7 +168,11 @@ impl DriveState {
                 let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
                     break;
                 };
-                match run.next(&self.words, profile, running, now) {
+                let next = match run.need(&self.words, profile, running, now) {
+                    Need::Next(next) => next,
+                    Need::Judge(repeats) => return Need::Judge(repeats),
+                };
+                match next {
                     Next::Send(step) => {
                         // A stop does not wait for late replies: it is sent at once.
                         let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
@@ -178,7 +182,7 @@ impl DriveState {
                             break;
                         }
                         if !run.asks_again() {
-                            return NextNeed::Step(urgency, step);
+                            return Need::Next(NextNeed::Step(urgency, step));
                         }
                     }
                     Next::Wait(until) => {
@@ -193,7 +197,7 @@ impl DriveState {
                 }
             }
         }
-        wake_at.map_or(NextNeed::Nothing, NextNeed::Wait)
+        Need::Next(wake_at.map_or(NextNeed::Nothing, NextNeed::Wait))
     }
 
     /// Whether stops were sent repeatedly before the end of a pulse, and the next stop is not on the wire yet.

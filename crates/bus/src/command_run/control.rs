@@ -7,9 +7,8 @@
 use std::time::{Duration, Instant};
 
 use super::known_words::KnownWords;
-use super::standstill::{KnownRun, Motor, Verdict, Wants, depends_on_motor, judge};
-use super::steps::{Action, Check, RequestContext, Step, StepPurpose};
-use drivegate_core::order::Refusal;
+use super::steps::{Action, Check, Permit, RequestContext, Step, StepPurpose};
+use drivegate_core::permit::{Form, KnownRun, Motor, OnRunning, Repeats, Wants};
 use drivegate_model::drive::control::{self, Control, ControlItem, Mask, OwnWord, Run, Setting, Until};
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Raw, Value};
@@ -64,6 +63,15 @@ impl Word {
             Word::Others(_) => Some(Wants::Others),
         }
     }
+
+    /// Effect of the word on a motor that keeps its run command.
+    fn on_running(self, control: &Control) -> OnRunning {
+        match self {
+            Word::ResetLow(reset) | Word::ResetHigh(reset) if stops_by_reset(control, reset) => OnRunning::Stops,
+            Word::ResetLow(_) | Word::ResetHigh(_) if control.restarts_on_reset => OnRunning::Restarts,
+            _ => OnRunning::Harmless,
+        }
+    }
 }
 
 /// The result of building a control word.
@@ -73,12 +81,12 @@ pub(super) enum Made {
     Send(Step),
     /// Nothing is sent because the drive already has the word.
     Nothing,
+    /// What the word would repeat must be judged before the word is made.
+    Judge(Repeats),
     /// The running state must be read before the word is made.
     Look,
     /// Nothing is sent now: this direction is kept for the next start.
     AtNextStart(bool),
-    /// The order is refused, as its effect would be unknown.
-    Refused(Refusal),
 }
 
 /// A state for which a sequence waits.
@@ -380,17 +388,24 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Req
         pulsed.map_or(own, |pulsed| pulsed.released(own))
     });
     let base = released.unwrap_or(0);
-    let verdict = match may_stand(word, control, words, released, known) {
-        Ok(verdict) => verdict,
-        Err(made) => return made,
+    let form = match basis(word, control, words, released, known) {
+        Basis::Certain(form) => form,
+        Basis::Judged(repeats) => match known.permit {
+            Some(Permit::Write(of)) if of == repeats => repeats.form(),
+            Some(Permit::Look(of)) if of == repeats => return Made::Look,
+            _ => return Made::Judge(repeats),
+        },
     };
-    let stays = match verdict {
-        Verdict::AsItStands => control.always.applied(base),
-        _ => control.resting(base),
+    let runs = form == Form::AsItStands;
+    let stays = match runs {
+        true => control.always.applied(base),
+        false => control.resting(base),
     };
-    let runs = verdict == Verdict::AsItStands;
     let sent = |place: ControlItem, word: u16| Made::Send(Step::new(StepPurpose::Execute, write(place, word, profile)));
     match word {
+        Word::Direction(reverse) | Word::DirectionElsewhere(reverse) if form == Form::AtNextStart => {
+            Made::AtNextStart(reverse)
+        }
         Word::Stop(reverse) => {
             let stop = control.stop_word(base);
             let turned = reverse.map_or(stop, |reverse| control.with_direction(stop, reverse));
@@ -437,12 +452,6 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Req
                 reverse.map_or(word, |reverse| control.with_direction(word, reverse)),
             )
         }
-        Word::ResetLow(reset) | Word::ResetHigh(reset) if runs && stops_by_reset(control, reset) => {
-            Made::Refused(Refusal::NotAllowed(STOPS_BY_RESET.to_string()))
-        }
-        Word::ResetLow(_) | Word::ResetHigh(_) if runs && control.restarts_on_reset => {
-            Made::Refused(Refusal::NotAllowed(RESTARTS_ON_RESET.to_string()))
-        }
         // The word of a motor that runs stays as it is, as does one that the drive has. The coil of a motor that stands is written
         // in any case: no other write of the reset takes away a run command that another master has set since the last reading.
         Word::ResetLow(reset) if runs && reset.place.is_some() => Made::Nothing,
@@ -453,49 +462,39 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Req
     }
 }
 
-const STOPS_BY_RESET: &str = "the motor is running, and on this family a reset would stop it; nothing was written";
-const RESTARTS_ON_RESET: &str = "the motor is running, and on this family a reset starts a motor that has tripped meanwhile; \
-     nothing was written";
-
 /// Whether a reset by the control word also takes the run command away.
 fn stops_by_reset(control: &Control, reset: Setting) -> bool {
     reset.place.is_none() && control.runs().iter().any(|run| !reset.agrees(run))
 }
 
-/// Which other bits may be written together with a word; a word that itself decides whether the motor runs needs no
-/// read. `released` is the known control word without a reset.
-///
-/// # Errors
-/// If the word must not be written; contains the result instead.
-fn may_stand(
-    word: Word,
-    control: &Control,
-    words: &KnownWords,
-    released: Option<u16>,
-    known: RequestContext,
-) -> Result<Verdict, Made> {
-    let told = known.check == Check::Read;
+/// What decides which run command is written together with a word.
+enum Basis {
+    /// The word is formed this way, whatever the motor does.
+    Certain(Form),
+    /// The word would repeat this, which is judged first.
+    Judged(Repeats),
+}
+
+/// What decides which run command is written together with a word. `released` is the known control word without a reset.
+fn basis(word: Word, control: &Control, words: &KnownWords, released: Option<u16>, known: RequestContext) -> Basis {
+    // A word that itself decides whether the motor runs repeats nothing.
     let Some(wants) = word.wants() else {
-        return Ok(Verdict::AsItStands);
+        return Basis::Certain(Form::AsItStands);
     };
     // The drive may have received a stop that it did not acknowledge, and its motor may still be slowing down.
     if known.stopped {
-        return Ok(Verdict::WithoutRun);
+        return Basis::Certain(Form::WithoutRun);
     }
     let Some(holds) = holds(control, words, released) else {
-        return Ok(Verdict::WithoutRun);
+        return Basis::Certain(Form::WithoutRun);
     };
-    let motor = match known.motor {
-        None if depends_on_motor(wants, holds, told) => return Err(Made::Look),
-        motor => motor.unwrap_or(Motor::NotShown),
-    };
-    match (judge(wants, holds, told, motor), word) {
-        (Verdict::AtNextStart, Word::Direction(reverse) | Word::DirectionElsewhere(reverse)) => {
-            Err(Made::AtNextStart(reverse))
-        }
-        (Verdict::Refused(refusal), _) => Err(Made::Refused(refusal)),
-        (verdict, _) => Ok(verdict),
-    }
+    Basis::Judged(Repeats {
+        wants,
+        holds,
+        told: known.check == Check::Read,
+        motor: known.motor,
+        on_running: word.on_running(control),
+    })
 }
 
 /// The run command that the drive is known to have; `None` if it is known to have a stop.

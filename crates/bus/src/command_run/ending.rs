@@ -7,6 +7,7 @@ use super::steps::{Action, Check};
 use super::{CommandRun, Phase};
 use crate::confirm::Effect;
 use drivegate_core::order::{Interruption, Outcome, Receipt, Refusal};
+use drivegate_core::permit::right_lost;
 use drivegate_proto::Exception;
 
 impl CommandRun {
@@ -36,9 +37,7 @@ impl CommandRun {
             }
             Outcome::Interrupted(Interruption::RightLost) => {
                 self.leave_motor();
-                let why = "a reload removed the right of this client to write; nothing was written";
-                let refusal = Refusal::NotAllowed(why.to_string());
-                self.unless_begun(Outcome::Refused(refusal), Interruption::RightLost)
+                self.unless_begun(Outcome::Refused(right_lost()), Interruption::RightLost)
             }
             Outcome::Expired => self.unless_begun(Outcome::Expired, Interruption::Expired),
             outcome => outcome,

@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 use super::control::{self, Made, Word};
 use super::functions::other_function;
 use super::steps::{Action, Step, step_of};
-use super::{CommandRun, KnownWords, Next, Phase};
+use super::{CommandRun, KnownWords, Need, Next, Phase};
 use drivegate_core::order::{Interruption, Outcome};
+use drivegate_core::permit::Repeats;
 use drivegate_model::drive::Profile;
 use drivegate_proto::Exception;
 
@@ -18,34 +19,48 @@ enum First {
     Nothing,
     /// The action was removed, or replaced by another one.
     Changed,
+    /// The gate first judges what the word would repeat.
+    Judge(Repeats),
 }
 
 impl CommandRun {
-    /// The next step of the command. `running` is the state that the drive reported last. Once the command has expired
-    /// nothing more is sent, except to clear a reset bit that is set.
+    /// The next step of a command that no gate judges, such as in the proof of a profile: the command itself asks what its
+    /// words may repeat.
     pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
+        loop {
+            match self.need(words, profile, running, now) {
+                Need::Next(next) => return next,
+                Need::Judge(repeats) => self.judged(repeats, repeats.verdict()),
+            }
+        }
+    }
+
+    /// What the command needs next. `running` is the state that the drive reported last. Once the command has expired
+    /// nothing more is sent, except to clear a reset bit that is set.
+    pub(crate) fn need(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Need<Next> {
         (self.known.running, self.known.masks) = (running, words.functions.masks(profile));
         self.end_late(now);
         if let Some(at) = self.pauses_until(now) {
-            return Next::Wait(at);
+            return Need::Next(Next::Wait(at));
         }
         while let Some(action) = self.actions.front() {
             if let Action::Wait(time) = action {
                 let until = now + *time;
                 self.known.motor = None;
-                return self.hold_until(until);
+                return Need::Next(self.hold_until(until));
             }
             match self.first(words, profile, running, now) {
-                First::Step(step) => return Next::Send(self.formed(*step, words, profile)),
+                First::Step(step) => return Need::Next(Next::Send(self.formed(*step, words, profile))),
+                First::Judge(repeats) => return Need::Judge(repeats),
                 First::Changed => {}
                 First::Nothing => {
                     if let Some(high_at) = self.pass_over(words, profile, now) {
-                        return self.hold_until(high_at);
+                        return Need::Next(self.hold_until(high_at));
                     }
                 }
             }
         }
-        Next::Done
+        Need::Next(Next::Done)
     }
 
     /// An expired command sends nothing more than the end of a pulse.
@@ -94,16 +109,17 @@ impl CommandRun {
             Some(Action::Word(word)) => match control::word(*word, words, profile, self.known) {
                 Made::Send(step) => Some(step),
                 Made::Nothing => None,
+                Made::Judge(repeats) if self.is_judged() => return First::Judge(repeats),
+                Made::Judge(repeats) => {
+                    self.judged(repeats, repeats.verdict());
+                    return First::Changed;
+                }
                 Made::Look => match self.state_request(profile) {
                     Some(step) => Some(step),
                     None => return First::Changed,
                 },
                 Made::AtNextStart(reverse) => {
                     self.keep_direction(reverse);
-                    return First::Changed;
-                }
-                Made::Refused(refusal) => {
-                    self.give_up(self.unless_in_doubt(Outcome::Refused(refusal)));
                     return First::Changed;
                 }
             },

@@ -5,6 +5,7 @@
 use super::state_read::StateRead;
 use super::steps::{Step, StepPurpose};
 use drivegate_core::order::{Outcome, ParameterOrder, Refusal};
+use drivegate_core::permit::parameter;
 use drivegate_model::drive::Profile;
 use drivegate_model::drive::parameters::RawValue;
 use drivegate_proto::n2::Session;
@@ -164,16 +165,11 @@ impl ParameterRun {
             return Then::Go;
         }
         // A reply without the running state does not prove that the motor is at standstill.
-        if self.look.runs() == Some(false) {
-            return self.go(Stage::Write);
+        match parameter(self.look.runs()) {
+            Ok(()) => self.go(Stage::Write),
+            Err(_) if self.in_doubt && self.order.from.is_none() => Then::Over(unanswered.clone()),
+            Err(refusal) => Then::Over(Outcome::Refused(refusal)),
         }
-        Then::Over(match self.in_doubt && self.order.from.is_none() {
-            true => unanswered.clone(),
-            false => Outcome::Refused(Refusal::MotorRuns(
-                "the motor is running, and parameters are written only while it is stopped; nothing was written"
-                    .to_string(),
-            )),
-        })
     }
 
     fn value(&self, reply: &Reply) -> Option<RawValue> {

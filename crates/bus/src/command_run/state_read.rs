@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 
 use super::control::Word;
-use super::standstill::{self, Motor};
 use super::steps::Action;
 use super::{CommandRun, KnownWords, Step, StepPurpose};
 use drivegate_core::order::Outcome;
+use drivegate_core::permit::{AT_NEXT_START, Motor, not_seen};
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
 use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
@@ -200,7 +200,7 @@ impl CommandRun {
             self.tries.failures = 0;
             return None;
         }
-        let unsent = Outcome::Refused(standstill::not_seen(why));
+        let unsent = Outcome::Refused(not_seen(why));
         let outcome = if self.has_begun() { begun } else { unsent };
         Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
     }
@@ -244,7 +244,7 @@ impl CommandRun {
 
     /// Note on an order whose direction waits for the next start.
     pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
-        self.next_start.map(|_| standstill::AT_NEXT_START)
+        self.next_start.map(|_| AT_NEXT_START)
     }
 }
 

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
-use super::standstill::Motor;
 use drivegate_core::order::{Refusal, written};
+use drivegate_core::permit::{Motor, Repeats};
 use drivegate_model::drive::control::Setting;
 use drivegate_model::drive::profile::Form;
 use drivegate_model::drive::{Point, PointIndex, Profile, Raw, Value};
@@ -124,6 +124,17 @@ pub(super) struct RequestContext {
     pub(super) masks: bool,
     /// State of the motor as the drive reported it right before; `None` if it was not read.
     pub(super) motor: Option<Motor>,
+    /// The last answer about what a word would repeat.
+    pub(super) permit: Option<Permit>,
+}
+
+/// What may be sent, as long as the next word would repeat exactly this.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Permit {
+    /// The word may be written.
+    Write(Repeats),
+    /// The reads that show whether the motor runs may be sent.
+    Look(Repeats),
 }
 
 /// A word, with the bits of it that change.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use drivegate_core::order::{Admitted, Answer, Origin, SourceKind, WriteStats};
+use drivegate_core::order::{Admitted, Answer, Origin, Refusal, SourceKind, WriteStats};
 use drivegate_model::drive::profile::Profiles;
 use drivegate_model::drive::{DriveIndex, Value};
 use drivegate_proto::{Exception, RequestPdu, Table};

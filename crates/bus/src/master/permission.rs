@@ -4,11 +4,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::Master;
-use crate::command_run::CommandRun;
+use crate::command_run::{CommandRun, Need};
 use crate::drive_state::{DriveState, NextNeed};
 use crate::supervision::written_run;
 use drivegate_core::order::{Outcome, Urgency};
-use drivegate_core::permit::{Ask, DriveFacts, Facts, LastWritten, Stage, Verdict};
+use drivegate_core::permit::{Ask, DriveFacts, Facts, LastWritten, Repeats, Stage, Verdict};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::DriveImage;
 use drivegate_core::queue::Denied;
@@ -46,28 +46,29 @@ impl Facts for AtTurn {
         let reading = self.images.get(drive.place())?.reading(self.now, RANGE_AGE);
         let written = self.written.get(drive).copied();
         let run = self.run.get(drive).copied().flatten();
-        Some(DriveFacts { reading, written, run })
+        Some(DriveFacts {
+            reading,
+            written,
+            run,
+            repeats: None,
+        })
+    }
+}
+
+/// State of a drive when a frame of a started command to it is about to be sent.
+fn at_write<'a>(drive: &DriveState, image: &'a DriveImage, repeats: Option<Repeats>, now: Instant) -> DriveFacts<'a> {
+    DriveFacts {
+        reading: image.reading(now, RANGE_AGE),
+        written: Some(drive.written),
+        run: written_run(&image.spec.profile, &drive.words),
+        repeats,
     }
 }
 
 /// Whether the next frame of a started command may be sent. A stop and the end of a pulse are always sent.
-pub(super) fn may_write(
-    bus: &BusHandle,
-    index: DriveIndex,
-    image: &DriveImage,
-    (run, written, commanded): (&CommandRun, LastWritten, Option<bool>),
-    now: Instant,
-) -> Verdict {
-    if run.urgency() != Urgency::Command || !run.may_write_on() {
+fn may_write(bus: &BusHandle, index: DriveIndex, run: &CommandRun, seen: &DriveFacts<'_>, now: Instant) -> Verdict {
+    let Some(origin) = run.origins().next().filter(|_| run.is_judged()) else {
         return Verdict::Go;
-    }
-    let Some(origin) = run.origins().next() else {
-        return Verdict::Go;
-    };
-    let seen = DriveFacts {
-        reading: image.reading(now, RANGE_AGE),
-        written: Some(written),
-        run: commanded,
     };
     let ask = Ask {
         stage: Stage::Write,
@@ -75,30 +76,38 @@ pub(super) fn may_write(
         drive: index,
         intent: run.intent(),
         origin,
-        seen: Some(&seen),
+        seen: Some(seen),
     };
     bus.queue.lock().gate.ask(&ask)
 }
 
-/// The next need of the started commands of a drive, after those that may not continue have ended.
+/// The next need of the started commands of a drive, after those that may not continue have ended. Where the gate must know
+/// whether the motor runs, the need is the read of that.
 pub(super) fn next_need(
     bus: &BusHandle,
     index: DriveIndex,
     (drive, image): (&mut DriveState, &DriveImage),
-    want: impl Fn(&mut DriveState) -> NextNeed,
+    want: impl Fn(&mut DriveState) -> Need<NextNeed>,
     now: Instant,
 ) -> NextNeed {
     loop {
-        let wanted = want(drive);
-        let NextNeed::Step(slot @ Urgency::Command, _) = wanted else {
+        let (wanted, repeats) = match want(drive) {
+            Need::Next(wanted @ NextNeed::Step(Urgency::Command, _)) => (wanted, None),
+            Need::Next(wanted) => return wanted,
+            Need::Judge(repeats) => (NextNeed::Nothing, Some(repeats)),
+        };
+        let seen = at_write(drive, image, repeats, now);
+        let Some(run) = drive.run(Urgency::Command) else {
             return wanted;
         };
-        let (written, commanded) = (drive.written, written_run(&image.spec.profile, &drive.words));
-        let Some(run) = drive.run(slot) else { return wanted };
-        match may_write(bus, index, image, (run, written, commanded), now) {
-            Verdict::Go | Verdict::LookFirst => return wanted,
-            Verdict::Wait(until) => return NextNeed::Wait(until),
-            Verdict::Refuse(outcome) => deny(bus, index, run, outcome),
+        let verdict = may_write(bus, index, run, &seen, now);
+        let is_of_word = repeats.is_some_and(|repeats| repeats.verdict() == verdict);
+        match (verdict, repeats) {
+            (Verdict::Wait(until), _) => return NextNeed::Wait(until),
+            (Verdict::Refuse(outcome), _) if !is_of_word => deny(bus, index, run, outcome),
+            // If the state of the drive forbids the word, the result of the command says so; there is no event.
+            (verdict, Some(repeats)) => run.judged(repeats, verdict),
+            (_, None) => return wanted,
         }
     }
 }
@@ -121,11 +130,14 @@ impl Master {
     /// Whether a chosen frame of a started command may still be sent.
     pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
         let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
-        let (written, commanded) = (drive.written, written_run(&image.spec.profile, &drive.words));
+        if !drive.run(slot).is_some_and(|run| run.is_judged()) {
+            return true;
+        }
+        let seen = at_write(drive, image, None, now);
         let Some(run) = drive.run(slot) else { return true };
         // A denied command is refused, or made to wait, at the next choice.
         matches!(
-            may_write(&self.bus, index, image, (run, written, commanded), now),
+            may_write(&self.bus, index, run, &seen, now),
             Verdict::Go | Verdict::LookFirst
         )
     }

@@ -3,7 +3,7 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use super::*;
-use crate::command_run::{CommandRun, Next, Step};
+use crate::command_run::{CommandRun, Need, Next, Step};
 use crate::drive_state::{DriveState, NextNeed};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
@@ -197,7 +197,8 @@ impl SupervisedDrive {
 
     /// Sends the next step of the started command.
     fn send(&mut self) -> (Urgency, Step) {
-        let NextNeed::Step(urgency, step) = self.drive.next_need(&self.image(), &N2LateReplies::default(), self.now)
+        let Need::Next(NextNeed::Step(urgency, step)) =
+            self.drive.next_need(&self.image(), &N2LateReplies::default(), self.now)
         else {
             panic!("nothing to send")
         };

@@ -5,6 +5,7 @@ use std::time::Instant;
 use super::gate::{DriveGate, Gate};
 use super::reference_limits::LastWritten;
 use super::rules;
+use super::rules::standing::Repeats;
 use crate::order::{Asks, Effect, Intent, Order, Origin, Outcome, Refusal};
 use crate::process_image::Reading;
 use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
@@ -57,6 +58,9 @@ pub struct DriveFacts<'a> {
     pub written: Option<LastWritten>,
     /// Run command in the drive's word as the bus knows it, from reads and acknowledged writes; `None` if unknown.
     pub run: Option<bool>,
+    /// What the word that is about to be sent would repeat of the drive's word; `None` if it repeats nothing, or if no
+    /// word is about to be sent.
+    pub repeats: Option<Repeats>,
 }
 
 impl DriveFacts<'_> {
@@ -138,7 +142,7 @@ pub(super) struct Rule {
 }
 
 /// All rules in their order of evaluation.
-const RULES: [Rule; 10] = [
+const RULES: [Rule; 11] = [
     rules::access::RULE,
     rules::age::RULE,
     rules::restore_lock::RULE,
@@ -149,6 +153,7 @@ const RULES: [Rule; 10] = [
     rules::interlock::RULE,
     rules::guard::RULE,
     rules::limits::RULE,
+    rules::standing::RULE,
 ];
 
 /// Judges an order by every rule of its stage. The first refusal ends the evaluation; of several waits the longest counts.

@@ -4,7 +4,8 @@
 //! line, and each of its frames is about to be sent. In between the state may change: by another client, a stop, a
 //! reload, a pause of the process, a drive that restarts, an operator at the panel. So there is one list of rules
 //! (`judge`), each in a separate file below `rules`, and one state for all of them ([`Gate`]). The callers do not
-//! know the rules, and a rule does not know its caller. Before an order is judged it is checked and converted by
+//! know the rules, and a rule does not know its caller. An answer may be to look first ([`Verdict::LookFirst`]): the bus then
+//! reads the motor within the same command and asks again. Before an order is judged it is checked and converted by
 //! profile and limits ([`admit`]).
 //!
 //! - `admit`: what the profile, the configuration and the limits let through. `reference_limits`: the present reference
@@ -33,5 +34,8 @@ pub use holder::{
 pub use judge::{Ask, DriveFacts, Facts, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};
 pub use reference_limits::{LastWritten, is_reference, limits_passed};
-pub use rules::access::{access, client_access};
+pub use rules::access::{access, client_access, right_lost};
 pub use rules::machine::refusal as meant_another;
+pub use rules::standing::{
+    AT_NEXT_START, Form, KnownRun, Motor, OnRunning, Repeats, Wants, not_seen, parameter, running_unknown,
+};

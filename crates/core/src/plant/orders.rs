@@ -129,6 +129,7 @@ impl Facts for AtAccept<'_> {
             reading,
             written: None,
             run: None,
+            repeats: None,
         })
     }
 }

@@ -288,6 +288,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
                     running: false,
                     masks: false,
                     motor: None,
+                    permit: None,
                 };
                 let Made::Send(step) = control::word(word, &words, &profile, known) else {
                     continue;

@@ -8,7 +8,7 @@ use super::*;
 use crate::order::{
     Admitted, Arrival, Command, Commanded, Connection, Entry, Proof, Right, SourceKind, Ticket, Urgency, Window,
 };
-use crate::permit::{AwaitedFiles, DrillLock, Mode, Principal, Rules, Verb};
+use crate::permit::{AwaitedFiles, DrillLock, KnownRun, Mode, Motor, OnRunning, Principal, Rules, Verb, Wants};
 use crate::process_image::{DriveImage, RestoreLock};
 use crate::stalls::Stall;
 use crate::start_guard::{BusGuards, Guard, Guards, Interlock};
@@ -42,6 +42,8 @@ struct Rig {
     gate: Gate,
     image: Arc<DriveImage>,
     right: Arc<AtomicBool>,
+    /// What the next word of an order would repeat.
+    repeats: Option<Repeats>,
     /// When the orders arrive, and when they are judged.
     asked: Instant,
     now: Instant,
@@ -54,6 +56,7 @@ impl Facts for Rig {
             reading,
             written: None,
             run: None,
+            repeats: self.repeats,
         })
     }
 }
@@ -111,6 +114,7 @@ impl Rig {
             gate: Gate::default(),
             image: drive_image,
             right: Arc::new(AtomicBool::new(true)),
+            repeats: None,
             asked,
             now: asked + Duration::from_millis(10),
         };
@@ -303,6 +307,39 @@ fn each_rule_is_asked_at_its_moments_and_of_its_orders() {
     ];
     for (why, expected) in table {
         assert_eq!(refused(why), expected, "{why:?}");
+    }
+}
+
+/// A word that would repeat a run command from memory, by what was read of the motor in the same command.
+#[test]
+fn a_word_from_memory_is_judged_by_the_motor_right_before_it_is_sent() {
+    for (motor, expected) in [
+        (None, "go go look"),
+        (Some(Motor::Runs), "go go go"),
+        (Some(Motor::Stands), "go go not_allowed"),
+        (Some(Motor::NotShown), "go go not_allowed"),
+    ] {
+        for (what, expected) in [("reset", expected), ("stop", "go go go")] {
+            let told = [Stage::Accept, Stage::Turn, Stage::Write].map(|stage| {
+                let mut rig = Rig::new(Why::Nothing);
+                rig.repeats = Some(Repeats {
+                    wants: Wants::Others,
+                    holds: KnownRun::Run,
+                    told: false,
+                    motor,
+                    on_running: OnRunning::Harmless,
+                });
+                let command = rig.command(what, "alice", rig.asked);
+                let (mut gate, now) = (std::mem::take(&mut rig.gate), rig.now);
+                match gate.judge(stage, &command, &rig, now) {
+                    Verdict::Go => "go",
+                    Verdict::LookFirst => "look",
+                    Verdict::Wait(_) => "wait",
+                    Verdict::Refuse(outcome) => outcome.code(),
+                }
+            });
+            assert_eq!(told.join(" "), expected, "{what} {motor:?}");
+        }
     }
 }
 

@@ -46,6 +46,11 @@ pub fn access(stage: Stage, is_stop: bool, may_write: bool) -> Result<(), Refusa
     Err(Refusal::NotAllowed(format!("{why}; nothing was written")))
 }
 
+/// The refusal of a command whose client lost its right after the turn of the command, before anything was written.
+pub fn right_lost() -> Refusal {
+    Refusal::NotAllowed("a reload removed the right of this client to write; nothing was written".to_string())
+}
+
 /// Judges a command of this client for a drive of this bus.
 ///
 /// # Errors

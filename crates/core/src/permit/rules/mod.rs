@@ -12,3 +12,4 @@ pub(super) mod limits;
 pub(crate) mod machine;
 pub(super) mod priorities;
 pub(super) mod restore_lock;
+pub(super) mod standing;
