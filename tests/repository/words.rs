@@ -113,7 +113,7 @@ fn literals(code: &str) -> Vec<(usize, String)> {
 }
 
 /// Index of the end of a string literal; `text` begins after its opening quotation mark.
-fn closing(text: &str) -> usize {
+pub(super) fn closing(text: &str) -> usize {
     let mut escaped = false;
     let end = text.char_indices().find(|(_, c)| {
         let is_end = *c == '"' && !escaped;
@@ -161,7 +161,7 @@ fn rust_files(folders: &[&str]) -> Vec<PathBuf> {
 }
 
 /// Whether a file, or a folder that contains it, has only tests.
-fn is_test(path: &Path) -> bool {
+pub(super) fn is_test(path: &Path) -> bool {
     let parts = path.strip_prefix(root()).unwrap().iter();
     parts
         .map(|part| part.to_string_lossy())
