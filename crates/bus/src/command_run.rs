@@ -28,7 +28,7 @@ use super::start_gate::Start;
 use drivegate_core::order::{
     Command, Intent, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Work, written,
 };
-use drivegate_core::permit::{Repeats, Verdict, running_unknown};
+use drivegate_core::permit::{Motor, Repeats, Verdict, running_unknown};
 use drivegate_model::drive::control::Run;
 use drivegate_model::drive::{ModelPoint, Profile};
 use drivegate_proto::{Reply, Table};
@@ -111,6 +111,69 @@ struct Tries {
     pause: Option<Duration>,
 }
 
+/// How a command ends when nothing is left to send.
+#[derive(Debug)]
+enum Ending {
+    /// All was sent; with the reply to the order itself.
+    Acknowledged(Reply),
+    /// The command ends before all was sent, or could not be sent as a whole.
+    Cut(Outcome),
+}
+
+impl Ending {
+    /// The outcome of a command that is cut off.
+    fn cut(&self) -> Option<&Outcome> {
+        match self {
+            Ending::Acknowledged(_) => None,
+            Ending::Cut(outcome) => Some(outcome),
+        }
+    }
+}
+
+/// The motor as the drive shows it in this command, right before a write.
+#[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there are few commands, and a look needs no allocation of its own"
+)]
+enum Look {
+    NotTaken,
+    /// The reads in progress that show whether the motor runs.
+    UnderWay(StateRead),
+    Seen(Motor),
+}
+
+impl Look {
+    /// State of the motor; `None` if it was not read.
+    fn motor(&self) -> Option<Motor> {
+        match self {
+            Look::NotTaken | Look::UnderWay(_) => None,
+            Look::Seen(motor) => Some(*motor),
+        }
+    }
+
+    /// The state of the motor counts no longer. Returns whether it was known; reads in progress go on.
+    fn forget(&mut self) -> bool {
+        let seen = matches!(self, Look::Seen(_));
+        if seen {
+            *self = Look::NotTaken;
+        }
+        seen
+    }
+}
+
+/// Effect of a command on the direction that is kept for the next start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum NextDirection {
+    Unchanged,
+    /// The command sets the direction, or starts the motor: a kept direction is dropped.
+    Dropped,
+    /// The direction that a stop orders, where no word of the family has it while the motor stands.
+    OfStop(bool),
+    /// The ordered direction takes effect at the next start.
+    Ordered(bool),
+}
+
 /// A command that the bus has started.
 #[derive(Debug)]
 pub struct CommandRun {
@@ -125,24 +188,16 @@ pub struct CommandRun {
     tickets: Vec<Ticket>,
     effects: Vec<Effect>,
     tries: Tries,
-    /// The outcome of a command that ends before all was sent.
-    cut: Option<Outcome>,
+    ending: Ending,
     phase: Phase,
-    reply: Reply,
     on_wire: OnWire,
     known: RequestContext,
     /// The drive refused the function code of the present step, so the alternative function is being tried.
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
-    /// The reads in progress that show whether the motor runs.
-    look: Option<StateRead>,
-    /// The ordered direction, if it takes effect at the next start.
-    next_start: Option<bool>,
-    /// The direction that a stop orders, where no word of the family has it while the motor stands.
-    at_stop: Option<bool>,
-    /// Whether the command sets the direction, or starts the motor.
-    turns: bool,
+    look: Look,
+    next_direction: NextDirection,
     /// Whether the command waited for a late reply since its last step was chosen.
     held_up: bool,
     /// Stops that were done since the command's last write.
@@ -183,11 +238,14 @@ impl CommandRun {
             stopped: false,
             running: true,
             masks: false,
-            motor: None,
             permit: None,
         };
-        let turns = starts_or_sets_direction(profile, &order);
-        let at_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
+        let of_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
+        let next_direction = match of_stop {
+            Some(reverse) => NextDirection::OfStop(reverse),
+            None if starts_or_sets_direction(profile, &order) => NextDirection::Dropped,
+            None => NextDirection::Unchanged,
+        };
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
             Order::Points(_) | Order::Write(_) | Order::Read(_) => None,
@@ -229,17 +287,17 @@ impl CommandRun {
                 busy: 0,
                 pause: None,
             },
-            cut: unsendable.map(Outcome::Refused),
+            ending: match unsendable {
+                Some(refusal) => Ending::Cut(Outcome::Refused(refusal)),
+                None => Ending::Acknowledged(Reply::Written),
+            },
             phase: Phase::Steps,
-            reply: Reply::Written,
             on_wire: if was_begun { OnWire::Command } else { OnWire::Nothing },
             known,
             by_other_function: false,
             control: profile.run_place().map(|place| (place.table, place.address)),
-            look: None,
-            next_start: None,
-            at_stop,
-            turns,
+            look: Look::NotTaken,
+            next_direction,
             held_up: false,
             overtaken: 0,
             intent,
@@ -372,13 +430,13 @@ impl CommandRun {
     /// bits.
     pub fn is_checked(&mut self) -> bool {
         let settings = self.known.check == Check::Read && self.settings().is_some();
-        settings || self.known.motor.is_some() || self.parameter().is_some_and(|run| run.is_checked())
+        settings || self.look.motor().is_some() || self.parameter().is_some_and(|run| run.is_checked())
     }
 
     /// Notes that another transaction goes first: the motor state, or the other settings of the register, must then
     /// be read again before the write.
     pub fn others_go_first(&mut self) {
-        if self.settings().is_some() || self.known.motor.take().is_some() {
+        if self.settings().is_some() || self.look.forget() {
             self.known.check = Check::NotYet;
         }
         if let Some(run) = self.parameter() {
@@ -415,7 +473,7 @@ impl CommandRun {
         if step.pdu.is_write() {
             self.overtaken = 0;
             // The motor must be read again before the next write.
-            self.known.motor = None;
+            self.look.forget();
         }
     }
 

@@ -369,7 +369,14 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
 }
 
 /// The request that writes a word, based on the known control word; or the read of the control word if it is not known.
-pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: RequestContext) -> Made {
+/// `motor` is the state of the motor as the drive reported it right before; `None` if it was not read.
+pub(super) fn word(
+    word: Word,
+    words: &KnownWords,
+    profile: &Profile,
+    known: RequestContext,
+    motor: Option<Motor>,
+) -> Made {
     let Some(control) = profile.control.as_ref() else {
         return Made::Nothing;
     };
@@ -379,7 +386,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Req
         .get(at.table, at.address)
         .map(|own| control.standing(own))
         .or_else(either);
-    if asks_first(word, control, own, known) {
+    if asks_first(word, control, own, known, motor) {
         return Made::Send(read_of(at));
     }
     let pulsed = word.pulsed();
@@ -388,7 +395,7 @@ pub(super) fn word(word: Word, words: &KnownWords, profile: &Profile, known: Req
         pulsed.map_or(own, |pulsed| pulsed.released(own))
     });
     let base = released.unwrap_or(0);
-    let form = match basis(word, control, words, released, known) {
+    let form = match basis(word, control, words, released, known, motor) {
         Basis::Certain(form) => form,
         Basis::Judged(repeats) => match known.permit {
             Some(Permit::Write(of)) if of == repeats => repeats.form(),
@@ -476,7 +483,14 @@ enum Basis {
 }
 
 /// What decides which run command is written together with a word. `released` is the known control word without a reset.
-fn basis(word: Word, control: &Control, words: &KnownWords, released: Option<u16>, known: RequestContext) -> Basis {
+fn basis(
+    word: Word,
+    control: &Control,
+    words: &KnownWords,
+    released: Option<u16>,
+    known: RequestContext,
+    motor: Option<Motor>,
+) -> Basis {
     // A word that itself decides whether the motor runs repeats nothing.
     let Some(wants) = word.wants() else {
         return Basis::Certain(Form::AsItStands);
@@ -492,7 +506,7 @@ fn basis(word: Word, control: &Control, words: &KnownWords, released: Option<u16
         wants,
         holds,
         told: known.check == Check::Read,
-        motor: known.motor,
+        motor,
         on_running: word.on_running(control),
     })
 }
@@ -516,7 +530,7 @@ fn holds(control: &Control, words: &KnownWords, released: Option<u16>) -> Option
 
 /// Whether the word must first be read from the drive, because a bit is to keep its value. A stop and a start need
 /// no read, unless the other bits must be kept and are unknown.
-fn asks_first(word: Word, control: &Control, own: Option<u16>, known: RequestContext) -> bool {
+fn asks_first(word: Word, control: &Control, own: Option<u16>, known: RequestContext, motor: Option<Motor>) -> bool {
     let is_coil = matches!(control.at.table, Table::Coil | Table::DiscreteInput);
     if is_coil || known.blind || known.check != Check::NotYet {
         return false;
@@ -532,7 +546,7 @@ fn asks_first(word: Word, control: &Control, own: Option<u16>, known: RequestCon
         (OwnWord::Kept, word) => own.is_none_or(|own| {
             // A run command that the order does not contain may have been taken away elsewhere since the word was
             // read; writing it again would start the motor.
-            let running = known.motor.map_or(known.running, |motor| motor == Motor::Runs);
+            let running = motor.map_or(known.running, |motor| motor == Motor::Runs);
             let is_taken_away = !running && matches!(word, Word::ResetLow(_));
             let stops = is_taken_away || control.is_stop(control.at, own);
             let is_low = running && matches!(word, Word::ResetLow(pulse) if pulse.released(own) == own);

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use super::control::Word;
 use super::steps::{Action, Check};
-use super::{CommandRun, Phase};
+use super::{CommandRun, Ending, Phase};
 use crate::confirm::Effect;
 use drivegate_core::order::{Interruption, Outcome, Receipt, Refusal};
 use drivegate_core::permit::right_lost;
@@ -14,10 +14,13 @@ impl CommandRun {
     /// Ends the command with this outcome; if it started a motor, that is stopped.
     pub(super) fn give_up(&mut self, outcome: Outcome) {
         self.actions.clear();
-        self.cut.get_or_insert(outcome);
+        if self.ending.cut().is_none() {
+            self.ending = Ending::Cut(outcome);
+        }
         let phase = std::mem::replace(&mut self.phase, Phase::OnlyEnds);
         self.tries.pause = None;
-        (self.tries.failures, self.known.check, self.known.motor) = (0, Check::NotYet, None);
+        (self.tries.failures, self.known.check) = (0, Check::NotYet);
+        self.look.forget();
         if phase == Phase::MotorStarted {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
@@ -97,18 +100,19 @@ impl CommandRun {
         if phase == Phase::MotorStarted && before > left {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
-        (self.tries.pause, self.known.motor) = (None, None);
+        self.tries.pause = None;
+        self.look.forget();
         if before != left {
-            self.cut = Some(outcome);
+            self.ending = Ending::Cut(outcome);
             self.tries.failures = 0;
         }
     }
 
     /// How the command ends when nothing is left to do.
     pub fn success(&self) -> Outcome {
-        match &self.cut {
-            Some(outcome) => outcome.clone(),
-            None => Outcome::Acknowledged(self.reply.clone()),
+        match &self.ending {
+            Ending::Cut(outcome) => outcome.clone(),
+            Ending::Acknowledged(reply) => Outcome::Acknowledged(reply.clone()),
         }
     }
 
@@ -131,10 +135,8 @@ impl CommandRun {
 
     /// Ends a command that cannot continue; with the outcome `unbegun` if nothing of it was sent.
     pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
-        let outcome = match &self.cut {
-            Some(outcome) => outcome.clone(),
-            None => self.unless_begun(unbegun, why),
-        };
+        let cut = self.ending.cut().cloned();
+        let outcome = cut.unwrap_or_else(|| self.unless_begun(unbegun, why));
         self.finish(&outcome, now);
     }
 }

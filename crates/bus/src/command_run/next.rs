@@ -46,7 +46,7 @@ impl CommandRun {
         while let Some(action) = self.actions.front() {
             if let Action::Wait(time) = action {
                 let until = now + *time;
-                self.known.motor = None;
+                self.look.forget();
                 return Need::Next(self.hold_until(until));
             }
             match self.first(words, profile, running, now) {
@@ -106,7 +106,7 @@ impl CommandRun {
                 self.only_last_word(*reverse, profile);
                 return First::Changed;
             }
-            Some(Action::Word(word)) => match control::word(*word, words, profile, self.known) {
+            Some(Action::Word(word)) => match control::word(*word, words, profile, self.known, self.look.motor()) {
                 Made::Send(step) => Some(step),
                 Made::Nothing => None,
                 Made::Judge(repeats) if self.is_judged() => return First::Judge(repeats),

@@ -6,7 +6,7 @@ use super::control::{LOOK_PAUSE, Word};
 use super::functions::other_function;
 use super::parameter::Then;
 use super::steps::{Action, Check};
-use super::{CommandRun, Doubt, KnownWords, Phase, Step, StepPurpose};
+use super::{CommandRun, Doubt, Ending, KnownWords, Phase, Step, StepPurpose};
 use drivegate_core::order::{Outcome, Urgency};
 use drivegate_proto::{Exception, Reply, RequestPdu};
 
@@ -72,8 +72,8 @@ impl CommandRun {
             (StepPurpose::Execute, Reply::Exception(code)) => self.ended(Outcome::Exception(code)),
             (purpose, reply) => {
                 words.written(&step.pdu);
-                if purpose == StepPurpose::Execute {
-                    self.reply = reply;
+                if let (StepPurpose::Execute, Ending::Acknowledged(of_order)) = (purpose, &mut self.ending) {
+                    *of_order = reply;
                 }
                 if let Some(Action::Word(Word::Direction(to) | Word::Run(Some(to)))) = self.actions.front() {
                     words.direction = Some(*to);
@@ -105,7 +105,7 @@ impl CommandRun {
     /// Ends the command with this outcome; if its sequence started the motor, a stop is sent first.
     fn ended(&mut self, outcome: Outcome) -> Option<Outcome> {
         if self.urgency == Urgency::Stop || self.phase != Phase::MotorStarted {
-            let cut = self.cut.clone().filter(|_| !self.may_write_on());
+            let cut = self.ending.cut().cloned().filter(|_| !self.may_write_on());
             return Some(cut.unwrap_or(outcome));
         }
         self.give_up(outcome);
@@ -263,7 +263,7 @@ impl CommandRun {
     }
 
     fn without_answer(&self) -> Outcome {
-        self.cut.clone().unwrap_or_else(|| self.tries.unanswered.clone())
+        self.ending.cut().unwrap_or(&self.tries.unanswered).clone()
     }
 
     /// The step was acknowledged, perhaps by a late reply to another request.

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::control::Word;
 use super::steps::Action;
-use super::{CommandRun, KnownWords, Step, StepPurpose};
+use super::{CommandRun, KnownWords, Look, NextDirection, Step, StepPurpose};
 use drivegate_core::order::Outcome;
 use drivegate_core::permit::{AT_NEXT_START, Motor, not_seen};
 use drivegate_model::drive::model::Kind;
@@ -169,40 +169,45 @@ impl StateRead {
 impl CommandRun {
     /// The next request of the reads that show the motor state; `None` if the family does not report it.
     pub(super) fn state_request(&mut self, profile: &Profile) -> Option<Step> {
-        if self.look.is_none() {
-            self.look = StateRead::at_motor(profile);
+        if !matches!(self.look, Look::UnderWay(_)) {
+            self.look = StateRead::at_motor(profile).map_or(Look::Seen(Motor::NotShown), Look::UnderWay);
         }
-        let pdu = self.look.as_ref().map(StateRead::request);
-        if pdu.is_none() {
-            self.known.motor = Some(Motor::NotShown);
+        match &self.look {
+            Look::UnderWay(read) => Some(Step::new(StepPurpose::Look, read.request())),
+            Look::NotTaken | Look::Seen(_) => None,
         }
-        pdu.map(|pdu| Step::new(StepPurpose::Look, pdu))
     }
 
     /// The drive answered a request of a look.
     pub(super) fn looked(&mut self, reply: &Reply) {
-        if let Some(look) = self.look.take_if(|look| look.take_reply(reply)) {
-            self.known.motor = Some(look.motor());
+        if let Look::UnderWay(read) = &mut self.look
+            && read.take_reply(reply)
+        {
+            self.look = Look::Seen(read.motor());
         }
     }
 
     /// Sets the result of a look without a reply to decode.
     pub(crate) fn set_motor_state(&mut self, runs: bool) {
-        self.look = None;
-        self.known.motor = Some(if runs { Motor::Runs } else { Motor::Stands });
+        self.look = Look::Seen(if runs { Motor::Runs } else { Motor::Stands });
     }
 
     /// Handles reads without a result: nothing is written except the end of a pulse, which then contains no run command.
     pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
-        self.look = None;
+        self.look = Look::NotTaken;
         if self.ends_pulse() {
-            self.known.motor = Some(Motor::NotShown);
+            self.look = Look::Seen(Motor::NotShown);
             self.tries.failures = 0;
             return None;
         }
         let unsent = Outcome::Refused(not_seen(why));
         let outcome = if self.has_begun() { begun } else { unsent };
-        Some(self.cut.clone().unwrap_or_else(|| self.unless_in_doubt(outcome)))
+        Some(
+            self.ending
+                .cut()
+                .cloned()
+                .unwrap_or_else(|| self.unless_in_doubt(outcome)),
+        )
     }
 
     /// This outcome, unless an earlier attempt that was not answered determines the outcome.
@@ -227,24 +232,24 @@ impl CommandRun {
         if matches!(self.actions.front(), Some(Action::Release(_))) {
             self.pop();
         }
-        self.known.motor = None;
-        self.next_start = Some(reverse);
+        self.look.forget();
+        self.next_direction = NextDirection::Ordered(reverse);
         // The remaining effects would be taken for the effect of the direction.
         self.effects.clear();
     }
 
     /// Keeps the direction that the command ordered; if it set another one, drops the kept one.
     pub(crate) fn note_direction(&self, words: &mut KnownWords) {
-        match self.next_start.or(self.at_stop) {
-            Some(reverse) => words.keep_direction(reverse),
-            None if self.turns => words.forget_direction(),
-            None => {}
+        match self.next_direction {
+            NextDirection::Ordered(reverse) | NextDirection::OfStop(reverse) => words.keep_direction(reverse),
+            NextDirection::Dropped => words.forget_direction(),
+            NextDirection::Unchanged => {}
         }
     }
 
     /// Note on an order whose direction waits for the next start.
     pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
-        self.next_start.map(|_| AT_NEXT_START)
+        matches!(self.next_direction, NextDirection::Ordered(_)).then_some(AT_NEXT_START)
     }
 }
 

@@ -7,7 +7,7 @@ use super::control::{self, AwaitedState, Ordered, Word};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
 use drivegate_core::order::{Refusal, written};
-use drivegate_core::permit::{Motor, Repeats};
+use drivegate_core::permit::Repeats;
 use drivegate_model::drive::control::Setting;
 use drivegate_model::drive::profile::Form;
 use drivegate_model::drive::{Point, PointIndex, Profile, Raw, Value};
@@ -122,8 +122,6 @@ pub(super) struct RequestContext {
     pub(super) running: bool,
     /// Whether the drive itself changes bits of a register.
     pub(super) masks: bool,
-    /// State of the motor as the drive reported it right before; `None` if it was not read.
-    pub(super) motor: Option<Motor>,
     /// The last answer about what a word would repeat.
     pub(super) permit: Option<Permit>,
 }

@@ -287,10 +287,9 @@ fn the_next_start_has_the_direction_that_was_kept() {
                     stopped: false,
                     running: false,
                     masks: false,
-                    motor: None,
                     permit: None,
                 };
-                let Made::Send(step) = control::word(word, &words, &profile, known) else {
+                let Made::Send(step) = control::word(word, &words, &profile, known, None) else {
                     continue;
                 };
                 for (address, word) in written(&step.pdu).unwrap().1 {
