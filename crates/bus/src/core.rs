@@ -375,8 +375,7 @@ impl BusCore {
             .report
             .tape_request(turn.drive(), &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
-        let late = self.master.take_late();
-        self.line.send(request, frame, sending, late, now);
+        self.line.send(request, frame, sending, now);
         self.connection.asked = true;
         self.stood = false;
         self.asked = Some(turn);
@@ -389,19 +388,19 @@ impl BusCore {
             if !bytes.is_empty() {
                 self.report.noise(bytes, self.line.quiet_since(), now);
                 self.report.diagnosis.figures().stray(bytes);
-                self.line.received(bytes, now);
+                self.line.received(bytes, self.master.n2_late(), now);
             }
             return;
         }
         if let Some(tap) = &mut self.tap {
             tap.received(bytes, now);
         }
-        if let Some(exchanged) = self.line.received(bytes, now) {
+        if let Some(exchanged) = self.line.received(bytes, self.master.n2_late(), now) {
             self.over(exchanged, now);
         }
     }
 
-    fn over(&mut self, mut exchanged: Exchanged, now: Instant) {
+    fn over(&mut self, exchanged: Exchanged, now: Instant) {
         let Some(turn) = self.asked.take() else { return };
         if matches!(exchanged.ended, Ended::Reply(_)) {
             self.connection = Connection {
@@ -417,7 +416,6 @@ impl BusCore {
         if let Some(tap) = self.tap.take() {
             tap.ended(&exchanged.ended, now);
         }
-        self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
         let doubted = exchanged.transaction.only_doubted();
         let frame = match turn.purpose {

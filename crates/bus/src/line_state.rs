@@ -211,7 +211,7 @@ impl LineState {
     }
 
     /// The frame of a request is given to the line at `now`.
-    pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, late: N2LateReplies, now: Instant) {
+    pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, now: Instant) {
         let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
         let sent = now + self.format.chars(frame.len());
         // A reply cannot be complete before its wire time has passed.
@@ -229,7 +229,6 @@ impl LineState {
             self.learned.echo,
         );
         transaction.receive_into(std::mem::take(&mut self.buffers));
-        transaction.expect_late(late);
         if self.learned.early_weight < WITHOUT_WIRE_TIME {
             transaction.ignore_before(sent);
             if doubtful {
@@ -276,13 +275,14 @@ impl LineState {
         self.underway.as_ref().map(|underway| underway.transaction.deadline())
     }
 
-    /// Adds bytes received at `now`. Returns the transaction if these bytes complete it.
-    pub fn received(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
+    /// Adds bytes received at `now`; `late` are the replies that may still arrive on an N2 line. Returns the transaction if
+    /// these bytes complete it.
+    pub fn received(&mut self, bytes: &[u8], late: &mut N2LateReplies, now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {
             self.begin_silence(now);
         }
         let underway = self.underway.as_mut()?;
-        match underway.transaction.on_bytes(now, bytes) {
+        match underway.transaction.receive(now, bytes, late) {
             Step::Wait(_) => None,
             Step::Done(ended) => self.over(ended, now),
         }

@@ -591,14 +591,9 @@ impl Master {
         self.schedule.unanswered()
     }
 
-    /// Takes the late replies that may still arrive on an N2 line, for the transaction that is about to start.
-    pub(crate) fn take_late(&mut self) -> N2LateReplies {
-        std::mem::take(&mut self.waits.n2_late)
-    }
-
-    /// Stores the late replies of N2 that a transaction has left.
-    pub(crate) fn put_late(&mut self, late: N2LateReplies) {
-        self.waits.n2_late = late;
+    /// The late replies that may still arrive on an N2 line, for the bytes of a transaction.
+    pub(crate) fn n2_late(&mut self) -> &mut N2LateReplies {
+        &mut self.waits.n2_late
     }
 }
 

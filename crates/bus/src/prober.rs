@@ -133,9 +133,7 @@ impl Prober<'_> {
             could_be_doubled: false,
             late_may_come: false,
         };
-        let late = N2LateReplies::default();
-        self.state
-            .send(request.clone(), frame.clone(), sending, late, Instant::now());
+        self.state.send(request.clone(), frame.clone(), sending, Instant::now());
         self.line.send(&frame)?;
         loop {
             let now = Instant::now();
@@ -159,8 +157,10 @@ impl Prober<'_> {
         if !self.state.is_underway() {
             self.unasked += count;
         }
-        Ok(self
-            .state
-            .received(buffer.get(..count).unwrap_or_default(), Instant::now()))
+        Ok(self.state.received(
+            buffer.get(..count).unwrap_or_default(),
+            &mut N2LateReplies::default(),
+            Instant::now(),
+        ))
     }
 }

@@ -57,6 +57,45 @@ pub(crate) struct Buffers {
     seen: Vec<u8>,
 }
 
+/// What the received bytes are, as far as they end the transaction before its deadline.
+#[derive(Debug, Clone, Copy)]
+enum Received {
+    /// The reply, or a part of it, may follow until the deadline.
+    Open,
+    /// The bytes may be the whole reply: until when to wait for more.
+    Whole(Instant),
+    /// The bytes are invalid: the reason, and until when to wait for the rest.
+    Garbage(&'static str, Instant),
+}
+
+/// Whether the request comes back before its reply.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Echo {
+    /// Nothing is known of the adapter: only a frame that cannot be the reply is an echo.
+    Possible,
+    /// The adapter is known to echo.
+    Expected,
+    /// The echo was received and removed.
+    Seen,
+}
+
+/// A reply that arrived too early to be valid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum EarlyReply {
+    None,
+    /// Nothing followed the reply.
+    Alone,
+    /// More bytes followed the reply.
+    Followed,
+}
+
+/// A frame that counts as the reply unless another one arrives before the deadline: then the first one was a late reply.
+#[derive(Debug)]
+struct Held {
+    frame: Vec<u8>,
+    reply: Reply,
+}
+
 /// A transaction whose request is on the line.
 #[derive(Debug)]
 pub struct Transaction {
@@ -67,28 +106,18 @@ pub struct Transaction {
     seen: Vec<u8>,
     deadline: Instant,
     reply_time: Duration,
-    /// The received bytes are invalid; until when to wait for the rest.
-    garbage: Option<(&'static str, Instant)>,
-    /// The received bytes may be the whole reply: until when to wait for more.
-    whole_at: Option<Instant>,
+    state: Received,
     /// Position of the reply's frame in `received`.
     reply: Range<usize>,
     first_byte: Option<Instant>,
     foreign: u32,
-    echo: bool,
-    echo_seen: bool,
+    echo: Echo,
     /// A reply complete before this instant cannot answer this request.
     doubted_before: Option<Instant>,
-    doubted: bool,
-    /// Whether more bytes followed a reply that was too early.
-    behind_doubted: bool,
+    early: EarlyReply,
     /// Bytes before this instant, other than an echo, arrived before the request ended.
     ignored_before: Option<Instant>,
-    /// Late replies that may still arrive on an N2 line.
-    late: N2LateReplies,
-    /// A frame that counts as the reply unless another one arrives before the deadline: then the first one was a
-    /// late reply.
-    unless_another: Option<(Vec<u8>, Reply)>,
+    held: Option<Held>,
 }
 
 impl Transaction {
@@ -111,19 +140,15 @@ impl Transaction {
             seen: Vec::new(),
             deadline: end_of_transmission + response_timeout + reply_time,
             reply_time,
-            garbage: None,
-            whole_at: None,
+            state: Received::Open,
             reply: 0..0,
             first_byte: None,
             foreign: 0,
-            echo,
-            echo_seen: false,
+            echo: if echo { Echo::Expected } else { Echo::Possible },
             doubted_before: None,
-            doubted: false,
-            behind_doubted: false,
+            early: EarlyReply::None,
             ignored_before: None,
-            late: N2LateReplies::default(),
-            unless_another: None,
+            held: None,
         }
     }
 
@@ -154,22 +179,12 @@ impl Transaction {
 
     /// Whether a reply arrived too early to be valid.
     pub(crate) fn doubted(&self) -> bool {
-        self.doubted
+        self.early != EarlyReply::None
     }
 
     /// Whether such a reply was all that arrived.
     pub(crate) fn only_doubted(&self) -> bool {
-        self.doubted && !self.behind_doubted
-    }
-
-    /// Late replies that may still arrive on an N2 line.
-    pub(crate) fn expect_late(&mut self, late: N2LateReplies) {
-        self.late = late;
-    }
-
-    /// Removes and returns the late replies that may still arrive.
-    pub(crate) fn take_late(&mut self) -> N2LateReplies {
-        std::mem::take(&mut self.late)
+        self.early == EarlyReply::Alone
     }
 
     /// Whether the rejected bytes were the drive's reply in damaged form: they begin like it or have its length. No
@@ -192,12 +207,19 @@ impl Transaction {
         &self.request
     }
 
-    /// Processes received bytes.
+    /// Processes received bytes, on a line on which no late reply of N2 may arrive.
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
+        self.receive(now, bytes, &mut N2LateReplies::default())
+    }
+
+    /// Processes received bytes; `late` are the replies that may still arrive on an N2 line.
+    pub(crate) fn receive(&mut self, now: Instant, bytes: &[u8], late: &mut N2LateReplies) -> Step {
         self.first_byte.get_or_insert(now);
-        self.behind_doubted |= self.doubted && !bytes.is_empty();
+        self.note_followed(bytes);
         self.received.extend_from_slice(bytes);
-        self.whole_at = None;
+        if let Received::Whole(_) = self.state {
+            self.state = Received::Open;
+        }
         let room = MOST_BYTES.saturating_sub(self.seen.len());
         self.seen.extend(bytes.iter().take(room));
         if self.received.len() > MOST_BYTES {
@@ -208,31 +230,32 @@ impl Transaction {
                 continue;
             }
             if !self.received.is_empty()
-                && let Some((frame, _)) = self.unless_another.take_if(|_| self.received.contains(&b'\r'))
+                && let Some(held) = self.held.take_if(|_| self.received.contains(&b'\r'))
             {
                 self.foreign += 1;
-                self.late.has_arrived(&frame, now);
+                late.has_arrived(&held.frame, now);
             }
-            match self
-                .late
-                .take(self.request.address, &self.request.pdu, &self.received, now)
-            {
+            match late.take(self.request.address, &self.request.pdu, &self.received, now) {
                 Taken::Reply => {}
                 Taken::Late(used) => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
                     self.first_byte = (!self.received.is_empty()).then_some(now);
-                    self.garbage = None;
+                    self.state = Received::Open;
                     continue;
                 }
                 Taken::Doubtful => match self.awaits_another() {
-                    true if self.unless_another.is_none() && self.hold_doubtful() => return self.on_time(now),
+                    true if self.held.is_none() && self.hold_doubtful() => return self.on_time(now),
                     _ => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
                 },
             }
             match self.protocol.decode(&self.request, &self.received) {
                 Decoded::Reply { .. } if self.may_go_on() => {
-                    self.whole_at = Some(now + WHOLE_AFTER);
+                    let until = now + WHOLE_AFTER;
+                    self.state = Received::Whole(match self.state {
+                        Received::Garbage(_, rest) => until.min(rest),
+                        Received::Open | Received::Whole(_) => until,
+                    });
                     return self.on_time(now);
                 }
                 Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => {
@@ -241,9 +264,11 @@ impl Transaction {
                 Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
-                    self.behind_doubted |= self.doubted && !self.received.is_empty();
+                    if !self.received.is_empty() && self.early == EarlyReply::Alone {
+                        self.early = EarlyReply::Followed;
+                    }
                     self.first_byte = (!self.received.is_empty()).then_some(now);
-                    self.garbage = None;
+                    self.state = Received::Open;
                     if self.received.is_empty() {
                         return self.on_time(now);
                     }
@@ -259,17 +284,24 @@ impl Transaction {
                 Decoded::Incomplete => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
                         // A new colon has started another frame, which may be complete before the deadline.
-                        self.garbage = None;
+                        self.state = Received::Open;
                         self.on_time(now)
                     });
                 }
                 Decoded::Corrupt(why) => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
-                        self.garbage = Some((why, now + self.rest_time()));
+                        self.state = Received::Garbage(why, now + self.rest_time());
                         self.on_time(now)
                     });
                 }
             }
+        }
+    }
+
+    /// Notes whether bytes follow a reply that was too early.
+    fn note_followed(&mut self, bytes: &[u8]) {
+        if self.early == EarlyReply::Alone && !bytes.is_empty() {
+            self.early = EarlyReply::Followed;
         }
     }
 
@@ -294,15 +326,18 @@ impl Transaction {
             return false;
         };
         let frame = self.received.drain(..used.min(self.received.len())).collect();
-        self.unless_another = Some((frame, reply));
-        self.garbage = None;
+        self.held = Some(Held { frame, reply });
+        self.state = Received::Open;
         true
     }
 
     fn is_too_early(&mut self, reply: &Reply, now: Instant) -> bool {
-        let early = self.doubted_before.is_some_and(|earliest| now < earliest);
-        self.doubted |= early && !matches!(reply, Reply::Exception(_));
-        early && !matches!(reply, Reply::Exception(_))
+        let is_early = self.doubted_before.is_some_and(|earliest| now < earliest);
+        let is_doubted = is_early && !matches!(reply, Reply::Exception(_));
+        if is_doubted && self.early == EarlyReply::None {
+            self.early = EarlyReply::Alone;
+        }
+        is_doubted
     }
 
     fn replied(&mut self, at: usize, used: usize, reply: Reply) -> Step {
@@ -329,7 +364,7 @@ impl Transaction {
 
     /// Accepts a complete reply after garbage.
     fn behind_garbage(&mut self, now: Instant) -> Option<Step> {
-        if self.echo && !self.echo_seen {
+        if self.echo == Echo::Expected {
             // The frame could be the echo of a write.
             return None;
         }
@@ -361,14 +396,15 @@ impl Transaction {
 
     /// Processes the passage of time.
     pub fn on_time(&mut self, now: Instant) -> Step {
-        let until = self
-            .garbage
-            .map_or(self.deadline, |(_, until)| until.min(self.deadline));
-        if let Some(at) = self.whole_at.map(|at| at.min(until))
+        let until = match self.state {
+            Received::Open => self.deadline,
+            Received::Whole(until) | Received::Garbage(_, until) => until.min(self.deadline),
+        };
+        if let Received::Whole(_) = self.state
             && let Decoded::Reply { used, reply } = self.protocol.decode(&self.request, &self.received)
         {
-            return if now < at {
-                Step::Wait(at)
+            return if now < until {
+                Step::Wait(until)
             } else {
                 self.replied(0, used, reply)
             };
@@ -376,13 +412,13 @@ impl Transaction {
         if now < until {
             return Step::Wait(until);
         }
-        if let Some((_, reply)) = self.unless_another.take().filter(|_| self.received.is_empty()) {
-            return Step::Done(Ended::Reply(reply));
+        if let Some(held) = self.held.take().filter(|_| self.received.is_empty()) {
+            return Step::Done(Ended::Reply(held.reply));
         }
-        let ended = match self.garbage {
-            Some((why, _)) => Ended::Corrupt(why),
-            None if self.received.is_empty() => Ended::Silent,
-            None => Ended::Corrupt("the reply is incomplete"),
+        let ended = match self.state {
+            Received::Garbage(why, _) => Ended::Corrupt(why),
+            Received::Open | Received::Whole(_) if self.received.is_empty() => Ended::Silent,
+            Received::Open | Received::Whole(_) => Ended::Corrupt("the reply is incomplete"),
         };
         Step::Done(ended)
     }
@@ -391,7 +427,11 @@ impl Transaction {
     /// answered by its own frame, so such a frame is an echo; the reply to a write of one register can equal the
     /// request, so there it must already be known that the adapter echoes.
     fn strip_echo(&mut self) -> bool {
-        let could_be_echo = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
+        let could_be_echo = match self.echo {
+            Echo::Possible => is_unlike_its_reply(&self.request.pdu),
+            Echo::Expected => true,
+            Echo::Seen => false,
+        };
         let noise = self.protocol.noise(&self.received);
         let from_frame = self.received.get(noise..).unwrap_or_default();
         if !could_be_echo || !from_frame.starts_with(&self.frame) {
@@ -399,7 +439,7 @@ impl Transaction {
         }
         self.received.drain(..noise + self.frame.len());
         self.first_byte = None;
-        self.echo_seen = true;
+        self.echo = Echo::Seen;
         true
     }
 
@@ -408,7 +448,8 @@ impl Transaction {
     /// on that one would swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));
-        (is_unlike_its_reply(&self.request.pdu) && (self.echo_seen || answered)).then_some(self.echo_seen)
+        let was_seen = self.echo == Echo::Seen;
+        (is_unlike_its_reply(&self.request.pdu) && (was_seen || answered)).then_some(was_seen)
     }
 
     /// When the first byte of the (last) frame arrived.

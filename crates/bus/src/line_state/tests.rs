@@ -56,8 +56,7 @@ impl DoublingLine {
             late_may_come: self.late,
         };
         self.now += Duration::from_secs(1);
-        self.line
-            .send(request, frame, sending, N2LateReplies::default(), self.now);
+        self.line.send(request, frame, sending, self.now);
         let sent = if self.at_once {
             self.now
         } else {
@@ -65,7 +64,7 @@ impl DoublingLine {
         };
         let exchanged = what
             .iter()
-            .find_map(|(after, bytes)| self.line.received(bytes, sent + *after));
+            .find_map(|(after, bytes)| self.line.received(bytes, &mut N2LateReplies::default(), sent + *after));
         let over = exchanged.or_else(|| self.line.on_time(sent + Duration::from_secs(1)).ok());
         let over = over.expect("it is over");
         let free = self.line.quiet_since() + Duration::from_millis(4);
@@ -172,7 +171,7 @@ fn a_request_waits_for_silence_but_not_for_ever() {
     );
     while !rig.line.babbles(since) {
         now += Duration::from_millis(2);
-        assert!(rig.line.received(&[0x55], now).is_none());
+        assert!(rig.line.received(&[0x55], &mut N2LateReplies::default(), now).is_none());
         assert!(rig.line.clear_at(since, rig.line.silence()) > now || rig.line.babbles(since));
     }
     assert!(rig.line.clear_at(since, rig.line.silence()) <= now + Duration::from_millis(4));
@@ -198,9 +197,15 @@ fn a_drive_has_its_own_silence_before_its_request_and_after_its_reply() {
             could_be_doubled: false,
             late_may_come: false,
         };
-        rig.line
-            .send(request, frame, sending, N2LateReplies::default(), rig.now);
-        let over = rig.line.received(&reply(), rig.line.quiet_since() + REGULAR).unwrap();
+        rig.line.send(request, frame, sending, rig.now);
+        let over = rig
+            .line
+            .received(
+                &reply(),
+                &mut N2LateReplies::default(),
+                rig.line.quiet_since() + REGULAR,
+            )
+            .unwrap();
         assert_eq!(
             rig.line.clear_at(over.at, of_next),
             over.at + expected,
@@ -261,10 +266,13 @@ fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
             late_may_come: false,
         };
         let now = bench.now;
-        bench.line.send(request, frame, sending, N2LateReplies::default(), now);
+        bench.line.send(request, frame, sending, now);
         let (sent, deadline) = (bench.line.quiet_since(), bench.line.deadline().unwrap());
         let read = sent + REGULAR + late;
-        let over = bench.line.received(&reply(), read).unwrap();
+        let over = bench
+            .line
+            .received(&reply(), &mut N2LateReplies::default(), read)
+            .unwrap();
         assert!(matches!(over.ended, Ended::Reply(_)));
         assert_eq!(over.at, read.min(deadline));
         assert!(deadline <= sent + Duration::from_millis(100 + 10), "timeout and reply");

@@ -11,7 +11,7 @@ fn state(start: u16) -> RequestPdu {
 }
 
 /// A transaction that begins while the late reply to the read of a state may still arrive.
-fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
+fn behind_late_state(pdu: RequestPdu, now: Instant) -> (Transaction, N2LateReplies) {
     let request = Request::new(1, pdu);
     let mut frame = Vec::new();
     Protocol::N2.encode(&request, &mut frame);
@@ -23,7 +23,7 @@ fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
         at: now,
     };
     late.given_up(asked, WINDOW, now);
-    let mut transaction = Transaction::new(
+    let transaction = Transaction::new(
         Protocol::N2,
         request,
         frame,
@@ -32,8 +32,7 @@ fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
         Duration::from_millis(15),
         false,
     );
-    transaction.expect_late(late);
-    transaction
+    (transaction, late)
 }
 
 #[test]
@@ -41,22 +40,22 @@ fn a_drive_that_started_anew_is_believed_unless_another_answer_comes() {
     let now = Instant::now();
     let soon = now + Duration::from_millis(20);
     let float = RequestPdu::read(Table::Input, 0, 2);
-    let mut alone = behind_late_state(float.clone(), now);
-    let Step::Wait(until) = alone.on_bytes(soon, b"N00\r") else {
+    let (mut alone, mut late) = behind_late_state(float.clone(), now);
+    let Step::Wait(until) = alone.receive(soon, b"N00\r", &mut late) else {
         panic!("it may be a late one")
     };
     assert_eq!(until, alone.deadline());
     let restarted = Reply::Exception(Exception::N2_RESTARTED);
     assert_eq!(alone.on_time(until), Step::Done(Ended::Reply(restarted)));
 
-    let mut with_own = behind_late_state(float.clone(), now);
-    assert!(matches!(with_own.on_bytes(soon, b"N00\r"), Step::Wait(_)));
-    let own = with_own.on_bytes(soon, b"A4248000092\r");
+    let (mut with_own, mut late) = behind_late_state(float.clone(), now);
+    assert!(matches!(with_own.receive(soon, b"N00\r", &mut late), Step::Wait(_)));
+    let own = with_own.receive(soon, b"A4248000092\r", &mut late);
     assert!(matches!(own, Step::Done(Ended::Reply(Reply::Registers(_)))), "{own:?}");
-    assert!(!with_own.take_late().may_come(soon), "the late one came");
+    assert!(!late.may_come(soon), "the late one came");
 
-    let mut other = behind_late_state(float, now);
-    let refused = other.on_bytes(soon, b"N11\r");
+    let (mut other, mut late) = behind_late_state(float, now);
+    let refused = other.receive(soon, b"N11\r", &mut late);
     assert_eq!(
         refused,
         Step::Done(Ended::Corrupt(MAY_BE_LATE)),
@@ -67,8 +66,8 @@ fn a_drive_that_started_anew_is_believed_unless_another_answer_comes() {
 #[test]
 fn an_identity_that_could_be_a_state_is_believed_unless_another_answer_comes() {
     let now = Instant::now();
-    let mut transaction = behind_late_state(RequestPdu::N2(Session::Identify), now);
-    let Step::Wait(until) = transaction.on_bytes(now, b"A1061\r") else {
+    let (mut transaction, mut late) = behind_late_state(RequestPdu::N2(Session::Identify), now);
+    let Step::Wait(until) = transaction.receive(now, b"A1061\r", &mut late) else {
         panic!("it may be a late state")
     };
     assert!(matches!(transaction.on_time(until), Step::Done(Ended::Reply(_))));
