@@ -154,6 +154,30 @@ pub struct TurnEnd {
     pub frame: Vec<u8>,
 }
 
+/// How a transaction used the line.
+#[derive(Debug, Clone, Copy)]
+struct LineUse {
+    /// When the request was given to the line.
+    began: Instant,
+    /// When the transaction ended: no later than a reply can have left the drive.
+    at: Instant,
+    /// Time for which the line was in use.
+    took: Duration,
+    /// Whether the thread was stalled meanwhile.
+    stood: bool,
+}
+
+impl TurnEnd {
+    fn line_use(&self) -> LineUse {
+        LineUse {
+            began: self.began,
+            at: self.at,
+            took: self.took,
+            stood: self.stood,
+        }
+    }
+}
+
 /// State of a drive that continues over a reload.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct CarriedState {
@@ -412,7 +436,7 @@ impl Master {
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if drive.has_authority || has_authority {
-                report_control(bus, index, image, drive, (has_authority, writes), now);
+                report_control(bus, index, image, drive, has_authority, writes, now);
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);
@@ -455,7 +479,7 @@ impl Master {
             if starts.guards(index) {
                 let reading = image.reading(now, drive.fresh);
                 starts.update(index, drive, &reading);
-                starts.check_interlocks(bus, (index, image), &drive.words, &reading, writes);
+                starts.check_interlocks(bus, index, image, &drive.words, &reading, writes);
             }
         }
         let mut pending = bus.queue.lock();

@@ -159,7 +159,7 @@ impl Report {
         };
         let index = *drive;
         let drive = self.drive(index);
-        let monitors = self.compare_selection((index, &drive), (read, words), *at);
+        let monitors = self.compare_selection(index, &drive, read, words, *at);
         let reading = drive.reading(now, RECENT);
         let new_fault = self.check_fault(index, &reading);
         self.report_state(index, &reading);
@@ -285,7 +285,7 @@ impl Report {
         let drive = self.drive(index);
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
         if read.class == PollClass::Monitor {
-            return self.monitor_refused((index, &drive), read, exception, now);
+            return self.monitor_refused(index, &drive, read, exception, now);
         }
         tracing::warn!(
             target: "drivegate::bus::report", bus = %self.image.spec.name, drive = %drive.spec.name,
@@ -441,7 +441,8 @@ impl Report {
     pub(super) fn foreign_read(
         &mut self,
         index: DriveIndex,
-        (table, start): (Table, u16),
+        table: Table,
+        start: u16,
         words: &[u16],
         at: Instant,
         now: Instant,

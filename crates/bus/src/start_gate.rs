@@ -117,7 +117,8 @@ impl StartGate {
     pub(super) fn check_interlocks(
         &mut self,
         bus: &BusHandle,
-        (index, image): (DriveIndex, &Arc<DriveImage>),
+        index: DriveIndex,
+        image: &DriveImage,
         words: &KnownWords,
         reading: &Reading<'_>,
         writes: &Arc<WriteStats>,

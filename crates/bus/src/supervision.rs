@@ -248,7 +248,7 @@ impl Supervision {
         drive: DriveIndex,
     ) {
         let in_vain = self.waits_in_vain(reading);
-        let Some(running) = self.running(since, (reading, words), in_vain, news, drive) else {
+        let Some(running) = self.running(since, reading, words, in_vain, news, drive) else {
             return;
         };
         // A motor with its run command on may run, or start, whatever its status shows.
@@ -304,7 +304,8 @@ impl Supervision {
     fn running(
         &mut self,
         since: Instant,
-        (reading, words): (&Reading<'_>, &KnownWords),
+        reading: &Reading<'_>,
+        words: &KnownWords,
         in_vain: bool,
         news: &mut Vec<News>,
         drive: DriveIndex,

@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
+use super::decoder::Exchange;
 use crate::transaction::Ended;
 use drivegate_core::order::{Change, Outcome, written};
 use drivegate_core::process_image::DriveSpec;
@@ -43,15 +44,16 @@ pub struct Commands {
 }
 
 impl Commands {
-    /// Processes a write received from `began` to `at`; returns the commands to report now.
+    /// Processes a write that was received in this exchange; returns the commands to report now.
     pub fn process_write(
         &mut self,
-        (spec, protocol): (&DriveSpec, Protocol),
+        spec: &DriveSpec,
+        protocol: Protocol,
         pdu: &RequestPdu,
-        ended: Option<&Ended>,
-        (began, at): (Instant, Instant),
+        exchange: &Exchange,
     ) -> Option<Commanded> {
-        let outcome = outcome(ended);
+        let (began, at) = (exchange.began, exchange.at);
+        let outcome = outcome(exchange.ended.as_ref());
         let (table, items) = items(pdu);
         let is_new = |(address, word): &&(u16, u16)| self.words.get(&(table, *address)) != Some(word);
         let fresh: Vec<u16> = items.iter().filter(is_new).map(|(address, _)| *address).collect();

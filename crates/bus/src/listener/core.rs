@@ -325,7 +325,7 @@ impl ListenCore {
         if is_wide(last) {
             words = words.get(..words.len() - 1).unwrap_or_default();
         }
-        if words.is_empty() || !self.report.foreign_read(index, (table, start), words, at, now) {
+        if words.is_empty() || !self.report.foreign_read(index, table, start, words, at, now) {
             return;
         }
         let key = (index, table, start);
@@ -347,11 +347,10 @@ impl ListenCore {
             return;
         };
         let (image, known) = (self.bus.image.drives.of(index), self.drives.of_mut(index));
-        let of = (&image.spec, self.bus.image.spec.protocol);
-        let ended = exchange.ended.as_ref();
+        let protocol = self.bus.image.spec.protocol;
         let commanded = known
             .commands
-            .process_write(of, &request.pdu, ended, (exchange.began, exchange.at));
+            .process_write(&image.spec, protocol, &request.pdu, exchange);
         if let Some(commanded) = commanded {
             self.report_command(index, commanded);
         }

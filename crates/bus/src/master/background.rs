@@ -327,7 +327,7 @@ impl Master {
             self.note_background_write(index, &turn.pdu, &outcome, now);
         }
         if let (Outcome::Acknowledged(reply), Some(index)) = (&outcome, drive) {
-            self.note_background_read((index, &turn.pdu), reply, (at, now), news);
+            self.note_background_read(index, &turn.pdu, reply, at, now, news);
         }
         begun.answer(outcome, frame, now);
     }
@@ -336,9 +336,11 @@ impl Master {
     /// have reported a restart or changes to the tool, so it is read again.
     fn note_background_read(
         &mut self,
-        (index, pdu): (DriveIndex, &RequestPdu),
+        index: DriveIndex,
+        pdu: &RequestPdu,
         reply: &Reply,
-        (at, now): (Instant, Instant),
+        at: Instant,
+        now: Instant,
         news: &mut Vec<News>,
     ) {
         match (pdu, reply) {

@@ -80,6 +80,22 @@ impl Commands {
     }
 }
 
+/// Result of one decision.
+enum Decided {
+    /// The request for the line.
+    Send(Turn),
+    /// Nothing is to be done before this time.
+    Wait(Instant),
+    /// The conditions for the next decision have changed.
+    Again,
+}
+
+impl From<Option<Turn>> for Decided {
+    fn from(turn: Option<Turn>) -> Decided {
+        turn.map_or(Decided::Again, Decided::Send)
+    }
+}
+
 impl Master {
     /// Makes decisions until there is a request for the line, or nothing to do.
     ///
@@ -88,15 +104,17 @@ impl Master {
     pub(super) fn choose(&mut self, now: Instant) -> Result<Turn, Instant> {
         let soon = now + Duration::from_millis(1);
         for _ in 0..MOST_DECISIONS {
-            if let Some(decided) = self.decide(now) {
-                return decided.map_err(|until| until.max(soon));
+            match self.decide(now) {
+                Decided::Send(turn) => return Ok(turn),
+                Decided::Wait(until) => return Err(until.max(soon)),
+                Decided::Again => {}
             }
         }
         Err(soon)
     }
 
-    /// Makes one decision; `None` if it changed the conditions for the next decision.
-    fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
+    /// Makes one decision.
+    fn decide(&mut self, now: Instant) -> Decided {
         self.purge(now);
         let quiet = self.bus.queue.quiet(now);
         if quiet != self.waits.quiet {
@@ -106,12 +124,12 @@ impl Master {
         if self.shutdown.is_none()
             && let Some(turn) = self.broadcast_stop(now)
         {
-            return Some(Ok(turn));
+            return Decided::Send(turn);
         }
         if self.shutdown.is_none()
             && let Some(turn) = self.owed_refresh(now)
         {
-            return Some(Ok(turn));
+            return Decided::Send(turn);
         }
         let mut commands = self.commands(now);
         if self.shutdown.is_none()
@@ -119,12 +137,12 @@ impl Master {
             && let Some(ready) = self.checked_write(now)
         {
             self.turns.served(Urgency::Command, commands.waits(Urgency::Read));
-            return Some(Ok(self.turn(ready, now)));
+            return Decided::Send(self.turn(ready, now));
         }
         if !commands.waits(Urgency::Stop)
             && let Some(turn) = self.refresh_goes_on(now)
         {
-            return Some(Ok(turn));
+            return Decided::Send(turn);
         }
         let rank = self.turns.rank(|rank| commands.waits(rank));
         if self.polls_cease() {
@@ -134,10 +152,10 @@ impl Master {
             return match rank {
                 Some(rank) => self.command(rank, &mut commands, now),
                 // The broadcast that stops the whole line goes before the single stops, which wait for it.
-                None => Some(
-                    self.stop_the_line(now)
-                        .map_err(|_| commands.wake_at.unwrap_or(now + super::LOOK_ROUND)),
-                ),
+                None => match self.stop_the_line(now) {
+                    Ok(turn) => Decided::Send(turn),
+                    Err(_) => Decided::Wait(commands.wake_at.unwrap_or(now + super::LOOK_ROUND)),
+                },
             };
         }
         let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));
@@ -149,15 +167,18 @@ impl Master {
                 .ok_or(())
                 .or_else(|()| self.background(false, now))
             {
-                Ok(turn) => Some(Ok(turn)),
+                Ok(turn) => Decided::Send(turn),
                 Err(_) => self.poll(poll, now),
             },
             Decision::Idle(until) => {
                 let turn = self.refresh(true, now).ok_or(());
-                Some(turn.or_else(|()| self.background(true, now)).map_err(|again| {
-                    let wake = commands.wake_at.into_iter().chain(again).chain(self.next_refresh(now));
-                    wake.fold(until, Instant::min)
-                }))
+                match turn.or_else(|()| self.background(true, now)) {
+                    Ok(turn) => Decided::Send(turn),
+                    Err(again) => {
+                        let wake = commands.wake_at.into_iter().chain(again).chain(self.next_refresh(now));
+                        Decided::Wait(wake.fold(until, Instant::min))
+                    }
+                }
             }
             Decision::Command(rank) => self.command(rank, &mut commands, now),
         }
@@ -174,7 +195,7 @@ impl Master {
             .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.of(drive);
         let want = |state: &mut DriveState| state.next_need(image, &waits.n2_late, now);
-        match next_need(bus, drive, (state, image), want, now) {
+        match next_need(bus, drive, state, image, want, now) {
             NextNeed::Step(Urgency::Command, step)
                 if step.pdu.is_write() && waits.sessions.before(drive, Some(slot), now).is_none() =>
             {
@@ -212,7 +233,7 @@ impl Master {
                 continue;
             }
             let want = |drive: &mut DriveState| drive.next_need(image, &waits.n2_late, now);
-            match next_need(bus, index, (drive, image), want, now) {
+            match next_need(bus, index, drive, image, want, now) {
                 NextNeed::Step(slot, step) => {
                     // Late replies can block the session step that N2 needs first, as they block the step itself.
                     let before = waits.sessions.before(index, Some(slot), now).map(RequestPdu::N2);
@@ -276,22 +297,26 @@ impl Master {
     }
 
     /// Serves a command of this rank: a started one, or the next one of the queue, which is then started.
-    fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Option<Result<Turn, Instant>> {
+    fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Decided {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
         if let Some(ready) = ready {
             self.turns.served(rank, lower_waits);
-            return Some(Ok(self.turn(ready, now)));
+            return Decided::Send(self.turn(ready, now));
         }
-        let chosen = commands.queued.get(rank as usize).copied().flatten()?;
-        let command = self.bus.queue.lock().take(chosen)?;
+        let Some(chosen) = commands.queued.get(rank as usize).copied().flatten() else {
+            return Decided::Again;
+        };
+        let Some(command) = self.bus.queue.lock().take(chosen) else {
+            return Decided::Again;
+        };
         if command.as_passed_on().is_some() {
             self.turns.served(rank, lower_waits);
-            return self.begin_passed_on(command, None, now).map(Ok);
+            return self.begin_passed_on(command, None, now).into();
         }
         self.begin(command, chosen.rank, now);
         // The started commands are judged again: one may wait, or another may be sent first.
-        None
+        Decided::Again
     }
 
     /// Begins a command from the queue. A stop is sent even to a drive that does not answer: it serves as the probe.
@@ -347,7 +372,7 @@ impl Master {
         }
     }
 
-    fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
+    fn poll(&mut self, poll: Poll, now: Instant) -> Decided {
         let pdu = poll.read.pdu();
         let drive = self.drives.of_mut(poll.drive);
         let session = self.waits.sessions.before(poll.drive, None, now);
@@ -358,7 +383,7 @@ impl Master {
         };
         if let Some(until) = drive.late.blocks(&pdu, now).max(on_n2) {
             self.schedule.postpone(&poll, until);
-            return None;
+            return Decided::Again;
         }
         let turn = match session {
             Some(session) => Turn {
@@ -370,7 +395,7 @@ impl Master {
                 pdu,
             },
         };
-        Some(Ok(turn))
+        Decided::Send(turn)
     }
 
     /// Whether a turn chosen earlier may still be sent at `now`: the time of its command has not expired.

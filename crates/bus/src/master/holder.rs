@@ -16,7 +16,8 @@ pub(super) fn report_control(
     index: DriveIndex,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
-    (has_authority, writes): (bool, &Arc<WriteStats>),
+    has_authority: bool,
+    writes: &Arc<WriteStats>,
     now: Instant,
 ) {
     drive.has_authority = has_authority;

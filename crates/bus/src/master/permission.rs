@@ -86,7 +86,8 @@ fn may_write(bus: &BusHandle, index: DriveIndex, run: &CommandRun, seen: &DriveF
 pub(super) fn next_need(
     bus: &BusHandle,
     index: DriveIndex,
-    (drive, image): (&mut DriveState, &DriveImage),
+    drive: &mut DriveState,
+    image: &DriveImage,
     want: impl Fn(&mut DriveState) -> Need<NextNeed>,
     now: Instant,
 ) -> NextNeed {

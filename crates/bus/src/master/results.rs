@@ -1,8 +1,8 @@
 //! Applies the result of a transaction: to the drive, its samples, the schedule and the command.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use super::{Before, Master, Purpose, Turn, TurnEnd};
+use super::{Before, LineUse, Master, Purpose, Turn, TurnEnd};
 use crate::command_run::{Step, StepPurpose};
 use crate::n2_late_replies::LateRequest;
 use crate::n2_session::Progress;
@@ -185,7 +185,7 @@ impl Master {
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
                 if failed {
-                    self.step_failed(drive, *slot, &unheard(step), &end.ended, (end.took, end.stood), now);
+                    self.step_failed(drive, *slot, &unheard(step), &end.ended, end.line_use(), now);
                 }
             }
         }
@@ -207,6 +207,7 @@ impl Master {
             self.restarted(poll.drive, now, news);
         }
         let took = end.took;
+        let used = end.line_use();
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
             // A gateway in between cannot reach the drive: its exception shows nothing about the drive.
@@ -217,7 +218,7 @@ impl Master {
                 Polled::Ok
             }
             Ended::Reply(reply) => {
-                self.read(poll.drive, poll.read, reply, (end.began, end.at), now, news);
+                self.read(poll.drive, poll.read, reply, used, now, news);
                 Polled::Ok
             }
             // The reply may have been lost by the stall: the drive does not count as offline before another request.
@@ -272,22 +273,22 @@ impl Master {
         news.push(News::Offline(index));
     }
 
-    /// The drive answered a read that was sent at `sent`; the reply arrived at `came` at the latest.
+    /// The drive answered a read.
     fn read(
         &mut self,
         index: DriveIndex,
         read: PlannedRead,
         reply: Reply,
-        (sent, came): (Instant, Instant),
+        used: LineUse,
         now: Instant,
         news: &mut Vec<News>,
     ) {
         let pdu = read.pdu();
         let drive = self.drives.of_mut(index);
         let address = self.bus.image.drives.of(index).spec.address;
-        let asked = self.waits.n2_late.asked_by(address, &pdu, came);
-        let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, came));
-        drive.late.answered(&pdu, sent, now);
+        let asked = self.waits.n2_late.asked_by(address, &pdu, used.at);
+        let at = asked.unwrap_or_else(|| drive.late.asked_by(&pdu, used.at));
+        drive.late.answered(&pdu, used.began, now);
         if let Some(words) = reply.into_words() {
             self.learn(index, read, words, at, news);
         }
@@ -336,11 +337,11 @@ impl Master {
         if self.waits.sessions.transaction_ended(index, &end.ended) == Progress::Restarted {
             self.restarted(index, now, news);
         }
+        let used = end.line_use();
         let reply = match end.ended {
             // The drive ignored the step, which is repeated once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
-                let how = (end.took, end.stood);
-                self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, how, now);
+                self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, used, now);
                 return;
             }
             Ended::Reply(reply) if !leaves_open(&reply, step) => reply,
@@ -348,7 +349,7 @@ impl Master {
                 if matches!(&ended, Ended::Reply(reply) if !says_no_answer(reply)) {
                     self.schedule.seen(index, now);
                 }
-                self.step_failed(index, slot, step, &ended, (end.took, end.stood), now);
+                self.step_failed(index, slot, step, &ended, used, now);
                 self.read_back(index, step, now);
                 return;
             }
@@ -388,7 +389,7 @@ impl Master {
         slot: Urgency,
         step: &Step,
         ended: &Ended,
-        (took, stood): (Duration, bool),
+        used: LineUse,
         now: Instant,
     ) {
         let online = self.schedule.is_online(index);
@@ -410,13 +411,13 @@ impl Master {
             Ended::Silent | Ended::Reply(_) => (Outcome::TimedOut, true),
         };
         if slot == Urgency::Stop && silent {
-            drive.vain_stops.not_answered(took);
+            drive.vain_stops.not_answered(used.took);
         }
         let retries = match *ended {
             // The request may never have reached the drive, so the failure shows nothing about the drive.
             Ended::Corrupt(CONNECTION_CLOSED) => retries.max(1),
             // A reply lost during a stall of the thread also earns one more try.
-            _ if online => retries.max(u32::from(stood)),
+            _ if online => retries.max(u32::from(used.stood)),
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
@@ -428,7 +429,7 @@ impl Master {
             }
         }
         if !online && (silent || matches!(ended, Ended::Corrupt(_))) {
-            self.schedule.probed_in_vain(index, took, now);
+            self.schedule.probed_in_vain(index, used.took, now);
         }
     }
 

@@ -13,8 +13,10 @@ impl Report {
     /// Compares the values that were just read. Returns the monitoring points to read: drive, point and time.
     pub(super) fn compare_selection(
         &mut self,
-        (index, drive): (DriveIndex, &DriveImage),
-        (read, words): (&PlannedRead, &[u16]),
+        index: DriveIndex,
+        drive: &DriveImage,
+        read: &PlannedRead,
+        words: &[u16],
         at: Instant,
     ) -> Vec<(DriveIndex, PointIndex, Instant)> {
         if !self.selections.are_concerned_by(index, read, words, at) {
@@ -30,7 +32,8 @@ impl Report {
     /// Notes that the drive has no such monitoring register: its process data is then used as it is.
     pub(super) fn monitor_refused(
         &mut self,
-        (index, drive): (DriveIndex, &DriveImage),
+        index: DriveIndex,
+        drive: &DriveImage,
         read: &PlannedRead,
         exception: Exception,
         now: Instant,
