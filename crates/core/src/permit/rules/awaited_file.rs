@@ -32,3 +32,69 @@ fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
         }))
     }))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::order::{Origin, SourceKind};
+    use crate::permit::rules::tests::{SECOND, Trial};
+    use crate::permit::{AwaitedFiles, Rules};
+
+    fn rules(mode: Mode) -> Arc<Rules> {
+        Arc::new(Rules {
+            mode,
+            ranks: vec!["site".into()],
+            lease: 30 * SECOND,
+            stop_at_local: true,
+            principals: Vec::new(),
+        })
+    }
+
+    #[test]
+    fn a_start_waits_for_the_files_that_may_forbid_it() {
+        use SourceKind::{Bacnet, Http, Interlock, ModbusTcp, Supervision};
+        let (advisory, exclusive) = (Some(Mode::Advisory), Some(Mode::Exclusive));
+        // The file that is not read yet, the mode of `[authority]`, the client, its order, and what becomes of that.
+        let table = [
+            ("none", exclusive, Http, "start", "go - -"),
+            ("slots", None, Http, "start", "held_by_other - -"),
+            ("slots", None, ModbusTcp, "start", "held_by_other - -"),
+            ("slots", None, Bacnet, "start", "held_by_other - -"),
+            ("slots", exclusive, Http, "start", "held_by_other - -"),
+            ("slots", None, Supervision, "start", "go - -"),
+            ("slots", None, Interlock, "stop", "- - -"),
+            ("slots", None, Http, "reference", "go - -"),
+            ("slots", None, Http, "reset", "go - -"),
+            ("slots", None, Http, "stop", "- - -"),
+            ("slots", None, Http, "read", "go - -"),
+            ("slots, read since", None, Http, "start", "go - -"),
+            ("reservations", None, Http, "start", "go - -"),
+            ("reservations", advisory, Http, "start", "go - -"),
+            ("reservations", exclusive, Http, "start", "held_by_other - -"),
+            ("reservations", exclusive, Http, "reference", "go - -"),
+            ("reservations", exclusive, Http, "stop", "- - -"),
+            ("reservations, read since", exclusive, Http, "start", "go - -"),
+        ];
+        for (file, mode, kind, order, expected) in table {
+            let mut trial = Trial::new();
+            let files = AwaitedFiles::default();
+            let awaited = match file.split(',').next() {
+                Some("slots") => Some(&files.slots),
+                Some("reservations") => Some(&files.reservations),
+                _ => None,
+            };
+            if let Some(awaited) = awaited {
+                awaited.begin("state/file.json".into());
+                if file.ends_with("read since") {
+                    awaited.end();
+                }
+            }
+            trial.gate.set_awaited(Arc::new(files));
+            trial.gate.set_rules(mode.map(rules));
+            let verdicts = trial.verdicts(&RULE, order, &Origin::new(kind, "c"));
+            assert_eq!(verdicts, expected, "{file}, {mode:?}: {order} of {kind:?}");
+        }
+    }
+}

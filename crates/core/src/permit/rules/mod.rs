@@ -13,3 +13,6 @@ pub(crate) mod machine;
 pub(super) mod priorities;
 pub(super) mod restore_lock;
 pub(super) mod standing;
+
+#[cfg(test)]
+mod tests;
