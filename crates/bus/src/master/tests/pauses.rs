@@ -97,6 +97,7 @@ fn a_lease_lasts_longer_by_what_nobody_was_heard_but_not_twice_as_long() {
         (&[][..], 450, 600),
         (&[300], 750, 900),
         (&[300, 300], 950, 1100),
+        (&[450, 450], 1050, 1250),
         (&[2000], 2050, 2200),
     ] {
         let mut rig = Rig::new(1);
@@ -119,17 +120,21 @@ fn a_lease_lasts_longer_by_what_nobody_was_heard_but_not_twice_as_long() {
     }
 }
 
-/// A reference and a start: the first of the two is on the wire.
+/// A reference and another point, which starts the motor or only sets a value: the first of the two is on the wire.
 #[test]
 fn a_sequence_that_a_pause_interrupted_is_not_continued() {
-    for (time, runs) in [(400, true), (1100, false)] {
+    let run = ("run", Value::Bool(true), 2000);
+    let data = ("process_data_in_5", Value::Number(30.0), 2007);
+    for (time, (last, value, register), goes_on) in [
+        (400, run, true),
+        (1100, run, false),
+        (400, data, true),
+        (1100, data, false),
+    ] {
         let mut rig = Rig::new(1);
         let image = &rig.bus.image.drives[0];
-        let points = [
-            (ModelPoint::SpeedReference, Value::Number(50.0)),
-            (ModelPoint::Run, Value::Bool(true)),
-        ];
-        let points = points.map(|(point, value)| (image.spec.profile.model_index(point).unwrap(), value));
+        let points = [("speed_reference", Value::Number(50.0)), (last, value)];
+        let points = points.map(|(point, value)| (image.spec.profile.point_index(point).unwrap(), value));
         let order = Order::Points(points.to_vec());
         let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
@@ -147,9 +152,14 @@ fn a_sequence_that_a_pause_interrupted_is_not_continued() {
         let reply = rig.drives[0].answer(turn.pdu());
         rig.ends(&turn, reply, (began + COST, true));
         rig.run(300 * MS);
-        assert_eq!(rig.runs(0), runs, "{time} ms");
-        let expected = (!runs).then_some(Outcome::Interrupted(Interruption::Expired));
-        assert_eq!(outcome(&mut answer).filter(|o| !o.is_ok()), expected);
+        let word = |register: u16| rig.drives[0].holding.get(&register).copied().unwrap_or(0);
+        assert_eq!((word(2002), word(register) != 0), (5000, goes_on), "{last}, {time} ms");
+        let expected = (!goes_on).then_some(Outcome::Interrupted(Interruption::Expired));
+        assert_eq!(
+            outcome(&mut answer).filter(|o| !o.is_ok()),
+            expected,
+            "{last}, {time} ms"
+        );
     }
 }
 
