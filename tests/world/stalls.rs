@@ -9,6 +9,7 @@ mod clients;
 mod incidents;
 mod own_timeouts;
 mod promised;
+mod resets;
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -102,6 +103,7 @@ struct World {
     history: History,
     calm: bool,
     own: own_timeouts::Own,
+    resets: resets::Resets,
 }
 
 fn families() -> Vec<String> {
@@ -187,6 +189,7 @@ impl World {
             history: History::default(),
             calm: false,
             own: own_timeouts::Own::new(drives),
+            resets: resets::Resets::default(),
             bus,
             dice,
         };
@@ -403,6 +406,7 @@ impl World {
             return;
         }
         self.own.wrote(&self.bus.profile, asked.acted, &asked.pdu, self.now);
+        self.resets.check(&self.bus.profile, asked.acted, &asked.pdu);
         self.promised.told(asked.acted, asked.at);
     }
 

@@ -52,7 +52,7 @@ impl World {
         let in_parts = !self.healthy && self.chance(0.15);
         match self.dice.within(0..=9) {
             0..=3 => self.write(index, unit, 0x8100, 1, in_parts),
-            4..=6 => self.write(index, unit, 0x8100, 0, in_parts),
+            4..=6 => self.stop(index, unit, in_parts),
             7 if !self.healthy => {
                 self.write(index, unit, 0x8100, 1, false);
                 self.write(index, unit, 0x8100, 0, false)
@@ -62,13 +62,31 @@ impl World {
         };
     }
 
+    /// Sends a stop. Every third one is a word by which drives of the family stop in another way, with its run bits
+    /// set, where there is such a word.
+    fn stop(&mut self, index: usize, unit: u8, in_parts: bool) -> usize {
+        let number = usize::from(self.number);
+        let other = self.bus.profile.control.as_ref().and_then(|control| {
+            let kind = (number / 3).checked_rem(control.also_stop.len())?;
+            let run = control.each_run().next()?.applied(0);
+            let word = control.also_stop[kind].applied(control.always.applied(run));
+            Some((control.at.address, word))
+        });
+        let (register, word) = other
+            .filter(|(register, _)| number.is_multiple_of(3) && *register < 0x8000)
+            .unwrap_or((0x8100, 0));
+        self.write(index, unit, register, word, in_parts)
+    }
+
     /// Sends a request over a connection; the rest of it may come later. Returns the number of its order.
     pub(super) fn write(&mut self, index: usize, unit: u8, register: u16, value: u16, in_parts: bool) -> usize {
         let now = self.now;
         let does = match (register, value) {
             (0x8100, 0) => Does::Stop,
             (0x8100, value) if value & 1 == 1 => Does::Run,
-            _ => Does::Other,
+            (0x8000.., _) => Does::Other,
+            // Clients write to the drive's own registers only what stops it.
+            _ => Does::Stop,
         };
         let drives = self.bus.line.drives;
         let machine = if self.bus.line.swapped { drives + 1 - unit } else { unit };

@@ -89,6 +89,10 @@ impl World {
                 drive.power_on(sim);
                 "restarts"
             }
+            2 if self.number.is_multiple_of(2) => {
+                drive.trip(1);
+                "trips"
+            }
             1 | 2 => {
                 let reference = 0;
                 drive.command(Command {
@@ -105,8 +109,14 @@ impl World {
         };
         drive.advance(sim);
         self.promised.runs(machine, drive.state().running);
-        self.promised.befell(machine, self.now);
+        self.befell(machine);
         self.note(move || format!("drive {machine} {what}"));
+    }
+
+    /// A drive was stopped by something other than a command on the line, so its run command is gone.
+    pub(super) fn befell(&mut self, machine: u8) {
+        self.promised.befell(machine, self.now);
+        self.resets.befell(machine);
     }
 
     /// A reload gives the names and units of the drives to the machines in the opposite order.

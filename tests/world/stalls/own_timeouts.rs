@@ -56,7 +56,7 @@ impl World {
                 });
             }
             self.promised.runs(machine, drive.state().running);
-            self.promised.befell(machine, now);
+            self.befell(machine);
             self.note(move || format!("drive {machine} stops by its own timeout"));
         }
     }

@@ -68,7 +68,7 @@ impl Word {
     fn on_running(self, control: &Control) -> OnRunning {
         match self {
             Word::ResetLow(reset) | Word::ResetHigh(reset) if stops_by_reset(control, reset) => OnRunning::Stops,
-            Word::ResetLow(_) | Word::ResetHigh(_) if control.restarts_on_reset => OnRunning::Restarts,
+            Word::ResetLow(_) | Word::ResetHigh(_) if starts_by_reset(control) => OnRunning::Restarts,
             _ => OnRunning::Harmless,
         }
     }
@@ -467,6 +467,11 @@ pub(super) fn word(
         Word::ResetLow(_) | Word::ResetEnd(_) => sent(at, stays),
         Word::Others(bits) => sent(at, bits.applied(stays)),
     }
+}
+
+/// Whether a reset starts a motor that has tripped and whose run command is still on.
+fn starts_by_reset(control: &Control) -> bool {
+    control.restarts_on_reset
 }
 
 /// Whether a reset by the control word also takes the run command away.
