@@ -102,6 +102,18 @@ impl Shared {
         queue.push_front(record);
     }
 
+    /// How many records wait, as text.
+    fn waiting(&self) -> String {
+        let queues = self.queues();
+        format!(
+            "{} records of commands that were sent and {} others wait in memory, where {} and {} have room",
+            queues.sent.len(),
+            queues.unsent.len(),
+            WAITING.0,
+            WAITING.1
+        )
+    }
+
     /// Waits until there is something to write, at most until `deadline`; returns whether this thread must end.
     fn wait(&self, thread: u64, deadline: Instant, for_records: bool) -> bool {
         let mut queues = self.queues();
@@ -288,10 +300,9 @@ impl Writer {
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
                         target: "drivegate::command::audit", "audit file: cannot write {path}: {error}; commands are \
-                                                              still carried out and are in the log; up to {} \
-                                                              records of commands that were sent and {} others wait \
-                                                              in memory; check [audit] and the disk",
-                        WAITING.0, WAITING.1
+                                                              still carried out and are in the log; {}; check [audit] \
+                                                              and the disk",
+                        self.shared.waiting()
                     );
                 }
                 let queues = self.shared.queues();

@@ -249,6 +249,41 @@ fn a_disk_that_comes_back_gets_what_waited_and_what_was_lost() {
     assert_eq!(faults(&blocked), Vec::<String>::new());
 }
 
+/// The number that waits and not the room for it, with which an operator could not tell whether records are being lost.
+#[test]
+fn the_log_says_how_many_records_wait() {
+    let dir = tempfile::tempdir().unwrap();
+    let blocked = dir.path().join("state");
+    fs::write(&blocked, "a file where the directory should be").unwrap();
+    let mut writer = writer(&blocked);
+    for (sent, unsent, waits) in [
+        (0..3, 0..2, "3 records of commands that were sent and 2 others wait"),
+        (3..4, 0..0, "4 records of commands that were sent and 2 others wait"),
+        (
+            4..WAITING.0 + 5,
+            2..WAITING.1 + 5,
+            "8192 records of commands that were sent and 1024 others wait",
+        ),
+    ] {
+        writer.push(sent, true);
+        writer.push(unsent, false);
+        assert!(writer.work(true).is_err());
+        let told = writer.shared.waiting();
+        assert!(
+            told.starts_with(waits) && told.ends_with("8192 and 1024 have room"),
+            "{told}"
+        );
+    }
+    fs::remove_file(&blocked).unwrap();
+    writer.work(true).unwrap();
+    assert!(
+        writer
+            .shared
+            .waiting()
+            .starts_with("0 records of commands that were sent and 0 others wait")
+    );
+}
+
 #[test]
 fn a_disk_that_is_full_gets_no_half_line() {
     let dir = tempfile::tempdir().unwrap();
