@@ -29,6 +29,7 @@ mod drives;
 mod families;
 mod history;
 mod holder;
+mod leases;
 mod listener;
 mod listening;
 mod matrix;

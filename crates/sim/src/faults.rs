@@ -6,7 +6,7 @@ pub use shape::{Burst, Kind};
 
 use super::random::Random;
 use drivegate_model::document::{Finding, parse_duration};
-use drivegate_proto::{RequestPdu, Table};
+use drivegate_proto::{Exception, RequestPdu, Table};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
@@ -182,8 +182,8 @@ pub struct FaultPlan {
     rates: Rates,
     script: BTreeMap<u64, Fault>,
     only: Vec<u8>,
-    /// A register that one drive refuses to read: address, table, register.
-    refused: Option<(u8, Table, u16)>,
+    /// A register that one drive refuses to read: address, table, register, and the exception.
+    refused: Option<(u8, Table, u16, Exception)>,
     while_running: bool,
     /// A second plan, which is used for requests without a fault in this plan.
     other: Option<Box<FaultPlan>>,
@@ -243,8 +243,14 @@ impl FaultPlan {
 
     /// Makes the drive at `address` refuse every read of that register with exception 02.
     #[must_use]
-    pub fn refusing(mut self, address: u8, table: Table, register: u16) -> FaultPlan {
-        self.refused = Some((address, table, register));
+    pub fn refusing(self, address: u8, table: Table, register: u16) -> FaultPlan {
+        self.refusing_with(Exception::ADDRESS, address, table, register)
+    }
+
+    /// Makes every read of that register of the drive at `address` end with this exception.
+    #[must_use]
+    pub fn refusing_with(mut self, exception: Exception, address: u8, table: Table, register: u16) -> FaultPlan {
+        self.refused = Some((address, table, register, exception));
         self
     }
 
@@ -257,16 +263,15 @@ impl FaultPlan {
         }
     }
 
-    /// Whether the drive at `address` refuses a request because it reads certain registers.
-    pub fn refuses(&self, address: u8, request: &RequestPdu) -> bool {
+    /// The exception by which the drive at `address` refuses a request because it reads certain registers.
+    pub fn refuses(&self, address: u8, request: &RequestPdu) -> Option<Exception> {
         let RequestPdu::Read { table, start, count } = request else {
-            return false;
+            return None;
         };
-        let reads = |(of, refused, register): (u8, Table, u16)| {
-            let end = u32::from(*start) + u32::from(*count);
-            of == address && refused == *table && register >= *start && u32::from(register) < end
-        };
-        self.refused.is_some_and(reads)
+        let (of, refused, register, exception) = self.refused?;
+        let end = u32::from(*start) + u32::from(*count);
+        let reads = of == address && refused == *table && register >= *start && u32::from(register) < end;
+        reads.then_some(exception)
     }
 
     /// The fault for the next request, addressed to `address`; `runs` returns whether a drive of the line runs.

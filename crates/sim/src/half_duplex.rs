@@ -408,16 +408,14 @@ impl HalfDuplex {
         };
         self.statistics.faults += u64::from(fault.is_some());
         let mut reply = Vec::with_capacity(64);
-        let refused = asked
-            .request
-            .as_ref()
-            .is_ok_and(|pdu| self.faults.refuses(asked.address, pdu));
-        match fault {
-            None if refused => refuse(asked, Exception::ADDRESS, &mut reply),
-            Some(Fault::Deaf | Fault::NeedsPause(_)) => return,
-            Some(Fault::CutRequest | Fault::CutEcho) => return self.cut_request(frame, asked, fault, now),
-            Some(Fault::DeafEcho) => {}
-            Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
+        let request = asked.request.as_ref().ok();
+        let refused = request.and_then(|pdu| self.faults.refuses(asked.address, pdu));
+        match (fault, refused) {
+            (None, Some(exception)) => refuse(asked, exception, &mut reply),
+            (Some(Fault::Deaf | Fault::NeedsPause(_)), _) => return,
+            (Some(Fault::CutRequest | Fault::CutEcho), _) => return self.cut_request(frame, asked, fault, now),
+            (Some(Fault::DeafEcho), _) => {}
+            (Some(Fault::Exception(code)), _) => refuse(asked, Exception(code), &mut reply),
             _ => {
                 self.slaves.answer(asked, now, &mut reply);
                 if let Some(acts) = &mut self.acts {
