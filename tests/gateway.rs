@@ -29,6 +29,7 @@ mod gateway {
     mod living;
     mod local_answers;
     mod local_socket;
+    mod login_memory;
     mod messages;
     mod openapi;
     mod operators;
