@@ -99,6 +99,7 @@ impl Trial {
                 reading: self.image.reading(self.now, 10 * SECOND),
                 written: (stage != Stage::Accept).then_some(self.written),
                 run: None,
+                repeats: None,
             };
             let ask = Ask {
                 stage,
