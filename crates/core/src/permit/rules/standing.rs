@@ -124,7 +124,7 @@ impl Repeats {
 
     /// How the word may be formed, from what is known of the motor.
     fn formed(self) -> Result<Form, Refusal> {
-        let form = self.from_word()?;
+        let form = self.by_motor()?;
         match self.on_running {
             OnRunning::Stops if form == Form::AsItStands => Err(Refusal::NotAllowed(STOPS_BY_RESET.to_string())),
             OnRunning::Restarts if form == Form::AsItStands => Err(Refusal::NotAllowed(RESTARTS_ON_RESET.to_string())),
@@ -132,7 +132,7 @@ impl Repeats {
         }
     }
 
-    fn from_word(self) -> Result<Form, Refusal> {
+    fn by_motor(self) -> Result<Form, Refusal> {
         use Form::{AsItStands, AtNextStart, WithoutRun};
 
         let Repeats { wants, holds, told, .. } = self;
