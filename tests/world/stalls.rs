@@ -10,6 +10,7 @@ mod incidents;
 mod own_timeouts;
 mod promised;
 mod resets;
+mod silence;
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -217,6 +218,7 @@ impl World {
         while self.now < end {
             self.step();
         }
+        self.fall_silent();
         self.heal();
     }
 

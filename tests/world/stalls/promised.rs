@@ -114,6 +114,11 @@ impl Promised {
         self.befell.insert(machine, now);
     }
 
+    /// Whether the drive was stopped by something else than the line since that time.
+    pub fn befell_since(&self, machine: u8, at: Instant) -> bool {
+        self.befell.get(&machine).is_some_and(|befell| *befell >= at)
+    }
+
     /// Whether the motor of the machine has just started or stopped.
     pub fn runs(&mut self, machine: u8, running: bool) -> bool {
         std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
