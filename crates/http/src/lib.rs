@@ -77,7 +77,8 @@ use drivegate_north::log_throttle::LogThrottle;
 use drivegate_north::reading::{Dated, Reader};
 use drivegate_north::refusals::Refusals;
 use drivegate_north::tcp_server::{TcpServer, TcpService};
-use drivegate_north::{NorthState, ServerError, ServerKind, tls_words};
+use drivegate_north::tls::{self, Peer};
+use drivegate_north::{NorthState, ServerError, ServerKind};
 
 pub use self::credentials::{Credential, CredentialError, Credentials};
 pub use self::loopback::Loopback;
@@ -256,7 +257,7 @@ impl ConnectionHandler for HttpConnections {
                 self.serve_requests((stream, reader), peer, local, &terms, &place).await;
             }
             Some(Ok(Err(error))) => {
-                let why = tls_words::explain(&error, tls_words::Peer::Client).unwrap_or_else(|| error.to_string());
+                let why = tls::in_words(&error, Peer::Client);
                 tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {why}");
             }
             Some(Err(_)) | None => {}

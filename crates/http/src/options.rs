@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use super::limits::{HEALTH, MAX_CONNECTIONS};
 use super::tokens::Tokens;
 use super::users::Users;
-use drivegate_north::ServerIdentity;
 use drivegate_north::connection_limit::Limits;
+use drivegate_north::tls::ServerIdentity;
 
 /// Configuration of the HTTP server.
 #[derive(Debug, Clone, PartialEq)]

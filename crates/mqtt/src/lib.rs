@@ -50,7 +50,6 @@ mod session;
 pub mod sparkplug;
 mod store;
 mod takeover;
-mod tls;
 mod topics;
 mod trail;
 

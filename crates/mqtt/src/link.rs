@@ -16,8 +16,8 @@ use super::outbox::Message;
 use super::reasons::CLOSED;
 use super::session::Will;
 use super::takeover::Takeovers;
-use super::{Broker, Options, Password, Secret, tls};
-use drivegate_north::LinkStatus;
+use super::{Broker, Options, Password, Secret};
+use drivegate_north::{LinkStatus, tls};
 
 /// The reasons of a broker that does not accept a password (any more): 0x86 and 0x87.
 const CREDENTIALS: [&str; 2] = ["BadUserNamePassword", "NotAuthorized"];
@@ -222,7 +222,12 @@ impl BrokerLink {
         let options = self.options.clone();
         // The files are read for each attempt, so that renewed certificates and tokens are used without a restart.
         let read = move || {
-            let config = tls::client_config(&options).map_err(|error| error.to_string())?;
+            let own = options.identity.as_ref();
+            let own = own.map(|(certificate, key)| (certificate.as_path(), key.as_path()));
+            let config = options
+                .tls
+                .then(|| tls::client(options.ca.as_deref(), own))
+                .transpose()?;
             let password = options.password.as_ref().map(Password::read).transpose()?;
             Ok::<_, String>((config, password))
         };

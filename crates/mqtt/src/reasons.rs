@@ -4,12 +4,12 @@ use rumqttc::mqttbytes::Error as PacketError;
 use rumqttc::mqttbytes::v5::Disconnect;
 use rumqttc::{ConnectReturnCode, ConnectionError, DisconnectReasonCode, StateError};
 
-use drivegate_north::tls_words;
+use drivegate_north::tls::{self, BROKER};
 
 /// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is not a packet
 /// of MQTT 5, and closes the connection; some close it at once.
 pub(super) fn refusal(error: &ConnectionError) -> String {
-    let is_of_tls = |error: &(dyn std::error::Error + 'static)| tls_words::explain(error, tls_words::BROKER).is_some();
+    let is_of_tls = |error: &(dyn std::error::Error + 'static)| tls::explain(error, BROKER).is_some();
     match error {
         _ if is_of_tls(error) => reason(error),
         // A port that nobody listens at, a name that is not known.
@@ -86,7 +86,7 @@ pub(super) fn is_closed(error: &ConnectionError) -> bool {
 }
 
 fn in_words(error: &(dyn std::error::Error + 'static)) -> String {
-    tls_words::explain(error, tls_words::BROKER).unwrap_or_else(|| error.to_string())
+    tls::in_words(error, BROKER)
 }
 
 pub(super) fn reason(error: &ConnectionError) -> String {
@@ -98,8 +98,8 @@ pub(super) fn reason(error: &ConnectionError) -> String {
             ConnectionError::Timeout(_) => "timed out".to_string(),
             ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
             ConnectionError::MqttState(StateError::ConnectionAborted) => CLOSED.to_string(),
-            ConnectionError::Tls(tls) if tls_words::is_handshake_end(tls) => HANDSHAKE_END.to_string(),
-            ConnectionError::Io(io) if tls_words::explain(io, tls_words::BROKER).is_none() => {
+            ConnectionError::Tls(tls) if tls::is_handshake_end(tls) => HANDSHAKE_END.to_string(),
+            ConnectionError::Io(io) if tls::explain(io, BROKER).is_none() => {
                 format!("{io}; check mqtt.url, and whether the broker is running")
             }
             // A decoding error may hide a read error, as after an alert of TLS 1.3.

@@ -3,11 +3,8 @@
 
 mod arrivals;
 pub mod bacnet;
-mod certificate;
-mod certificate_kind;
 pub mod command_json;
 pub mod connection_limit;
-pub mod identity;
 mod kept;
 mod link_status;
 pub mod listener;
@@ -16,28 +13,23 @@ pub mod metrics;
 pub mod modbus_tcp;
 pub mod parameter_jobs;
 pub mod patience;
-pub mod pem;
 pub mod readiness;
 pub mod reading;
 pub mod refusals;
 pub mod register_map;
 mod server;
-mod server_trust;
 pub mod slot;
 mod state;
 mod stats;
 pub mod tcp_server;
-pub mod tls_words;
+pub mod tls;
 
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-pub use identity::client_tls;
-pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use link_status::{LinkState, LinkStatus};
 pub use listener::ListenerStates;
-pub use pem::unreadable;
 pub use server::{Reconfigure, Server};
 pub use state::NorthState;
 pub use stats::{
@@ -45,7 +37,6 @@ pub use stats::{
     SlotOutcome, SlotStats,
 };
 pub use tcp_server::TcpServer;
-pub use tls_words::{GATEWAY, Peer, explain};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -74,7 +65,7 @@ pub enum ServerError {
     },
     /// The certificates of a server, named first, cannot be used.
     #[error("TLS of {0}: {1}")]
-    Tls(&'static str, IdentityFault),
+    Tls(&'static str, tls::TlsFault),
 }
 
 fn remedy(cause: &io::Error) -> &'static str {

@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::SystemTime;
 
 use drivegate_http::{Options, Scope, Token, Tokens};
-use drivegate_north::ServerIdentity;
+use drivegate_north::tls::ServerIdentity;
 
 use tokio::net::TcpStream;
 use tokio::time::timeout;

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::SystemTime;
 
 use drivegate_model::document::{Finding, Reader};
-use drivegate_north::{IdentityFault, TlsFile, certificate_warnings, unreadable};
+use drivegate_north::tls::{TlsFault, TlsFile, certificate_warnings, unreadable};
 
 /// Permissions of users who are neither owner nor in the group: to read, and to write.
 const OTHERS: u32 = 0o006;
@@ -33,10 +33,10 @@ pub(super) fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
 }
 
 /// Reports the problems in the files of an identity, each at the key that names the file, by `name`.
-pub(super) fn reported<T>(
+pub(super) fn reported<'k, T>(
     reader: &Reader<'_>,
-    loaded: Result<(T, Vec<IdentityFault>), Vec<IdentityFault>>,
-    name: impl Fn(TlsFile) -> &'static str,
+    loaded: Result<(T, Vec<TlsFault>), Vec<TlsFault>>,
+    name: impl Fn(TlsFile) -> &'k str,
 ) -> Option<T> {
     match loaded {
         Ok((identity, warnings)) => {
@@ -60,18 +60,9 @@ pub(super) fn reported<T>(
 
 /// Warns of certificates in a PEM file by which the server `host` may not be trusted; reports a file without certificates.
 pub(super) fn check_certificates(reader: &Reader<'_>, key: &str, path: &Path, host: &str) {
-    match certificate_warnings(path, host, SystemTime::now()) {
-        Ok(warnings) => {
-            for text in &warnings {
-                let (what, remedy) = parts(text);
-                reader.warning(key, what, remedy);
-            }
-        }
-        Err(text) => {
-            let (what, remedy) = parts(&text);
-            reader.problem(key, what, remedy);
-        }
-    }
+    let loaded = certificate_warnings(path, host, SystemTime::now());
+    let loaded = loaded.map(|warnings| ((), warnings)).map_err(|fault| vec![fault]);
+    reported(reader, loaded, |_| key);
 }
 
 /// Splits the fault of a file, which has the form `what; what to do`.

@@ -8,7 +8,7 @@ use super::keys::HTTP;
 use super::{files, values};
 use drivegate_http::{Credential, Credentials, Tokens, Users};
 use drivegate_model::document::{Finding, Place, Reader};
-use drivegate_north::{ServerIdentity, TlsFile};
+use drivegate_north::tls::{ServerIdentity, TlsFile};
 
 /// An address on which a server listens, with its place in the file.
 pub(super) type Listener = (SocketAddr, Place);

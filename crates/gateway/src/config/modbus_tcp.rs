@@ -12,8 +12,8 @@ use super::key::Key;
 use super::keys::{LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::{files, stale, values};
 use drivegate_model::document::{Place, Reader};
-use drivegate_north::TlsFile;
 use drivegate_north::modbus_tcp::{self, Identity, Registers, Role, Tls, View};
+use drivegate_north::tls::TlsFile;
 
 /// Default address of the short form, used if `listen` is absent.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
@@ -245,8 +245,8 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<Identity> {
     let name = |file: TlsFile| match file {
         TlsFile::Certificate => TLS.certificate.name,
         TlsFile::Key => TLS.key.name,
-        TlsFile::ClientCa => TLS.client_ca.name,
-        TlsFile::ClientCrl => TLS.client_crl.name,
+        TlsFile::Ca => TLS.client_ca.name,
+        TlsFile::Crl => TLS.client_crl.name,
     };
     let (certificate, key, client_ca) = (certificate?, key?, client_ca?);
     files::warn_of_readers(reader, TLS.key.name, &key);

@@ -11,7 +11,7 @@ use super::keys::{
 use super::{files, values};
 use drivegate_model::document::{Finding, FromNode, Reader, format_duration};
 use drivegate_mqtt::{Buffer, Options, Password, Qos, Secret, SecretFault, Telemetry, sparkplug};
-use drivegate_north::{ServerIdentity, TlsFile};
+use drivegate_north::tls::{ServerIdentity, TlsFile};
 
 /// Maximum number of brokers: with three attempts per second, all of them are tried within 10 s.
 const MOST_BROKERS: usize = 16;

@@ -8,7 +8,6 @@ mod admission;
 mod client;
 mod command_words;
 mod connection;
-mod crl;
 mod dialogue;
 mod forwarded_request;
 pub(crate) mod frame;
@@ -40,7 +39,8 @@ use crate::log_throttle::LogThrottle;
 use crate::reading::Watch;
 use crate::refusals::Refusals;
 use crate::tcp_server::{TcpServer, TcpService};
-use crate::{NorthState, ServerError, ServerKind, certificate};
+use crate::tls::certificate;
+use crate::{NorthState, ServerError, ServerKind};
 use drivegate_core::event::Events;
 use drivegate_core::plant::SharedPlant;
 

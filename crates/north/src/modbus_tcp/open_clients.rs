@@ -9,9 +9,8 @@ use rustls_pki_types::CertificateDer;
 use tokio_util::sync::CancellationToken;
 
 use super::tls::{Requirements, Role};
-use crate::certificate;
 use crate::connection_limit::Rights;
-use crate::identity::seconds;
+use crate::tls::{certificate, seconds};
 use drivegate_core::order::Authority;
 
 /// Longest time between two looks at the calendar, which can be set at any time.

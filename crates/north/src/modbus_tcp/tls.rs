@@ -8,21 +8,18 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use ipnet::IpNet;
+use rustls::ServerConfig;
+use rustls::server::NoServerSessionStorage;
 use rustls::server::danger::ClientCertVerifier;
-use rustls::server::{NoServerSessionStorage, VerifierBuilderError, WebPkiClientVerifier};
-use rustls::{RootCertStore, ServerConfig};
 use rustls_pki_types::CertificateDer;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
-use super::crl::{self, Crls};
 use super::open_clients::{CertificateGuard, OpenClients};
-use crate::certificate::{self, RoleError};
-use crate::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, unsupported_ca, validity};
-use crate::pem;
 use crate::reading::Dated;
-use crate::tls_words::{self, Peer};
+use crate::tls::certificate::{self, RoleError};
+use crate::tls::{self, ClientTrust, Peer, ServerIdentity, TlsFault};
 
 /// Time limit of a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
@@ -63,8 +60,7 @@ pub enum Role {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Identity {
     server: ServerIdentity,
-    client_ca: Vec<CertificateDer<'static>>,
-    client_crl: Crls,
+    clients: ClientTrust,
 }
 
 impl Identity {
@@ -78,58 +74,20 @@ impl Identity {
         client_ca: &Path,
         client_crl: Option<&Path>,
         now: SystemTime,
-    ) -> Result<(Identity, Vec<IdentityFault>), Vec<IdentityFault>> {
-        let (mut errors, mut warnings) = (Vec::new(), Vec::new());
-        let server = ServerIdentity::load(certificate, key, now).map_err(|faults| errors.extend(faults));
-        let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
-        // An expired CA is still a valid trust anchor (RFC 5280, 6.1.1), so no client is refused for it.
-        let anchors = ca.iter().flatten().flat_map(|anchor| {
-            let unsupported = unsupported_ca(client_ca, anchor);
-            validity(client_ca, anchor, now).into_iter().chain(unsupported)
-        });
-        warnings.extend(anchors.map(|problem| TlsFile::ClientCa.fault(problem)));
-        let lists = client_crl.map(|file| crl::load(file, ca.as_deref().unwrap_or_default(), now));
-        let lists = lists
-            .transpose()
-            .map_err(|problem| errors.push(TlsFile::ClientCrl.fault(problem)));
-        if let (Ok((server, expiry)), Ok(client_ca), Ok(lists)) = (server, ca, lists) {
-            let (client_crl, doubts) = lists.unwrap_or_default();
-            warnings.extend(expiry);
-            warnings.extend(doubts.into_iter().map(|problem| TlsFile::ClientCrl.fault(problem)));
-            let identity = Identity {
-                server,
-                client_ca,
-                client_crl,
-            };
-            match identity.verifier() {
-                Ok(_) => return Ok((identity, warnings)),
-                Err(fault) => errors.push(fault),
+    ) -> Result<(Identity, Vec<TlsFault>), Vec<TlsFault>> {
+        let server = ServerIdentity::load(certificate, key, now);
+        match (server, ClientTrust::load(client_ca, client_crl, now)) {
+            (Ok((server, mut warnings)), Ok((clients, of_clients))) => {
+                warnings.extend(of_clients);
+                Ok((Identity { server, clients }, warnings))
             }
+            (server, clients) => Err([server.err(), clients.err()].into_iter().flatten().flatten().collect()),
         }
-        Err(errors)
-    }
-
-    /// The verifier for certificates of clients. If there are revocation lists, each CA in the chain of a client
-    /// must have one; an outdated list remains in force.
-    fn verifier(&self) -> Result<Arc<dyn ClientCertVerifier>, IdentityFault> {
-        let unusable_ca = |why: &str| TlsFile::ClientCa.fault(FileProblem::UnusableCa(why.to_string()));
-        let mut roots = RootCertStore::empty();
-        for anchor in &self.client_ca {
-            let added = roots.add(anchor.clone());
-            added.map_err(|_| unusable_ca("it is not valid X.509"))?;
-        }
-        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider())
-            .with_crls(self.client_crl.clone())
-            .build()
-            .map_err(|error| match error {
-                VerifierBuilderError::InvalidCrl(error) => TlsFile::ClientCrl.fault(FileProblem::UnsupportedCrl(error)),
-                error => unusable_ca(&error.to_string()),
-            })
     }
 
     /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, so no
     /// session can outlive it.
-    fn server_config(&self, verifier: Arc<dyn ClientCertVerifier>) -> Result<Arc<ServerConfig>, IdentityFault> {
+    fn server_config(&self, verifier: Arc<dyn ClientCertVerifier>) -> Result<Arc<ServerConfig>, TlsFault> {
         let mut config = self.server.server_config(Some(verifier))?;
         config.session_storage = Arc::new(NoServerSessionStorage {});
         config.send_tls13_tickets = 0;
@@ -150,8 +108,8 @@ impl Requirements {
     ///
     /// # Errors
     /// If the certificates cannot be used.
-    pub(super) fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
-        let verifier = tls.identity.verifier()?;
+    pub(super) fn new(tls: &Tls) -> Result<Requirements, TlsFault> {
+        let verifier = tls.identity.clients.verifier()?;
         Ok(Requirements {
             config: tls.identity.server_config(verifier.clone())?,
             verifier,
@@ -200,16 +158,12 @@ pub(super) struct AuthenticatedClient {
 pub(super) enum AuthenticationError {
     #[error("the handshake took longer than {HANDSHAKE:?}")]
     Timeout,
-    #[error("{}", in_words(.0))]
+    #[error("{}", tls::in_words(.0, Peer::Client))]
     Handshake(#[from] io::Error),
     #[error(transparent)]
     Role(#[from] RoleError),
-    #[error("a reload during the handshake: {}", in_words(.0))]
+    #[error("a reload during the handshake: {}", tls::in_words(.0, Peer::Client))]
     Renewed(#[from] rustls::Error),
-}
-
-fn in_words(error: &(dyn std::error::Error + 'static)) -> String {
-    tls_words::explain(error, Peer::Client).unwrap_or_else(|| error.to_string())
 }
 
 impl TlsAuthenticator {

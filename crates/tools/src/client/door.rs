@@ -13,7 +13,7 @@ use tokio_rustls::client::TlsStream;
 
 use super::{ClientError, Url};
 use drivegate_http::{InProcess, basic_authorization};
-use drivegate_north::{GATEWAY, client_tls, explain};
+use drivegate_north::tls;
 
 /// Remedy for a failed TLS handshake whose error suggests none.
 const NO_TLS: &str = "pass the CA of the gateway's certificate with --ca, or use http://";
@@ -144,7 +144,7 @@ impl Network {
     }
 
     async fn with_tls(&self, socket: TcpStream) -> Result<TlsStream<TcpStream>, ClientError> {
-        let config = client_tls(self.ca.as_deref()).map_err(ClientError::File)?;
+        let config = tls::client(self.ca.as_deref(), None).map_err(ClientError::File)?;
         let failed = |why: String| {
             let (what, remedy) = why.split_once("; ").unwrap_or((&why, NO_TLS));
             ClientError::Tls(format!("{what}; {}; {remedy}", self.url))
@@ -153,6 +153,6 @@ impl Network {
         let handshake = TlsConnector::from(config).connect(name, socket);
         handshake
             .await
-            .map_err(|error| failed(explain(&error, GATEWAY).unwrap_or_else(|| error.to_string())))
+            .map_err(|error| failed(tls::in_words(&error, tls::GATEWAY)))
     }
 }

@@ -1,12 +1,22 @@
-//! The fields that the gateway itself reads from an X.509 certificate: subject, validity and role.
+//! What the gateway itself reads from an X.509 certificate: names, validity, role, and what decides whether it is accepted in
+//! addition to its signature. For checks before a connection, and messages after failed ones.
 //!
-//! Reads certificates of clients. Trust is decided by rustls: chain and signature were verified before.
+//! Trust is decided by rustls: where a client's certificate is read, chain and signature were verified before.
 
-use x509_cert::certificate::{Certificate, TbsCertificate};
+use std::path::Path;
+use std::time::{Duration, SystemTime};
+
+use rustls_pki_types::{CertificateDer, IpAddr, ServerName};
+use x509_cert::certificate::{Certificate, TbsCertificate, Version};
 use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
 use x509_cert::der::{self, Decode, Tag, Tagged};
+use x509_cert::ext::pkix::name::GeneralName;
+use x509_cert::ext::pkix::{BasicConstraints, ExtendedKeyUsage, SubjectAltName};
 use x509_cert::name::Name;
 
+use super::fault::Problem;
+use super::key::KeyKind;
+use super::{date, seconds};
 use drivegate_core::hex;
 
 /// The role of a client (Modbus/TCP Security protocol specification, 8.4).
@@ -16,23 +26,41 @@ const COMMON_NAME: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.3");
 const MAX_ROLE: usize = 256;
 /// Longest name in the log, characters.
 const MAX_NAME: usize = 64;
+const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
+const ANY_USAGE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
+/// Time before the end of a certificate at which a warning begins.
+const SOON: Duration = Duration::from_secs(30 * 86_400);
 
 /// The parts of a certificate that the gateway uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct CertificateSummary {
+pub(crate) struct CertificateSummary {
     /// Common name of the subject, or the serial number; printable, at most 64 characters.
-    pub(super) name: String,
+    pub(crate) name: String,
     /// Begin of the certificate's validity, seconds since 1970.
     pub(super) not_before: u64,
     /// End of the certificate's validity, seconds since 1970.
-    pub(super) not_after: u64,
+    pub(crate) not_after: u64,
     /// Role of a Modbus client, from the certificate.
-    pub(super) role: Result<Option<String>, RoleError>,
+    pub(crate) role: Result<Option<String>, RoleError>,
+    /// Issuer of the certificate, for messages.
+    pub(super) issuer: String,
+    pub(super) self_issued: bool,
+    /// Whether the certificate has a version below 3. Such certificates have no extensions.
+    pub(super) is_old: bool,
+    /// Whether the certificate may issue others.
+    pub(super) is_ca: bool,
+    pub(super) key: KeyKind,
+    /// Names of hosts and addresses (subjectAltName).
+    pub(super) names: Vec<String>,
+    /// The common name as written, in a certificate without `names`.
+    common_name: Option<String>,
+    /// Whether a server may use the certificate (extended key usage).
+    pub(super) serves: bool,
 }
 
 /// Why the role in a certificate is not accepted. A role can grant write access, so nothing ambiguous is accepted.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub(super) enum RoleError {
+pub(crate) enum RoleError {
     /// RFC 5280 allows one extension of each kind.
     #[error("the certificate has more than one role extension")]
     Repeated,
@@ -48,24 +76,112 @@ pub(super) enum RoleError {
 ///
 /// # Errors
 /// If the bytes are not one DER-encoded certificate.
-pub(super) fn read(der: &[u8]) -> der::Result<CertificateSummary> {
+pub(crate) fn read(der: &[u8]) -> der::Result<CertificateSummary> {
     let certificate = Certificate::from_der(der)?;
-    let certificate = certificate.tbs_certificate();
-    let validity = certificate.validity();
+    let content = certificate.tbs_certificate();
+    let validity = content.validity();
+    let constraints = extension::<BasicConstraints>(content);
+    let usages = extension::<ExtendedKeyUsage>(content);
     Ok(CertificateSummary {
-        name: name_of(certificate),
+        name: subject_name(&certificate),
         not_before: validity.not_before.to_unix_duration().as_secs(),
         not_after: validity.not_after.to_unix_duration().as_secs(),
-        role: role(certificate.extensions().map_or(&[], Vec::as_slice)),
+        role: role(content.extensions().map_or(&[], Vec::as_slice)),
+        issuer: issuer_name(content.issuer()),
+        self_issued: content.issuer() == content.subject(),
+        is_old: content.version() != Version::V3,
+        is_ca: constraints.is_some_and(|constraints| constraints.ca),
+        key: KeyKind::of(content.subject_public_key_info()),
+        names: extension::<SubjectAltName>(content).map_or_else(Vec::new, |names| shown(&names)),
+        common_name: common_name(content.subject()),
+        serves: usages.is_none_or(|usages| usages.0.iter().any(|use_| [SERVER_AUTH, ANY_USAGE].contains(use_))),
     })
+}
+
+/// What is wrong with a certificate of a file: its validity at `now`, and what `further` finds.
+pub(super) fn problems(
+    file: &Path,
+    der: &CertificateDer<'_>,
+    now: SystemTime,
+    further: impl FnOnce(CertificateSummary, String) -> Option<Problem>,
+) -> Vec<Problem> {
+    let shown = file.display().to_string();
+    let [first, second] = match read(der) {
+        Ok(certificate) => [certificate.validity(&shown, now), further(certificate, shown)],
+        Err(_) => [Some(Problem::NotACertificate(shown)), None],
+    };
+    first.into_iter().chain(second).collect()
+}
+
+impl CertificateSummary {
+    /// The fault in the validity period.
+    fn validity(&self, file: &str, now: SystemTime) -> Option<Problem> {
+        let now = seconds(now);
+        let (name, file, end) = (self.name.clone(), file.to_string(), date(self.not_after));
+        if now > self.not_after {
+            return Some(Problem::Expired { name, file, end });
+        }
+        if now < self.not_before {
+            let begin = date(self.not_before);
+            return Some(Problem::NotYetValid { name, file, begin });
+        }
+        let soon = self.not_after - now < SOON.as_secs();
+        soon.then_some(Problem::ExpiresSoon { name, file, end })
+    }
+
+    /// A problem if signatures by the key of this certificate cannot be verified.
+    pub(super) fn unsupported_key(self, file: String) -> Option<Problem> {
+        (!self.key.verifies).then_some(Problem::UnsupportedCaKey {
+            name: self.name,
+            file,
+            kind: self.key.name,
+        })
+    }
+
+    /// Whether the certificate has no names (subjectAltName) but its common name is this host or address; other
+    /// programs then compare the common name.
+    pub(super) fn is_commonly_named(&self, host: &ServerName<'_>) -> bool {
+        let Some(common) = self.common_name.as_deref().filter(|_| self.names.is_empty()) else {
+            return false;
+        };
+        match host {
+            ServerName::DnsName(host) => host.as_ref().eq_ignore_ascii_case(common),
+            ServerName::IpAddress(host) => IpAddr::try_from(common).is_ok_and(|address| address == *host),
+            _ => false,
+        }
+    }
+
+    /// Whether the certificate is for a host or address, as far as its names show.
+    pub(super) fn is_for(&self, host: &str) -> bool {
+        let Ok(host_name) = ServerName::try_from(host) else {
+            return false;
+        };
+        let fits = |name: &String| match name.strip_prefix("*.") {
+            Some(domain) => host
+                .split_once('.')
+                .is_some_and(|(_, rest)| rest.eq_ignore_ascii_case(domain)),
+            None => name.eq_ignore_ascii_case(host),
+        };
+        self.is_commonly_named(&host_name) || self.names.iter().any(fits)
+    }
+
+    /// The names that the certificate is valid for, as text.
+    pub(super) fn shown_names(&self) -> String {
+        match (self.names.as_slice(), &self.common_name) {
+            ([], Some(common)) => format!("only the common name `{}`", printable(common)),
+            ([], None) => "no host".to_string(),
+            (names, _) => names
+                .iter()
+                .map(|name| format!("`{name}`"))
+                .collect::<Vec<_>>()
+                .join(", "),
+        }
+    }
 }
 
 /// The name of the certificate's subject for messages, printable.
 pub(super) fn subject_name(certificate: &Certificate) -> String {
-    name_of(certificate.tbs_certificate())
-}
-
-fn name_of(certificate: &TbsCertificate) -> String {
+    let certificate = certificate.tbs_certificate();
     let bytes = certificate.serial_number().as_bytes();
     let serial = || format!("serial {}", hex::encode(bytes.get(..MAX_NAME / 2).unwrap_or(bytes)));
     common_name(certificate.subject()).map_or_else(serial, |name| printable(&name))
@@ -86,7 +202,7 @@ fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, Role
 }
 
 /// The common name, unescaped, not for messages.
-pub(super) fn common_name(subject: &Name) -> Option<String> {
+fn common_name(subject: &Name) -> Option<String> {
     let value = &subject.iter().find(|attribute| attribute.oid == COMMON_NAME)?.value;
     let is_text = matches!(value.tag(), Tag::Utf8String | Tag::PrintableString | Tag::Ia5String);
     is_text.then(|| String::from_utf8_lossy(value.value()).into_owned())
@@ -102,6 +218,32 @@ pub(super) fn printable(text: &str) -> String {
         }
     };
     text.chars().take(MAX_NAME).map(safe).collect()
+}
+
+fn extension<'a, T>(certificate: &'a TbsCertificate) -> Option<T>
+where
+    T: Decode<'a> + x509_cert::der::oid::AssociatedOid,
+{
+    // A repeated or malformed one is refused by who verifies.
+    certificate.get_extension::<T>().ok().flatten().map(|(_, value)| value)
+}
+
+fn issuer_name(name: &Name) -> String {
+    common_name(name).map_or_else(|| printable(&name.to_string()), |common| printable(&common))
+}
+
+fn shown(names: &SubjectAltName) -> Vec<String> {
+    let shown = |name: &GeneralName| match name {
+        GeneralName::DnsName(name) => Some(printable(name.as_str())),
+        GeneralName::IpAddress(bytes) => match <[u8; 4]>::try_from(bytes.as_bytes()) {
+            Ok(v4) => Some(std::net::Ipv4Addr::from(v4).to_string()),
+            Err(_) => <[u8; 16]>::try_from(bytes.as_bytes())
+                .ok()
+                .map(|v6| std::net::Ipv6Addr::from(v6).to_string()),
+        },
+        _ => None,
+    };
+    names.0.iter().filter_map(shown).collect()
 }
 
 #[cfg(test)]

@@ -7,28 +7,11 @@ use std::path::Path;
 use rustls_pki_types::pem::{self, PemObject};
 use rustls_pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer};
 
-/// Why a PEM file cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum PemError {
-    #[error("{what}; {remedy}")]
-    Unreadable { what: String, remedy: String },
-    #[error("{file} contains no {expected}{}; {}", found.what(expected), found.remedy(file, expected))]
-    Missing {
-        file: String,
-        expected: &'static str,
-        found: Found,
-    },
-    #[error("{file} contains no valid {expected}: {cause}; specify a PEM file")]
-    Invalid {
-        file: String,
-        expected: &'static str,
-        cause: String,
-    },
-}
+use super::fault::Problem;
 
 /// The content of a file instead of the expected one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Found {
+pub(super) enum Found {
     /// A private key that needs a passphrase.
     EncryptedKey,
     /// A private key in the form of OpenSSH.
@@ -74,7 +57,7 @@ impl Found {
         }
     }
 
-    fn what(self, expected: &str) -> &'static str {
+    pub(super) fn what(self, expected: &str) -> &'static str {
         match self {
             Found::EncryptedKey if expected == PRIVATE_KEY => {
                 " that can be read: it is encrypted, and there is nobody to enter its passphrase"
@@ -93,7 +76,7 @@ impl Found {
         }
     }
 
-    fn remedy(self, file: &str, expected: &str) -> String {
+    pub(super) fn remedy(self, file: &str, expected: &str) -> String {
         match (self, expected) {
             (Found::EncryptedKey, PRIVATE_KEY) => {
                 format!("save it without a passphrase, readable only by the gateway: openssl pkey -in {file} -out NEW")
@@ -129,7 +112,7 @@ fn is_sequence(bytes: &[u8]) -> bool {
 }
 
 /// All certificates of a file; an error if there is none.
-pub fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemError> {
+pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, Problem> {
     let bytes = content(file)?;
     let read: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&bytes).collect();
     let certificates = read.map_err(|error| pem_error(file, CERTIFICATE, &bytes, &error))?;
@@ -140,7 +123,7 @@ pub fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemErro
 }
 
 /// The first private key of a file.
-pub fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
+pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, Problem> {
     let bytes = content(file)?;
     PrivateKeyDer::from_pem_slice(&bytes).map_err(|error| match Found::of(&bytes) {
         // An encrypted key in the old form would otherwise pass for a broken key.
@@ -150,7 +133,7 @@ pub fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
 }
 
 /// All certificate revocation lists of a file, at least one: in PEM, or a single one in DER as CAs publish it.
-pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, PemError> {
+pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, Problem> {
     let bytes = content(file)?;
     // A DER file begins with the tag of a sequence, which is not a letter of PEM.
     if Found::of(&bytes) == Found::Binary {
@@ -164,14 +147,14 @@ pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationL
     }
 }
 
-fn content(file: &Path) -> Result<Vec<u8>, PemError> {
+fn content(file: &Path) -> Result<Vec<u8>, Problem> {
     let mut bytes = Vec::new();
     let read = File::open(file).and_then(|open| open.take(MOST_BYTES).read_to_end(&mut bytes));
     match read {
         Ok(_) => Ok(bytes),
         Err(error) => {
             let (what, remedy) = unreadable(file, &error);
-            Err(PemError::Unreadable { what, remedy })
+            Err(Problem::Unreadable { what, remedy })
         }
     }
 }
@@ -199,15 +182,15 @@ pub fn unreadable(file: &Path, error: &io::Error) -> (String, String) {
     )
 }
 
-fn pem_error(file: &Path, expected: &'static str, bytes: &[u8], error: &pem::Error) -> PemError {
+fn pem_error(file: &Path, expected: &'static str, bytes: &[u8], error: &pem::Error) -> Problem {
     let file = file.display().to_string();
     match error {
-        pem::Error::NoItemsFound => PemError::Missing {
+        pem::Error::NoItemsFound => Problem::Missing {
             file,
             expected,
             found: Found::of(bytes),
         },
-        cause => PemError::Invalid {
+        cause => Problem::Invalid {
             file,
             expected,
             cause: cause.to_string(),

@@ -5,24 +5,29 @@
 //! that one, so its version and signing rights do not matter. Dates, purpose and host do matter, and the server
 //! must prove in the handshake that it has the key.
 
+use std::path::Path;
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::crypto::{WebPkiSupportedAlgorithms, verify_tls13_signature_with_raw_key};
 use rustls::pki_types::{CertificateDer, ServerName, SubjectPublicKeyInfoDer, UnixTime};
 use rustls::server::ParsedCertificate;
-use rustls::{CertificateError, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme};
+use rustls::{
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
+};
 use x509_cert::certificate::Certificate;
 use x509_cert::der::{Decode, Encode};
 use x509_cert::spki::SubjectPublicKeyInfoOwned;
 
-use super::certificate;
-use super::certificate_kind::Kind;
-use super::identity::provider;
+use super::certificate::{self, CertificateSummary};
+use super::fault::{Problem, TlsFault, TlsFile};
+use super::identity::ServerIdentity;
+use super::{pem, provider};
 
 #[derive(Debug)]
-pub(super) struct ServerTrust {
+struct ServerTrust {
     by_ca: Arc<WebPkiServerVerifier>,
     /// Certificates of the configured file.
     named: Vec<CertificateDer<'static>>,
@@ -39,16 +44,29 @@ pub(super) struct UnknownIssuer {
 }
 
 impl ServerTrust {
-    /// Trusts the certificates in `named` and all certificates signed by the CAs in `roots`.
-    ///
-    /// # Errors
-    /// If there is no usable CA.
-    pub(super) fn new(roots: RootCertStore, named: Vec<CertificateDer<'static>>) -> Result<ServerTrust, Error> {
+    /// Trusts the certificates in a file and all certificates signed by the CAs in it; without a file, those signed by a CA of
+    /// the system.
+    fn new(ca: Option<&Path>) -> Result<ServerTrust, Problem> {
+        let mut roots = RootCertStore::empty();
+        let mut named = Vec::new();
+        match ca {
+            Some(path) => {
+                named = pem::certificates(path)?;
+                for certificate in &named {
+                    let added = roots.add(certificate.clone());
+                    added.map_err(|_| Problem::NotACa(path.display().to_string()))?;
+                }
+            }
+            // A certificate of the system that rustls cannot parse must not disable TLS.
+            None => {
+                roots.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
+            }
+        }
         let provider = provider();
         let algorithms = provider.signature_verification_algorithms;
         let by_ca = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), provider)
             .build()
-            .map_err(|error| Error::General(error.to_string()))?;
+            .map_err(|_| Problem::NoSystemRoots)?;
         Ok(ServerTrust {
             by_ca,
             named,
@@ -59,6 +77,62 @@ impl ServerTrust {
     fn names(&self, certificate: &CertificateDer<'_>) -> bool {
         self.named.iter().any(|named| named.as_ref() == certificate.as_ref())
     }
+}
+
+/// TLS of a client that trusts the servers with a certificate in the file `ca`, or with one issued by a CA in it; without a
+/// file, those with a certificate of a CA of the system. With its own certificate and key, if the server requires one.
+/// Blocking, because it reads files.
+///
+/// # Errors
+/// If a file cannot be used: contains the file and the remedy.
+pub fn client(ca: Option<&Path>, own: Option<(&Path, &Path)>) -> Result<Arc<ClientConfig>, String> {
+    let config = client_config(ca, own).map_err(|problem| problem.to_string());
+    config.map(Arc::new)
+}
+
+fn client_config(ca: Option<&Path>, own: Option<(&Path, &Path)>) -> Result<ClientConfig, Problem> {
+    let builder = ClientConfig::builder_with_provider(provider())
+        .with_safe_default_protocol_versions()
+        .map_err(Problem::Protocol)?;
+    let trust = Arc::new(ServerTrust::new(ca)?);
+    let builder = builder.dangerous().with_custom_certificate_verifier(trust);
+    let Some((certificate, key)) = own else {
+        return Ok(builder.with_no_client_auth());
+    };
+    let identity = ServerIdentity::new(pem::certificates(certificate)?, pem::private_key(key)?);
+    identity
+        .client_config(builder)
+        .map_err(|cause| Problem::UnusableIdentity {
+            file: certificate.display().to_string(),
+            cause: Box::new(cause),
+        })
+}
+
+/// Problems that will or may keep the server `host` from being trusted by the certificates of a PEM file: certificates that
+/// have ended, or end within 30 days of `now`, whose keys are not supported, or that are its own and for another host.
+///
+/// # Errors
+/// If the file cannot be read, or contains no certificate.
+pub fn certificate_warnings(file: &Path, host: &str, now: SystemTime) -> Result<Vec<TlsFault>, TlsFault> {
+    let certificates = pem::certificates(file).map_err(|why| TlsFile::Ca.fault(why))?;
+    let problems = certificates
+        .iter()
+        .flat_map(|der| certificate::problems(file, der, now, |read, file| unfit_for(read, file, host)));
+    Ok(problems.map(|why| TlsFile::Ca.fault(why)).collect())
+}
+
+fn unfit_for(certificate: CertificateSummary, file: String, host: &str) -> Option<Problem> {
+    if !certificate.key.verifies {
+        return certificate.unsupported_key(file);
+    }
+    // A certificate of version 1 does not show whether it is a CA.
+    let is_own = !certificate.is_ca && !certificate.is_old;
+    let other = is_own && !certificate.is_for(host);
+    other.then(|| Problem::OtherHost {
+        difference: format!("{}, not for `{host}`", certificate.shown_names()),
+        name: certificate.name,
+        file,
+    })
 }
 
 impl ServerCertVerifier for ServerTrust {
@@ -76,12 +150,12 @@ impl ServerCertVerifier for ServerTrust {
         let verified = self
             .by_ca
             .verify_server_cert(certificate, intermediates, host, ocsp, now);
-        verified.map_err(|error| match Kind::of(certificate) {
+        verified.map_err(|error| match certificate::read(certificate) {
             // A self-signed certificate is reported as unknown before any other defect.
-            Some(kind) if kind.self_issued && is_of_ca(&error) || is_unknown(&error) => other(UnknownIssuer {
-                name: kind.name,
-                issuer: kind.issuer,
-                self_issued: kind.self_issued,
+            Ok(read) if read.self_issued && is_of_ca(&error) || is_unknown(&error) => other(UnknownIssuer {
+                name: read.name,
+                issuer: read.issuer,
+                self_issued: read.self_issued,
             }),
             _ => error,
         })
@@ -119,9 +193,7 @@ impl ServerCertVerifier for ServerTrust {
 
 /// Whether a certificate that the configuration itself names is valid now, for a server, and for this host.
 fn check_named(certificate: &CertificateDer<'_>, host: &ServerName<'_>, now: UnixTime) -> Result<(), Error> {
-    let (Ok(read), Some(kind)) = (certificate::read(certificate), Kind::of(certificate)) else {
-        return Err(bad_encoding());
-    };
+    let read = certificate::read(certificate).map_err(|_| bad_encoding())?;
     let at = |seconds| UnixTime::since_unix_epoch(std::time::Duration::from_secs(seconds));
     if now.as_secs() > read.not_after {
         let not_after = at(read.not_after);
@@ -131,14 +203,14 @@ fn check_named(certificate: &CertificateDer<'_>, host: &ServerName<'_>, now: Uni
         let not_before = at(read.not_before);
         return Err(CertificateError::NotValidYetContext { time: now, not_before }.into());
     }
-    if !kind.serves {
+    if !read.serves {
         return Err(CertificateError::InvalidPurpose.into());
     }
     // If a certificate has no other names, other programs compare the common name as well.
-    if kind.is_commonly_named(host) {
+    if read.is_commonly_named(host) {
         return Ok(());
     }
-    if kind.is_old {
+    if read.is_old {
         return Err(CertificateError::NotValidForNameContext {
             expected: host.to_owned(),
             presented: Vec::new(),

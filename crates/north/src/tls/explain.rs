@@ -5,8 +5,9 @@ use std::io;
 
 use rustls::{AlertDescription, CertificateError, Error};
 
-use super::certificate_kind::{SUPPORTED_KEYS, algorithm};
-use super::identity::date;
+use super::certificate::printable;
+use super::date;
+use super::key::{SUPPORTED_KEYS, algorithm};
 use super::server_trust::UnknownIssuer;
 
 /// The peer of a TLS connection.
@@ -23,6 +24,7 @@ pub enum Peer {
     Client,
 }
 
+/// A broker that the MQTT client connects to.
 pub const BROKER: Peer = Peer::Server {
     ca: "mqtt.ca",
     own: "mqtt.certificate and mqtt.key",
@@ -54,6 +56,11 @@ pub fn explain(error: &(dyn StdError + 'static), peer: Peer) -> Option<String> {
         error => return Some(format!("TLS: {error}")),
     };
     Some(format!("{what}; {remedy}"))
+}
+
+/// What [`explain`] finds, or the error's own text.
+pub fn in_words(error: &(dyn StdError + 'static), peer: Peer) -> String {
+    explain(error, peer).unwrap_or_else(|| error.to_string())
 }
 
 /// Whether a server closed the connection in the middle of the handshake.
@@ -219,7 +226,7 @@ fn wrong_name(expected: &str, presented: &[String], pin: &str) -> (String, Strin
         let inner = name
             .split_once('(')
             .map_or(name.as_str(), |(_, inner)| inner.trim_end_matches(')'));
-        format!("`{}`", super::certificate::printable(inner.trim_matches('"')))
+        format!("`{}`", printable(inner.trim_matches('"')))
     };
     let names: Vec<String> = presented.iter().map(word).collect();
     (
