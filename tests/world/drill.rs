@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_core::drill::{DrillOptions, DrillReport, DrillState, Drills, Kind, LOOK, SavedDrills};
+use drivegate_core::files::State as _;
 use drivegate_core::order::{Authority, Origin, Outcome, SourceKind};
 use drivegate_core::plant::OrderRequest;
 use drivegate_core::process_image::{LeaseAction, Supervision};
@@ -517,7 +518,7 @@ impl Disk {
         match self.writing.take() {
             Some((0, generation, saved)) => {
                 // The drills as the next process reads them.
-                let bytes = serde_json::to_vec(&saved).unwrap();
+                let bytes = saved.to_json().unwrap();
                 self.on_disk = Some(SavedDrills::from_json(&bytes).unwrap());
                 drills.kept(generation, now);
             }

@@ -20,6 +20,7 @@ pub mod register_map;
 mod server;
 pub mod slot;
 mod state;
+pub mod state_file;
 mod stats;
 pub mod tcp_server;
 pub mod tls;

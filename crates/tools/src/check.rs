@@ -15,13 +15,13 @@ use super::failure::{Failure, Outcome};
 use super::{EXIT_CONFIG, NamedConfig, report};
 use drivegate_bus::predict::{PredictedRequest, Prediction};
 use drivegate_bus::proof;
-use drivegate_core::drill::{Kind, ways};
+use drivegate_core::drill::{Kind, SavedDrills, ways};
+use drivegate_core::files::State as _;
 use drivegate_core::files::names::DRILLS;
 use drivegate_core::history::trend::Reach;
 use drivegate_core::process_image::{Access, DriveSpec};
 use drivegate_gateway::config::memory::{BusMemory, Memory};
 use drivegate_gateway::config::{BusSettings, Loaded, Settings, environment};
-use drivegate_gateway::daemon::drills::load as kept_drills;
 use drivegate_model::document::format_duration;
 use drivegate_model::document::{Finding, Problem};
 use drivegate_model::drive::raw_writes;
@@ -147,7 +147,7 @@ fn unproven_stops(settings: &Settings) -> Option<Problem> {
     let path = settings.state_dir.join(DRILLS);
     let problem =
         |what: String, remedy: String| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
-    let saved = match kept_drills(&path) {
+    let saved = match SavedDrills::load(&path) {
         Ok(saved) => saved.unwrap_or_default(),
         Err(why) => {
             return Some(problem(

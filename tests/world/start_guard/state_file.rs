@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
+use drivegate_core::files::State as _;
 use drivegate_core::start_guard::{Guards, Saved};
 
 const PATH: &str = "state/starts.json";
@@ -134,7 +135,7 @@ impl StateFile {
             .duration_since(SystemTime::UNIX_EPOCH)
             .unwrap_or_default()
             .as_millis();
-        let file: serde_json::Value = serde_json::from_slice(&self.holds.to_json()).unwrap();
+        let file: serde_json::Value = serde_json::from_slice(&self.holds.to_json().unwrap()).unwrap();
         let motors = file["motors"].as_array().unwrap().iter();
         let mut starts = motors
             .filter(|motor| motor["address"] == address)

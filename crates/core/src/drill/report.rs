@@ -4,6 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
+use crate::files::{State, Words};
 use crate::process_image::Machine;
 
 /// A way in which a motor must stop, as a drill tests it.
@@ -223,16 +224,15 @@ impl SavedDrills {
         };
         kinds.iter().filter(|kind| !proven(kind)).copied().collect()
     }
+}
 
-    /// Parses the file of saved drills.
-    ///
-    /// # Errors
-    /// If the file is damaged or of another version: contains the reason.
-    pub fn from_json(bytes: &[u8]) -> Result<SavedDrills, String> {
-        let saved: SavedDrills = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-        match saved.drivegate_drills {
-            VERSION => Ok(saved),
-            other => Err(format!("version {other} of the file is not known")),
-        }
-    }
+impl State for SavedDrills {
+    const WORDS: Words = Words {
+        what: "the drills",
+        unread: "no drill starts",
+        unsaved: "no drill starts",
+        lost: "earlier drills are unknown",
+    };
+    const VERSION_KEY: &'static str = "drivegate_drills";
+    const LONGEST: u64 = 16 << 20;
 }

@@ -1,6 +1,7 @@
 use std::time::{Duration, SystemTime};
 
 use super::*;
+use crate::files::State as _;
 use crate::process_image::{DriveSpec, LeaseAction, Supervision};
 use crate::testkit;
 

@@ -3,11 +3,13 @@
 //! - [`rotated`]: a file of lines with its older files, bounded together.
 //! - [`Keeper`]: the thread that writes some of these files.
 //! - [`names`]: the names of the gateway's files.
-//! - [`read`]: the content of one of them. [`replace`]: writes new content completely or not at all.
+//! - [`State`]: the content of a small file that outlives the process, and how it is read and written.
+//! - [`replace`]: writes new content completely or not at all.
 
 mod keeper;
 pub mod names;
 pub mod rotated;
+pub mod state;
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -15,32 +17,10 @@ use std::path::Path;
 
 pub use keeper::Keeper;
 pub use rotated::Rotated;
+pub use state::{State, Words};
 
 /// Ending of a file that is not completely written.
 pub const PARTIAL: &str = "partial";
-
-/// Renames a file that cannot be used, and returns the result as text for the log.
-pub fn set_aside(path: &Path, aside: &Path) -> String {
-    match fs::rename(path, aside) {
-        Ok(()) => format!("it is kept as {}", aside.display()),
-        Err(error) => format!("it cannot be renamed ({error})"),
-    }
-}
-
-/// The content of a file of at most `longest` bytes; `None` if the file does not exist.
-///
-/// # Errors
-/// If the file cannot be read, or is longer than `longest`: the gateway did not write such a file.
-pub fn read(path: &Path, longest: u64) -> Result<Option<Vec<u8>>, String> {
-    let length = match fs::metadata(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        metadata => metadata.map_err(|error| error.to_string())?.len(),
-    };
-    if length > longest {
-        return Err(format!("it has {length} bytes, more than {longest}"));
-    }
-    fs::read(path).map(Some).map_err(|error| error.to_string())
-}
 
 /// Replaces the content of a file: after a power failure the file has the old content or the new one. Creates the
 /// directory if necessary.

@@ -18,13 +18,15 @@ pub const SPARKPLUG: &str = "sparkplug-bdseq";
 pub const RESERVATIONS: &str = "reservations.json";
 /// File of the drills, and of the time at which each way to stop was last proven.
 pub const DRILLS: &str = "drills.json";
+/// File of the slots in which BACnet clients hold `run` inactive.
+pub const BACNET_PRIORITIES: &str = "bacnet-priorities.json";
 /// Directory of the recordings.
 pub const RECORDINGS: &str = "recordings";
 /// Directory of the parameters.
 pub const PARAMS: &str = "params";
 
 /// Start of the names, before a `.` or `-` or their end; counters are written and set aside under other endings.
-const OWN: [&str; 11] = [
+const OWN: [&str; 12] = [
     EVENTS,
     "counters",
     "starts",
@@ -34,6 +36,7 @@ const OWN: [&str; 11] = [
     SPARKPLUG,
     "reservations",
     "drills",
+    "bacnet-priorities",
     RECORDINGS,
     PARAMS,
 ];
@@ -62,6 +65,7 @@ mod tests {
             SPARKPLUG,
             RESERVATIONS,
             DRILLS,
+            BACNET_PRIORITIES,
             RECORDINGS,
             PARAMS,
         ] {

@@ -4,7 +4,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
-use std::io::{self, ErrorKind};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
@@ -18,7 +18,7 @@ use super::counters::Totals;
 use super::drives::History;
 use crate::event::{self, Event, Events};
 use crate::files::names::{COUNTERS, EVENTS};
-use crate::files::{self, Keeper, Rotated};
+use crate::files::{Keeper, Rotated, State, Words};
 
 /// Time within which events reach the disk, and the interval of further attempts after a failure.
 const TICK: Duration = Duration::from_secs(1);
@@ -30,15 +30,41 @@ pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);
 const WAITING: usize = 4096;
 /// Maximum number of drives with counters in a file. A file with more drives was not written by the gateway.
 const MOST_DRIVES: usize = 16_384;
-/// Version of the counter file's format.
-const VERSION: u32 = 1;
-
 #[derive(Debug, Serialize, Deserialize)]
 struct CounterFile {
-    drivegate_counters: u32,
     #[serde(default)]
     time: String,
     drives: BTreeMap<String, Totals>,
+}
+
+impl State for CounterFile {
+    const WORDS: Words = Words {
+        what: "the run hours and starts",
+        unread: "they are not saved",
+        unsaved: "a restart loses those from now on",
+        lost: "counting starts at 0; to continue from it, stop the gateway, repair the file and rename it back",
+    };
+    const VERSION_KEY: &'static str = "drivegate_counters";
+    const LONGEST: u64 = 64 << 20;
+
+    fn check(&self) -> Result<(), String> {
+        if self.drives.len() > MOST_DRIVES {
+            return Err(format!("it has {} drives, more than {MOST_DRIVES}", self.drives.len()));
+        }
+        match self.drives.iter().find(|(_, totals)| !totals.is_sane()) {
+            Some((drive, _)) => Err(format!("its figures for `{drive}` are impossible")),
+            None => Ok(()),
+        }
+    }
+
+    /// A free name: earlier damaged counters may still be of use to somebody.
+    fn aside(path: &Path) -> PathBuf {
+        let named = |ending: String| path.with_extension(ending);
+        let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));
+        names
+            .find(|name| !name.exists())
+            .unwrap_or_else(|| named("damaged".to_string()))
+    }
 }
 
 /// Saves events and counters in this directory from now on. For the `first` call of this run, the channel yields
@@ -114,8 +140,9 @@ impl Writer {
 
     /// Takes over the counters of earlier runs; returns their events.
     fn remember(&mut self) -> Vec<Event> {
-        let done = self.open();
-        let earlier = if done.is_ok() { self.earlier() } else { Vec::new() };
+        let opened = self.open();
+        let earlier = if opened.is_ok() { self.earlier() } else { Vec::new() };
+        let done = opened.and_then(|()| self.count_on());
         self.report(done, false);
         earlier
     }
@@ -156,6 +183,8 @@ impl Writer {
         if !self.events.is_open() {
             self.open()?;
         }
+        // Events are saved also where the counters cannot be read.
+        let counted = self.count_on();
         while let Some(event) = self.waiting.front() {
             let mut line = serde_json::to_vec(&**event).map_err(io::Error::other)?;
             line.push(b'\n');
@@ -167,6 +196,7 @@ impl Writer {
             self.waiting.pop_front();
         }
         self.events.sync()?;
+        counted?;
         if counters { self.write_counters() } else { Ok(()) }
     }
 
@@ -181,7 +211,7 @@ impl Writer {
         }
     }
 
-    /// Opens the file of events. On the first call of this run it also takes over the counters and events of earlier runs.
+    /// Opens the file of events.
     fn open(&mut self) -> io::Result<()> {
         let (file, bytes) = self.events.open()?;
         let ended = bytes == 0 || ends_with_newline(file, bytes)?;
@@ -189,30 +219,20 @@ impl Writer {
             // A line cut off by a power failure stays as it is; the line end keeps the next event apart from it.
             self.events.append(b"\n")?;
         }
-        if !std::mem::replace(&mut self.counted_on, true) {
-            self.count_on();
-        }
         Ok(())
     }
 
-    fn count_on(&mut self) {
-        let path = &self.counters;
-        let found = match fs::read(path) {
-            Err(error) if error.kind() == ErrorKind::NotFound => return,
-            Err(error) => Err(error.to_string()),
-            Ok(bytes) => read_counters(&bytes),
-        };
-        match found {
-            Ok(totals) => self.history.count_on(totals),
-            Err(why) => {
-                let kept = files::set_aside(path, &kept_aside(path));
-                tracing::error!(
-                    target: "drivegate::history",
-                    "cannot use the run hours and starts in {}: {why}; {kept}, and counting starts at 0; to continue \
-                     from it, stop the gateway, repair the file and rename it back", path.display()
-                );
-            }
+    /// Adds the counters of earlier runs, on the first call at which the disk returns them; until then the file stays as it is.
+    fn count_on(&mut self) -> io::Result<()> {
+        if self.counted_on {
+            return Ok(());
         }
+        let path = &self.counters;
+        let found = CounterFile::take_up(path)
+            .map_err(|error| io::Error::new(error.kind(), format!("cannot read {}: {error}", path.display())))?;
+        found.into_iter().for_each(|file| self.history.count_on(file.drives));
+        self.counted_on = true;
+        Ok(())
     }
 
     fn write_counters(&mut self) -> io::Result<()> {
@@ -221,12 +241,10 @@ impl Writer {
             return Ok(());
         }
         let file = CounterFile {
-            drivegate_counters: VERSION,
             time: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
             drives: totals,
         };
-        let bytes = serde_json::to_vec_pretty(&file).map_err(io::Error::other)?;
-        files::replace(&self.counters, &bytes)?;
+        file.save(&self.counters).map_err(io::Error::other)?;
         self.written = Some(file.drives);
         Ok(())
     }
@@ -267,37 +285,6 @@ fn ends_with_newline(file: &fs::File, bytes: u64) -> io::Result<bool> {
     let mut last = [0];
     file.read_exact_at(&mut last, bytes.saturating_sub(1))?;
     Ok(last == *b"\n")
-}
-
-/// The counters in a file, or why its content is not valid.
-fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
-    #[derive(Deserialize)]
-    struct Version {
-        drivegate_counters: u32,
-    }
-    let Version {
-        drivegate_counters: version,
-    } = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-    if version != VERSION {
-        return Err(format!("it has version {version}, this gateway knows {VERSION}"));
-    }
-    let file: CounterFile = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-    if file.drives.len() > MOST_DRIVES {
-        return Err(format!("it has {} drives, more than {MOST_DRIVES}", file.drives.len()));
-    }
-    match file.drives.iter().find(|(_, totals)| !totals.is_sane()) {
-        Some((drive, _)) => Err(format!("its figures for `{drive}` are impossible")),
-        None => Ok(file.drives),
-    }
-}
-
-/// A free name next to that path.
-fn kept_aside(path: &Path) -> PathBuf {
-    let named = |ending: String| path.with_extension(ending);
-    let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));
-    names
-        .find(|name| !name.exists())
-        .unwrap_or_else(|| named("damaged".to_string()))
 }
 
 #[cfg(test)]

@@ -29,7 +29,8 @@ pub use admit::{admit, authority, broken_limit, converted, may_restore, sets_twi
 pub use awaited_files::{AwaitedFile, AwaitedFiles};
 pub use gate::{DrillLock, Gate, Unheld};
 pub use holder::{
-    Claim, Denial, HoldChange, HoldState, HoldView, Holding, KeptReservation, Mode, Principal, Rules, Verb, What,
+    Claim, Denial, HoldChange, HoldState, HoldView, Holding, KeptReservation, KeptReservations, Mode, Principal, Rules,
+    Verb, What,
 };
 pub use judge::{Ask, DriveFacts, Facts, Stage, Verdict};
 pub use priorities::{Follows, PRIORITIES, PROTECTING, Priorities, Protects, Settled, VoidSlot};

@@ -5,19 +5,17 @@ use std::time::{Duration, SystemTime};
 use serde::{Deserialize, Serialize};
 
 use super::MOST_STARTS;
+use crate::files::{State, Words};
 use crate::process_image::Machine;
 
-/// Version of the file format.
-const VERSION: u32 = 1;
 /// Maximum number of motors in a file. A file with more motors was not written by the gateway.
 const MOST_MOTORS: usize = 16_384;
 /// The year 9999, in which no clock is.
 const LATEST: Duration = Duration::from_secs(253_370_764_800);
 
 /// The starts of the last hour of all motors.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Saved {
-    drivegate_starts: u32,
     motors: Vec<SavedMotor>,
 }
 
@@ -29,12 +27,24 @@ struct SavedMotor {
     starts: Vec<u64>,
 }
 
-impl Default for Saved {
-    fn default() -> Saved {
-        Saved {
-            drivegate_starts: VERSION,
-            motors: Vec::new(),
+impl State for Saved {
+    const WORDS: Words = Words {
+        what: "the starts",
+        unread: "drives with a guard are not started",
+        unsaved: "drives with a guard are not started",
+        lost: "starts before now are not counted",
+    };
+    const VERSION_KEY: &'static str = "drivegate_starts";
+    const LONGEST: u64 = 64 << 20;
+
+    fn check(&self) -> Result<(), String> {
+        let most = MOST_STARTS as usize + 1;
+        if self.motors.len() > MOST_MOTORS || self.motors.iter().any(|motor| motor.starts.len() > most) {
+            return Err(format!(
+                "it has more than {MOST_MOTORS} motors, or {most} starts of one"
+            ));
         }
+        Ok(())
     }
 }
 
@@ -50,7 +60,6 @@ impl Saved {
         };
         Saved {
             motors: motors.map(motor).collect(),
-            ..Saved::default()
         }
     }
 
@@ -64,32 +73,5 @@ impl Saved {
             };
             (motor.machine.clone(), motor.starts.iter().map(at))
         })
-    }
-
-    /// The file as JSON.
-    pub fn to_json(&self) -> Vec<u8> {
-        // Numbers and strings can always be serialized.
-        serde_json::to_vec(self).unwrap_or_default()
-    }
-
-    /// Parses the content of a file of starts.
-    ///
-    /// # Errors
-    /// If the file is not a list of starts of this version: contains the reason.
-    pub fn from_json(bytes: &[u8]) -> Result<Saved, String> {
-        let saved: Saved = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-        let most = MOST_STARTS as usize + 1;
-        if saved.drivegate_starts != VERSION {
-            return Err(format!(
-                "it has version {}, this gateway knows {VERSION}",
-                saved.drivegate_starts
-            ));
-        }
-        if saved.motors.len() > MOST_MOTORS || saved.motors.iter().any(|motor| motor.starts.len() > most) {
-            return Err(format!(
-                "it has more than {MOST_MOTORS} motors, or {most} starts of one"
-            ));
-        }
-        Ok(saved)
     }
 }

@@ -11,12 +11,11 @@ use super::drives_by_name::DrivesByName;
 use super::file::Saved;
 use super::motor::{HOUR, Motor, Reserved};
 use super::{Guard, Guarded, Reason, shown};
+use crate::files::state::AGAIN;
 use crate::process_image::{DriveImage, Machine};
 
 /// Longest wait of a start for the disk.
 pub(super) const DISK: Duration = Duration::from_secs(1);
-/// Time after which a failed write of the file, or a failed read, is tried again.
-pub(super) const AGAIN: Duration = Duration::from_secs(1);
 
 /// The starts of the whole gateway, shared by its buses and kept over every reload.
 #[derive(Debug, Default)]

@@ -2,6 +2,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
+use crate::files::State as _;
 use crate::order::{
     Arrival, Command, Effect, Effects, Intent, Order, Origin, Outcome, PassedOn, Refusal, SourceKind, Target, Ticket,
     Touched, Window,
@@ -393,7 +394,7 @@ fn a_start_waits_until_it_is_on_disk() {
     assert_eq!(rig.shared.to_write(rig.at(1.2), time), None);
     // If the gateway is killed before it has written the word, the next run knows of the start.
     let next = GuardedDrives::of(per_hour(1), Vec::new());
-    let saved = Saved::from_json(&saved.to_json()).unwrap();
+    let saved = Saved::from_json(&saved.to_json().unwrap()).unwrap();
     next.shared.keep(&saved, next.start, time + 60 * SECOND);
     next.read(0, false, 0.0);
     assert_eq!(

@@ -1,76 +1,87 @@
 //! Drills in progress, and the file in which they are saved.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate_core::drill::{DrillState, Drills, LOOK, SavedDrills};
-use drivegate_core::files;
+use drivegate_core::files::State as _;
 use drivegate_core::files::names::DRILLS;
 use drivegate_core::order::{Origin, SourceKind};
 use drivegate_core::plant::SharedPlant;
 use drivegate_north::patience::Patience;
+use drivegate_north::state_file::{self, LATE, StateFile};
 
 /// Interval of the looks at an armed drill.
 const IDLE: Duration = Duration::from_millis(500);
-/// Time between two tries to write the file.
-const AGAIN: Duration = Duration::from_secs(10);
 /// Time limit for the last stop of a drill that the shutdown ends, and for saving it afterwards.
 const LAST_STOP: Duration = Duration::from_secs(3);
-/// Largest valid size of the file, bytes.
-const LONGEST: u64 = 16 << 20;
 
 /// The file of the drills; `None` while drills are not kept.
-pub(super) type DrillsFile = Arc<Mutex<Option<PathBuf>>>;
+pub(super) type DrillsFile = Arc<Mutex<Option<Target>>>;
 
-fn path(file: &DrillsFile) -> Option<PathBuf> {
-    file.lock().unwrap_or_else(PoisonError::into_inner).clone()
+/// Where drills are saved. A file that was not read is not overwritten.
+#[derive(Debug)]
+pub(super) enum Target {
+    Unread(PathBuf),
+    Read(PathBuf),
 }
 
-/// Saves drills in this state directory from now on. Drills saved in the previous state directory are taken over.
-pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patience: &Patience, drills: &Drills) {
-    let new = state_dir.map(|dir| dir.join(DRILLS));
-    drills.keep(new.is_some());
-    let before = std::mem::replace(&mut *file.lock().unwrap_or_else(PoisonError::into_inner), new.clone());
-    let Some(path) = new.filter(|new| before.as_ref() != Some(new)) else {
-        return;
-    };
-    let found = patience.read({
-        let path = path.clone();
-        move || load(&path)
-    });
-    match found.await.and_then(|found| found) {
-        Ok(Some(saved)) => drills.restore(saved),
-        Ok(None) => {}
-        Err(why) => tracing::error!(
-            target: "drivegate::daemon",
-            "cannot read {}: {why}; earlier drills are unknown, and the next drill replaces the file; move it away to \
-             keep it",
-            path.display()
-        ),
+fn lock(file: &DrillsFile) -> MutexGuard<'_, Option<Target>> {
+    file.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The file once it may be written.
+fn path(file: &DrillsFile) -> Option<PathBuf> {
+    match &*lock(file) {
+        Some(Target::Read(path)) => Some(path.clone()),
+        Some(Target::Unread(_)) | None => None,
     }
 }
 
-/// Reads the drills saved in a file; `None` if the file does not exist.
-///
-/// # Errors
-/// If the file cannot be read, or is not a file of drills.
-pub fn load(path: &Path) -> Result<Option<SavedDrills>, String> {
-    let bytes = files::read(path, LONGEST)?;
-    bytes.map(|bytes| SavedDrills::from_json(&bytes)).transpose()
+/// Saves drills in this state directory from now on. Drills saved there earlier are taken over.
+pub(super) async fn keep_in(file: &DrillsFile, state_dir: Option<&Path>, patience: &Patience, drills: &Arc<Drills>) {
+    drills.keep(state_dir.is_some());
+    let Some(path) = state_dir.map(|dir| dir.join(DRILLS)) else {
+        *lock(file) = None;
+        return;
+    };
+    if let Some(Target::Unread(same) | Target::Read(same)) = &*lock(file)
+        && *same == path
+    {
+        return;
+    }
+    *lock(file) = Some(Target::Unread(path.clone()));
+    let reading = state_file::read::<SavedDrills>(path.clone());
+    let taken_up = {
+        let (file, drills, path) = (file.clone(), drills.clone(), path.clone());
+        async move {
+            // A thread that panicked has logged that, and the file stays unread.
+            let Ok(found) = reading.await else { return };
+            let mut target = lock(&file);
+            // A reload may have chosen another file meanwhile.
+            if matches!(&*target, Some(Target::Unread(awaited)) if *awaited == path) {
+                found.into_iter().for_each(|saved| drills.restore(saved));
+                *target = Some(Target::Read(path));
+            }
+        }
+    };
+    if patience.wait(taken_up).await.is_none() {
+        SavedDrills::WORDS.not_read(&path, &LATE);
+    }
 }
 
 /// Evaluates drills as long as the gateway runs, and keeps their file up to date.
 pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -> tokio::task::JoinHandle<()> {
     tokio::spawn(async move {
-        let mut writer = Writer::default();
+        let mut saved = StateFile::new(SavedDrills::WORDS);
         loop {
             // The end of the wait by time or by a signal is a reason to look.
             let _ = tokio::time::timeout(IDLE, drills.begun()).await;
             loop {
                 let goes_on = drills.advance(&plant.load(), Instant::now(), SystemTime::now());
-                writer.advance(&drills, &file).await;
-                if !goes_on && writer.writing.is_none() {
+                save(&mut saved, &drills, path(&file));
+                if !goes_on && !saved.is_writing() {
                     break;
                 }
                 tokio::time::sleep(LOOK).await;
@@ -79,58 +90,17 @@ pub(super) fn watch(plant: SharedPlant, drills: Arc<Drills>, file: DrillsFile) -
     })
 }
 
-type Writing = tokio::task::JoinHandle<(u64, Result<(), String>)>;
-
-/// Writes the file in parallel to the drill: a slow disk delays no stop.
-#[derive(Default)]
-struct Writer {
-    writing: Option<Writing>,
-    /// When a failed write is tried again.
-    again: Option<Instant>,
-}
-
-impl Writer {
-    /// Processes the result of a completed write, and starts the next one that is due.
-    async fn advance(&mut self, drills: &Drills, file: &DrillsFile) {
-        if let Some(writing) = self.writing.take_if(|writing| writing.is_finished()) {
-            match writing.await {
-                Ok((generation, Ok(()))) => {
-                    if self.again.take().is_some() {
-                        tracing::info!(target: "drivegate::daemon", "the drills are on disk again");
-                    }
-                    drills.kept(generation, Instant::now());
-                }
-                Ok((_, Err(why))) => self.failed(drills, &why),
-                Err(error) => self.failed(drills, &error.to_string()),
-            }
-        }
-        // If a drill is waiting for the write, it is repeated at once.
-        let waits = self.again.is_some_and(|again| Instant::now() < again) && !drills.waits_for_disk();
-        if self.writing.is_none() && !waits {
-            self.writing = begin_to_write(drills, file);
-        }
+/// Keeps the file up to date in parallel to the drill: a slow disk delays no stop.
+fn save(saved: &mut StateFile<(PathBuf, u64)>, drills: &Drills, path: Option<PathBuf>) {
+    let now = Instant::now();
+    match saved.ended(now) {
+        Some(Ok((_, generation))) => drills.kept(*generation, now),
+        Some(Err(why)) => drills.not_kept(&why, SystemTime::now()),
+        None => {}
     }
-
-    fn failed(&mut self, drills: &Drills, why: &str) {
-        if self.again.replace(Instant::now() + AGAIN).is_none() {
-            tracing::error!(
-                target: "drivegate::daemon",
-                "the drills cannot be written: {why}; no drill starts until they can; retrying every {} s; check the disk",
-                AGAIN.as_secs()
-            );
-        }
-        drills.not_kept(why, SystemTime::now());
+    if let Some((path, (generation, state))) = path.zip(drills.to_keep()) {
+        saved.keep((path, generation), now, move |(path, _)| state.save(path));
     }
-}
-
-fn begin_to_write(drills: &Drills, file: &DrillsFile) -> Option<Writing> {
-    let path = path(file)?;
-    let (generation, saved) = drills.to_keep()?;
-    let write = move || {
-        let text = serde_json::to_vec_pretty(&saved).map_err(|error| error.to_string())?;
-        files::replace(&path, &text).map_err(|error| format!("{}: {error}", path.display()))
-    };
-    Some(tokio::task::spawn_blocking(move || (generation, write())))
 }
 
 /// Ends a drill because the gateway or the bus of the drive ends; the drill stops its motor.

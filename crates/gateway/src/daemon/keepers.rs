@@ -5,13 +5,15 @@ use std::sync::Arc;
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
 use crate::config::Settings;
-use drivegate_core::files::Keeper;
+use drivegate_core::files::names::STARTS;
+use drivegate_core::files::{Keeper, State as _};
 use drivegate_core::history::{self, RecorderTask};
 use drivegate_core::order::AuditFile;
 use drivegate_core::parameters::Store;
-use drivegate_core::start_guard;
+use drivegate_core::start_guard::{self, Saved};
 use drivegate_north::parameter_jobs::{hold_unfinished, keep_reading};
 use drivegate_north::patience::late;
+use drivegate_north::state_file::LATE;
 
 impl Daemon {
     /// Starts the recorder, or replaces it if its configuration differs; the recordings of the replaced one are on
@@ -111,11 +113,7 @@ impl Daemon {
             Ok((keeper, read)) => {
                 self.starts = Some(keeper);
                 if self.north.patience.wait(read).await.is_none() {
-                    tracing::error!(
-                        target: "drivegate::daemon",
-                        "cannot read the starts of earlier runs in {}: {}; drives with a guard are not started until it answers; \
-                         check the disk of state_dir", settings.state_dir.display(), late()
-                    );
+                    Saved::WORDS.not_read(&settings.state_dir.join(STARTS), &LATE);
                 }
             }
             Err(error) => tracing::error!(

@@ -1,11 +1,10 @@
 //! The number of the session (bdSeq), which links the death of a node to its birth, kept over restarts in a file.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use drivegate_core::files::names::SPARKPLUG;
+use drivegate_core::files::{self, names::SPARKPLUG};
 use drivegate_north::patience::Patience;
 
 /// Longest wait for writing the file.
@@ -53,7 +52,7 @@ impl BdSeq {
             return (self.number, Ok(()));
         }
         let (path, number) = (self.path.clone(), self.number);
-        let work = tokio::task::spawn_blocking(move || write(&path, number));
+        let work = tokio::task::spawn_blocking(move || files::replace(&path, format!("{number}\n").as_bytes()));
         let written = match tokio::time::timeout(WRITE, work).await {
             Ok(Ok(written)) => written.map_err(|error| error.to_string()),
             _ => Err("the disk does not respond".to_string()),
@@ -71,17 +70,6 @@ impl BdSeq {
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
-}
-
-fn write(path: &Path, number: u8) -> io::Result<()> {
-    if let Some(dir) = path.parent() {
-        fs::create_dir_all(dir)?;
-    }
-    let new = path.with_extension("new");
-    let mut file = File::create(&new)?;
-    writeln!(file, "{number}")?;
-    file.sync_data()?;
-    fs::rename(&new, path)
 }
 
 #[cfg(test)]

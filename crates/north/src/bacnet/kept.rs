@@ -4,29 +4,23 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
-use futures_util::FutureExt as _;
 use serde::{Deserialize, Serialize};
-use tokio::task::JoinHandle;
 
 use super::rights::HostRights;
 use crate::NorthState;
 use crate::patience::DISK;
+use crate::state_file::StateFile;
 use drivegate_core::event::{Event, EventKind, Events};
-use drivegate_core::files;
+use drivegate_core::files::names::BACNET_PRIORITIES;
+use drivegate_core::files::{State, Words};
 use drivegate_core::order::{Commanded, Entry, Origin, SourceKind};
 use drivegate_core::permit::PROTECTING;
 use drivegate_core::plant::{BusHandle, Plant};
 use drivegate_core::process_image::{Access, Machine};
 use drivegate_model::drive::Value;
 
-/// The name of the file in `state_dir`.
-pub(super) const FILE: &str = "bacnet-priorities.json";
-/// Longest file that the gateway reads.
-const LONGEST: u64 = 4 << 20;
-/// Time between two tries to write the file.
-const AGAIN: Duration = Duration::from_secs(10);
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct KeptSlot {
     #[serde(flatten)]
@@ -36,7 +30,23 @@ pub(super) struct KeptSlot {
     client: String,
 }
 
-pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
+/// The slots on disk.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub(super) struct KeptSlots(pub(super) Vec<KeptSlot>);
+
+impl State for KeptSlots {
+    const WORDS: Words = Words {
+        what: "the BACnet priorities",
+        unread: "no motor is started",
+        unsaved: "slots do not survive a restart",
+        lost: "the slots from before the restart are lost; write them again",
+    };
+    const VERSION_KEY: &'static str = "drivegate_bacnet_priorities";
+    const LONGEST: u64 = 4 << 20;
+}
+
+pub(super) fn of_plant(plant: &Plant) -> KeptSlots {
     let mut all = Vec::new();
     for drive in plant
         .drives()
@@ -52,12 +62,18 @@ pub(super) fn of_plant(plant: &Plant) -> Vec<KeptSlot> {
             }));
         });
     }
-    all
+    KeptSlots(all)
 }
 
 /// Restores the saved entries into their slots. An entry is void if its client may no longer write, or its drive no
 /// longer exists.
-pub(super) fn restore(plant: &Plant, rights: &HostRights, slots: &[KeptSlot], now: Instant, time: SystemTime) {
+pub(super) fn restore(
+    plant: &Plant,
+    rights: &HostRights,
+    KeptSlots(slots): &KeptSlots,
+    now: Instant,
+    time: SystemTime,
+) {
     for slot in slots.iter().filter(|slot| (1..=PROTECTING).contains(&slot.priority)) {
         let Some(drive) = plant.drive_at(&slot.machine) else {
             plant.events.publish(slot.void(time));
@@ -92,51 +108,34 @@ impl KeptSlot {
     }
 }
 
-/// Reads the file with the kept slots; a missing file holds no slots.
-///
-/// # Errors
-/// If the file cannot be read, or is not a list of slots.
-pub(super) fn load(path: &Path) -> Result<Vec<KeptSlot>, String> {
-    match files::read(path, LONGEST)? {
-        Some(text) => serde_json::from_slice(&text).map_err(|error| error.to_string()),
-        None => Ok(Vec::new()),
-    }
-}
-
-/// Writes the file of saved slots.
-///
-/// # Errors
-/// If the file cannot be written.
-fn save(path: &Path, slots: &[KeptSlot]) -> Result<(), String> {
-    let text = serde_json::to_vec_pretty(slots).map_err(|error| error.to_string())?;
-    files::replace(path, &text).map_err(|error| error.to_string())
-}
-
 fn remove(path: &Path) -> Result<(), String> {
     match std::fs::remove_file(path) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error.to_string()),
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(format!("cannot remove {}: {error}", path.display()))
+        }
         _ => Ok(()),
     }
 }
 
 /// Notes that a server is about to load the slots of an earlier run: until then no motor is started.
 pub fn expect(stats: &NorthState, state_dir: &Path) {
-    stats.awaited.slots.begin(state_dir.join(FILE));
+    stats.awaited.slots.begin(state_dir.join(BACNET_PRIORITIES));
 }
 
 /// Discards the slots of an earlier run, at the start of a gateway that does not save slots. No later configuration
 /// revives them.
 pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
     stats.kept_slots_read.store(true, Ordering::Relaxed);
-    let (path, events) = (state_dir.join(FILE), events.clone());
+    let (path, events) = (state_dir.join(BACNET_PRIORITIES), events.clone());
     let discard = move || {
-        for slot in load(&path).unwrap_or_default() {
+        let kept = KeptSlots::load(&path).ok().flatten();
+        for slot in kept.into_iter().flat_map(|KeptSlots(slots)| slots) {
             events.publish(slot.void(SystemTime::now()));
         }
         if let Err(why) = remove(&path) {
             tracing::error!(
                 target: "drivegate::bacnet",
-                "cannot remove {}: {why}; remove it, or its slots come back with keep_priorities", path.display()
+                "{why}; remove it, or its slots come back with keep_priorities"
             );
         }
     };
@@ -144,93 +143,45 @@ pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
     let _ = stats.patience.read(discard).await;
 }
 
-/// Path of the file for saved slots, and the slots in it.
-type Kept = (PathBuf, Vec<KeptSlot>);
+/// The file of saved slots; the mark is its path with the slots in it, `None` if there is no file.
+pub(super) type KeptFile = StateFile<Option<(PathBuf, KeptSlots)>>;
 
-/// The file of saved slots, kept up to date by a server with one write after the other.
-#[derive(Debug, Default)]
-pub(super) struct KeptFile {
-    /// Slots known to be on disk, with the path of their file.
-    written: Option<Kept>,
-    writing: Option<JoinHandle<Result<Option<Kept>, String>>>,
-    /// When a failed write is tried again.
-    again: Option<Instant>,
+/// Writes the slots to `path` if they are not on disk yet; without `path`, removes the saved ones.
+pub(super) fn keep(file: &mut KeptFile, path: Option<PathBuf>, plant: &Plant, now: Instant) {
+    // The file has logged a failure.
+    let _ = file.ended(now);
+    let before = file.written().as_ref().map(|(path, _)| path.clone());
+    let outdated = before.filter(|before| Some(before) != path.as_ref());
+    let wanted = path.map(|path| (path, of_plant(plant)));
+    file.keep(wanted, now, move |wanted| {
+        outdated.as_deref().map_or(Ok(()), remove)?;
+        wanted.as_ref().map_or(Ok(()), |(path, slots)| slots.save(path))
+    });
 }
 
-impl KeptFile {
-    /// Notes that the file was read.
-    pub(super) fn read(&mut self, path: PathBuf, slots: Vec<KeptSlot>) {
-        self.written = Some((path, slots));
-    }
-
-    /// Writes these slots to `path` if they are not on disk yet; without `path`, removes the saved ones.
-    pub(super) fn keep(&mut self, path: Option<PathBuf>, plant: &Plant, now: Instant) {
-        if let Some(done) = self.writing.take_if(|writing| writing.is_finished()) {
-            match done.now_or_never() {
-                Some(Ok(Ok(written))) => (self.written, self.again) = (written, None),
-                Some(Ok(Err(why))) => self.failed(&why, now),
-                // A thread that panicked has logged that.
-                _ => self.again = Some(now + AGAIN),
-            }
-        }
-        if self.writing.is_some() || self.again.is_some_and(|again| now < again) {
-            return;
-        }
-        let wanted = path.map(|path| (path, of_plant(plant)));
-        if wanted == self.written {
-            return;
-        }
-        let before = self.written.as_ref().map(|(path, _)| path.clone());
-        self.writing = Some(tokio::task::spawn_blocking(move || {
-            let path = wanted.as_ref().map(|(path, _)| path);
-            if let Some(outdated) = before.as_ref().filter(|before| Some(*before) != path) {
-                remove(outdated)?;
-            }
-            if let Some((path, slots)) = &wanted {
-                save(path, slots)?;
-            }
-            Ok(wanted)
-        }));
-    }
-
-    fn failed(&mut self, why: &str, now: Instant) {
-        if self.again.replace(now + AGAIN).is_none() {
-            tracing::error!(
-                target: "drivegate::bacnet",
-                "cannot keep {FILE} up to date: {why}; slots may not survive a restart; retrying every {} s",
-                AGAIN.as_secs()
-            );
-        }
-    }
-
-    /// Writes the slots a last time and waits for it, within the time limit for the disk.
-    pub(super) async fn finish(&mut self, path: Option<PathBuf>, plant: &Plant) {
-        let until = tokio::time::Instant::now() + DISK;
-        loop {
-            if let Some(writing) = self.writing.take() {
-                match tokio::time::timeout_at(until, writing).await {
-                    Ok(Ok(Ok(written))) => self.written = written,
-                    _ => return,
-                }
-            }
-            self.again = None;
-            self.keep(path.clone(), plant, Instant::now());
-            if self.writing.is_none() {
-                return;
-            }
-        }
+/// Writes the slots a last time and waits for it, within the time limit for the disk.
+pub(super) async fn finish(file: &mut KeptFile, path: Option<PathBuf>, plant: &Plant) {
+    let until = tokio::time::Instant::now() + DISK;
+    if file.settled(until).await {
+        keep(file, path, plant, Instant::now());
+        file.settled(until).await;
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use drivegate_core::files::PARTIAL;
+    use drivegate_core::files::state::AGAIN;
+
     use super::*;
 
     #[test]
     fn what_is_saved_is_loaded_and_what_is_broken_is_told() {
         let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join(FILE);
-        assert_eq!(load(&file), Ok(Vec::new()));
+        let file = folder.path().join(BACNET_PRIORITIES);
+        assert_eq!(KeptSlots::load(&file).unwrap(), None);
         let slot = KeptSlot {
             machine: Machine {
                 port: "/dev/ttyUSB0".to_string(),
@@ -241,38 +192,46 @@ mod tests {
             who: "10.0.0.5:47808".to_string(),
             client: "bacnet 10.0.0.5".to_string(),
         };
-        save(&file, std::slice::from_ref(&slot)).unwrap();
-        assert_eq!(load(&file), Ok(vec![slot]));
+        let slots = KeptSlots(vec![slot]);
+        slots.save(&file).unwrap();
+        assert_eq!(KeptSlots::load(&file).unwrap(), Some(slots));
         std::fs::write(&file, "[{").unwrap();
-        assert!(load(&file).is_err());
+        assert!(KeptSlots::load(&file).is_err());
     }
 
     /// Waits until the write in progress has ended.
-    async fn until_ended(kept: &mut KeptFile, path: &Path, plant: &Plant, now: Instant) {
-        while kept.writing.is_some() {
+    async fn until_ended(kept: &mut KeptFile, path: Option<&PathBuf>, plant: &Plant, now: Instant) {
+        while kept.is_writing() {
             tokio::time::sleep(Duration::from_millis(1)).await;
-            kept.keep(Some(path.to_path_buf()), plant, now);
+            keep(kept, path.cloned(), plant, now);
         }
     }
 
     #[tokio::test]
     async fn what_a_full_disk_refused_is_written_when_there_is_room_unasked() {
         let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join(FILE);
+        let file = folder.path().join(BACNET_PRIORITIES);
         // A folder of this name prevents the file from being created.
-        let aside = file.with_extension(files::PARTIAL);
+        let aside = file.with_extension(PARTIAL);
         std::fs::create_dir(&aside).unwrap();
         let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
-        let (mut kept, start) = (KeptFile::default(), Instant::now());
-        kept.keep(Some(file.clone()), &plant, start);
-        until_ended(&mut kept, &file, &plant, start).await;
-        assert!(kept.again.is_some() && !file.exists());
+        let (mut kept, start) = (KeptFile::new(KeptSlots::WORDS), Instant::now());
+        keep(&mut kept, Some(file.clone()), &plant, start);
+        until_ended(&mut kept, Some(&file), &plant, start).await;
+        assert!(!file.exists());
         std::fs::remove_dir(&aside).unwrap();
-        kept.keep(Some(file.clone()), &plant, start + AGAIN / 2);
-        assert!(kept.writing.is_none(), "too early");
-        kept.keep(Some(file.clone()), &plant, start + AGAIN);
-        until_ended(&mut kept, &file, &plant, start + AGAIN).await;
-        assert_eq!(load(&file), Ok(Vec::new()));
-        assert!(file.exists() && kept.again.is_none());
+        keep(&mut kept, Some(file.clone()), &plant, start + AGAIN / 2);
+        assert!(!kept.is_writing(), "too early");
+        keep(&mut kept, Some(file.clone()), &plant, start + AGAIN);
+        until_ended(&mut kept, Some(&file), &plant, start + AGAIN).await;
+        assert_eq!(KeptSlots::load(&file).unwrap(), Some(KeptSlots::default()));
+        // The slots move with the state directory, and go with `keep_priorities`.
+        let elsewhere = folder.path().join("elsewhere").join(BACNET_PRIORITIES);
+        keep(&mut kept, Some(elsewhere.clone()), &plant, start);
+        until_ended(&mut kept, Some(&elsewhere), &plant, start).await;
+        assert!(elsewhere.exists() && !file.exists());
+        keep(&mut kept, None, &plant, start);
+        until_ended(&mut kept, None, &plant, start).await;
+        assert!(!elsewhere.exists());
     }
 }

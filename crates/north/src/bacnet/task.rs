@@ -14,23 +14,23 @@ use drivegate_bacnet::To;
 use futures_util::stream::FuturesUnordered;
 use futures_util::{FutureExt as _, StreamExt as _};
 use tokio::net::UdpSocket;
-use tokio::sync::oneshot::error::TryRecvError;
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval};
 use tokio_util::sync::CancellationToken;
 
 use super::desk::{Desk, Ended};
-use super::kept::{self, KeptFile, KeptSlot};
+use super::kept::{self, KeptFile, KeptSlots};
 use super::rights::HostRights;
 use super::sockets::Sockets;
 use super::writes::Waiting;
 use super::{NorthState, Options};
-use crate::patience;
 use crate::reading::{Reader, is_readable};
+use crate::state_file::{self, LATE};
 use crate::stats::BacnetFigures;
 use drivegate_core::event::{Event, EventKind};
-use drivegate_core::files;
+use drivegate_core::files::State as _;
+use drivegate_core::files::names::BACNET_PRIORITIES;
 use drivegate_core::order::Commanded;
 use drivegate_core::plant::SharedPlant;
 use drivegate_core::process_image::Snapshot;
@@ -59,7 +59,7 @@ pub(super) enum ToTask {
 type Ending = Pin<Box<dyn Future<Output = Ended> + Send>>;
 
 /// The slots from before the start, once their file is read.
-type SlotsRead = oneshot::Receiver<Result<Vec<KeptSlot>, String>>;
+type SlotsRead = oneshot::Receiver<KeptSlots>;
 
 pub(super) struct Task {
     options: Arc<Options>,
@@ -105,7 +105,7 @@ impl Task {
             writes: FuturesUnordered::new(),
             news: Arc::default(),
             seen: HashMap::new(),
-            kept: KeptFile::default(),
+            kept: KeptFile::new(KeptSlots::WORDS),
             reading: None,
             watched: BTreeSet::new(),
             resolved: None,
@@ -154,7 +154,7 @@ impl Task {
             Some(_) => self.stats.awaited.slots.end(),
             None => {
                 let (path, plant) = (self.keep_file(), self.desk.newest_plant());
-                self.kept.finish(path, &plant).await;
+                kept::finish(&mut self.kept, path, &plant).await;
             }
         }
         self.stats.bacnet.set(None);
@@ -234,7 +234,7 @@ impl Task {
         self.take_up_kept();
         if self.reading.is_none() {
             let path = self.keep_file();
-            self.kept.keep(path, &self.desk.view.plant, now);
+            kept::keep(&mut self.kept, path, &self.desk.view.plant, now);
         }
     }
 
@@ -274,7 +274,7 @@ impl Task {
     /// file useless.
     fn keep_file(&self) -> Option<std::path::PathBuf> {
         let keeps = self.options.keep_priorities && self.desk.view.rights.are_there();
-        keeps.then(|| self.options.state_dir.join(kept::FILE))
+        keeps.then(|| self.options.state_dir.join(BACNET_PRIORITIES))
     }
 
     /// Loads the slots saved before the start; a disk that hangs is not waited for. A server that a reload starts
@@ -287,23 +287,14 @@ impl Task {
         if self.stats.kept_slots_read.swap(true, Ordering::Relaxed) {
             return;
         }
-        let (found, reading) = oneshot::channel();
-        let load = {
-            let path = path.clone();
-            // A server that has ended takes nothing up any more.
-            move || drop(found.send(kept::load(&path)))
+        let (taken, reading) = oneshot::channel();
+        let found = state_file::read::<KeptSlots>(path.clone());
+        let read = async move {
+            // A thread that panicked has logged that, and the file stays unread. A server that has ended takes nothing up.
+            let _ = found.await.map(|found| taken.send(found.unwrap_or_default()));
         };
-        if self
-            .stats
-            .patience
-            .wait(tokio::task::spawn_blocking(load))
-            .await
-            .is_none()
-        {
-            tracing::error!(
-                target: "drivegate::bacnet",
-                "cannot read {}: {}; no motor is started until it is read; check the disk", path.display(), patience::late()
-            );
+        if self.stats.patience.wait(read).await.is_none() {
+            KeptSlots::WORDS.not_read(&path, &LATE);
         }
         self.reading = Some((path, reading));
         self.take_up_kept();
@@ -311,34 +302,20 @@ impl Task {
 
     /// Restores the slots from before the start once their file is read.
     fn take_up_kept(&mut self) {
-        let found = match self.reading.as_mut().map(|(_, reading)| reading.try_recv()) {
-            None | Some(Err(TryRecvError::Empty)) => return,
-            Some(Ok(found)) => found,
-            Some(Err(TryRecvError::Closed)) => Err("the thread that reads it has panicked".to_string()),
+        let Some(slots) = self.reading.as_mut().and_then(|(_, reading)| reading.try_recv().ok()) else {
+            return;
         };
         let Some((path, _)) = self.reading.take() else { return };
-        match found {
-            Ok(slots) => {
-                if self.keep_file().is_some() {
-                    let view = &self.desk.view;
-                    kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
-                }
-                self.kept.read(path, slots);
-                let protected = |device: &u32| {
-                    let drive = self.desk.view.drives.get(device);
-                    drive.is_some_and(|drive| drive.handle.priorities(|all| all.kept().next().is_some()))
-                };
-                self.watched = self.desk.view.drives.keys().copied().filter(protected).collect();
-            }
-            Err(why) => {
-                let aside = files::set_aside(&path, &path.with_extension("damaged"));
-                tracing::error!(
-                    target: "drivegate::bacnet",
-                    "cannot read {}: {why}; the slots from before the restart are lost, write them again; {aside}",
-                    path.display()
-                );
-            }
+        let view = &self.desk.view;
+        if self.keep_file().is_some() {
+            kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
         }
+        self.kept.holds(Some((path, slots)));
+        let protected = |device: &u32| {
+            let drive = view.drives.get(device);
+            drive.is_some_and(|drive| drive.handle.priorities(|all| all.kept().next().is_some()))
+        };
+        self.watched = view.drives.keys().copied().filter(protected).collect();
         self.stats.awaited.slots.end();
     }
 

@@ -1,3 +1,5 @@
+use std::io::ErrorKind;
+
 use super::*;
 use crate::event::{EventKind, Search};
 
@@ -217,6 +219,29 @@ fn counters_that_cannot_be_read_are_kept_aside_and_never_cut() {
         drop(run);
         assert_eq!(Run::new(dir.path()).history.all_totals(), totals(1, 1.0));
     }
+}
+
+#[test]
+fn counters_that_the_disk_does_not_return_stay_and_cost_no_event() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join(COUNTERS);
+    // A folder of this name cannot be read as a file.
+    fs::create_dir(&path).unwrap();
+    let mut run = Run::new(dir.path());
+    run.history.count_on(totals(1, 2.0));
+    run.publish(0..3);
+    let why = run.work().unwrap_err().to_string();
+    assert!(why.contains("cannot read") && why.contains(COUNTERS), "{why}");
+    assert_eq!(fs::read_to_string(dir.path().join(EVENTS)).unwrap().lines().count(), 3);
+    assert!(path.is_dir(), "it is neither replaced nor renamed");
+    fs::remove_dir(&path).unwrap();
+    fs::write(
+        &path,
+        r#"{"drives": {"pump-1": {"starts": 3, "running_seconds": 10.0}}}"#,
+    )
+    .unwrap();
+    run.work().unwrap();
+    assert_eq!(run.history.all_totals()["pump-1"].starts, 4);
 }
 
 #[tokio::test]

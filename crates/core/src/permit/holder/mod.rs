@@ -13,7 +13,7 @@ mod saved_reservation;
 pub use denial::Denial;
 pub use holding::{HoldChange, HoldState, HoldView, Holding, Verb, What};
 pub use principal::{Claim, Mode, Principal, Rules};
-pub use saved_reservation::KeptReservation;
+pub use saved_reservation::{KeptReservation, KeptReservations};
 
 #[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::{Deserialize, Serialize};
 
 use super::{Claim, Rules};
+use crate::files::{State, Words};
 use crate::process_image::Machine;
 
 /// A reservation as it is saved on disk.
@@ -21,6 +22,22 @@ pub struct KeptReservation {
     pub stopped_ms: u64,
     /// Duration of the reservation, ms.
     pub lease_ms: u64,
+}
+
+/// The reservations on disk.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct KeptReservations(pub Vec<KeptReservation>);
+
+impl State for KeptReservations {
+    const WORDS: Words = Words {
+        what: "the reservations after stops",
+        unread: "no motor is started",
+        unsaved: "they end with the process",
+        lost: "drives stopped just before the restart are no longer reserved",
+    };
+    const VERSION_KEY: &'static str = "drivegate_reservations";
+    const LONGEST: u64 = 1 << 20;
 }
 
 /// Milliseconds of the clock of the day.
