@@ -155,10 +155,9 @@ impl TcpService<Options> for HttpService {
         listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
                 Some(handler) => handler.clone(),
-                None => {
-                    let tokens = (cancel, stopping);
-                    Arc::new(HttpConnections::new(&options, plant, stats, terms, operating, tokens))
-                }
+                None => Arc::new(HttpConnections::new(
+                    &options, plant, stats, terms, operating, cancel, stopping,
+                )),
             };
             handler.limit.set_limits(options.limits());
             (handler, Handle::current())
@@ -200,7 +199,8 @@ impl HttpConnections {
         stats: &Arc<NorthState>,
         terms: &Arc<ArcSwap<Terms>>,
         operating: &Arc<Operating>,
-        (cancel, stopping): (&CancellationToken, &CancellationToken),
+        cancel: &CancellationToken,
+        stopping: &CancellationToken,
     ) -> HttpConnections {
         HttpConnections {
             router: routes::router(plant.clone(), stats.clone(), operating.clone(), cancel.clone()),

@@ -25,7 +25,7 @@ use super::home_assistant::{Announcer, Sources};
 use super::link::BrokerLink;
 use super::outbox::{Delivery, Key, Message, Outbox, Settled};
 use super::payload;
-use super::publisher::{Publisher, Update};
+use super::publisher::{PublishInterval, Publisher, Update};
 use super::reply::ResponseTopics;
 use super::request::Incoming;
 use super::retry::Retry;
@@ -61,14 +61,16 @@ fn seconds(expiry: Duration) -> u32 {
 
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
-    options: (Options, Right, ClientLeft<OrdersLeft>),
+    options: Options,
+    right: Right,
+    left: ClientLeft<OrdersLeft>,
     plant: SharedPlant,
     stats: Arc<NorthState>,
     events: Receiver<Arc<Event>>,
     cancel: CancellationToken,
 ) {
     stats.mqtt.configured.store(true, Ordering::Relaxed);
-    let mut client = PlainClient::new(options, plant, stats, events);
+    let mut client = PlainClient::new(options, right, left, plant, stats, events);
     session::run(&mut client, cancel).await;
     client.shut_down().await;
 }
@@ -105,7 +107,9 @@ struct PlainClient {
 
 impl PlainClient {
     fn new(
-        (options, right, left): (Options, Right, ClientLeft<OrdersLeft>),
+        options: Options,
+        right: Right,
+        left: ClientLeft<OrdersLeft>,
         plant: SharedPlant,
         stats: Arc<NorthState>,
         events: Receiver<Arc<Event>>,
@@ -114,7 +118,8 @@ impl PlainClient {
         let link = BrokerLink::new(
             options.clone(),
             options.client_id.clone(),
-            ("", stats.mqtt.plain.clone()),
+            "",
+            stats.mqtt.plain.clone(),
             broker.as_ref(),
         );
         let common = Common::new(link, plant, stats);
@@ -124,8 +129,11 @@ impl PlainClient {
         let most = options.message_expiry.map_or(options.max_interval, |expiry| {
             options.max_interval.min(expiry / RENEWED)
         });
-        let intervals = (options.min_interval, most);
-        let mut publisher = Publisher::new(topics.clone(), intervals, options.telemetry, common.fresh.clone());
+        let pace = PublishInterval {
+            min: options.min_interval,
+            max: most,
+        };
+        let mut publisher = Publisher::new(topics.clone(), pace, options.telemetry, common.fresh.clone());
         let mut announcer = announcer(&options, &topics);
         publisher.adopt(observed, discovery_topics(announcer.as_mut(), observed));
         let rules = Rules {
@@ -155,8 +163,8 @@ impl PlainClient {
             orders,
         );
         let mut client = PlainClient {
-            store: Store::open(events_buffer, MQTT_EVENTS, (stats, MqttKind::Event)),
-            history: Store::open(history_buffer, MQTT_HISTORY, (stats, MqttKind::History)),
+            store: Store::open(events_buffer, MQTT_EVENTS, stats, MqttKind::Event),
+            history: Store::open(history_buffer, MQTT_HISTORY, stats, MqttKind::History),
             history_at: now,
             commands,
             outbox: Outbox::new(delivery),
@@ -324,7 +332,8 @@ impl session::Client for PlainClient {
         let plant = (!limits.wildcards).then_some(self.common.observed.as_ref());
         self.subscriptions = subscriptions(
             &self.topics,
-            (self.options.commands, self.options.principals.as_deref()),
+            self.options.commands,
+            self.options.principals.as_deref(),
             self.announcer.as_ref(),
             self.leftovers_known,
             plant,

@@ -193,7 +193,7 @@ impl Commands {
             }
         }
         let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
-        let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
+        let placed = match asked.place(&drive, &what, origin, arrival, now) {
             Ok(placed) => placed,
             Err(answer) => return refused(&answer, id),
         };

@@ -203,7 +203,7 @@ impl Connection {
         tls: Option<Arc<ClientConfig>>,
         (dial, first): (Dial, usize),
     ) -> Connection {
-        let mut mqtt = mqtt_options(options, (broker, client_id), will, tls);
+        let mut mqtt = mqtt_options(options, broker, client_id, will, tls);
         if let Some(user) = &options.username {
             let password = password.map(|password| password.0).unwrap_or_default();
             mqtt.set_credentials(user, password);
@@ -418,7 +418,8 @@ pub(super) fn packet_size(message: &Message) -> usize {
 
 fn mqtt_options(
     options: &Options,
-    (broker, client_id): (&Broker, &str),
+    broker: &Broker,
+    client_id: &str,
     will: LastWill,
     tls: Option<Arc<ClientConfig>>,
 ) -> MqttOptions {

@@ -275,7 +275,9 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthState>, c
         ))
     });
     let client = tokio::spawn(client::run(
-        (options, topics, of_client),
+        options,
+        topics,
+        of_client,
         plant,
         stats.clone(),
         events,

@@ -89,7 +89,8 @@ impl BrokerLink {
     pub(super) fn new(
         options: Options,
         client_id: String,
-        (prefix, status): (&'static str, Arc<LinkStatus>),
+        prefix: &'static str,
+        status: Arc<LinkStatus>,
         kept: Option<&Broker>,
     ) -> BrokerLink {
         let brokers = &options.brokers;

@@ -55,9 +55,9 @@ pub(super) struct Publisher {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct PublishInterval {
-    min: Duration,
-    max: Duration,
+pub(super) struct PublishInterval {
+    pub(super) min: Duration,
+    pub(super) max: Duration,
 }
 
 impl PublishInterval {
@@ -113,16 +113,11 @@ struct BusTopic {
 }
 
 impl Publisher {
-    /// `min` and `max` as configured; `fresh` is woken when a drive was updated.
-    pub(super) fn new(
-        topics: Topics,
-        (min, max): (Duration, Duration),
-        telemetry: Telemetry,
-        fresh: Arc<Notify>,
-    ) -> Publisher {
+    /// `pace` as configured; `fresh` is woken when a drive was updated.
+    pub(super) fn new(topics: Topics, pace: PublishInterval, telemetry: Telemetry, fresh: Arc<Notify>) -> Publisher {
         Publisher {
             topics,
-            pace: PublishInterval { min, max },
+            pace,
             telemetry,
             fresh,
             drives: Vec::new(),
@@ -256,8 +251,8 @@ impl Publisher {
                 return;
             }
             let shown = drive.shown(&reading);
-            let points = (drive.names.as_slice(), drive.indices.as_slice(), drive.fits);
-            let render = |shown: &StateContent| render(points, &reading, shown, wall, true);
+            let (names, indices, fits) = (&drive.names, &drive.indices, drive.fits);
+            let render = |shown: &StateContent| render(names, indices, fits, &reading, shown, wall, true);
             drive.recorder.limit(most);
             let wait = drive.recorder.record(mode, pace.min, shown, fresh, render, now);
             drive.seen = Some(reading.snapshot);
@@ -373,8 +368,7 @@ impl DriveTopics {
     ) -> Option<Vec<u8>> {
         let room = most.saturating_sub(self.state.as_ref().map_or(0, |topic| topic.len()) + PACKET_OVERHEAD);
         loop {
-            let points = (self.names.as_slice(), self.indices.as_slice(), self.fits);
-            let payload = render(points, reading, shown, wall, false)?;
+            let payload = render(&self.names, &self.indices, self.fits, reading, shown, wall, false)?;
             if payload.len() <= room || self.fits == 0 {
                 return Some(payload);
             }
@@ -423,7 +417,9 @@ impl DriveTopics {
 
 /// The state object with the first `fits` points.
 fn render(
-    (names, indices, fits): (&[String], &[PointIndex], usize),
+    names: &[String],
+    indices: &[PointIndex],
+    fits: usize,
     reading: &Reading<'_>,
     shown: &StateContent,
     wall: SystemTime,

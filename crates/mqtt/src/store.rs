@@ -111,11 +111,7 @@ impl Shared {
 impl Store {
     /// Opens the buffer with this name for messages of this kind, without waiting for it; without a buffer,
     /// messages are not kept. If the buffer cannot be used, that is logged and messages wait in memory.
-    pub(super) fn open(
-        buffer: Option<Buffer>,
-        name: &'static str,
-        (stats, kind): (&Arc<NorthState>, MqttKind),
-    ) -> Store {
+    pub(super) fn open(buffer: Option<Buffer>, name: &'static str, stats: &Arc<NorthState>, kind: MqttKind) -> Store {
         let Some(buffer) = buffer else {
             return Store::default();
         };

@@ -64,7 +64,8 @@ impl Daemon {
     pub(super) async fn hold_unfinished(&self, settings: &Settings) {
         hold_unfinished(
             &self.north.parameters,
-            (&self.events, &self.north.patience),
+            &self.events,
+            &self.north.patience,
             settings.drives(),
         )
         .await;

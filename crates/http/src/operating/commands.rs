@@ -231,7 +231,7 @@ impl Operating {
         let Some(drive) = plant.drive(name) else {
             if let Some(former) = plant.drive_formerly(&DriveKey::Name(name.to_string()), arrival.asked)
                 && let Ok(asked) = command_json::order(payload, &former.image.spec.profile)
-                && let Some(placed) = asked.place_at_former(&former, &what, origin.clone(), (arrival, now))
+                && let Some(placed) = asked.place_at_former(&former, &what, origin.clone(), arrival, now)
             {
                 return Progress::Placed(Box::new(Waiting {
                     placed,
@@ -262,7 +262,7 @@ impl Operating {
                 Err(SkippedCommand::Refused(why)) => asked.refused = Some(Refusal::NotAllowed(why)),
             }
         }
-        let placed = match asked.place(&drive, &what, origin, (arrival, now)) {
+        let placed = match asked.place(&drive, &what, origin, arrival, now) {
             Ok(placed) => placed,
             Err(answer) => return reply(&answer),
         };

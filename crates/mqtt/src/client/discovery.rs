@@ -40,7 +40,8 @@ pub(super) fn discovery_topics(announcer: Option<&mut Announcer>, plant: &Plant)
 /// Subscriptions of a connection; `plant` if the broker takes no wildcards.
 pub(super) fn subscriptions(
     topics: &Topics,
-    (commands, principals): (bool, Option<&[String]>),
+    commands: bool,
+    principals: Option<&[String]>,
     announcer: Option<&Announcer>,
     leftovers_known: bool,
     plant: Option<&Plant>,

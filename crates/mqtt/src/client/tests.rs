@@ -51,7 +51,9 @@ async fn client_with(options: Options) -> PlainClient {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
     PlainClient::new(
-        (options, Right::lasting(), ClientLeft::default()),
+        options,
+        Right::lasting(),
+        ClientLeft::default(),
         plant,
         Arc::default(),
         events,

@@ -22,8 +22,11 @@ impl PublishedPlant {
             points: true,
             history: History::All,
         };
-        let intervals = (Duration::from_millis(100), Duration::from_secs(60));
-        let mut publisher = Publisher::new(topics, intervals, telemetry, Arc::default());
+        let pace = PublishInterval {
+            min: Duration::from_millis(100),
+            max: Duration::from_secs(60),
+        };
+        let mut publisher = Publisher::new(topics, pace, telemetry, Arc::default());
         publisher.adopt(&plant, Vec::new());
         let bench = PublishedPlant {
             plant,

@@ -128,7 +128,8 @@ impl NodeClient {
         let link = BrokerLink::new(
             broker.clone(),
             client_id,
-            ("Sparkplug: ", stats.mqtt.sparkplug.clone()),
+            "Sparkplug: ",
+            stats.mqtt.sparkplug.clone(),
             left.broker.as_ref(),
         );
         let mut client = NodeClient {

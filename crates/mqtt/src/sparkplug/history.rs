@@ -20,7 +20,8 @@ impl Recorder {
         &mut self,
         before: &[Option<Sample>],
         now_is: &[Sample],
-        (least, most): (Duration, usize),
+        least: Duration,
+        most: usize,
         now: Instant,
     ) -> Option<u64> {
         let early = |at: Instant| now.saturating_duration_since(at) < least;
@@ -75,12 +76,12 @@ mod tests {
             quality: Quality::Good,
             time: number as u64,
         };
-        let bounds = (Duration::from_millis(50), 3);
+        let least = Duration::from_millis(50);
         let mut before = vec![None];
         let mut outcomes = Vec::new();
         for (ms, number) in [(0, 1.0), (10, 2.0), (50, 2.0), (100, 2.0), (150, 3.0), (200, 4.0)] {
             let now = [sample(number)];
-            let recorded = recorder.record(&before, &now, bounds, start + Duration::from_millis(ms));
+            let recorded = recorder.record(&before, &now, least, 3, start + Duration::from_millis(ms));
             if recorded.is_some() {
                 before = vec![Some(now[0].clone())];
             }

@@ -126,7 +126,7 @@ impl Orders {
         let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
         let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
         let profile = &drive.image.spec.profile;
-        let mut asked = match request.asked(profile, (session, place), expiry) {
+        let mut asked = match request.asked(profile, session, place, expiry) {
             Err(refusal) => return refused(&drive.refuse(&request.what(), refusal, origin, now)),
             Ok(asked) => asked,
         };
@@ -137,7 +137,7 @@ impl Orders {
             asked.refused = Some(Refusal::NotAllowed(why.to_string()));
         }
         let arrival = incoming.arrival.clone().unwrap_or_else(|| Arrival::now(now));
-        let mut placed = match asked.place(drive, &request.what(), origin, (arrival, now)) {
+        let mut placed = match asked.place(drive, &request.what(), origin, arrival, now) {
             Ok(placed) => placed,
             Err(answer) => return refused(&answer),
         };
@@ -257,7 +257,8 @@ impl Request {
     fn asked(
         &self,
         profile: &Profile,
-        (session, device): (&Session, usize),
+        session: &Session,
+        device: usize,
         expiry: Duration,
     ) -> Result<ParsedCommand, Refusal> {
         let alias = |metric| session.alias(device, metric);

@@ -243,8 +243,8 @@ impl Session {
         device.gone |= device.born && !present;
         // A device that was never present records nothing.
         if record && (present || device.sent.iter().any(Option::is_some)) {
-            let bounds = (self.rules.min_interval, (HISTORY / count).max(1));
-            if let Some(lost) = device.history.record(&device.sent, &samples, bounds, now) {
+            let (least, most) = (self.rules.min_interval, (HISTORY / count).max(1));
+            if let Some(lost) = device.history.record(&device.sent, &samples, least, most, now) {
                 self.lost += lost;
                 device.sent = samples.iter().cloned().map(Some).collect();
             }

@@ -99,7 +99,7 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
         dir: dir.path().to_path_buf(),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", &Arc::default(), MqttKind::Event);
     for n in 0..10 {
         store.push(event(n), false);
     }
@@ -112,7 +112,7 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
     store.remember(vec!["a/b".to_string(), "c".to_string()]);
     store.close().await;
 
-    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let mut store = Store::open(Some(buffer), "mqtt-events", &Arc::default(), MqttKind::Event);
     let report = store.next().await;
     let (_, topics) = store.take(report);
     assert_eq!(topics, ["a/b", "c"]);
@@ -133,7 +133,7 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
         dir: "/proc/drivegate".into(),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let mut store = Store::open(Some(buffer), "mqtt-events", &Arc::default(), MqttKind::Event);
     store.push(event(0), true);
     let report = store.next().await;
     store.take(report);
@@ -161,7 +161,7 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
         max_bytes: 64 << 10,
     };
     let counted = Arc::<NorthState>::default();
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&counted, MqttKind::Event));
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", &counted, MqttKind::Event);
     let report = store.next().await;
     store.take(report);
     let mut outbox = Outbox::new(Delivery {
@@ -185,7 +185,7 @@ async fn of_a_full_buffer_each_message_waits_or_is_counted_over_a_restart() {
     store.close().await;
 
     let counted = Arc::<NorthState>::default();
-    let mut store = Store::open(Some(buffer), "mqtt-events", (&counted, MqttKind::Event));
+    let mut store = Store::open(Some(buffer), "mqtt-events", &counted, MqttKind::Event);
     let report = store.next().await;
     store.take(report);
     assert_eq!(store.waiting(), waiting);
@@ -207,7 +207,7 @@ async fn deleted_files_and_topics_are_written_again() {
         dir: dir.path().join("buffer"),
         max_bytes: 1 << 20,
     };
-    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", &Arc::default(), MqttKind::Event);
     store.remember(vec!["a/b".to_string()]);
     (0..5).for_each(|n| drop(store.push(event(n), false)));
     let report = store.next().await;
@@ -216,7 +216,7 @@ async fn deleted_files_and_topics_are_written_again() {
     std::fs::remove_dir_all(&buffer.dir).unwrap();
     store.push(event(5), false);
     store.close().await;
-    let mut store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let mut store = Store::open(Some(buffer), "mqtt-events", &Arc::default(), MqttKind::Event);
     let report = store.next().await;
     let (_, topics) = store.take(report);
     assert_eq!((store.waiting(), topics), (6, vec!["a/b".to_string()]));
@@ -231,7 +231,7 @@ async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
     };
     let new = dir.path().join(format!("{MQTT_TOPICS}.new"));
     std::os::unix::fs::symlink("/dev/full", &new).unwrap();
-    let store = Store::open(Some(buffer), "mqtt-events", (&Arc::default(), MqttKind::Event));
+    let store = Store::open(Some(buffer), "mqtt-events", &Arc::default(), MqttKind::Event);
     store.remember(vec!["a/b".to_string()]);
     store.close().await;
     assert!(new.symlink_metadata().is_err(), "it would take the room of messages");

@@ -200,7 +200,8 @@ impl server::Server for Server {
         let rights = HostRights::new(&options);
         let task = Task::new(
             options.clone(),
-            (sockets, rights.clone()),
+            sockets,
+            rights.clone(),
             plant,
             stats.clone(),
             busy.clone(),

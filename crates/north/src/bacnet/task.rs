@@ -88,7 +88,8 @@ pub(super) struct Task {
 impl Task {
     pub(super) fn new(
         options: Options,
-        (sockets, rights): (Sockets, HostRights),
+        sockets: Sockets,
+        rights: HostRights,
         plant: SharedPlant,
         stats: Arc<NorthState>,
         busy: Arc<AtomicBool>,

@@ -77,7 +77,7 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
         }
         (Meaning::Reset(index), Some(Datum::Bool(true))) => order((index, Value::Bool(true)), origin, arrival),
         (Meaning::Reset(_), _) => JobProgress::Answered(Ok(())),
-        (Meaning::Slot(what, index), _) => slot(handle, (what, index), job, origin, (arrival, now)),
+        (Meaning::Slot(what, index), _) => slot(handle, what, index, job, origin, arrival, now),
         _ => JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
 }
@@ -117,10 +117,12 @@ fn described(job: &Job) -> String {
 /// Processes a write to a slot of the priority array and the order that results from it.
 fn slot(
     handle: &DriveHandle,
-    (what, index): (Commanded, PointIndex),
+    what: Commanded,
+    index: PointIndex,
     job: &Job,
     origin: Origin,
-    (arrival, now): (Arrival, Instant),
+    arrival: Arrival,
+    now: Instant,
 ) -> JobProgress {
     let priority = job.priority.unwrap_or(16);
     let value = job.value.as_ref().and_then(value_of);

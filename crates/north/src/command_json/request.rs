@@ -134,7 +134,8 @@ impl ParsedCommand {
         drive: &DriveHandle,
         what: &str,
         origin: Origin,
-        (arrival, now): (Arrival, Instant),
+        arrival: Arrival,
+        now: Instant,
     ) -> Result<Placed, Answer> {
         let (write, expiry) = (Authority::Write, self.expiry);
         let Some(refusal) = self.refused else {
@@ -157,7 +158,8 @@ impl ParsedCommand {
         former: &DriveHandle,
         what: &str,
         origin: Origin,
-        (arrival, now): (Arrival, Instant),
+        arrival: Arrival,
+        now: Instant,
     ) -> Option<Placed> {
         let stop = stop_of(&self.points, &former.image.spec.profile)?;
         let request = OrderRequest::new(Order::Points(stop), origin, Authority::Write).within(self.expiry);

@@ -76,7 +76,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     let known = known
         .map(|last| Reading::addresses_of(&spec.profile, last))
         .unwrap_or_default();
-    let result = read(&drive, origin, known, (how.pace, &names), |looks| {
+    let result = read(&drive, origin, known, how.pace, &names, |looks| {
         vault.update(&machine, |job| {
             job.waits = looks.waits;
             if job.waits.is_none() {
@@ -114,7 +114,8 @@ async fn read(
     drive: &DriveHandle,
     origin: Origin,
     known: BTreeSet<u16>,
-    (pace, names): (Pace, &Names),
+    pace: Pace,
+    names: &Names,
     mut seen: impl FnMut(ReadProgress),
 ) -> Result<ParameterFile, String> {
     let spec = &drive.image.spec;

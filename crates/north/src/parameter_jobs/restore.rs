@@ -81,7 +81,7 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
             (restore.progress, restore.waits) = (looks.progress, looks.waits);
         });
     };
-    let stage = match read(&drive, origin, known, (Pace::Brisk, &names), seen).await {
+    let stage = match read(&drive, origin, known, Pace::Brisk, &names, seen).await {
         Err(why) => RestoreStage::Failed(format!(
             "the parameters of `{name}` cannot be read: {why}; nothing was written"
         )),
@@ -166,7 +166,7 @@ pub fn carry_out(
     }
     let file = vault.journal(&spec.name).ok_or_else(no_store)?;
     let restoration = Restoration::begin(journal, Instant::now());
-    start(plant.clone(), vault.clone(), drive, (file, restoration), origin);
+    start(plant.clone(), vault.clone(), drive, file, restoration, origin);
     Ok(())
 }
 
@@ -217,7 +217,7 @@ pub async fn take_up(
         Again::Resume => Restoration::resume(journal, now),
         Again::Undo => Restoration::undo(journal, now),
     };
-    start(plant.clone(), vault.clone(), drive, (file, restoration), origin);
+    start(plant.clone(), vault.clone(), drive, file, restoration, origin);
     Ok(())
 }
 
@@ -321,7 +321,8 @@ fn start(
     plant: SharedPlant,
     vault: Arc<Vault>,
     drive: &DriveHandle,
-    (file, restoration): (JournalFile, Restoration),
+    file: JournalFile,
+    restoration: Restoration,
     origin: Origin,
 ) {
     let (spec, machine) = (&drive.image.spec, drive.machine());

@@ -190,7 +190,8 @@ struct Configured {
 /// however slow the disk is.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
-    (events, patience): (&Events, &Patience),
+    events: &Events,
+    patience: &Patience,
     drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,
 ) {
     let configured = |(bus, spec): (&BusSpec, &DriveSpec)| {

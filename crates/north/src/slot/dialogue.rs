@@ -201,7 +201,7 @@ impl Dialogue {
             ..
         } = held;
         self.asked = Some(now);
-        match self.tool.decide(&request, (arrival, stops), deadline, now) {
+        match self.tool.decide(&request, arrival, stops, deadline, now) {
             Decision::Refuse(why) => {
                 self.tool.count(SlotOutcome::Refused);
                 if !request.is_broadcast(self.tool.protocol()) {

@@ -51,7 +51,8 @@ impl SlotListener {
         number: usize,
         served: Option<Served>,
         refusals: Arc<Refusals>,
-        (cancel, stopping): (CancellationToken, CancellationToken),
+        cancel: CancellationToken,
+        stopping: CancellationToken,
     ) -> SlotListener {
         SlotListener {
             number,

@@ -257,7 +257,8 @@ impl TcpService<Options> for Slots {
                         *opened,
                         served,
                         refusals.clone(),
-                        (cancel.clone(), stopping.clone()),
+                        cancel.clone(),
+                        stopping.clone(),
                     ))
                 }
             };

@@ -180,7 +180,8 @@ impl Tool {
     pub(super) fn decide(
         &self,
         request: &ToolRequest,
-        (mut arrival, stops): (Arrival, u64),
+        mut arrival: Arrival,
+        stops: u64,
         deadline: Instant,
         now: Instant,
     ) -> Decision {
