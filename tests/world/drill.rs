@@ -567,8 +567,7 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         }
         let turned = turns(&mut play.rig);
         // The killed process leaves only its file.
-        let drive = play.rig.drive(1);
-        drive.bus.queue.set_drill(drive.index, None);
+        play.rig.killed();
         play.drills = Arc::default();
         play.drills.set_options(Some(OPTIONS));
         if let Some(saved) = disk.on_disk {
@@ -592,4 +591,45 @@ fn a_kill_at_any_moment_leaves_no_motor_running() {
         }
     }
     assert!(stopped >= 20, "{stopped} motors turned at the kill");
+}
+
+/// The disk returns the file of a drill that was cut off only after a client has started the motor: it runs on.
+#[test]
+fn a_drill_that_is_read_late_stops_no_motor_that_a_client_has_started_since() {
+    for starts in [false, true] {
+        // Without supervision, so that only the drill stops the drive.
+        let works = Line {
+            supervision: None,
+            ..works("vacon-nx", Protocol::ModbusRtu)
+        };
+        let mut play = Play::of(&works, 3);
+        let id = play.begin(&[Kind::Order], 10.0);
+        while !turns(&mut play.rig) {
+            play.rig.run(LOOK);
+            play.drills.advance(&play.rig.plant, play.rig.now, play.time());
+            play.rig.bus.command_came(play.rig.now);
+        }
+        let (_, saved) = play.drills.to_keep().unwrap();
+        play.rig.killed();
+        play.drills = Arc::default();
+        play.rig.until("it is read", PATIENCE, Rig::is_whole);
+        if starts {
+            let started = play.rig.set(1, &[("run", 1.0), ("speed_reference", 30.0)]);
+            assert!(started.is_ok(), "{started:?}");
+        }
+        play.drills.restore(saved);
+        for _ in 0..200 {
+            play.rig.run(LOOK);
+            play.drills.advance(&play.rig.plant, play.rig.now, play.time());
+            play.rig.bus.command_came(play.rig.now);
+        }
+        assert_eq!(turns(&mut play.rig), starts);
+        let report = play.drills.report(&id).unwrap();
+        assert!(report.state.is_over(), "{report:#?}");
+        assert_eq!(
+            report.text.contains("a client has started the motor since"),
+            starts,
+            "{report:#?}"
+        );
+    }
 }

@@ -8,6 +8,7 @@ use drivegate_core::event::Events;
 use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate_core::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
 use drivegate_core::process_image::{OnShutdown, Outcome as Counted};
+use drivegate_core::start_guard::Guards;
 use drivegate_model::drive::{ModelPoint, PollClass, Sample, State, Value};
 use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
 use drivegate_sim::SimTime;
@@ -167,6 +168,15 @@ impl Rig {
             self.bus.wire.cut();
         }
         self.bus.restart(0, &self.plant.events, &self.plant.writes, self.now);
+        self.plant.buses = vec![self.bus.handle.clone()];
+    }
+
+    /// The process is killed, and started again at once.
+    pub fn killed(&mut self) {
+        self.bus.vanish();
+        self.bus.open = true;
+        self.bus
+            .kill(Guards::default(), &self.plant.events, &self.plant.writes, self.now);
         self.plant.buses = vec![self.bus.handle.clone()];
     }
 

@@ -365,6 +365,8 @@ impl State {
         let why = match plant.drive_at(&report.machine()) {
             _ if !run::is_recent(&report, time) => "that was too long ago to stop the motor now",
             None => "the drive is no longer configured, so no stop was sent",
+            // The file of the drills was read late: the motor runs by the will of that client.
+            Some(drive) if drive.last_starter() != 0 => "a client has started the motor since, so no stop was sent",
             Some(drive) => {
                 self.run = Some(Run::cut_off(report, &drive, now));
                 return;
