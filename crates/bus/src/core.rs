@@ -152,6 +152,8 @@ impl BusCore {
         self.stood = true;
         self.master.after_stall(stall, now);
         self.report.after_stall(stall);
+        // The chosen frame may rest on what was read before the stall.
+        self.command_came();
         true
     }
 

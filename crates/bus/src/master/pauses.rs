@@ -8,7 +8,8 @@ use drivegate_core::stalls::Stall;
 
 impl Master {
     /// The thread did not run until `now`. Waiting commands are judged by that when they are chosen again. A command of
-    /// several steps that a pause interrupted is not continued, except for the end of a pulse.
+    /// several steps that a pause interrupted is not continued, except for the end of a pulse. What a command has read of
+    /// its drive is read again: the drive may have restarted during the stall.
     pub(crate) fn after_stall(&mut self, stall: Stall, now: Instant) {
         let slept = stall.slept;
         self.prolong(stall.length());
@@ -27,6 +28,9 @@ impl Master {
             match stall.is_pause() {
                 true => drive.refresh.after_stall(stall.length(), now),
                 false => drive.refresh.others_go_first(false, &image.spec.profile),
+            }
+            if let Some(run) = drive.run(Urgency::Command) {
+                run.others_go_first();
             }
             for urgency in [Urgency::Command, Urgency::Read] {
                 if let Some(run) = drive.run(urgency).filter(|_| stall.is_pause()) {

@@ -375,6 +375,10 @@ impl Master {
             drive.refresh.ordered(&image.spec.profile, &step.pdu, now);
         }
         let outcome = drive.answered(slot, step, reply, now);
+        if let Some(run) = drive.run(slot).filter(|_| end.stood) {
+            // The reply lay unread during a stall, so it does not show the drive as it is now.
+            run.others_go_first();
+        }
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
         }

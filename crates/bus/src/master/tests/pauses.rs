@@ -163,6 +163,45 @@ fn a_sequence_that_a_pause_interrupted_is_not_continued() {
     }
 }
 
+/// A direction is ordered to a motor that runs. The drive restarts behind the read that shows that, and the thread of the bus
+/// stalls before it has the reply, or behind it.
+#[test]
+fn what_was_read_before_a_stall_lets_no_run_bit_through() {
+    for (stalled, runs) in [
+        ("never", true),
+        ("before the reply", false),
+        ("behind the reply", false),
+    ] {
+        let mut rig = Rig::new(1);
+        let _run = rig.switch(0, "client", true);
+        rig.run(200 * MS);
+        assert!(rig.runs(0));
+        let _reverse = rig.order(0, "client", ModelPoint::Reverse, Value::Bool(true));
+        let turn = rig.next_turn(|turn| {
+            matches!(
+                turn.pdu(),
+                RequestPdu::Read {
+                    start: 2100,
+                    count: 2,
+                    ..
+                }
+            )
+        });
+        let reply = rig.drives[0].answer(turn.pdu());
+        rig.drives[0].holding.insert(2000, 0);
+        let came = rig.now + COST;
+        if stalled == "before the reply" {
+            rig.stands(270 * MS);
+        }
+        rig.ends(&turn, reply, (came, stalled == "before the reply"));
+        if stalled == "behind the reply" {
+            rig.stands(270 * MS);
+        }
+        rig.run(100 * MS);
+        assert_eq!(rig.runs(0), runs, "stalled {stalled}");
+    }
+}
+
 #[test]
 fn the_end_of_a_reset_is_sent_after_a_pause() {
     let mut rig = Rig::new(1);
