@@ -4,7 +4,10 @@ use std::path::Path;
 
 use arc_swap::ArcSwap;
 
-use super::super::kept::{FILE, load};
+use drivegate_core::files::State as _;
+use drivegate_core::files::names::BACNET_PRIORITIES;
+
+use super::super::kept::KeptSlots;
 use super::*;
 use drivegate_core::order::Entry;
 
@@ -19,7 +22,10 @@ fn keeping(dir: &Path) -> Options {
 #[tokio::test]
 async fn a_refused_reload_leaves_slots_and_rights_and_where_slots_are_kept() {
     let (here, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-    let (file, other) = (here.path().join(FILE), elsewhere.path().join(FILE));
+    let (file, other) = (
+        here.path().join(BACNET_PRIORITIES),
+        elsewhere.path().join(BACNET_PRIORITIES),
+    );
     let rig = ControlledDrive::new();
     let (drive, plant) = (rig.drive(), Arc::new(ArcSwap::from(rig.view.plant.clone())));
     let cancel = CancellationToken::new();
@@ -31,8 +37,14 @@ async fn a_refused_reload_leaves_slots_and_rights_and_where_slots_are_kept() {
         let entry = Entry::new(Value::Bool(false), origin, Instant::now());
         drive.priorities(|all| all.restore(Commanded::Run, priority, entry));
     };
+    let kept = || {
+        KeptSlots::load(&file)
+            .ok()
+            .flatten()
+            .map(|KeptSlots(slots)| slots.len())
+    };
     let until_kept = async |slots: usize| {
-        while load(&file).map(|all| all.len()) != Ok(slots) {
+        while kept() != Some(slots) {
             assert!(!other.exists(), "slots are kept where the refused reload said");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -51,5 +63,5 @@ async fn a_refused_reload_leaves_slots_and_rights_and_where_slots_are_kept() {
     until_kept(2).await;
     cancel.cancel();
     server::Server::stopped(server).await;
-    assert_eq!((load(&file).unwrap().len(), other.exists()), (2, false));
+    assert_eq!((kept(), other.exists()), (Some(2), false));
 }
