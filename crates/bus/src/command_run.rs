@@ -136,27 +136,27 @@ impl Ending {
     clippy::large_enum_variant,
     reason = "there are few commands, and a look needs no allocation of its own"
 )]
-enum Look {
+enum MotorRead {
     NotTaken,
     /// The reads in progress that show whether the motor runs.
     UnderWay(StateRead),
     Seen(Motor),
 }
 
-impl Look {
+impl MotorRead {
     /// State of the motor; `None` if it was not read.
     fn motor(&self) -> Option<Motor> {
         match self {
-            Look::NotTaken | Look::UnderWay(_) => None,
-            Look::Seen(motor) => Some(*motor),
+            MotorRead::NotTaken | MotorRead::UnderWay(_) => None,
+            MotorRead::Seen(motor) => Some(*motor),
         }
     }
 
     /// The state of the motor counts no longer. Returns whether it was known; reads in progress go on.
     fn forget(&mut self) -> bool {
-        let seen = matches!(self, Look::Seen(_));
+        let seen = matches!(self, MotorRead::Seen(_));
         if seen {
-            *self = Look::NotTaken;
+            *self = MotorRead::NotTaken;
         }
         seen
     }
@@ -196,7 +196,7 @@ pub struct CommandRun {
     by_other_function: bool,
     /// The register, or coil, of the run command.
     control: Option<(Table, u16)>,
-    look: Look,
+    look: MotorRead,
     next_direction: NextDirection,
     /// Whether the command waited for a late reply since its last step was chosen.
     held_up: bool,
@@ -296,7 +296,7 @@ impl CommandRun {
             known,
             by_other_function: false,
             control: profile.run_place().map(|place| (place.table, place.address)),
-            look: Look::NotTaken,
+            look: MotorRead::NotTaken,
             next_direction,
             held_up: false,
             overtaken: 0,

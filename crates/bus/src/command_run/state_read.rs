@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::control::Word;
 use super::steps::Action;
-use super::{CommandRun, KnownWords, Look, NextDirection, Step, StepPurpose};
+use super::{CommandRun, KnownWords, MotorRead, NextDirection, Step, StepPurpose};
 use drivegate_core::order::Outcome;
 use drivegate_core::permit::{AT_NEXT_START, Motor, not_seen};
 use drivegate_model::drive::model::Kind;
@@ -169,34 +169,34 @@ impl StateRead {
 impl CommandRun {
     /// The next request of the reads that show the motor state; `None` if the family does not report it.
     pub(super) fn state_request(&mut self, profile: &Profile) -> Option<Step> {
-        if !matches!(self.look, Look::UnderWay(_)) {
-            self.look = StateRead::at_motor(profile).map_or(Look::Seen(Motor::NotShown), Look::UnderWay);
+        if !matches!(self.look, MotorRead::UnderWay(_)) {
+            self.look = StateRead::at_motor(profile).map_or(MotorRead::Seen(Motor::NotShown), MotorRead::UnderWay);
         }
         match &self.look {
-            Look::UnderWay(read) => Some(Step::new(StepPurpose::Look, read.request())),
-            Look::NotTaken | Look::Seen(_) => None,
+            MotorRead::UnderWay(read) => Some(Step::new(StepPurpose::Look, read.request())),
+            MotorRead::NotTaken | MotorRead::Seen(_) => None,
         }
     }
 
     /// The drive answered a request of a look.
     pub(super) fn looked(&mut self, reply: &Reply) {
-        if let Look::UnderWay(read) = &mut self.look
+        if let MotorRead::UnderWay(read) = &mut self.look
             && read.take_reply(reply)
         {
-            self.look = Look::Seen(read.motor());
+            self.look = MotorRead::Seen(read.motor());
         }
     }
 
     /// Sets the result of a look without a reply to decode.
     pub(crate) fn set_motor_state(&mut self, runs: bool) {
-        self.look = Look::Seen(if runs { Motor::Runs } else { Motor::Stands });
+        self.look = MotorRead::Seen(if runs { Motor::Runs } else { Motor::Stands });
     }
 
     /// Handles reads without a result: nothing is written except the end of a pulse, which then contains no run command.
     pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
-        self.look = Look::NotTaken;
+        self.look = MotorRead::NotTaken;
         if self.ends_pulse() {
-            self.look = Look::Seen(Motor::NotShown);
+            self.look = MotorRead::Seen(Motor::NotShown);
             self.tries.failures = 0;
             return None;
         }
