@@ -43,8 +43,8 @@ pub enum DriveKey {
 }
 
 impl NamedBy {
-    /// Those of the clients of a drive that may name it in this way.
-    fn those_of(self, clients: &[Arc<str>]) -> Vec<Arc<str>> {
+    /// Selects the clients that may name their drive in this way.
+    fn clients_of(self, clients: &[Arc<str>]) -> Vec<Arc<str>> {
         let is_tool = |client: &&Arc<str>| client.starts_with(SourceKind::Slot.name());
         match self {
             NamedBy::Address => clients.iter().filter(is_tool).cloned().collect(),
@@ -259,7 +259,7 @@ fn meanings(bus: &BusHandle) -> Vec<(DriveKey, Meaning)> {
             let meaning = Meaning {
                 machine: bus.image.spec.machine(&drive.spec),
                 earlier: bus.formerly.of(index, by),
-                clients: by.those_of(&clients),
+                clients: by.clients_of(&clients),
                 ended: None,
             };
             (DriveKey::of(by, &drive.spec), meaning)

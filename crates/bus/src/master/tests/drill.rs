@@ -320,7 +320,15 @@ fn the_motor_of_a_drill_that_was_cut_off_is_stopped_at_the_next_start() {
         plant.1.kept(generation, rig.now);
         look(&mut rig, &plant, time(1), Duration::from_secs(1));
         assert!(rig.runs(0));
-        // The process that starts after the killed one.
+        // The process that starts after the killed one finds the drives as they are.
+        let mut killed = std::mem::replace(
+            &mut rig,
+            Rig::empty(2, "vacon-nx", Protocol::ModbusRtu, Duration::from_millis(10), |spec| {
+                spec
+            }),
+        );
+        (rig.drives, rig.now) = (std::mem::take(&mut killed.drives), rig.now.max(killed.now));
+        rig.bus.image.update_health(|health| health.up = true);
         let plant = self::plant(&rig);
         plant.1.restore(saved);
         let mut events = plant.0.events.subscribe();
