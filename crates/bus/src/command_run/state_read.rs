@@ -196,6 +196,8 @@ impl CommandRun {
     pub(super) fn not_seen(&mut self, why: &str, begun: Outcome) -> Option<Outcome> {
         self.look = MotorRead::NotTaken;
         if self.ends_pulse() {
+            // An attempt that is not acknowledged may have stopped the motor, which then still turns.
+            self.known.stopped = true;
             self.look = MotorRead::Seen(Motor::NotShown);
             self.tries.failures = 0;
             return None;
