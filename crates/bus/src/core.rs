@@ -9,6 +9,7 @@ use super::closing_server::ClosingServer;
 use super::drive_counters::DriveCounters;
 use super::line_state::{Exchanged, LineState};
 use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
+use super::n2_late_replies::N2LateReplies;
 use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
@@ -238,6 +239,7 @@ impl BusCore {
     /// Handles a port that was lost or cannot be opened: all values are stale at once, and all pending requests end.
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.bus.queue.close(Outcome::BusDown, now);
+        self.forget_late_replies();
         (self.chosen, self.asked, self.tap) = (None, None, None);
         self.master.lost(now);
         self.server.lost();
@@ -248,9 +250,17 @@ impl BusCore {
     /// transaction may still arrive.
     pub fn ended(&mut self, now: Instant) -> Handover {
         let broken_off = self.asked.as_ref().and(self.line.deadline());
+        self.forget_late_replies();
         Handover {
             learned: Some(self.line.learned()),
             ..self.master.ended(broken_off, now)
+        }
+    }
+
+    /// Late replies of N2 are no longer expected after a broken-off transaction: a later reply would be taken for one of them.
+    fn forget_late_replies(&mut self) {
+        if self.asked.is_some() {
+            *self.master.n2_late() = N2LateReplies::default();
         }
     }
 
