@@ -202,7 +202,11 @@ impl World {
             "a stop went out where the action is {:?}",
             supervision.action
         );
-        let retries = self.buses[bus].line.retries;
+        // On N2 an attempt whose reply may be a late one to an earlier request is not counted.
+        let retries = match self.buses[bus].line.protocol {
+            Protocol::N2 => u32::MAX,
+            _ => self.buses[bus].line.retries,
+        };
         let truth = &mut self.truths[bus][drive];
         // An action that is on the wire when a client returns is not withdrawn, lost or not: its attempts continue.
         let began = truth.action_began(pdu, retries, now);
