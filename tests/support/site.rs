@@ -135,15 +135,11 @@ impl Site {
         assert!(added.status.success(), "{added:?}");
     }
 
-    /// Status and reply of a user's request to the HTTP API, by curl; `more` has the method or the body. The request is
-    /// repeated where an order expired: after a pause of the machine of more than a second, starts are refused.
+    /// Status and reply of a user's request to the HTTP API, by curl; `more` has the method or the body.
     pub(crate) fn curl(&self, user: &str, path: &str, more: &[&str]) -> (u16, serde_json::Value) {
         let url = format!("http://127.0.0.1:{}/api/v1/{path}", self.http);
         let login = format!("{user}:{PASSWORD}");
-        until("a request that no pause of the machine held up", || {
-            let answer = curl(&[&["-u", &login][..], more, &[&url]].concat());
-            (answer.1["result"] != "expired").then_some(answer)
-        })
+        curl(&[&["-u", &login][..], more, &[&url]].concat())
     }
 
     /// Simulated drives at the port of `line1`, at 38400 baud; the traffic on their line is recorded.
@@ -241,16 +237,19 @@ impl Site {
     }
 }
 
-/// Status and reply, JSON or a text, of a request by curl.
+/// Status and reply, JSON or a text, of a request by curl; repeated where an order expired: after a pause of the machine
+/// of more than a second, starts are refused.
 pub(crate) fn curl(arguments: &[&str]) -> (u16, serde_json::Value) {
-    let output = run(
-        &tool("curl"),
-        &[&["-sS", "-w", "\n%{http_code}"][..], arguments].concat(),
-    );
-    let text = String::from_utf8(output.stdout).unwrap();
-    let (body, status) = text.rsplit_once('\n').unwrap();
-    let reply = serde_json::from_str(body).unwrap_or_else(|_| body.into());
-    (status.parse().unwrap(), reply)
+    until("a request that no pause of the machine held up", || {
+        let output = run(
+            &tool("curl"),
+            &[&["-sS", "-w", "\n%{http_code}"][..], arguments].concat(),
+        );
+        let text = String::from_utf8(output.stdout).unwrap();
+        let (body, status) = text.rsplit_once('\n').unwrap();
+        let reply: serde_json::Value = serde_json::from_str(body).unwrap_or_else(|_| body.into());
+        (reply["result"] != "expired").then(|| (status.parse().unwrap(), reply))
+    })
 }
 
 /// Simulated drives at the port `link`, at 38400 baud; the traffic on their line is recorded.

@@ -23,6 +23,7 @@ mod compound;
 mod connection;
 mod control;
 mod cost;
+mod device_server;
 mod diagnosis;
 mod drill;
 mod drives;
