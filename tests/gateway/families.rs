@@ -85,9 +85,10 @@ impl Rig {
     fn order(&self, orders: &[Order]) {
         for order in orders {
             let before = self.drive.output().len();
-            // On a busy machine the gateway may consider an order older than the stop before it, and answer 06.
+            // On a busy machine the gateway may consider an order older than the stop before it, and answer 06; after a pause
+            // of the machine an order has expired, 0B.
             let answer = until("an answer", || {
-                Some(self.exchange(order)).filter(|answer| *answer != Answer::Exception(6))
+                Some(self.exchange(order)).filter(|answer| ![6, 11].map(Answer::Exception).contains(answer))
             });
             assert_eq!(answer, Answer::Done, "{order:?}");
             let wanted = order.as_seen();
@@ -152,14 +153,14 @@ impl Rig {
 }
 
 /// Sends a request on a separate connection; `head` is the number of bytes before the function of the reply. A slot serves four
-/// tools, and refuses a connection while it has not noticed the end of former ones.
+/// tools, and refuses a connection while it has not noticed the end of former ones; it does not answer what has expired.
 fn answer(port: u16, frame: &[u8], head: usize) -> Answer {
     until("a reply", || answer_once(port, frame, head).ok())
 }
 
 fn answer_once(port: u16, frame: &[u8], head: usize) -> std::io::Result<Answer> {
     let mut stream = TcpStream::connect(("127.0.0.1", port))?;
-    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_read_timeout(Some(PATIENCE / 10))?;
     stream.write_all(frame)?;
     let mut reply = vec![0; head + 2];
     stream.read_exact(&mut reply)?;
