@@ -4,8 +4,14 @@
 use super::ordered::Reference;
 use drivegate_model::drive::{ModelPoint, Profile, Raw};
 
-/// Share of the reference by which a motor at its reference may deviate from it.
+/// Share of the reference within which a motor keeps its speed, and by which it may stay below its reference.
 const BAND: f64 = 0.005;
+
+/// Share of the reference by which a drive that compensates slip may turn faster than its reference.
+const SLIP: f64 = 0.05;
+
+/// Share of the reference by which a motor that slows down becomes slower from look to look, at least.
+const FALL: f64 = 0.001;
 
 /// Speed of a refreshed motor in relation to the reference of the last order.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -13,12 +19,40 @@ pub(super) enum Pace {
     /// The motor follows the order, or turns at another speed, as with a process controller in the drive.
     #[default]
     Free,
-    /// The motor was at its reference in the last look.
-    Arrived,
-    /// The motor was at its reference in at least two consecutive looks.
-    Steady,
-    /// The motor was at its reference, and has slowed down to this speed since.
+    /// The motor was at its reference in the last look, at this speed.
+    Arrived(f64),
+    /// The motor kept its speed at its reference in at least two consecutive looks.
+    Steady(Kept),
+    /// The motor kept its speed at its reference, and has slowed down to this speed since.
     Falls(f64),
+}
+
+/// Speeds of a motor that is at its reference.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Kept {
+    low: f64,
+    high: f64,
+}
+
+impl Kept {
+    /// Whether a motor with this speed has slowed down: it is below the lowest speed by more than its speeds differ.
+    fn is_left_by(self, speed: f64) -> bool {
+        speed < self.low - (self.high - self.low)
+    }
+
+    fn of(speed: f64) -> Kept {
+        Kept {
+            low: speed,
+            high: speed,
+        }
+    }
+
+    fn with(self, speed: f64) -> Kept {
+        Kept {
+            low: self.low.min(speed),
+            high: self.high.max(speed),
+        }
+    }
 }
 
 impl Pace {
@@ -26,15 +60,17 @@ impl Pace {
     pub(super) fn after(self, speed: f64, reference: f64) -> Pace {
         let (speed, reference) = (speed.abs(), reference.abs());
         let band = reference * BAND;
-        let last = match self {
-            Pace::Steady => reference,
-            Pace::Falls(last) => last,
-            Pace::Free | Pace::Arrived => 0.0,
-        };
+        let is_there = (reference - band..=reference * (1.0 + SLIP)).contains(&speed);
+        let together = |kept: Kept| is_there && kept.high - kept.low <= band;
         match self {
-            _ if speed < last - band => Pace::Falls(speed),
-            Pace::Arrived | Pace::Steady if (speed - reference).abs() <= band => Pace::Steady,
-            _ if (speed - reference).abs() <= band => Pace::Arrived,
+            Pace::Steady(kept) if kept.is_left_by(speed) => Pace::Falls(speed),
+            // A motor that brakes at 0 Hz still shows that it runs.
+            Pace::Falls(last) if speed < last - reference * FALL || speed <= band => Pace::Falls(speed),
+            Pace::Steady(kept) if together(kept.with(speed)) => Pace::Steady(kept.with(speed)),
+            Pace::Arrived(last) | Pace::Falls(last) if together(Kept::of(last).with(speed)) => {
+                Pace::Steady(Kept::of(last).with(speed))
+            }
+            _ if is_there => Pace::Arrived(speed),
             _ => Pace::Free,
         }
     }
@@ -74,13 +110,22 @@ mod tests {
     fn a_motor_falls_only_from_its_reference() {
         for (speeds, expected) in [
             // A start, then a stop that nobody here ordered.
-            (&[0.0, 20.0, 50.0, 50.0, 49.9, 45.0, 40.0, 3.0][..], "ffassvvv"),
+            (&[0.0, 20.0, 50.0, 50.0, 49.9, 45.0, 40.0, 3.0][..], "ffasvvvv"),
             // A stop in the first look at the reference cannot be told from a reversal.
             (&[50.0, 45.0, 30.0], "aff"),
             // A dip, then the motor is back at its reference.
             (&[50.0, 50.0, 48.0, 49.0, 50.0, 50.0], "asvfas"),
             // The motor turns on at a lower speed.
-            (&[50.0, 50.0, 48.0, 47.9, 47.9], "asvff"),
+            (&[50.0, 50.0, 48.0, 47.96, 47.96], "asvff"),
+            // A ramp of many minutes: the speed differs little from look to look.
+            (&[50.0, 50.0, 49.9, 49.8, 49.7, 49.6], "asvvvv"),
+            // The end of a ramp, then the drive brakes the standing motor with direct current.
+            (&[50.0, 50.0, 30.0, 10.0, 0.2, 0.0, 0.0, 0.0], "asvvvvvv"),
+            // A measured speed is never twice the same.
+            (&[49.99, 50.02, 49.97, 50.01, 49.94, 50.03, 49.9, 50.0], "asssssss"),
+            (&[49.99, 50.02, 49.97, 49.8, 49.4, 45.0], "assvvv"),
+            // The drive compensates slip; then it sheds load, then it is stopped.
+            (&[51.2, 51.2, 51.2, 50.6, 50.6, 50.6, 50.2, 49.0], "assvssvv"),
             // A process controller in the drive: the speed does not stay at the reference.
             (&[44.0, 50.0, 53.0, 50.0, 46.0, 40.0, 31.0], "fafafff"),
             // An order that lowers the reference.
@@ -95,8 +140,8 @@ mod tests {
                     pace = pace.after(*speed, 50.0);
                     match pace {
                         Pace::Free => 'f',
-                        Pace::Arrived => 'a',
-                        Pace::Steady => 's',
+                        Pace::Arrived(_) => 'a',
+                        Pace::Steady(_) => 's',
                         Pace::Falls(_) => 'v',
                     }
                 })
