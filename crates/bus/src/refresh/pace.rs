@@ -4,14 +4,16 @@
 use super::ordered::Reference;
 use drivegate_model::drive::{ModelPoint, Profile, Raw};
 
-/// Share of the reference within which a motor keeps its speed, and by which it may stay below its reference.
+/// Share of the reference within which a motor keeps its speed, by which it may stay below its reference, and by which a
+/// motor that slows down becomes slower from look to look, at least. A speed that is measured differs by less.
 const BAND: f64 = 0.005;
 
 /// Share of the reference by which a drive that compensates slip may turn faster than its reference.
 const SLIP: f64 = 0.05;
 
-/// Share of the reference by which a motor that slows down becomes slower from look to look, at least.
-const FALL: f64 = 0.001;
+/// Share of the reference by which a motor that kept its speed has at least become slower in the first look behind a stop.
+/// A wrong first look costs one refresh, and the next look decides.
+const FIRST_FALL: f64 = 0.001;
 
 /// Speed of a refreshed motor in relation to the reference of the last order.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -35,9 +37,10 @@ pub(super) struct Kept {
 }
 
 impl Kept {
-    /// Whether a motor with this speed has slowed down: it is below the lowest speed by more than its speeds differ.
-    fn is_left_by(self, speed: f64) -> bool {
-        speed < self.low - (self.high - self.low)
+    /// Whether a motor with this speed has slowed down: it is below the lowest speed by more than its speeds differ, and by
+    /// more than `least`.
+    fn is_left_by(self, speed: f64, least: f64) -> bool {
+        speed < self.low - (self.high - self.low).max(least)
     }
 
     fn of(speed: f64) -> Kept {
@@ -61,11 +64,13 @@ impl Pace {
         let (speed, reference) = (speed.abs(), reference.abs());
         let band = reference * BAND;
         let is_there = (reference - band..=reference * (1.0 + SLIP)).contains(&speed);
+        // Slip compensation turns the motor faster by its load, which may change for many periods.
+        let is_below = speed < reference;
         let together = |kept: Kept| is_there && kept.high - kept.low <= band;
         match self {
-            Pace::Steady(kept) if kept.is_left_by(speed) => Pace::Falls(speed),
+            Pace::Steady(kept) if kept.is_left_by(speed, reference * FIRST_FALL) => Pace::Falls(speed),
             // A motor that brakes at 0 Hz still shows that it runs.
-            Pace::Falls(last) if speed < last - reference * FALL || speed <= band => Pace::Falls(speed),
+            Pace::Falls(last) if is_below && speed < last - band || speed <= band => Pace::Falls(speed),
             Pace::Steady(kept) if together(kept.with(speed)) => Pace::Steady(kept.with(speed)),
             Pace::Arrived(last) | Pace::Falls(last) if together(Kept::of(last).with(speed)) => {
                 Pace::Steady(Kept::of(last).with(speed))
@@ -117,8 +122,10 @@ mod tests {
             (&[50.0, 50.0, 48.0, 49.0, 50.0, 50.0], "asvfas"),
             // The motor turns on at a lower speed.
             (&[50.0, 50.0, 48.0, 47.96, 47.96], "asvff"),
-            // A ramp of many minutes: the speed differs little from look to look.
-            (&[50.0, 50.0, 49.9, 49.8, 49.7, 49.6], "asvvvv"),
+            // A ramp of two minutes: the first looks differ little.
+            (&[50.0, 50.0, 49.9, 49.5, 49.1, 48.7], "asvvvv"),
+            // The speed drifts, and is not constant.
+            (&[50.0, 50.0, 49.9, 49.8, 49.9, 49.8, 49.78], "asvssss"),
             // The end of a ramp, then the drive brakes the standing motor with direct current.
             (&[50.0, 50.0, 30.0, 10.0, 0.2, 0.0, 0.0, 0.0], "asvvvvvv"),
             // A measured speed is never twice the same.
@@ -126,6 +133,8 @@ mod tests {
             (&[49.99, 50.02, 49.97, 49.8, 49.4, 45.0], "assvvv"),
             // The drive compensates slip; then it sheds load, then it is stopped.
             (&[51.2, 51.2, 51.2, 50.6, 50.6, 50.6, 50.2, 49.0], "assvssvv"),
+            // The load falls for seconds: one refresh is left out, and none where the speed stays above the reference.
+            (&[51.25, 51.25, 51.125, 51.0, 50.875, 50.75, 50.625], "asvssas"),
             // A process controller in the drive: the speed does not stay at the reference.
             (&[44.0, 50.0, 53.0, 50.0, 46.0, 40.0, 31.0], "fafafff"),
             // An order that lowers the reference.
