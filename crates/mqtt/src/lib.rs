@@ -17,6 +17,7 @@
 //! the way to one of the brokers: it owns the `connection`, which wraps rumqttc and keeps no state: every
 //! connection is a new rumqttc client with a clean session, and unacknowledged messages are sent again from the
 //! outbox. `reasons` has the texts for a lost connection; `LinkStatus` of `drivegate_north` shows them. `handover` keeps the state that a client leaves for the one after a reload.
+//! `number` has the number of a message, the same on disk, in the store and in the outbox; packet ids belong to one connection.
 
 mod back_off;
 mod broker_limits;
@@ -33,6 +34,7 @@ mod keep_alive;
 mod link;
 mod loopback;
 mod message_log;
+mod number;
 mod outage_log;
 mod outbox;
 mod password;

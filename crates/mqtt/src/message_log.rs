@@ -1,10 +1,10 @@
 //! Keeps messages on disk until the broker has acknowledged them, across restarts and crashes. Blocking: runs on
 //! the thread of the [`store`](super::store).
 //!
-//! Segment files `{name}-{number}.log` in one directory, each a sequence of records ([`super::record`]): messages with
+//! Segment files `{name}-{segment}.log` in one directory, each a sequence of records ([`super::record`]): messages with
 //! ascending numbers, and marks up to which number all messages are acknowledged. Records are only appended. A segment
 //! whose messages are all acknowledged is deleted (the last one: truncated). When the buffer or the disk is full, the
-//! oldest segment is deleted. Damaged parts are copied to `{name}-{number}-{offset}.damaged`; reading continues at the
+//! oldest segment is deleted. Damaged parts are copied to `{name}-{segment}-{offset}.damaged`; reading continues at the
 //! next valid record.
 //!
 //! Messages that cannot be written wait in memory behind those on disk, so that the order is kept, and are written
@@ -18,12 +18,11 @@ use std::path::{Path, PathBuf};
 
 mod segments;
 
-use self::segments::{is_deleted, is_full, lock, remove_old_quarantine, segment_size, segments};
+use self::segments::{SegmentNumber, is_deleted, is_full, lock, remove_old_quarantine, segment_size, segments};
+use super::number::MessageNumber;
 use super::outbox::{KEPT_BYTES, LOADED_BYTES, Message};
 use super::record::{self, Entry, Record};
 
-const SUFFIX: &str = ".log";
-const DAMAGED: &str = ".damaged";
 /// Largest and smallest size of a segment, bytes; between them a 64th of the buffer.
 const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
 /// Maximum number of messages that wait in memory because the disk does not accept them; their size is at most
@@ -34,7 +33,7 @@ const QUARANTINED: usize = 16;
 
 #[derive(Debug)]
 struct Segment {
-    number: u64,
+    number: SegmentNumber,
     path: PathBuf,
     file: File,
     /// Position after the last record.
@@ -42,7 +41,7 @@ struct Segment {
     /// Up to here the records were loaded.
     read: u64,
     /// Numbers of the first and the last message in the segment.
-    numbers: Option<(u64, u64)>,
+    numbers: Option<(MessageNumber, MessageNumber)>,
 }
 
 /// The messages on disk, and after them the messages in memory.
@@ -51,25 +50,25 @@ pub(super) struct MessageLog {
     /// The directory; `None` keeps everything in memory.
     place: Option<MessageLogDir>,
     segments: VecDeque<Segment>,
-    next_segment: u64,
+    next_segment: SegmentNumber,
     /// Messages loaded from disk and not taken yet.
-    loaded: VecDeque<(u64, Message)>,
-    unwritten: VecDeque<(u64, Message)>,
+    loaded: VecDeque<(MessageNumber, Message)>,
+    unwritten: VecDeque<(MessageNumber, Message)>,
     unwritten_bytes: usize,
     /// The last number given to a message.
-    pub(super) last: u64,
+    pub(super) last: MessageNumber,
     /// Up to here messages were loaded, taken or lost.
-    passed: u64,
+    passed: MessageNumber,
     /// Number up to which all messages are acknowledged; the mark on disk may be older.
-    acknowledged: u64,
-    marked: u64,
+    acknowledged: MessageNumber,
+    marked: MessageNumber,
     unsynced: bool,
     lost: u64,
     /// Messages already counted as lost in the gaps that are still to be passed.
     pub(super) counted: u64,
     /// Number up to which no messages are kept, because the buffer was full. Messages up to this number that were
     /// taken and not acknowledged are lost.
-    pub(super) lost_up_to: u64,
+    pub(super) lost_up_to: MessageNumber,
     /// The files were deleted since the last call of [`Journal::take_wiped`].
     wiped: bool,
 }
@@ -92,18 +91,18 @@ impl MessageLog {
         MessageLog {
             place: None,
             segments: VecDeque::new(),
-            next_segment: 1,
+            next_segment: SegmentNumber::FIRST,
             loaded: VecDeque::new(),
             unwritten: VecDeque::new(),
             unwritten_bytes: 0,
-            last: 0,
-            passed: 0,
-            acknowledged: 0,
-            marked: 0,
+            last: MessageNumber::NONE,
+            passed: MessageNumber::NONE,
+            acknowledged: MessageNumber::NONE,
+            marked: MessageNumber::NONE,
             unsynced: false,
             lost: 0,
             counted: 0,
-            lost_up_to: 0,
+            lost_up_to: MessageNumber::NONE,
             wiped: false,
         }
     }
@@ -126,23 +125,20 @@ impl MessageLog {
             ..MessageLog::in_memory()
         };
         for (number, path) in segments(dir, name)? {
-            journal.next_segment = number.saturating_add(1);
+            journal.next_segment = number.next();
             journal.adopt(number, path)?;
         }
         journal.marked = journal.acknowledged;
         // Messages missing before the first one were lost or acknowledged in an earlier run.
-        let first = journal
-            .segments
-            .iter()
-            .find_map(|s| s.numbers)
-            .map_or(1, |(first, _)| first);
-        journal.passed = journal.acknowledged.max(first - 1).min(journal.last);
+        let first = journal.segments.iter().find_map(|s| s.numbers);
+        let before = first.map_or(MessageNumber::NONE, |(first, _)| first.previous());
+        journal.passed = journal.acknowledged.max(before).min(journal.last);
         journal.remove_acknowledged()?;
         Ok(journal)
     }
 
     /// Finds the records of a file that is there when the journal is opened.
-    fn adopt(&mut self, number: u64, path: PathBuf) -> io::Result<()> {
+    fn adopt(&mut self, number: SegmentNumber, path: PathBuf) -> io::Result<()> {
         let file = OpenOptions::new().read(true).write(true).open(&path)?;
         let bytes = fs::read(&path)?;
         if let Some(version) = record::other_version(&bytes) {
@@ -155,7 +151,7 @@ impl MessageLog {
             );
             return Ok(());
         }
-        let mut numbers: Option<(u64, u64)> = None;
+        let mut numbers: Option<(MessageNumber, MessageNumber)> = None;
         let mut end = 0;
         for Record { entry, range } in record::records(&bytes).flatten() {
             end = range.end as u64;
@@ -179,10 +175,8 @@ impl MessageLog {
             self.lost += 1;
             file.set_len(end)?;
         }
-        self.last = self
-            .last
-            .max(numbers.map_or(0, |(_, last)| last))
-            .max(self.acknowledged);
+        let last = numbers.map_or(MessageNumber::NONE, |(_, last)| last);
+        self.last = self.last.max(last).max(self.acknowledged);
         self.segments.push_back(Segment {
             number,
             path,
@@ -196,12 +190,12 @@ impl MessageLog {
 
     /// Number of messages that wait to be taken.
     pub(super) fn waiting(&self) -> u64 {
-        self.loaded.len() as u64 + (self.last - self.passed)
+        self.loaded.len() as u64 + self.last.since(self.passed)
     }
 
     /// Number of the last message that was taken, or lost before the next one.
-    pub(super) fn through(&self) -> u64 {
-        self.loaded.front().map_or(self.passed, |(number, _)| number - 1)
+    pub(super) fn through(&self) -> MessageNumber {
+        self.loaded.front().map_or(self.passed, |(number, _)| number.previous())
     }
 
     /// Number of messages lost since the previous call because the buffer was full or they were damaged.
@@ -217,7 +211,7 @@ impl MessageLog {
                 .iter()
                 .filter(|(number, _)| *number > self.acknowledged)
                 .count() as u64,
-            None => (self.last - self.acknowledged).saturating_sub(self.counted),
+            None => self.last.since(self.acknowledged).saturating_sub(self.counted),
         }
     }
 
@@ -229,7 +223,7 @@ impl MessageLog {
     /// Appends a message; [`Journal::write`] writes it. A message that is already `taken` is kept only until it is
     /// acknowledged.
     pub(super) fn append(&mut self, message: Message, taken: bool) {
-        self.last += 1;
+        self.last = self.last.next();
         if taken {
             self.passed = self.last;
             if self.place.is_none() {
@@ -250,7 +244,7 @@ impl MessageLog {
     }
 
     /// Drops the first message that waits to be written; returns its number.
-    fn drop_unwritten(&mut self) -> Option<u64> {
+    fn drop_unwritten(&mut self) -> Option<MessageNumber> {
         let (number, message) = self.unwritten.pop_front()?;
         self.unwritten_bytes -= message.bytes();
         Some(number)
@@ -258,7 +252,7 @@ impl MessageLog {
 
     /// Removes and returns messages in order with their numbers: at most `most`, and none after the first
     /// [`LOADED_BYTES`] bytes.
-    pub(super) fn take(&mut self, most: usize) -> Vec<(u64, Message)> {
+    pub(super) fn take(&mut self, most: usize) -> Vec<(MessageNumber, Message)> {
         let (mut taken, mut bytes) = (Vec::new(), 0);
         let all_of_disk = loop {
             if taken.len() >= most || bytes >= LOADED_BYTES {
@@ -272,7 +266,7 @@ impl MessageLog {
         };
         if all_of_disk {
             let passed = self.passed;
-            let fits = |(_, message): &&(u64, Message)| {
+            let fits = |(_, message): &&(MessageNumber, Message)| {
                 let fits = bytes < LOADED_BYTES;
                 bytes += message.bytes();
                 fits
@@ -296,7 +290,8 @@ impl MessageLog {
             return false;
         };
         let (from, end) = (std::mem::replace(&mut segment.read, segment.end), segment.end);
-        let (number, last) = (segment.number, segment.numbers.map_or(0, |(_, last)| last));
+        let number = segment.number;
+        let last = segment.numbers.map_or(MessageNumber::NONE, |(_, last)| last);
         let mut bytes = vec![0; (end - from) as usize];
         let read = segment.file.read_exact_at(&mut bytes, from);
         if let Err(error) = read {
@@ -326,7 +321,7 @@ impl MessageLog {
     }
 
     /// Notes that the messages up to this number are passed; those that were not taken are lost.
-    fn pass_all(&mut self, last: u64) {
+    fn pass_all(&mut self, last: MessageNumber) {
         if last > self.passed {
             self.pass(last);
             self.lost += 1;
@@ -334,11 +329,11 @@ impl MessageLog {
     }
 
     /// Notes that the next message has this number; the messages in between are lost.
-    fn pass(&mut self, number: u64) {
+    fn pass(&mut self, number: MessageNumber) {
         if number <= self.passed {
             return;
         }
-        let gap = number - self.passed - 1;
+        let gap = number.previous().since(self.passed);
         let known = gap.min(self.counted);
         self.counted -= known;
         self.lost += gap - known;
@@ -346,7 +341,7 @@ impl MessageLog {
     }
 
     /// Notes that all messages up to this number are acknowledged.
-    pub(super) fn acknowledge(&mut self, number: u64) {
+    pub(super) fn acknowledge(&mut self, number: MessageNumber) {
         self.acknowledged = self.acknowledged.max(number.min(self.last));
     }
 
@@ -407,7 +402,7 @@ impl MessageLog {
             self.drop_oldest()?;
         }
         self.write_at_end(&bytes)?;
-        let written: Vec<u64> = (0..count).filter_map(|_| self.drop_unwritten()).collect();
+        let written: Vec<MessageNumber> = (0..count).filter_map(|_| self.drop_unwritten()).collect();
         if let (Some(segment), Some(first), Some(last)) = (self.segments.back_mut(), written.first(), written.last()) {
             segment.numbers = Some((segment.numbers.map_or(*first, |(first, _)| first), *last));
             if *last <= self.passed {
@@ -430,9 +425,9 @@ impl MessageLog {
     fn begin_segment(&mut self) -> io::Result<()> {
         let Some(place) = &self.place else { return Ok(()) };
         let number = self.next_segment;
-        let path = place.dir.join(format!("{}-{number:012}{SUFFIX}", place.name));
+        let path = place.dir.join(number.file(place.name));
         let file = (place.create)(&path)?;
-        self.next_segment = number.saturating_add(1);
+        self.next_segment = number.next();
         self.segments.push_back(Segment {
             number,
             path,
@@ -528,11 +523,11 @@ impl MessageLog {
     }
 
     /// Keeps a copy of bytes that are not valid records.
-    fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) -> io::Result<()> {
+    fn quarantine(&self, segment: SegmentNumber, offset: u64, bytes: &[u8]) -> io::Result<()> {
         let Some(MessageLogDir { dir, name, .. }) = &self.place else {
             return Ok(());
         };
-        let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));
+        let path = dir.join(segment.damaged(name, offset));
         let kept = remove_old_quarantine(dir, name).and_then(|()| fs::write(&path, bytes));
         let shown = match &kept {
             Err(error) => format!("they cannot be saved: {error}"),

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
 
 use super::Qos;
-use super::store::Number;
+use super::number::{MessageNumber, Place};
 use drivegate_north::MqttKind;
 
 /// Maximum number of waiting results, and their size in bytes; beyond it, no commands are accepted.
@@ -65,8 +65,8 @@ impl Message {
 pub(super) enum Key {
     /// The latest value of this telemetry topic.
     Latest(Arc<str>),
-    /// Entry of a queue, with this serial number.
-    Queued(MqttKind, u64),
+    /// Entry of a queue, at this place.
+    Queued(MqttKind, Place),
 }
 
 /// A message that has left the outbox.
@@ -105,9 +105,8 @@ struct Slot {
 
 #[derive(Debug)]
 struct Entry {
-    serial: u64,
+    place: Place,
     message: Message,
-    number: Option<Number>,
     in_flight: bool,
     attempts: u8,
 }
@@ -116,6 +115,8 @@ struct Entry {
 #[derive(Debug, Default)]
 struct Queue {
     entries: VecDeque<Entry>,
+    /// Place of the last message that was added.
+    last: Place,
     bytes: usize,
     /// Whether the broker refused one of the messages for now; all then wait for [`Outbox::retry`], so that the
     /// order is kept.
@@ -136,7 +137,6 @@ pub(super) struct Outbox {
     results_of: HashMap<Arc<str>, usize>,
     events: Queue,
     history: Queue,
-    serial: u64,
     /// Published messages whose packet id is not known yet.
     published: VecDeque<Key>,
     /// Published messages by packet id.
@@ -157,7 +157,6 @@ impl Outbox {
             results_of: HashMap::new(),
             events: Queue::default(),
             history: Queue::default(),
-            serial: 0,
             published: VecDeque::new(),
             unacknowledged: HashMap::new(),
             has_leader: false,
@@ -206,7 +205,7 @@ impl Outbox {
     }
 
     /// Adds an event or history, with its number if it is on disk; if too many wait, the oldest is dropped.
-    pub(super) fn push(&mut self, kind: MqttKind, message: Message, number: Option<Number>) {
+    pub(super) fn push(&mut self, kind: MqttKind, message: Message, number: Option<MessageNumber>) {
         let message = match (kind, self.delivery.events) {
             (MqttKind::Event | MqttKind::History, Qos::AtMostOnce) => Message {
                 acknowledged: false,
@@ -214,8 +213,6 @@ impl Outbox {
             },
             _ => message,
         };
-        self.serial += 1;
-        let serial = self.serial;
         let queue = self.queue_mut(kind);
         while kind != MqttKind::Result && queue.is_full_for(&message) {
             // Entries in flight are dropped last, because the broker has probably received them.
@@ -224,10 +221,10 @@ impl Outbox {
             queue.lost += 1;
         }
         queue.bytes += message.bytes();
+        queue.last = queue.last.next(number);
         queue.entries.push_back(Entry {
-            serial,
+            place: queue.last,
             message,
-            number,
             in_flight: false,
             attempts: 0,
         });
@@ -235,13 +232,13 @@ impl Outbox {
 
     /// Drops the waiting messages up to this one: they are no longer on disk because the buffer was full, and count
     /// as lost, as after a restart. Messages in flight have probably been delivered.
-    pub(super) fn drop_gone(&mut self, kind: MqttKind, through: Number) {
+    pub(super) fn drop_gone(&mut self, kind: MqttKind, through: MessageNumber) {
         let queue = self.queue_mut(kind);
-        let is_older = |entry: &&Entry| entry.number.is_none_or(|number| number <= through);
-        let is_gone = |entry: &Entry| !entry.in_flight && entry.number.is_some();
-        // The numbers are ascending, so the loop ends at the first message that is kept.
-        while let Some(place) = queue.entries.iter().take_while(is_older).position(is_gone) {
-            queue.remove(place);
+        let is_older = |entry: &&Entry| entry.place.is_within(through);
+        let is_gone = |entry: &Entry| !entry.in_flight && entry.place.number().is_some();
+        // The places are ascending, so the loop ends at the first message that is kept.
+        while let Some(index) = queue.entries.iter().take_while(is_older).position(is_gone) {
+            queue.remove(index);
             queue.lost += 1;
         }
     }
@@ -284,8 +281,8 @@ impl Outbox {
     }
 
     /// Number of the first message of this kind that is on disk and not acknowledged.
-    pub(super) fn oldest(&self, kind: MqttKind) -> Option<Number> {
-        self.queue(kind).entries.iter().find_map(|entry| entry.number)
+    pub(super) fn oldest(&self, kind: MqttKind) -> Option<MessageNumber> {
+        self.queue(kind).entries.iter().find_map(|entry| entry.place.number())
     }
 
     /// Number of events, results and history that wait or are in flight.
@@ -308,7 +305,7 @@ impl Outbox {
         self.queue(kind)
             .entries
             .iter()
-            .filter(|entry| entry.number.is_none())
+            .filter(|entry| entry.place.number().is_none())
             .count() as u64
     }
 
@@ -376,14 +373,14 @@ impl Outbox {
                     (slot.sent, slot.in_flight) = (slot.waiting.take().filter(|_| acknowledged), true);
                 }
                 // The topic is at or near the front: only topics in flight precede it.
-                if let Some(place) = self.order.iter().position(|t| t == topic) {
-                    self.order.remove(place);
+                if let Some(index) = self.order.iter().position(|t| t == topic) {
+                    self.order.remove(index);
                 }
                 self.has_leader = false;
                 self.turn = 0;
             }
-            Key::Queued(kind, serial) => {
-                if let Some(entry) = self.queue_mut(*kind).get_mut(*serial) {
+            Key::Queued(kind, place) => {
+                if let Some(entry) = self.queue_mut(*kind).get_mut(*place) {
                     entry.in_flight = true;
                 }
                 match kind {
@@ -436,10 +433,10 @@ impl Outbox {
                 }
                 topic.clone()
             }
-            Key::Queued(kind, serial) if for_now => {
+            Key::Queued(kind, place) if for_now => {
                 let queue = self.queue_mut(*kind);
                 queue.put_back = true;
-                let entry = queue.get_mut(*serial)?;
+                let entry = queue.get_mut(*place)?;
                 entry.in_flight = false;
                 entry.message.topic.clone()
             }
@@ -479,10 +476,10 @@ impl Outbox {
                 }
                 Some(Settled { topic, kind: None })
             }
-            Key::Queued(kind, serial) => {
+            Key::Queued(kind, place) => {
                 let queue = self.queue_mut(kind);
-                let place = queue.place(serial)?;
-                let topic = queue.remove(place)?.message.topic;
+                let index = queue.index(place)?;
+                let topic = queue.remove(index)?.message.topic;
                 if kind == MqttKind::Result {
                     self.forget_result(&topic);
                 }
@@ -518,8 +515,8 @@ impl Outbox {
                 entry.in_flight = false;
             }
         }
-        while let Some(place) = self.results.entries.iter().position(|e| e.attempts >= RESULT_ATTEMPTS) {
-            if let Some(entry) = self.results.remove(place) {
+        while let Some(index) = self.results.entries.iter().position(|e| e.attempts >= RESULT_ATTEMPTS) {
+            if let Some(entry) = self.results.remove(index) {
                 self.forget_result(&entry.message.topic);
                 self.results.lost += 1;
             }
@@ -544,19 +541,19 @@ impl Queue {
     fn next(&self, kind: MqttKind, free: bool) -> Option<(Key, Message)> {
         let entry = self.entries.iter().find(|e| !e.in_flight).filter(|_| !self.put_back)?;
         let may = free || !entry.message.acknowledged;
-        may.then(|| (Key::Queued(kind, entry.serial), entry.message.clone()))
+        may.then(|| (Key::Queued(kind, entry.place), entry.message.clone()))
     }
 
-    fn place(&self, serial: u64) -> Option<usize> {
-        self.entries.binary_search_by_key(&serial, |entry| entry.serial).ok()
+    fn index(&self, place: Place) -> Option<usize> {
+        self.entries.binary_search_by_key(&place, |entry| entry.place).ok()
     }
 
-    fn get_mut(&mut self, serial: u64) -> Option<&mut Entry> {
-        self.entries.get_mut(self.place(serial)?)
+    fn get_mut(&mut self, place: Place) -> Option<&mut Entry> {
+        self.entries.get_mut(self.index(place)?)
     }
 
-    fn remove(&mut self, place: usize) -> Option<Entry> {
-        let entry = self.entries.remove(place)?;
+    fn remove(&mut self, index: usize) -> Option<Entry> {
+        let entry = self.entries.remove(index)?;
         self.bytes -= entry.message.bytes();
         Some(entry)
     }

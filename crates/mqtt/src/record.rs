@@ -3,6 +3,7 @@
 
 use std::ops::Range;
 
+use super::number::MessageNumber;
 use super::outbox::Message;
 
 /// Start mark of a record, which no UTF-8 text contains. The third byte is the version of the format: `J` is the
@@ -18,9 +19,9 @@ const ACKNOWLEDGED: u8 = b'A';
 #[derive(Debug, PartialEq)]
 pub(super) enum Entry {
     /// A message with its number.
-    Message(u64, Message),
+    Message(MessageNumber, Message),
     /// All messages up to this number were acknowledged.
-    Acknowledged(u64),
+    Acknowledged(MessageNumber),
 }
 
 /// A record of the journal, with its position in the file.
@@ -36,7 +37,7 @@ pub(super) fn length(message: &Message) -> u64 {
 }
 
 /// Appends the record of a message, whose topic has at most 65535 bytes, as MQTT requires.
-pub(super) fn message(number: u64, message: &Message, bytes: &mut Vec<u8>) {
+pub(super) fn message(number: MessageNumber, message: &Message, bytes: &mut Vec<u8>) {
     let topic = message.topic.as_bytes();
     let length = u16::try_from(topic.len()).unwrap_or(u16::MAX);
     encode(
@@ -48,16 +49,16 @@ pub(super) fn message(number: u64, message: &Message, bytes: &mut Vec<u8>) {
 }
 
 /// The record of an acknowledgement up to this number.
-pub(super) fn mark(number: u64) -> Vec<u8> {
+pub(super) fn mark(number: MessageNumber) -> Vec<u8> {
     let mut bytes = Vec::new();
     encode(ACKNOWLEDGED, number, &[], &mut bytes);
     bytes
 }
 
-fn encode(kind: u8, number: u64, body: &[&[u8]], bytes: &mut Vec<u8>) {
+fn encode(kind: u8, number: MessageNumber, body: &[&[u8]], bytes: &mut Vec<u8>) {
     let length = body.iter().map(|part| part.len()).sum::<usize>() as u32;
     let mut head = vec![kind];
-    head.extend_from_slice(&number.to_le_bytes());
+    head.extend_from_slice(&number.get().to_le_bytes());
     head.extend_from_slice(&length.to_le_bytes());
     let sum = body.iter().fold(crc32(u32::MAX, &head), |sum, part| crc32(sum, part));
     bytes.extend_from_slice(&MARK);
@@ -122,7 +123,7 @@ fn decode(bytes: &[u8]) -> Option<(Entry, usize)> {
     if !crc32(crc32(u32::MAX, head), body) != expected {
         return None;
     }
-    let number = u64::from_le_bytes(*number);
+    let number = MessageNumber::new(u64::from_le_bytes(*number));
     let entry = match *kind {
         ACKNOWLEDGED => Entry::Acknowledged(number),
         MESSAGE => {
@@ -158,19 +159,19 @@ mod tests {
         let mut bytes = Vec::new();
         for number in 1..=3 {
             message(
-                number,
+                MessageNumber::new(number),
                 &Message::not_retained("a/b", vec![number as u8; 40]),
                 &mut bytes,
             );
         }
-        bytes.extend(mark(2));
+        bytes.extend(mark(MessageNumber::new(2)));
         bytes
     }
 
     fn numbers(bytes: &[u8]) -> Vec<u64> {
         let number = |found: Result<Record, _>| match found.ok()?.entry {
-            Entry::Message(number, _) => Some(number),
-            Entry::Acknowledged(number) => Some(100 + number),
+            Entry::Message(number, _) => Some(number.get()),
+            Entry::Acknowledged(number) => Some(100 + number.get()),
         };
         records(bytes).filter_map(number).collect()
     }
@@ -182,7 +183,7 @@ mod tests {
         let first = records(&bytes).next().unwrap().unwrap();
         assert_eq!(
             first.entry,
-            Entry::Message(1, Message::not_retained("a/b", vec![1; 40]))
+            Entry::Message(MessageNumber::new(1), Message::not_retained("a/b", vec![1; 40]))
         );
         assert_eq!(
             first.range.len() as u64,

@@ -7,7 +7,38 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
 
-use super::{DAMAGED, QUARANTINED, SEGMENT, SUFFIX};
+use super::{QUARANTINED, SEGMENT};
+
+pub(super) const SUFFIX: &str = ".log";
+pub(super) const DAMAGED: &str = ".damaged";
+
+/// Number of a segment, ascending from 1, in the names of its files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct SegmentNumber(u64);
+
+impl SegmentNumber {
+    pub(super) const FIRST: SegmentNumber = SegmentNumber(1);
+
+    pub(super) fn next(self) -> SegmentNumber {
+        SegmentNumber(self.0.saturating_add(1))
+    }
+
+    /// Name of the segment's file in the journal with this name.
+    pub(super) fn file(self, journal: &str) -> String {
+        format!("{journal}-{:012}{SUFFIX}", self.0)
+    }
+
+    /// Name of a file with the damaged bytes that the segment has at this offset.
+    pub(super) fn damaged(self, journal: &str, offset: u64) -> String {
+        format!("{journal}-{:012}-{offset}{DAMAGED}", self.0)
+    }
+
+    /// The segment whose file has this name.
+    fn of_file(file: &str, journal: &str) -> Option<SegmentNumber> {
+        let number = file.strip_prefix(journal)?.strip_prefix('-')?;
+        number.strip_suffix(SUFFIX)?.parse().ok().map(SegmentNumber)
+    }
+}
 
 /// Locks the directory for this process.
 pub(super) fn lock(dir: &Path, name: &str) -> io::Result<File> {
@@ -40,14 +71,12 @@ pub(super) fn is_full(error: &io::Error) -> bool {
 }
 
 /// The segments in `dir`, oldest first.
-pub(super) fn segments(dir: &Path, name: &str) -> io::Result<Vec<(u64, PathBuf)>> {
+pub(super) fn segments(dir: &Path, name: &str) -> io::Result<Vec<(SegmentNumber, PathBuf)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(dir)? {
         let path = entry?.path();
         let text = path.file_name().and_then(|file| file.to_str()).unwrap_or_default();
-        let number = text.strip_prefix(name).and_then(|rest| rest.strip_prefix('-'));
-        let number = number.and_then(|rest| rest.strip_suffix(SUFFIX)?.parse().ok());
-        found.extend(number.map(|number| (number, path.clone())));
+        found.extend(SegmentNumber::of_file(text, name).map(|number| (number, path.clone())));
     }
     found.sort();
     Ok(found)

@@ -1,5 +1,6 @@
 use std::io::ErrorKind;
 
+use super::segments::{DAMAGED, SUFFIX};
 use super::*;
 
 const BIG: u64 = 64 << 20;
@@ -24,7 +25,7 @@ fn append(journal: &mut MessageLog, range: std::ops::Range<usize>) {
     }
 }
 
-fn take_all(journal: &mut MessageLog) -> Vec<(u64, usize)> {
+fn take_all(journal: &mut MessageLog) -> Vec<(MessageNumber, usize)> {
     let mut all = Vec::new();
     loop {
         let taken = journal.take(usize::MAX);
@@ -35,7 +36,7 @@ fn take_all(journal: &mut MessageLog) -> Vec<(u64, usize)> {
     }
 }
 
-fn numbers(taken: &[(u64, usize)]) -> Vec<usize> {
+fn numbers(taken: &[(MessageNumber, usize)]) -> Vec<usize> {
     taken.iter().map(|(_, n)| *n).collect()
 }
 
@@ -52,7 +53,7 @@ fn unacknowledged_messages_survive_a_restart() {
     let mut journal = open(dir.path(), BIG);
     append(&mut journal, 1..5);
     assert_eq!(numbers(&take_all(&mut journal)), [1, 2, 3, 4]);
-    journal.acknowledge(2);
+    journal.acknowledge(MessageNumber::new(2));
     journal.write().unwrap();
     drop(journal); // nothing is written at the end: the same as a killed process
     let mut journal = open(dir.path(), BIG);
@@ -105,7 +106,7 @@ fn what_is_acknowledged_before_it_is_written_is_not_written() {
     let dir = tempfile::tempdir().unwrap();
     let mut journal = open(dir.path(), BIG);
     journal.append(event(1), true);
-    journal.acknowledge(1);
+    journal.acknowledge(MessageNumber::new(1));
     journal.write().unwrap();
     assert_eq!(journal.bytes(), 0);
 }
@@ -114,7 +115,7 @@ fn what_is_acknowledged_before_it_is_written_is_not_written() {
 fn an_incomplete_tail_is_kept_aside() {
     for tail in [b"X".repeat(100), vec![0; 4096], {
         let mut bytes = Vec::new();
-        record::message(9, &event(9), &mut bytes);
+        record::message(MessageNumber::new(9), &event(9), &mut bytes);
         bytes[..30].to_vec()
     }] {
         let dir = tempfile::tempdir().unwrap();
@@ -258,7 +259,7 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
     assert_eq!(journal.unkept(), 100, "they end with the process");
     assert!(journal.take(30).iter().map(|(_, m)| number(m)).eq(0..30));
     journal.append(event(100), true);
-    journal.acknowledge(101);
+    journal.acknowledge(MessageNumber::new(101));
     assert_eq!(journal.unkept(), 0);
     assert!(
         !journal.write().unwrap(),

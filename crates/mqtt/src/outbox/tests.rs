@@ -178,8 +178,8 @@ fn telemetry_without_acknowledgement_passes_a_full_window() {
         events: Qos::AtLeastOnce,
         expiry: Some(300),
     });
-    for name in ["e1", "e2"] {
-        outbox.push(MqttKind::Event, event(name), Some(7));
+    for (name, number) in [("e1", 7), ("e2", 8)] {
+        outbox.push(MqttKind::Event, event(name), Some(MessageNumber::new(number)));
     }
     outbox.put(topic("t"), vec![1]);
     outbox.put_lasting(topic("gone"), Vec::new());
@@ -192,11 +192,37 @@ fn telemetry_without_acknowledgement_passes_a_full_window() {
         (false, Some(300), true)
     );
     assert!(outbox.mark_published(key, false).is_some());
-    assert_eq!(outbox.oldest(MqttKind::Event), Some(7));
+    assert_eq!(outbox.oldest(MqttKind::Event), Some(MessageNumber::new(7)));
     outbox.numbered(1).unwrap();
     outbox.acked(1);
     let (_, message) = outbox.next(1, true).unwrap();
     assert!(message.acknowledged && message.expiry.is_none());
+}
+
+#[test]
+fn messages_that_no_log_keeps_have_their_place_among_the_others() {
+    let mut outbox = outbox();
+    for (name, number) in [
+        ("e1", Some(1)),
+        ("e2", None),
+        ("e3", None),
+        ("e4", Some(2)),
+        ("e5", Some(3)),
+    ] {
+        outbox.push(MqttKind::Event, event(name), number.map(MessageNumber::new));
+    }
+    assert_eq!(outbox.oldest(MqttKind::Event), Some(MessageNumber::new(1)));
+    assert_eq!(outbox.unkept(MqttKind::Event), 2);
+    assert_eq!(names(&drain(&mut outbox, 3)), ["e1", "e2", "e3"]);
+    (1..=3).for_each(|packet| outbox.numbered(packet).unwrap());
+    assert_eq!(outbox.acked(2).unwrap().topic.as_ref(), "e2");
+    assert_eq!(outbox.acked(1).unwrap().topic.as_ref(), "e1");
+    assert_eq!(outbox.oldest(MqttKind::Event), Some(MessageNumber::new(2)));
+    outbox.lost();
+    // The disk is full: it has no message up to number 2 any more, and never had e3.
+    outbox.drop_gone(MqttKind::Event, MessageNumber::new(2));
+    assert_eq!(lost(&mut outbox, MqttKind::Event), 1);
+    assert_eq!(names(&drain(&mut outbox, 10)), ["e3", "e5"]);
 }
 
 #[test]

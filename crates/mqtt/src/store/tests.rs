@@ -1,3 +1,6 @@
+use drivegate_core::files::names::MQTT_TOPICS;
+use flume::Receiver;
+
 use super::super::Qos;
 use super::super::outbox::{Delivery, Outbox};
 use super::*;
@@ -20,15 +23,21 @@ fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, Arc<NorthState>) {
             jobs,
             loaded,
             shared: Shared::new(lost.clone(), MqttKind::Event),
+            progress: Progress::Opening(0),
         }),
-        ..Store::default()
     };
     (store, todo, report, lost)
 }
 
-fn opened(waiting: u64) -> Loaded {
+fn number(n: u64) -> MessageNumber {
+    MessageNumber::new(n)
+}
+
+/// The report of a disk with the messages 1 to `last` of earlier runs.
+fn opened(last: u64) -> Loaded {
     Loaded::Opened {
-        waiting,
+        through: MessageNumber::NONE,
+        last: number(last),
         topics: Vec::new(),
     }
 }
@@ -38,11 +47,11 @@ fn a_disk_that_hangs_delays_nothing() {
     let (mut store, todo, _report, lost) = stalled();
     store.take(opened(0));
     for n in 0..JOBS {
-        let (number, message) = store.push(event(n), true).expect("it is sent at once");
-        assert_eq!((number, message), (Some(n as Number + 1), event(n)));
+        let sent = store.push(event(n), true).expect("it is sent at once");
+        assert_eq!(sent, (Some(number(n as u64 + 1)), event(n)));
     }
-    let (number, _) = store.push(event(JOBS), true).unwrap();
-    assert_eq!(number, None, "sent, though nothing keeps it");
+    let (unkept, _) = store.push(event(JOBS), true).unwrap();
+    assert_eq!(unkept, None, "sent, though nothing keeps it");
     assert_eq!((store.push(event(0), false), self::lost(&lost)), (None, 1), "counted");
     assert_eq!(todo.try_iter().count(), JOBS);
 }
@@ -78,18 +87,19 @@ fn messages_wait_behind_those_on_disk() {
         jobs[..],
         [Job::Append(_, false), Job::Append(_, false), Job::Load(100)]
     ));
-    let messages = (-1..=2).map(|n| (n, event(9))).collect();
-    let (loaded, _) = store.take(Loaded::Messages { messages, through: 2 });
+    let messages = (1..=4).map(|n| (number(n), event(9))).collect();
+    let through = number(4);
+    let (loaded, _) = store.take(Loaded::Messages { messages, through });
     assert_eq!((loaded.len(), store.waiting()), (4, 0));
-    assert_eq!(store.push(event(3), true).unwrap().0, Some(3));
-    store.acknowledge(Some(2));
-    store.acknowledge(Some(2));
+    assert_eq!(store.push(event(3), true).unwrap().0, Some(number(5)));
+    store.acknowledge(Some(number(4)));
+    store.acknowledge(Some(number(4)));
     store.acknowledge(None);
-    let told = todo.try_iter().filter_map(|job| match job {
+    let noted = todo.try_iter().filter_map(|job| match job {
         Job::Acknowledge(number) => Some(number),
         _ => None,
     });
-    assert_eq!(told.collect::<Vec<_>>(), [1, 3]);
+    assert_eq!(noted.collect::<Vec<_>>(), [number(3), number(5)]);
 }
 
 #[tokio::test]
@@ -108,7 +118,7 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
     store.load(4);
     let report = store.next().await;
     assert_eq!(store.take(report).0.len(), 4);
-    store.acknowledge(Some(3));
+    store.acknowledge(Some(number(3)));
     store.remember(vec!["a/b".to_string(), "c".to_string()]);
     store.close().await;
 
@@ -121,10 +131,10 @@ async fn what_is_not_acknowledged_is_there_in_the_next_run() {
     store.load(100);
     let report = store.next().await;
     let (messages, _) = store.take(report);
-    let numbers: Vec<Number> = messages.iter().map(|(number, _)| *number).collect();
-    assert_eq!(numbers, (-7..=1).collect::<Vec<_>>());
+    let numbers: Vec<u64> = messages.iter().map(|(number, _)| number.get()).collect();
+    assert_eq!(numbers, (3..=11).collect::<Vec<_>>(), "as they were in the last run");
     assert_eq!(messages[0].1, event(2));
-    assert_eq!(store.push(event(11), true).unwrap().0, Some(2));
+    assert_eq!(store.push(event(11), true).unwrap().0, Some(number(12)));
 }
 
 #[tokio::test]
@@ -139,8 +149,8 @@ async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
     store.take(report);
     store.load(10);
     let report = store.next().await;
-    assert_eq!(store.take(report).0, [(1, event(0))]);
-    assert_eq!(store.push(event(1), true).unwrap().0, Some(2));
+    assert_eq!(store.take(report).0, [(number(1), event(0))]);
+    assert_eq!(store.push(event(1), true).unwrap().0, Some(number(2)));
 }
 
 /// Waits until the disk has finished all its jobs.

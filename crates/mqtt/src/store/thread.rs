@@ -1,0 +1,201 @@
+//! The thread that reads and writes the files of one kind of message.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use flume::{Receiver, RecvTimeoutError};
+use tokio::sync::mpsc;
+
+use super::super::Buffer;
+use super::super::message_log::MessageLog;
+use super::{Job, Loaded, Shared};
+use drivegate_core::files::names::MQTT_TOPICS;
+
+/// Messages that are written at a time.
+const BATCH: usize = 1024;
+/// Time after which messages on disk survive a power failure.
+const SYNC: Duration = Duration::from_secs(1);
+/// Attempts to lock the directory, and the wait between them: a process that is stopping may still have it locked.
+const LOCK_ATTEMPTS: u32 = 20;
+const LOCK_WAIT: Duration = Duration::from_millis(50);
+
+/// The thread that owns the files.
+pub(super) struct Thread {
+    dir: PathBuf,
+    journal: MessageLog,
+    report: mpsc::Sender<Loaded>,
+    shared: Arc<Shared>,
+    /// The topics to be kept for the next run.
+    topics: Vec<String>,
+    /// Whether the last write failed; logged once.
+    failing: bool,
+    synced: Instant,
+}
+
+impl Thread {
+    /// Opens the files of messages with this name, and reports the messages of earlier runs.
+    pub(super) fn open(
+        buffer: &Buffer,
+        name: &'static str,
+        report: mpsc::Sender<Loaded>,
+        shared: Arc<Shared>,
+    ) -> Thread {
+        let dir = buffer.dir.clone();
+        let mut attempts = LOCK_ATTEMPTS;
+        let journal = loop {
+            attempts -= 1;
+            match MessageLog::open(&dir, name, buffer.max_bytes) {
+                Ok(journal) => break journal,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
+                    std::thread::sleep(LOCK_WAIT);
+                }
+                Err(error) => {
+                    tracing::error!(
+                        target: "drivegate::north::mqtt", "cannot keep {name} in {}: {error}; keeping them in memory; check mqtt.buffer",
+                        dir.display()
+                    );
+                    break MessageLog::in_memory();
+                }
+            }
+        };
+        let waiting = journal.waiting();
+        if waiting > 0 {
+            tracing::info!(
+                target: "drivegate::north::mqtt", "{waiting} earlier {name} in {} are waiting for the broker",
+                dir.display()
+            );
+        }
+        let thread = Thread {
+            topics: Vec::new(),
+            dir,
+            journal,
+            report,
+            shared,
+            failing: false,
+            synced: Instant::now(),
+        };
+        thread.report(Loaded::Opened {
+            through: thread.journal.through(),
+            last: thread.journal.last,
+            topics: thread.read_topics(),
+        });
+        thread
+    }
+
+    /// Executes jobs until all senders of jobs have been dropped.
+    pub(super) fn work(mut self, jobs: &Receiver<Job>) {
+        loop {
+            let mut load = None;
+            let mut next = match jobs.recv_timeout(SYNC) {
+                Ok(job) => Some(job),
+                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            let mut count = 0;
+            while let Some(job) = next.take() {
+                match job {
+                    Job::Append(message, sent) => {
+                        self.shared.bytes.fetch_sub(message.bytes(), Ordering::Relaxed);
+                        self.journal.append(message, sent);
+                    }
+                    Job::Acknowledge(number) => self.journal.acknowledge(number),
+                    Job::Load(most) => load = Some(most),
+                    Job::Topics(topics) => {
+                        self.topics = topics;
+                        self.write_topics();
+                    }
+                }
+                count += 1;
+                // The report covers the messages present at this moment, no later ones.
+                if count < BATCH && load.is_none() {
+                    next = jobs.try_recv().ok();
+                }
+            }
+            if let Some(most) = load {
+                self.load(most);
+            }
+            self.write();
+        }
+        self.write();
+        self.sync();
+        let unkept = self.journal.unkept();
+        if unkept > 0 {
+            self.shared.lost(unkept);
+            tracing::error!(
+                target: "drivegate::north::mqtt", "{unkept} messages that the broker did not accept are lost: {} does \
+                                                   not accept them either; check mqtt.buffer",
+                self.dir.display()
+            );
+        }
+    }
+
+    fn load(&mut self, most: usize) {
+        let messages = self.journal.take(most);
+        let through = self.journal.through();
+        self.report(Loaded::Messages { messages, through });
+    }
+
+    fn report(&self, loaded: Loaded) {
+        // At most two reports are on their way; the client may have ended.
+        let _ = self.report.try_send(loaded);
+    }
+
+    fn write(&mut self) {
+        let written = self.journal.write();
+        match written {
+            Ok(true) if std::mem::take(&mut self.failing) => {
+                tracing::info!(target: "drivegate::north::mqtt", "the MQTT buffer in {} works again", self.dir.display());
+            }
+            Err(error) if !std::mem::replace(&mut self.failing, true) => {
+                tracing::error!(
+                    target: "drivegate::north::mqtt", "cannot write to {}: {error}; the newest messages wait in memory; check mqtt.buffer",
+                    self.dir.display()
+                );
+            }
+            _ => {}
+        }
+        if self.journal.take_wiped() && !self.topics.is_empty() {
+            self.write_topics();
+        }
+        self.shared.lost(self.journal.take_lost());
+        let gone = self.journal.lost_up_to.get();
+        self.shared.gone.store(gone, Ordering::Relaxed);
+        self.shared.missing.store(self.journal.counted, Ordering::Relaxed);
+        if self.synced.elapsed() >= SYNC {
+            self.sync();
+        }
+    }
+
+    fn sync(&mut self) {
+        if let Some(file) = self.journal.unsynced()
+            && let Err(error) = file.sync_data()
+        {
+            let dir = self.dir.display();
+            tracing::warn!(target: "drivegate::north::mqtt", "{dir}: {error}; buffered messages may not survive a power failure");
+        }
+        self.synced = Instant::now();
+    }
+
+    fn topics_file(&self) -> PathBuf {
+        self.dir.join(MQTT_TOPICS)
+    }
+
+    fn read_topics(&self) -> Vec<String> {
+        let text = std::fs::read_to_string(self.topics_file()).unwrap_or_default();
+        text.lines().map(str::to_string).collect()
+    }
+
+    fn write_topics(&self) {
+        let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
+        let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
+        if let Err(error) = written {
+            // An incomplete file would only take room from the messages.
+            let _ = std::fs::remove_file(&new);
+            let file = file.display();
+            tracing::warn!(target: "drivegate::north::mqtt", "{file}: {error}; topics removed before the next start are not cleared");
+        }
+    }
+}
