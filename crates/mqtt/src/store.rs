@@ -5,6 +5,7 @@
 //! process ends before it is acknowledged. Otherwise it waits behind the messages on disk.
 
 mod thread;
+mod topics_file;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};

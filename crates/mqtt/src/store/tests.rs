@@ -1,3 +1,4 @@
+use drivegate_core::files::PARTIAL;
 use drivegate_core::files::names::MQTT_TOPICS;
 use flume::Receiver;
 
@@ -239,10 +240,12 @@ async fn a_list_of_topics_that_finds_no_room_leaves_nothing_behind() {
         dir: dir.path().to_path_buf(),
         max_bytes: 1 << 20,
     };
-    let new = dir.path().join(format!("{MQTT_TOPICS}.new"));
+    let new = dir.path().join(MQTT_TOPICS).with_extension(PARTIAL);
     std::os::unix::fs::symlink("/dev/full", &new).unwrap();
     let store = Store::open(Some(buffer), "mqtt-events", &Arc::default(), MqttKind::Event);
     store.remember(vec!["a/b".to_string()]);
     store.close().await;
     assert!(new.symlink_metadata().is_err(), "it would take the room of messages");
+    let topics = std::fs::read_to_string(dir.path().join(MQTT_TOPICS)).unwrap();
+    assert_eq!(topics, "a/b", "they are offered again");
 }

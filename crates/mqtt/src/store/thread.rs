@@ -11,8 +11,8 @@ use tokio::sync::mpsc;
 
 use super::super::Buffer;
 use super::super::message_log::MessageLog;
+use super::topics_file::TopicsFile;
 use super::{Job, Loaded, Shared};
-use drivegate_core::files::names::MQTT_TOPICS;
 
 /// Messages that are written at a time.
 const BATCH: usize = 1024;
@@ -28,8 +28,7 @@ pub(super) struct Thread {
     journal: MessageLog,
     report: mpsc::Sender<Loaded>,
     shared: Arc<Shared>,
-    /// The topics to be kept for the next run.
-    topics: Vec<String>,
+    topics: TopicsFile,
     /// Whether the last write failed; logged once.
     failing: bool,
     synced: Instant,
@@ -69,7 +68,7 @@ impl Thread {
             );
         }
         let thread = Thread {
-            topics: Vec::new(),
+            topics: TopicsFile::in_dir(&dir),
             dir,
             journal,
             report,
@@ -80,7 +79,7 @@ impl Thread {
         thread.report(Loaded::Opened {
             through: thread.journal.through(),
             last: thread.journal.last,
-            topics: thread.read_topics(),
+            topics: thread.topics.read(),
         });
         thread
     }
@@ -103,10 +102,7 @@ impl Thread {
                     }
                     Job::Acknowledge(number) => self.journal.acknowledge(number),
                     Job::Load(most) => load = Some(most),
-                    Job::Topics(topics) => {
-                        self.topics = topics;
-                        self.write_topics();
-                    }
+                    Job::Topics(topics) => self.topics.keep(topics),
                 }
                 count += 1;
                 // The report covers the messages present at this moment, no later ones.
@@ -121,6 +117,7 @@ impl Thread {
         }
         self.write();
         self.sync();
+        self.topics.retry();
         let unkept = self.journal.unkept();
         if unkept > 0 {
             self.shared.lost(unkept);
@@ -157,8 +154,8 @@ impl Thread {
             }
             _ => {}
         }
-        if self.journal.take_wiped() && !self.topics.is_empty() {
-            self.write_topics();
+        if self.journal.take_wiped() {
+            self.topics.restore();
         }
         self.shared.lost(self.journal.take_lost());
         let gone = self.journal.lost_up_to.get();
@@ -166,6 +163,7 @@ impl Thread {
         self.shared.missing.store(self.journal.counted, Ordering::Relaxed);
         if self.synced.elapsed() >= SYNC {
             self.sync();
+            self.topics.retry();
         }
     }
 
@@ -177,25 +175,5 @@ impl Thread {
             tracing::warn!(target: "drivegate::north::mqtt", "{dir}: {error}; buffered messages may not survive a power failure");
         }
         self.synced = Instant::now();
-    }
-
-    fn topics_file(&self) -> PathBuf {
-        self.dir.join(MQTT_TOPICS)
-    }
-
-    fn read_topics(&self) -> Vec<String> {
-        let text = std::fs::read_to_string(self.topics_file()).unwrap_or_default();
-        text.lines().map(str::to_string).collect()
-    }
-
-    fn write_topics(&self) {
-        let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
-        let written = std::fs::write(&new, self.topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
-        if let Err(error) = written {
-            // An incomplete file would only take room from the messages.
-            let _ = std::fs::remove_file(&new);
-            let file = file.display();
-            tracing::warn!(target: "drivegate::north::mqtt", "{file}: {error}; topics removed before the next start are not cleared");
-        }
     }
 }
