@@ -18,10 +18,10 @@ impl NodeClient {
         let mut filters = vec![commanding(topics.node_commands())];
         filters.extend(topics.state().into_iter().chain(topics.old_state()).map(plain));
         let name = |drive: &Drive| topics.commands_of(&drive.metrics.drive.image.spec.name);
-        match limits.wildcards {
-            _ if !self.broker.commands => {}
-            true => filters.push(commanding(topics.device_commands())),
-            false => filters.extend(self.drives.iter().map(name).map(commanding)),
+        if self.broker.commands && limits.wildcards {
+            filters.push(commanding(topics.device_commands()));
+        } else if self.broker.commands {
+            filters.extend(self.drives.iter().map(name).map(commanding));
         }
         filters
     }
