@@ -163,9 +163,9 @@ fn rust_files(folders: &[&str]) -> Vec<PathBuf> {
 /// Whether a file, or a folder that contains it, has only tests.
 pub(super) fn is_test(path: &Path) -> bool {
     let parts = path.strip_prefix(root()).unwrap().iter();
-    parts
-        .map(|part| part.to_string_lossy())
-        .any(|name| matches!(&*name, "tests" | "tests.rs" | "testkit") || name.ends_with("_tests.rs"))
+    parts.map(|part| part.to_string_lossy()).any(|name| {
+        matches!(&*name, "tests" | "tests.rs" | "testkit") || name.trim_end_matches(".rs").ends_with("_tests")
+    })
 }
 
 #[test]
