@@ -22,6 +22,7 @@ use self::segments::{SegmentNumber, is_deleted, is_full, lock, remove_old_quaran
 use super::number::MessageNumber;
 use super::outbox::{KEPT_BYTES, LOADED_BYTES, Message};
 use super::record::{self, Entry, Record};
+use drivegate_core::files;
 
 /// Largest and smallest size of a segment, bytes; between them a 64th of the buffer.
 const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
@@ -528,7 +529,7 @@ impl MessageLog {
             return Ok(());
         };
         let path = dir.join(segment.damaged(name, offset));
-        let kept = remove_old_quarantine(dir, name).and_then(|()| fs::write(&path, bytes));
+        let kept = remove_old_quarantine(dir, name).and_then(|()| files::replace(&path, bytes));
         let shown = match &kept {
             Err(error) => format!("they cannot be saved: {error}"),
             Ok(()) => format!("kept in {}", path.display()),

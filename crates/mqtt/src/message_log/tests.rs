@@ -425,9 +425,10 @@ fn what_a_full_disk_left_of_a_file_does_not_keep_the_others_from_being_read() {
     fs::write(&torn, [7; 100]).unwrap();
     // The disk has no space for a copy.
     let copy = dir.path().join(format!("mqtt-events-{last:012}-0{DAMAGED}"));
-    std::os::unix::fs::symlink("/dev/full", &copy).unwrap();
+    std::os::unix::fs::symlink("/dev/full", copy.with_extension(files::PARTIAL)).unwrap();
     let mut journal = open(dir.path(), 64 << 10);
     append(&mut journal, 200..201);
     assert_eq!(numbers(&take_all(&mut journal)), (0..201).collect::<Vec<_>>());
     assert_eq!(journal.take_lost(), 1);
+    assert!(!copy.exists(), "no part of it takes the room of messages");
 }
