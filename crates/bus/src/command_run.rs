@@ -109,6 +109,8 @@ struct Tries {
     busy: u32,
     /// Pause before the next attempt; `None` without one.
     pause: Option<Duration>,
+    /// When the last pause ends, or has ended.
+    due: Option<Instant>,
 }
 
 /// How a command ends when nothing is left to send.
@@ -286,6 +288,7 @@ impl CommandRun {
                 doubt: Doubt::No,
                 busy: 0,
                 pause: None,
+                due: None,
             },
             ending: match unsendable {
                 Some(refusal) => Ending::Cut(Outcome::Refused(refusal)),

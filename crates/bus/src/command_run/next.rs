@@ -78,11 +78,17 @@ impl CommandRun {
         self.cut_off(outcome);
     }
 
+    /// Since when a step is due that the drive was too busy for; `None` if it was not.
+    pub(crate) fn repeats_since(&self) -> Option<Instant> {
+        self.tries.due.filter(|_| self.tries.busy > 0)
+    }
+
     /// Until when the command sends nothing; `None` if it may send now.
     fn pauses_until(&mut self, now: Instant) -> Option<Instant> {
         if let Some(pause) = self.tries.pause.take() {
             let end = if self.may_write_on() { self.expires } else { now + pause };
             self.not_before = Some((now + pause).min(end));
+            self.tries.due = self.not_before;
         }
         self.not_before = self.not_before.filter(|at| now < *at);
         self.not_before

@@ -22,9 +22,9 @@ const MOST_DECISIONS: usize = 1000;
 /// The ranks of commands, highest first.
 const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
 
-/// How often each rank went before waiting lower ones.
+/// How often each rank went before waiting lower ones, and queued commands before repetitions of their rank.
 #[derive(Debug, Default)]
-pub(super) struct Turns([u32; 3]);
+pub(super) struct Turns([u32; 3], u32);
 
 impl Turns {
     /// Which of the waiting ranks is served next: the highest, unless it had eight transactions in a row.
@@ -37,6 +37,19 @@ impl Turns {
             }
         }
         None
+    }
+
+    /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy:
+    /// several such drives must not keep a stop from the others.
+    fn begins_before(&mut self, repetition: bool) -> bool {
+        let Turns(_, began) = self;
+        let begins = repetition && *began < IN_A_ROW;
+        match begins {
+            true => *began += 1,
+            false if repetition => *began = 0,
+            false => {}
+        }
+        begins
     }
 
     /// Counts a transaction of this rank, with lower ranks waiting or not.
@@ -57,6 +70,8 @@ struct NextStep {
     slot: Urgency,
     rank: Urgency,
     step: Step,
+    /// Since when a repetition is due for a drive that was busy.
+    repeats_since: Option<Instant>,
 }
 
 /// What all started commands need at one time.
@@ -204,6 +219,7 @@ impl Master {
                     slot,
                     rank,
                     step,
+                    repeats_since: None,
                 })
             }
             _ => None,
@@ -244,13 +260,18 @@ impl Master {
                         continue;
                     }
                     let rank = drive.run(slot).map_or(slot, |run| run.rank);
+                    let repeats_since = drive.run(slot).and_then(|run| run.repeats_since());
                     let place = commands.ready.get_mut(rank as usize);
-                    if let Some(place @ None) = place {
+                    let is_next = |other: &NextStep| repeats_since < other.repeats_since;
+                    if let Some(place) = place
+                        && place.as_ref().is_none_or(is_next)
+                    {
                         *place = Some(NextStep {
                             drive: index,
                             slot,
                             rank,
                             step,
+                            repeats_since,
                         });
                     }
                 }
@@ -300,11 +321,13 @@ impl Master {
     fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Decided {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
-        if let Some(ready) = ready {
+        let queued = commands.queued.get(rank as usize).copied().flatten();
+        let mut goes = |ready: &NextStep| queued.is_none() || !self.turns.begins_before(ready.repeats_since.is_some());
+        if let Some(ready) = ready.filter(|ready| goes(ready)) {
             self.turns.served(rank, lower_waits);
             return Decided::Send(self.turn(ready, now));
         }
-        let Some(chosen) = commands.queued.get(rank as usize).copied().flatten() else {
+        let Some(chosen) = queued else {
             return Decided::Again;
         };
         let Some(command) = self.bus.queue.lock().take(chosen) else {
@@ -354,6 +377,7 @@ impl Master {
             slot,
             rank,
             step,
+            ..
         } = ready;
         match self.waits.sessions.before(drive, Some(slot), now) {
             Some(session) => Turn {

@@ -73,3 +73,38 @@ fn a_drive_is_tried_as_often_as_it_says_before_it_is_offline() {
     assert_eq!(tries_until_offline(&mut rig, 0), 1 + 1);
     assert_eq!(tries_until_offline(&mut rig, 1), 4 + 1);
 }
+
+/// Drives that are busy get their stops again and again, which fills the line.
+#[test]
+fn a_stop_does_not_wait_until_other_drives_are_no_longer_busy() {
+    let mut rig = Rig::new(12);
+    for drive in &mut rig.drives {
+        drive.holding.insert(2000, 1);
+    }
+    rig.run(Duration::from_secs(2));
+    let busy = 0..10;
+    for drive in busy.clone() {
+        rig.drives[drive].to_writes = Some((u32::MAX, Exception::BUSY));
+    }
+    let _stops: Vec<_> = busy.clone().map(|k| rig.switch(k, "client", false)).collect();
+    rig.run(Duration::from_millis(500));
+    let (from, asked) = (rig.wire.len(), rig.now);
+    let _stops: Vec<_> = [10, 11].map(|k| rig.switch(k, "client", false)).into();
+    rig.run(Duration::from_secs(1));
+    let writes = |drive: usize| {
+        let to = move |(_, turn): &&(Instant, Turn)| turn.pdu().is_write() && turn.target() == DriveIndex::new(drive);
+        rig.wire[from..].iter().filter(to).map(|(at, _)| *at - asked)
+    };
+    for drive in [10, 11] {
+        let first = writes(drive).next();
+        assert!(first.is_some_and(|after| after <= 5 * COST), "{drive}: {first:?}");
+    }
+    let tries: Vec<usize> = busy.map(|drive| writes(drive).count()).collect();
+    let (least, most) = (tries.iter().min(), tries.iter().max());
+    assert!(
+        least
+            .zip(most)
+            .is_some_and(|(least, most)| *least > 0 && most - least <= 1),
+        "{tries:?}"
+    );
+}
