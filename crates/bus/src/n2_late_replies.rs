@@ -101,11 +101,15 @@ impl N2LateReplies {
     }
 
     /// The drive answered a request. Replies of another form to earlier requests will not arrive any more. Another
-    /// reply to the same request may arrive within `window`.
+    /// reply to the same request may arrive within `window`; if the request was sent before, replies to requests that
+    /// were sent in between may arrive too.
     pub fn answered(&mut self, address: u8, pdu: &RequestPdu, window: Duration, now: Instant) {
         let Some(form) = form(pdu) else { return };
-        self.0
-            .retain(|late| late.address != address || late.form.is_like(form) || form.is_like(late.form));
+        let first = self.of(address, pdu).map(|late| late.asked);
+        let is_behind = |late: &Late| first.is_some_and(|first| late.asked > first);
+        self.0.retain(|late| {
+            late.address != address || late.form.is_like(form) || form.is_like(late.form) || is_behind(late)
+        });
         if let Some(late) = self.of(address, pdu).filter(|late| !late.answered) {
             (late.until, late.answered) = (now + window, true);
         }
@@ -180,12 +184,16 @@ impl N2LateReplies {
         }
     }
 
+    /// Notes that a late reply came: each of the other replies of its drive may take as long again.
     fn one_came(&mut self, index: usize, now: Instant) {
         let Some(late) = self.0.get_mut(index) else { return };
+        let address = late.address;
         late.count = late.count.saturating_sub(1);
-        late.until = late.until.max(now + late.window);
         if late.count == 0 {
             self.0.remove(index);
+        }
+        for late in self.0.iter_mut().filter(|late| late.address == address) {
+            late.until = late.until.max(now + late.window);
         }
     }
 
@@ -380,6 +388,41 @@ mod tests {
         let second = first + WINDOW * 9 / 10;
         assert_eq!(late.asked_by(1, &float, second), Some(now), "it may be a value of then");
         assert!(late.may_come(second) && !late.may_come(first + WINDOW));
+    }
+
+    #[test]
+    fn a_drive_takes_as_long_again_for_its_next_request() {
+        let now = Instant::now();
+        let (float, state) = (read(Table::Input, 8, 2), read(Table::Coil, 1, 1));
+        let release = RequestPdu::N2(Session::Release {
+            table: Table::Holding,
+            address: 0,
+        });
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &release, now), WINDOW, now);
+        late.given_up(asked(1, &float, now), WINDOW, now);
+        late.given_up(asked(2, &state, now), WINDOW, now);
+        let came = now + WINDOW * 9 / 10;
+        assert_eq!(late.take(3, &state, b"A\r", came), Taken::Late(2));
+        assert_eq!(late.blocks(&float, came), Some(came + WINDOW));
+        assert_eq!(
+            late.blocks(&state, came),
+            Some(now + WINDOW),
+            "another drive is not slower"
+        );
+    }
+
+    #[test]
+    fn the_answer_to_the_first_of_two_equal_requests_settles_nothing_sent_between_them() {
+        let at = |ms| Instant::now() + Duration::from_millis(ms);
+        let (first, between, answered) = (at(0), at(300), at(700));
+        let (float, state) = (read(Table::Input, 0, 2), read(Table::DiscreteInput, 0, 1));
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &float, first), WINDOW, between);
+        late.given_up(asked(1, &state, between), WINDOW, answered);
+        assert_eq!(late.take(1, &float, b"A4248000092\r", answered), Taken::Reply);
+        late.answered(1, &float, WINDOW, answered);
+        assert!(late.blocks(&state, answered).is_some(), "its reply is still to come");
     }
 
     #[test]
