@@ -39,6 +39,9 @@ struct Drive {
     proved: bool,
     /// The device type that was reported last.
     device: Option<u8>,
+    /// Whether the drive has replied to another request since it reported this device type. Otherwise the report may
+    /// have been the late reply of another drive.
+    device_proved: bool,
 }
 
 /// The effect of a transaction on the session.
@@ -71,6 +74,7 @@ impl N2Sessions {
             polled: None,
             proved: false,
             device: None,
+            device_proved: false,
         };
         N2Sessions {
             drives: drives.into_iter().map(drive).collect(),
@@ -137,12 +141,12 @@ impl N2Sessions {
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
                 let known = drive.proved;
                 drive.phase = Phase::Waiting;
-                drive.proved = false;
+                drive.unproved();
                 if known { Progress::Restarted } else { Progress::Failed }
             }
             Ended::Reply(Reply::Identified(_)) => Progress::Going,
             _ => {
-                drive.proved = true;
+                (drive.proved, drive.device_proved) = (true, true);
                 Progress::Going
             }
         }
@@ -159,7 +163,7 @@ impl N2Sessions {
     pub fn gone(&mut self, drive: DriveIndex) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);
-            drive.proved = false;
+            drive.unproved();
             drive.polled = None;
         }
     }
@@ -186,6 +190,15 @@ impl Drive {
         self.polled.is_none_or(|at| since(at) >= self.options.poll)
     }
 
+    /// The drive must be identified again. A device type that nothing has confirmed is forgotten: late replies to
+    /// Identify would be recognised by it, and the states of other drives taken for them.
+    fn unproved(&mut self) {
+        self.proved = false;
+        if !self.device_proved {
+            self.device = None;
+        }
+    }
+
     /// Starts to poll the drive for changes.
     fn report(&mut self) {
         self.phase = Phase::Reporting {
@@ -206,6 +219,7 @@ impl Drive {
             return Progress::Going;
         };
         let before = self.device.replace(*device);
+        self.device_proved &= before == Some(*device);
         if *device != self.options.device_type && before != Some(*device) {
             Progress::Unlike(*device)
         } else {

@@ -165,3 +165,30 @@ fn other_buses_have_none() {
         Progress::Going
     );
 }
+
+#[test]
+fn a_device_type_that_no_other_reply_has_confirmed_is_forgotten() {
+    let drive = DriveIndex::new(0);
+    let other = Ended::Reply(Reply::Identified(0));
+    // The drive is away, and its identity was the late state of another drive.
+    let mut rig = rig();
+    assert_eq!(rig.done(IDENTIFY, &other), Progress::Unlike(0));
+    assert_eq!(rig.sessions.device(drive), 0);
+    rig.sessions.transaction_ended(drive, &Ended::Silent);
+    rig.sessions.gone(drive);
+    assert_eq!(rig.sessions.device(drive), 0x10);
+    // The same through a late refusal.
+    rig.done(IDENTIFY, &other);
+    rig.sessions.transaction_ended(drive, &restarted());
+    assert_eq!(rig.sessions.device(drive), 0x10);
+    // A drive that was read keeps its type, and a report of another one needs a reply of its own.
+    rig.done(IDENTIFY, &other);
+    rig.sessions.transaction_ended(drive, &value());
+    for _ in 0..2 {
+        rig.sessions.gone(drive);
+        assert_eq!(rig.sessions.device(drive), 0);
+    }
+    rig.done(IDENTIFY, &identity());
+    rig.sessions.gone(drive);
+    assert_eq!(rig.sessions.device(drive), 0x10);
+}
