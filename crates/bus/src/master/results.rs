@@ -422,6 +422,8 @@ impl Master {
             Ended::Corrupt(CONNECTION_CLOSED) => retries.max(1),
             // A reply lost during a stall of the thread also earns one more try.
             _ if online => retries.max(u32::from(used.stood)),
+            // Even a damaged reply shows that something answers: a stop is tried as often as at a drive that is online.
+            Ended::Corrupt(_) if slot == Urgency::Stop => retries,
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));

@@ -401,6 +401,21 @@ fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
 }
 
 #[test]
+fn a_stop_to_a_drive_that_is_away_is_sent_again_after_a_damaged_reply() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(20));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
+    rig.drives[0].silent = false;
+    rig.drives[0].holding.insert(2000, 1);
+    rig.drives[0].next_write = Some(Ended::Corrupt("checksum"));
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(200));
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+    assert!(!rig.runs(0));
+}
+
+#[test]
 fn stops_at_a_silent_drive_leave_the_line_to_the_others() {
     let mut rig = Rig::new(2);
     rig.drives[0].silent = true;
