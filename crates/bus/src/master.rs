@@ -232,8 +232,9 @@ pub struct Master {
     drives: PerDrive<DriveState>,
     /// Conditions that a transaction may have to wait for.
     waits: Waits,
-    /// The last reply on the line, valid or damaged, of which a duplicate may arrive.
-    last_answered: Option<(Target, RequestPdu)>,
+    /// The last two requests with a reply, valid or damaged, the later one first: a duplicate of the reply may arrive.
+    /// The duplicate of a long reply takes longer than the next short transaction.
+    last_answered: [Option<(Target, RequestPdu)>; 2],
     turns: Turns,
     /// The background request that is next to be sent, or is on the line.
     background: Option<ChosenTransaction>,
@@ -305,7 +306,7 @@ impl Master {
                 starts: StartGate::of(&bus),
                 quiet: None,
             },
-            last_answered: None,
+            last_answered: [None, None],
             turns: Turns::default(),
             background: None,
             passed_on_last: false,
@@ -322,7 +323,7 @@ impl Master {
     pub fn opened(&mut self, now: Instant) {
         self.schedule.reset(now);
         self.waits.sessions.reset();
-        self.last_answered = None;
+        self.last_answered = [None, None];
         self.probes.fill(0);
     }
 
@@ -547,18 +548,21 @@ impl Master {
             .map(|drive| &drive.late)
             .chain(self.waits.strangers.values());
         self.late_before = self.waits.n2_late.may_come(now) || late.any(|late| late.may_come(now));
-        let last = self.last_answered.as_ref();
         let n2 = !self.waits.sessions.is_empty();
+        let is_alike = |(of, answered): &(Target, RequestPdu)| match n2 {
+            // An N2 reply does not even show its drive.
+            true => n2_look_alike(answered, &turn.pdu),
+            false => *of == turn.target() && are_alike(answered, &turn.pdu),
+        };
         Sending {
             silence: self.silence_of(turn),
             response_timeout: self.timeout_of(turn),
             late_may_come: self.late_before,
-            // An N2 reply does not even show its drive. After reopening a line that was in use, the last request on
-            // it is unknown.
-            could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
-                true => n2_look_alike(last, &turn.pdu),
-                false => *of == turn.target() && are_alike(last, &turn.pdu),
-            }),
+            // After reopening a line that was in use, the last request on it is unknown.
+            could_be_doubled: match &self.last_answered {
+                [None, _] => self.successor,
+                answered => answered.iter().flatten().any(is_alike),
+            },
         }
     }
 

@@ -87,12 +87,10 @@ impl Master {
                         *self.probes.of_mut(drive) = 0;
                     }
                 }
-                self.last_answered = Some((target, turn.pdu.clone()));
+                self.note_answered(turn);
             }
-            Ended::Corrupt(_) if came_mangled => {
-                // A valid reply may follow the damaged one.
-                self.last_answered = Some((target, turn.pdu.clone()));
-            }
+            // A valid reply may follow the damaged one.
+            Ended::Corrupt(_) if came_mangled => self.note_answered(turn),
             Ended::Silent | Ended::Corrupt(_) if self.bus.image.spec.tells_replies_apart() => {
                 let image = target.drive().map(|drive| self.bus.image.drives.of(drive));
                 if let Some((drive, image)) = drive.zip(image) {
@@ -113,6 +111,12 @@ impl Master {
             }
             Ended::Silent | Ended::Corrupt(_) => {}
         }
+    }
+
+    /// Keeps the request whose reply a duplicate may follow.
+    pub(super) fn note_answered(&mut self, turn: &Turn) {
+        let [last, before] = &mut self.last_answered;
+        *before = last.replace((turn.target(), turn.pdu.clone()));
     }
 
     /// Whether the drive's own reply arrived damaged; false if the damaged one may have been a late reply to an

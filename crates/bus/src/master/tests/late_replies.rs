@@ -60,7 +60,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         let mut turn = read(&mut rig);
         // The reply before has another form than this one's.
         let written = RequestPdu::WriteCoil { address: 0, on: true };
-        rig.master.last_answered = Some((turn.target(), written));
+        rig.master.last_answered = [Some((turn.target(), written)), None];
         assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
         rig.now += COST;
         rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
@@ -69,6 +69,31 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         }
         assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
     }
+}
+
+#[test]
+fn a_duplicate_of_the_reply_before_the_last_one_may_come() {
+    let mut rig = Rig::new(1);
+    let turn = loop {
+        match rig.master.next(rig.now, &mut Vec::new()) {
+            Ok(turn) => break turn,
+            Err(until) => rig.now = until,
+        }
+    };
+    let other = Turn {
+        pdu: RequestPdu::WriteCoil { address: 0, on: true },
+        ..turn.clone()
+    };
+    let mut may_be_doubled = |answered: &Turn| {
+        rig.master.note_answered(answered);
+        rig.master.sending(&turn, rig.now).could_be_doubled
+    };
+    assert!(may_be_doubled(&turn));
+    assert!(
+        may_be_doubled(&other),
+        "a long reply takes longer than a short transaction"
+    );
+    assert!(!may_be_doubled(&other));
 }
 
 #[test]
