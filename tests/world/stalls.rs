@@ -199,7 +199,9 @@ impl World {
         world
     }
 
+    /// Runs the world to its end; the plant must then be freed.
     fn run(mut self) {
+        let plant = Arc::downgrade(&self.plant);
         if let Err(cause) = catch_unwind(AssertUnwindSafe(|| self.live())) {
             println!("{:#?}", self.bus.line.family);
             println!("{}", self.history.take());
@@ -211,6 +213,12 @@ impl World {
             );
             resume_unwind(cause)
         }
+        let seed = self.seed;
+        drop(self);
+        assert!(
+            plant.upgrade().is_none(),
+            "seed {seed}: something keeps the plant in memory"
+        );
     }
 
     fn live(&mut self) {
@@ -523,7 +531,10 @@ fn first_word(asked: &Asked) -> Option<(drivegate_proto::Table, u16)> {
 fn no_motor_starts_that_nobody_wants_to_run() {
     let seeds = match super::number("STALLS_SEED") {
         Some(seed) => seed..seed + 1,
-        None => 0..super::number("STALLS_SEEDS").unwrap_or(FIXED),
+        None => {
+            let first = super::number("STALLS_FROM").unwrap_or(0);
+            first..first + super::number("STALLS_SEEDS").unwrap_or(FIXED)
+        }
     };
     for seed in seeds {
         World::new(seed).run();

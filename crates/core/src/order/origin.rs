@@ -219,6 +219,13 @@ impl Origin {
         self.with_right(Right::lasting())
     }
 
+    /// The origin for a record of the past, without the right: a right keeps what grants it in memory, and with that
+    /// the plant.
+    #[must_use]
+    pub(crate) fn recorded(&self) -> Origin {
+        self.clone().lasting()
+    }
+
     /// The right of the client to write.
     pub fn right(&self) -> &Right {
         &self.right

@@ -229,7 +229,7 @@ impl Gate {
         for (drive, _) in command.intent.effects.iter().filter(|(_, effect)| effect.stops) {
             if command.is_stop() {
                 let of_drive = self.drive(drive);
-                (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.clone()));
+                (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.recorded()));
             }
             if !self.repeats_its_word(drive, origin) {
                 self.drive(drive).last_stops.note(connection, now);
@@ -246,7 +246,7 @@ impl Gate {
             ..Effect::default()
         };
         let of_drive = self.drive(drive);
-        (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.clone()));
+        (of_drive.stops, of_drive.stopped_by) = (of_drive.stops + 1, Some(origin.recorded()));
         of_drive.last_stops.note(&Connection::opened(now), now);
         of_drive.priorities.accepted(origin, effect, None, now);
     }

@@ -348,7 +348,7 @@ impl Priorities {
     /// from a slot.
     pub fn accepted(&mut self, origin: &Origin, effect: Effect, write: Option<&SlotWrite>, now: Instant) {
         self.orders += 1;
-        self.last = Some((origin.clone(), now));
+        self.last = Some((origin.recorded(), now));
         if let Some(write) = write {
             self.ask(write);
             return;

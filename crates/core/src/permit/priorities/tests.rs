@@ -366,3 +366,20 @@ fn an_order_that_was_planned_follows_only_from_what_still_stands() {
     write(&mut all, Run, "c", 8, Some(1.0));
     assert!(!all.still_follows(&null), "it is another one's order");
 }
+
+#[test]
+fn what_is_recorded_of_an_order_keeps_no_right_in_memory() {
+    use crate::order::Right;
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
+    let grants = Arc::new(AtomicBool::new(true));
+    let origin = client("a").with_right(Right::of(grants.clone()));
+    let mut gate = crate::permit::Gate::default();
+    gate.stop_joined(drivegate_model::drive::DriveIndex::new(0), &origin, Instant::now());
+    drop(origin);
+    assert_eq!(
+        Arc::strong_count(&grants),
+        1,
+        "the right, and with it the plant, is never freed"
+    );
+}
