@@ -78,8 +78,10 @@ impl World {
         );
         if let Some(supervision) = &self.buses[bus].line.supervision {
             let last = truth.heard.1.expect("a client whose order is written again");
+            // The refresh begins again with the reference that supervision wrote, which may come long after the lease
+            // expired, if the reference could not be calculated before.
             let speed = matches!(supervision.action, LeaseAction::SpeedReference(_));
-            let acted = speed && truth.supervised.is_some_and(|at| at >= last);
+            let acted = speed && truth.action.as_ref().is_some_and(|action| action.last >= last);
             assert!(
                 acted || now - last <= supervision.timeout + ACTION,
                 "drive {} is fed {:?} after its client fell silent",
