@@ -47,12 +47,13 @@ impl World {
         }
         self.truths[bus][drive].asked = Some(now);
         if !pdu.is_write() {
-            // A lease begins with any frame of an order, also of one that only reads and writes nothing.
+            // A lease begins with any frame of an order, also of one that only reads and writes nothing. A raw read is none.
             let open = self.open.get(&(bus, drive)).into_iter().flatten();
-            let reads = open
-                .clone()
-                .any(|id| matches!(self.records[*id].wish, Wish::Reverse | Wish::Reset));
-            if reads && !asked.is_poll && !asked.is_refresh && matches!(pdu, RequestPdu::Read { .. }) {
+            let mut of_order = open.clone().map(|id| &self.records[*id]);
+            let reads = of_order.any(|record| matches!(record.wish, Wish::Reverse | Wish::Reset));
+            let mut raw_reads = open.filter_map(|id| self.records[*id].read.as_ref());
+            let is_raw = raw_reads.any(|(raw, _)| raw == pdu);
+            if reads && !is_raw && !asked.is_poll && !asked.is_refresh && matches!(pdu, RequestPdu::Read { .. }) {
                 self.truths[bus][drive].maybe_heard(now);
             }
             return;
