@@ -32,16 +32,32 @@ pub struct Healing {
     pub settled: Instant,
 }
 
+/// A stop that was given when the faults ended.
+struct StopAtOnce {
+    bus: usize,
+    drive: usize,
+    order: usize,
+    /// When it must be on the wire.
+    due: Instant,
+    /// Whether the client has given it again.
+    again: bool,
+}
+
 impl World {
     /// Ends every fault, after which everything must recover.
     pub(super) fn heal(&mut self) {
         let online = self.end_faults();
-        let stops = self.stop_at_once();
+        let client = self.new_client();
+        let mut stops = self.stop_at_once(client);
         let longest = (0..self.buses.len())
             .map(|bus| self.rounds(bus))
             .max()
             .unwrap_or_default();
-        self.look_until(self.now + longest, |world| world.check_stops(&stops));
+        let end = self.now + longest;
+        while self.now < end {
+            self.step();
+            self.check_stops(client, &mut stops);
+        }
         self.check_back(&online, false, "drives that answered go on");
         let slow = self
             .buses
@@ -50,7 +66,7 @@ impl World {
             .max()
             .unwrap_or_default();
         let away = PROBED + longest + COMMANDED.max(slow);
-        self.look_until(self.now + away, |_| {});
+        self.look_until(self.now + away);
         self.look_until_whole(longest + slow);
         let all: Vec<_> = self.drives_that_answer().collect();
         self.check_back(&all, true, "every drive is back");
@@ -67,9 +83,9 @@ impl World {
         let since = self.healing.map_or(self.now, |healing| healing.since);
         let last = since + WHOLE_AGAIN + settles;
         while self.now < last && self.reads_in_parts() {
-            self.look_until(last.min(self.now + Duration::from_secs(1)), |_| {});
+            self.look_until(last.min(self.now + Duration::from_secs(1)));
         }
-        self.look_until(self.now + settles, |_| {});
+        self.look_until(self.now + settles);
     }
 
     fn reads_in_parts(&self) -> bool {
@@ -80,11 +96,15 @@ impl World {
     fn rounds(&self, bus: usize) -> Duration {
         let bus = &self.buses[bus];
         let round = bus.round.max(bus.line.cycle);
-        let late = match bus.line.protocol {
+        self.late(bus) + MUTE + 3 * round + self.exchange(bus)
+    }
+
+    /// Time within which the replies to requests from before may arrive.
+    fn late(&self, bus: &WorldBus) -> Duration {
+        match bus.line.protocol {
             Protocol::N2 => 4 * bus.line.response_timeout,
             Protocol::ModbusRtu | Protocol::ModbusAscii => 2 * FORGOTTEN,
-        };
-        late + MUTE + 3 * round + self.exchange(bus)
+        }
     }
 
     /// Duration of the longest transaction on a line.
@@ -149,35 +169,45 @@ impl World {
     }
 
     /// Stops one drive of each line: whatever happened before, the stop is on the wire soon.
-    fn stop_at_once(&mut self) -> Vec<(usize, usize, Instant)> {
+    fn stop_at_once(&mut self, client: usize) -> Vec<StopAtOnce> {
         let mut stops = Vec::new();
-        let client = self.new_client();
         for bus in 0..self.buses.len() {
             let drive = self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize;
             if self.is_alive(bus, drive) {
-                self.plain(client, bus, drive, Wish::Stop, Duration::from_millis(400));
-                // If a slow acknowledgement is being waited for, that wait is added for this stop.
-                let waiting = self
-                    .open
-                    .values()
-                    .flatten()
-                    .filter(|id| self.records[**id].wish.is_stop());
-                let others = waiting.count() as u32;
-                let flooded = match self.buses[bus].core.remains(self.now).held_stops {
-                    0 => Duration::ZERO,
-                    _ => FLOODED,
-                };
-                // A restarted bus sends nothing until no late reply can arrive.
-                let rests = if self.scenario.reloads {
-                    FORGOTTEN
-                } else {
-                    Duration::ZERO
-                };
-                let within = self.exchange(&self.buses[bus]) * (3 + others) + flooded + rests;
-                stops.push((bus, drive, self.now + within));
+                stops.push(self.order_stop(client, bus, drive));
             }
         }
         stops
+    }
+
+    fn order_stop(&mut self, client: usize, bus: usize, drive: usize) -> StopAtOnce {
+        let order = self.records.len();
+        self.plain(client, bus, drive, Wish::Stop, Duration::from_millis(400));
+        // If a slow acknowledgement is being waited for, that wait is added for this stop.
+        let waiting = self
+            .open
+            .values()
+            .flatten()
+            .filter(|id| self.records[**id].wish.is_stop());
+        let others = waiting.count() as u32;
+        let flooded = match self.buses[bus].core.remains(self.now).held_stops {
+            0 => Duration::ZERO,
+            _ => FLOODED,
+        };
+        // A restarted bus sends nothing until no late reply can arrive.
+        let rests = if self.scenario.reloads {
+            FORGOTTEN
+        } else {
+            Duration::ZERO
+        };
+        let within = self.exchange(&self.buses[bus]) * (3 + others) + flooded + rests;
+        StopAtOnce {
+            bus,
+            drive,
+            order,
+            due: self.now + within,
+            again: false,
+        }
     }
 
     /// A client with plain orders of its own; its number.
@@ -193,27 +223,40 @@ impl World {
         self.clients.len() - 1
     }
 
-    fn check_stops(&self, stops: &[(usize, usize, Instant)]) {
+    /// Checks that the stops are on the wire in time. One that failed because of a reply to a request from before the
+    /// faults ended is reported to its client, which gives it again, once.
+    fn check_stops(&mut self, client: usize, stops: &mut [StopAtOnce]) {
         let since = self.healing.map_or(self.now, |healing| healing.since);
-        for (bus, drive, due) in stops {
-            let truth = &self.truths[*bus][*drive];
-            let profile = &self.buses[*bus].profile;
-            let stop = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
+        for stop in stops {
+            let truth = &self.truths[stop.bus][stop.drive];
+            let bus = &self.buses[stop.bus];
+            let stops = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(&bus.profile, did) == Some(false);
             // On N2, an output is written only when it changes.
-            let reached = truth.did(since, stop) || !truth.run;
+            let reached = truth.did(since, stops) || !truth.run;
+            let disturbed = |(code, at): &(String, Instant)| {
+                ["timeout", "garbled"].contains(&code.as_str()) && *at < since + self.late(bus)
+            };
+            let fails = self.records[stop.order].answer.as_ref().is_some_and(disturbed);
+            if !reached && fails && !stop.again {
+                *stop = StopAtOnce {
+                    again: true,
+                    ..self.order_stop(client, stop.bus, stop.drive)
+                };
+                continue;
+            }
             assert!(
-                reached || self.now < *due,
-                "line{bus} drive {}: its stop is not on the wire {:?} after it listens again",
-                drive + 1,
+                reached || self.now < stop.due,
+                "line{} drive {}: its stop is not on the wire {:?} after it listens again",
+                stop.bus,
+                stop.drive + 1,
                 self.now - since
             );
         }
     }
 
-    pub(super) fn look_until(&mut self, end: Instant, check: impl Fn(&World)) {
+    pub(super) fn look_until(&mut self, end: Instant) {
         while self.now < end {
             self.step();
-            check(self);
         }
     }
 
@@ -279,7 +322,7 @@ impl World {
         let mut healed: Vec<Ages> = self.buses.iter().map(|bus| ages_of(&bus.handle)).collect();
         while self.now < began + window {
             let next = self.now + STEP;
-            self.look_until(next, |_| {});
+            self.look_until(next);
             for (ages, bus) in healed.iter_mut().zip(&self.buses) {
                 note_ages(ages, &bus.handle, self.now);
             }

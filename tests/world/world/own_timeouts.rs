@@ -98,7 +98,7 @@ impl World {
         let began = self.now;
         while self.now < began + longest.mul_f64(1.3) {
             self.client_is_there(&drives);
-            self.look_until(self.now + Duration::from_millis(90), |_| {});
+            self.look_until(self.now + Duration::from_millis(90));
         }
         for (bus, drive) in &drives {
             let truth = &self.truths[*bus][*drive];
@@ -145,7 +145,7 @@ impl World {
             healing.settled = self.now + TRIED * 60;
         }
         // Whatever was on its way to the drives is lost.
-        self.look_until(self.now + Duration::from_secs(1), |_| {});
+        self.look_until(self.now + Duration::from_secs(1));
         let (now, sim) = (self.now, self.now - self.began);
         for (bus, place) in drives {
             let drive = self.buses[*bus].wire.slaves().drive(*place as u8 + 1).unwrap();
@@ -160,7 +160,7 @@ impl World {
             .iter()
             .map(|(bus, _)| 2 * self.buses[*bus].first_slow_round)
             .max();
-        self.look_until(now + PROBED + rounds.unwrap_or_default(), |_| {});
+        self.look_until(now + PROBED + rounds.unwrap_or_default());
     }
 
     /// A client runs all these drives.
@@ -173,7 +173,7 @@ impl World {
         while self.records[first..].iter().any(|record| record.answer.is_none()) {
             assert!(self.now < until, "orders to run that nobody answers");
             self.client_is_there(drives);
-            self.look_until(self.now + Duration::from_millis(90), |_| {});
+            self.look_until(self.now + Duration::from_millis(90));
         }
         for record in &self.records[first..] {
             let answer = record.answer.as_ref().map(|(code, _)| code.as_str());
@@ -195,7 +195,7 @@ impl World {
         }
         let soon = longest.mul_f64(self.dice.unit());
         let away = if self.dice.chance(0.5) { longest + ACTION } else { soon };
-        self.look_until(killed + away, |_| {});
+        self.look_until(killed + away);
         self.note(|| "the gateway is started again".to_string());
         for bus in &mut self.buses {
             bus.open = true;
@@ -209,7 +209,7 @@ impl World {
         let leases = self.buses.iter().filter_map(|bus| bus.line.supervision.as_ref());
         let lease = leases.map(|supervision| supervision.timeout).max().unwrap_or_default();
         // An adopted motor gets one more write, which its drive counts: the action of the lease.
-        self.look_until(self.now + 2 * longest + lease + PROBED, |_| {});
+        self.look_until(self.now + 2 * longest + lease + PROBED);
         for (bus, drive) in drives {
             let truth = &self.truths[*bus][*drive];
             let stopped = truth.stop_sent.is_some_and(|at| at > killed);
