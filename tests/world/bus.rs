@@ -209,6 +209,20 @@ impl WorldBus {
         }
     }
 
+    /// Whether a drive of the bus that answers was not found yet, or has values that were never read: then slow polls have
+    /// half of the line.
+    pub fn has_unread(&self) -> bool {
+        let of_class = |class| matches!(class, PollClass::Slow | PollClass::Once);
+        let has_unread = |image: &Arc<DriveImage>| {
+            let snapshot = image.snapshot();
+            let mut slow = image.plan.reads.iter().filter(|read| of_class(read.class));
+            !snapshot.link.is_online() || slow.any(|read| snapshot.read_at(read.table, read.start).is_none())
+        };
+        let drives = self.handle.image.drives.iter();
+        let mut answering = drives.filter(|image| !self.line.dead.contains(&image.spec.address));
+        answering.any(has_unread)
+    }
+
     /// Restarts the bus as a reload does, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.handle.queue.begin_handover(Vec::new(), now);
