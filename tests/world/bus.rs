@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 use drivegate_bus::BusOptions;
 use drivegate_bus::core::{Action, BusCore, Closed};
 use drivegate_bus::master::{Handover, Purpose};
-use drivegate_bus::predict::predict;
+use drivegate_bus::predict::{Prediction, predict};
+use drivegate_bus::schedule::slow_share;
 use drivegate_core::event::Events;
 use drivegate_core::order::WriteStats;
 use drivegate_core::plant::BusHandle;
@@ -136,6 +137,16 @@ impl Parts {
     }
 }
 
+/// A slow round on a line that is full of process data.
+fn slow_round_of_full_line(predicted: &Prediction, slow_cycle: Duration) -> Duration {
+    let slow = predicted
+        .requests
+        .iter()
+        .filter(|request| request.read.class == PollClass::Slow);
+    let work: Duration = slow.map(|request| request.wire).sum();
+    work.div_f64(slow_share(work.as_secs_f64() / slow_cycle.as_secs_f64()))
+}
+
 impl WorldBus {
     pub fn new(
         index: usize,
@@ -160,6 +171,12 @@ impl WorldBus {
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
+        // A drive that refuses a register is read in more requests than planned, which may fill the line: then slow polls
+        // have no more than their share.
+        let slow_round = match line.refuses {
+            Some(_) => slow_round.map(|round| round.max(slow_round_of_full_line(&predicted, line.slow_cycle))),
+            None => slow_round,
+        };
         let (mut slow, mut monitors) = (0, 0);
         for plan in handle.image.drives.iter().map(|drive| &drive.plan) {
             slow += plan.reads.iter().filter(|read| read.class == PollClass::Slow).count() as u32;
