@@ -335,13 +335,15 @@ impl World {
             }
         }
         for (bus, healed) in self.buses.iter().zip(&healed) {
-            let sound = sound_ages(bus, window);
+            let (sound, probed) = sound_ages(bus, window);
             let round = bus.round.max(bus.line.cycle);
-            // The probe of a silent N2 drive, and requests that wait for its late reply, come at other moments than
-            // in the world without faults.
-            let probe = match bus.line.dead.is_empty() || bus.line.protocol != Protocol::N2 {
-                true => Duration::ZERO,
-                false => bus.line.response_timeout + self.exchange(bus),
+            // The probe of a silent drive, and on N2 the requests that wait for its late reply, come at other moments than
+            // in the world without faults, where the time of observation may have none.
+            let probe = match bus.line.protocol {
+                _ if bus.line.dead.is_empty() => Duration::ZERO,
+                Protocol::N2 => bus.line.response_timeout + self.exchange(bus),
+                Protocol::ModbusRtu | Protocol::ModbusAscii if probed => Duration::ZERO,
+                Protocol::ModbusRtu | Protocol::ModbusAscii => self.exchange(bus),
             };
             for ((drive, healed), sound) in healed.iter().enumerate().zip(&sound) {
                 if !self.is_alive(bus.index, drive) {
@@ -387,8 +389,8 @@ fn note_ages(ages: &mut Ages, handle: &drivegate_core::plant::BusHandle, now: In
     }
 }
 
-/// Ages of the reads on a line of equal drives that never had a fault.
-fn sound_ages(bus: &WorldBus, window: Duration) -> Ages {
+/// Ages of the reads on a line of equal drives that never had a fault, and whether a silent drive was probed meanwhile.
+fn sound_ages(bus: &WorldBus, window: Duration) -> (Ages, bool) {
     let line = crate::scenario::Line {
         faults: String::new(),
         flips: 0.0,
@@ -398,17 +400,21 @@ fn sound_ages(bus: &WorldBus, window: Duration) -> Ages {
     let parts = Parts::of(bus.index, &line, 0);
     let mut twin = WorldBus::new(bus.index, &line, parts, &events, &writes, now);
     let warm = now + PROBED;
-    let mut ages = ages_of(&twin.handle);
+    let (mut ages, mut probed) = (ages_of(&twin.handle), false);
+    let is_dead = |drive: usize| line.dead.iter().any(|address| usize::from(*address) == drive + 1);
     while now < warm + window {
         let until = now + STEP;
+        let mut seen = Vec::new();
         while twin.wake_at() <= until {
             now = twin.wake_at().max(now);
-            twin.step(now, &mut Vec::new());
+            twin.step(now, &mut seen);
         }
         now = until;
         if now >= warm {
             note_ages(&mut ages, &twin.handle, now);
+            let is_probe = |seen: &Seen| matches!(seen, Seen::Sent(asked) if is_dead(asked.drive));
+            probed |= seen.iter().any(is_probe);
         }
     }
-    ages
+    (ages, probed)
 }
