@@ -63,7 +63,7 @@ use self::world::{Figures, World};
 /// Seeds of every test run.
 const FIXED: u64 = 400;
 /// Seeds of every test run that found a fault which the fixed ones do not meet.
-const FOUND: [u64; 10] = [
+const FOUND: [u64; 14] = [
     508,
     816,
     4816,
@@ -74,6 +74,10 @@ const FOUND: [u64; 10] = [
     810_000_137,
     810_003_971,
     820_001_257,
+    810_002_578,
+    820_001_334,
+    820_001_432,
+    830_000_546,
 ];
 /// Seeds of every test run in which clients flood without a pause.
 const FLOODED: Range<u64> = 0..16;
