@@ -66,19 +66,13 @@ pub fn plant(name: &str, drives: u16) -> Result<Plant, Box<dyn Error>> {
         cycle: Duration::from_millis(10),
         slow_cycle: Duration::from_secs(1),
     };
-    let bus = BusHandle {
-        formerly: std::sync::Arc::default(),
-        image: Arc::new(BusImage::new(spec, (1..=drives).map(image).collect())),
-        queue: Arc::new(CommandQueue::new()?),
-    };
+    let bus = BusHandle::new(
+        Arc::new(BusImage::new(spec, (1..=drives).map(image).collect())),
+        Arc::new(CommandQueue::new()?),
+        Arc::default(),
+    );
     bus.image.update_health(|health| health.up = true);
-    Ok(Plant {
-        gateway: name.to_string(),
-        stale_after: Duration::from_secs(60),
-        buses: vec![bus],
-        events: Default::default(),
-        writes: Default::default(),
-    })
+    Ok(Plant::new(name, Duration::from_secs(60), vec![bus]))
 }
 
 /// Updates each drive once a cycle, evenly spread, until the end.

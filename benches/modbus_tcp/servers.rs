@@ -148,17 +148,8 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         .collect();
     let image = BusImage::new(bus.spec.clone(), drives.clone());
     image.update_health(|health| health.up = true);
-    let plant = Plant {
-        gateway: "bench".to_string(),
-        stale_after: settings.stale_after.limit,
-        buses: vec![BusHandle {
-            formerly: std::sync::Arc::default(),
-            image: Arc::new(image),
-            queue: Arc::new(CommandQueue::new()?),
-        }],
-        events: Default::default(),
-        writes: Default::default(),
-    };
+    let handle = BusHandle::new(Arc::new(image), Arc::new(CommandQueue::new()?), Arc::default());
+    let plant = Plant::new("bench", settings.stale_after.limit, vec![handle]);
     let poll = move || {
         for (drive, value) in drives.iter().cycle().zip((0..=u16::MAX).cycle()) {
             let now = Instant::now();

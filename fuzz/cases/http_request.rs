@@ -14,7 +14,7 @@ static SERVER: LazyLock<Loopback> = LazyLock::new(|| {
         stale_after: std::time::Duration::from_secs(1),
         buses: Vec::new(),
         events: Default::default(),
-        writes: Default::default(),
+        command_log: Default::default(),
     };
     Loopback::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
 });

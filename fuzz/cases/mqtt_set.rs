@@ -42,18 +42,9 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         }
         let image = BusImage::new(bus.spec.clone(), drives);
         image.update_health(|h| h.up = true);
-        BusHandle { formerly: std::sync::Arc::default(),
-            image: Arc::new(image),
-            queue: Arc::new(CommandQueue::new().expect("a queue")),
-        }
+        BusHandle::new(Arc::new(image), Arc::new(CommandQueue::new().expect("a queue")), Arc::default())
     });
-    Arc::new(ArcSwap::from_pointee(Plant {
-        gateway: settings.gateway.clone(),
-        stale_after: Duration::from_secs(1_000_000),
-        buses: buses.collect(),
-        events: Default::default(),
-        writes: Default::default(),
-    }))
+    Arc::new(ArcSwap::from_pointee(Plant::new(&settings.gateway, Duration::from_secs(1_000_000), buses.collect())))
 });
 
 pub(crate) fn run(data: &[u8]) {

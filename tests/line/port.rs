@@ -73,7 +73,7 @@ async fn a_command_that_loses_its_port_is_answered_once() {
         // The drive does not answer, so the command is on the line when the port disappears.
         let met = rig.line.statistics().faults;
         rig.line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
-        let before: u64 = rig.plant.writes.results().values().sum();
+        let before: u64 = rig.plant.command_log.results().values().sum();
         let commands = futures_util::future::join_all((0..5).map(|i| {
             let value = f64::from(i);
             let rig = &rig;
@@ -103,7 +103,7 @@ async fn a_command_that_loses_its_port_is_answered_once() {
             *outcome == Outcome::BusDown || *outcome == down
         };
         assert!(outcomes.iter().any(cut), "{outcomes:?}");
-        let after: u64 = rig.plant.writes.results().values().sum();
+        let after: u64 = rig.plant.command_log.results().values().sum();
         assert_eq!(after - before, 5, "each is answered once");
         rig.line.set_faults(FaultPlan::default());
         rig.line.restore().unwrap();

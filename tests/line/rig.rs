@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use drivegate_bus::{BusOptions, BusTask};
 use drivegate_core::event::Events;
-use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind};
 use drivegate_core::plant::{DriveHandle, OrderRequest, Plant};
 use drivegate_core::process_image::{BusSpec, DriveImage, DriveSpec};
 use drivegate_line::LineOptions;
@@ -100,7 +100,7 @@ impl Rig {
             Arc::new(DriveImage::new(spec, Duration::from_millis(500)).with_stale_floor(PATIENCE))
         };
         let handle = testkit::bus(spec, (1..=setup.drives).map(image).collect());
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let events = Events::default();
         let options = BusOptions {
             response_timeout: setup.response_timeout,
             retries: 1,
@@ -109,10 +109,9 @@ impl Rig {
             allow: Vec::new(),
             mode: Default::default(),
         };
-        let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
+        let bus = BusTask::start(handle.clone(), options, events.clone()).unwrap();
         let plant = Plant {
             events: events.clone(),
-            writes,
             ..Plant::new("test", PATIENCE, vec![handle])
         };
         Rig {

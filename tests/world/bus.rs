@@ -9,7 +9,7 @@ use drivegate_bus::master::{Handover, Purpose};
 use drivegate_bus::predict::{Prediction, predict};
 use drivegate_bus::schedule::slow_share;
 use drivegate_core::event::Events;
-use drivegate_core::order::WriteStats;
+use drivegate_core::order::CommandLog;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate_core::queue::CommandQueue;
@@ -153,7 +153,7 @@ impl WorldBus {
         line: &Line,
         parts: Parts,
         events: &Events,
-        writes: &Arc<WriteStats>,
+        command_log: &Arc<CommandLog>,
         now: Instant,
     ) -> WorldBus {
         let profile = parts.profile;
@@ -167,7 +167,7 @@ impl WorldBus {
             mode: Default::default(),
         };
         let guards = Arc::new(Guards::default());
-        let handle = handle(index, line, &profile, format, (&guards, now));
+        let handle = handle(index, line, &profile, format, (&guards, now), command_log);
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
@@ -190,14 +190,7 @@ impl WorldBus {
         let slaves = Slaves::new(parts.drives, Duration::ZERO);
         let mut wire = HalfDuplex::new(rules, slaves, parts.faults, Transcript::new(0));
         wire.take_acts();
-        let mut core = BusCore::new(
-            handle.clone(),
-            &options,
-            events.clone(),
-            writes.clone(),
-            &Handover::default(),
-            now,
-        );
+        let mut core = BusCore::new(handle.clone(), &options, events.clone(), &Handover::default(), now);
         core.opened(now);
         WorldBus {
             index,
@@ -241,20 +234,21 @@ impl WorldBus {
     }
 
     /// Restarts the bus as a reload does, with the same drives on the same line.
-    pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
+    pub fn restart(&mut self, index: usize, events: &Events, now: Instant) {
         self.handle.queue.begin_handover(Vec::new(), now);
         let leaving: Vec<_> = self.handle.image.drives.iter().cloned().collect();
         self.guards.expect(&leaving, now);
         let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
+        let log = self.handle.command_log.clone();
         let stopped = std::mem::replace(
             &mut self.handle,
-            handle(index, &self.line, &self.profile, format, (&self.guards, now)),
+            handle(index, &self.line, &self.profile, format, (&self.guards, now), &log),
         );
         self.handle.take_over(std::slice::from_ref(&stopped), now);
         stopped.queue.close(drivegate_core::order::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
-        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
+        self.core = BusCore::new(bus, options, events.clone(), &before, now);
         if self.open {
             self.core.opened(now);
         }
@@ -270,13 +264,14 @@ impl WorldBus {
     }
 
     /// The process is killed and started again: of all that it knew, `guards` has what is left.
-    pub fn kill(&mut self, guards: Guards, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
+    pub fn kill(&mut self, guards: Guards, events: &Events, now: Instant) {
         self.wire.cut();
         self.guards = Arc::new(guards);
         let format = self.handle.image.spec.format;
-        self.handle = handle(self.index, &self.line, &self.profile, format, (&self.guards, now));
+        let log = self.handle.command_log.clone();
+        self.handle = handle(self.index, &self.line, &self.profile, format, (&self.guards, now), &log);
         let (bus, options, before) = (self.handle.clone(), &self.options, Handover::default());
-        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
+        self.core = BusCore::new(bus, options, events.clone(), &before, now);
         if self.open {
             self.core.opened(now);
         }
@@ -514,6 +509,7 @@ pub fn handle(
     profile: &Arc<Profile>,
     format: LineFormat,
     (guards, now): (&Arc<Guards>, Instant),
+    command_log: &Arc<CommandLog>,
 ) -> BusHandle {
     let name = format!("line{index}");
     let spec = BusSpec {
@@ -548,9 +544,6 @@ pub fn handle(
     guarded.iter().for_each(|guarded| guarded.begin());
     let watched = drives.iter().map(|drive| (spec.machine(&drive.spec), drive.clone()));
     guards.watch(watched, Duration::from_secs(1), now);
-    BusHandle {
-        formerly: std::sync::Arc::default(),
-        image: Arc::new(BusImage::new(spec, drives)),
-        queue: Arc::new(CommandQueue::new().unwrap().guarded(guarded)),
-    }
+    let queue = Arc::new(CommandQueue::new().unwrap().guarded(guarded));
+    BusHandle::new(Arc::new(BusImage::new(spec, drives)), queue, command_log.clone())
 }

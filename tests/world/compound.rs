@@ -72,7 +72,7 @@ fn the_stop_goes_first_and_the_rest_behind_it() {
         if protocol == Protocol::ModbusRtu {
             assert_eq!(writes(&rig, before), [(6, CONTROL_WORD), (6, REFERENCE)]);
         }
-        let audit = rig.plant.writes.audit().recent(None);
+        let audit = rig.plant.command_log.audit().recent(None);
         let last: Vec<_> = audit.iter().rev().take(2).collect();
         let has = |command: &str| {
             last.iter()

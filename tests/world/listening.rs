@@ -9,7 +9,7 @@ use drivegate_bus::listener::ListenCore;
 use drivegate_bus::{BusOptions, Mode};
 use drivegate_core::diagnosis::Cause;
 use drivegate_core::event::{EventKind, Events};
-use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind};
 use drivegate_core::plant::{BusHandle, OrderRequest, Plant};
 use drivegate_core::process_image::{Access, BusImage, DriveImage, DriveSpec, Outcome as Counted};
 use drivegate_line::LineOptions;
@@ -47,7 +47,6 @@ struct Scene {
     core: ListenCore,
     handle: BusHandle,
     events: Events,
-    writes: Arc<WriteStats>,
     format: LineFormat,
     began: Instant,
     now: SimTime,
@@ -69,11 +68,8 @@ fn listening(handle: &BusHandle) -> BusHandle {
         Arc::new(DriveImage::new(spec, Duration::ZERO))
     };
     let drives = handle.image.drives.iter().map(image).collect();
-    BusHandle {
-        formerly: std::sync::Arc::default(),
-        image: Arc::new(BusImage::new(handle.image.spec.clone(), drives)),
-        queue: handle.queue.clone(),
-    }
+    let image = Arc::new(BusImage::new(handle.image.spec.clone(), drives));
+    BusHandle::new(image, handle.queue.clone(), handle.command_log.clone())
 }
 
 impl Scene {
@@ -81,13 +77,20 @@ impl Scene {
         let format = LineFormat::new(line.baud, line.format).unwrap();
         let parts = Parts::of(0, &line, seed);
         let began = Instant::now();
-        let handle = listening(&bus::handle(0, &line, &parts.profile, format, (&Arc::default(), began)));
+        let handle = listening(&bus::handle(
+            0,
+            &line,
+            &parts.profile,
+            format,
+            (&Arc::default(), began),
+            &Arc::default(),
+        ));
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         let slaves = Slaves::new(parts.drives, Duration::ZERO);
         let mut wire = HalfDuplex::new(rules, slaves, parts.faults, Transcript::new(0));
         wire.take_acts();
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let events = Events::default();
         let options = BusOptions {
             response_timeout: PATIENCE,
             retries: 1,
@@ -96,7 +99,7 @@ impl Scene {
             allow: Vec::new(),
             mode: Mode::Listen,
         };
-        let mut core = ListenCore::new(handle.clone(), &options, events.clone(), writes.clone(), began);
+        let mut core = ListenCore::new(handle.clone(), &options, events.clone(), began);
         core.opened(began);
         let reads = &handle.image.drives[0].plan.reads;
         Scene {
@@ -105,7 +108,6 @@ impl Scene {
             core,
             handle,
             events,
-            writes,
             format,
             began,
             now: Duration::from_millis(50),
@@ -488,7 +490,7 @@ fn commands_of_the_other_master_are_told_when_they_change() {
         "{texts:?}"
     );
     assert!(texts[1].contains("run=false"), "{texts:?}");
-    let audited = scene.writes.audit().recent(None);
+    let audited = scene.handle.command_log.audit().recent(None);
     assert_eq!(audited.len(), 2);
     assert!(audited[0].contains(r#""source":"other_master""#) && audited[0].contains(r#""result":"acknowledged""#));
     assert!(
@@ -539,7 +541,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         stale_after: Duration::from_secs(1),
         buses: vec![scene.handle.clone()],
         events: scene.events.clone(),
-        writes: scene.writes.clone(),
+        command_log: scene.handle.command_log.clone(),
     };
     let profile = scene.handle.image.drives[0].spec.profile.clone();
     let index = |point: ModelPoint| profile.model_index(point).unwrap();

@@ -23,8 +23,8 @@ impl Rig {
             return Outcome::Offline;
         }
         let origin = Origin::new(SourceKind::LocalSocket, "test");
-        let writes = self.plant.writes.clone();
-        let (ticket, mut answer) = Ticket::new(origin, "d0-1", String::new(), false, self.now, writes);
+        let command_log = self.plant.command_log.clone();
+        let (ticket, mut answer) = Ticket::new(origin, "d0-1", String::new(), false, self.now, command_log);
         let request = BackgroundRequest {
             target: DriveIndex::new(0).into(),
             pdu,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_core::event::Events;
-use drivegate_core::order::{Authority, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::order::{Authority, CommandLog, Order, Origin, Outcome, SourceKind};
 use drivegate_core::plant::{DriveHandle, OrderRequest, Placed, Plant, SharedPlant};
 use drivegate_core::process_image::{OnShutdown, Outcome as Counted};
 use drivegate_core::start_guard::Guards;
@@ -96,14 +96,14 @@ impl Rig {
 
     pub fn new(line: &Line, parts: Parts) -> Rig {
         let now = Instant::now();
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
-        let bus = WorldBus::new(0, line, parts, &events, &writes, now);
+        let (events, command_log) = (Events::default(), Arc::new(CommandLog::default()));
+        let bus = WorldBus::new(0, line, parts, &events, &command_log, now);
         let plant = Plant {
             gateway: "world".to_string(),
             stale_after: Duration::from_secs(1),
             buses: vec![bus.handle.clone()],
             events,
-            writes,
+            command_log,
         };
         Rig { bus, now, plant }
     }
@@ -167,7 +167,7 @@ impl Rig {
         if self.bus.core.asked().is_some() {
             self.bus.wire.cut();
         }
-        self.bus.restart(0, &self.plant.events, &self.plant.writes, self.now);
+        self.bus.restart(0, &self.plant.events, self.now);
         self.plant.buses = vec![self.bus.handle.clone()];
     }
 
@@ -175,8 +175,7 @@ impl Rig {
     pub fn killed(&mut self) {
         self.bus.vanish();
         self.bus.open = true;
-        self.bus
-            .kill(Guards::default(), &self.plant.events, &self.plant.writes, self.now);
+        self.bus.kill(Guards::default(), &self.plant.events, self.now);
         self.plant.buses = vec![self.bus.handle.clone()];
     }
 
@@ -187,7 +186,7 @@ impl Rig {
             stale_after: self.plant.stale_after,
             buses: self.plant.buses.clone(),
             events: self.plant.events.clone(),
-            writes: self.plant.writes.clone(),
+            command_log: self.plant.command_log.clone(),
         }))
     }
 

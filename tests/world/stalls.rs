@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use drivegate_bus::core::Action;
 use drivegate_core::event::Events;
-use drivegate_core::order::{Authority, Order, Origin, SourceKind, WriteStats};
+use drivegate_core::order::{Authority, CommandLog, Order, Origin, SourceKind};
 use drivegate_core::plant::{OrderRequest, Placed, Plant, SharedPlant, UnusedNames};
 use drivegate_core::process_image::{LeaseAction, Supervision};
 use drivegate_core::stalls::{Heartbeat, TICK};
@@ -154,15 +154,15 @@ impl World {
             ..line(family, Protocol::ModbusRtu, baud, drives)
         };
         let now = Instant::now();
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
-        let bus = WorldBus::new(0, &line, Parts::of(0, &line, seed), &events, &writes, now);
+        let (events, command_log) = (Events::default(), Arc::new(CommandLog::default()));
+        let bus = WorldBus::new(0, &line, Parts::of(0, &line, seed), &events, &command_log, now);
         let beat = events.pauses().reader(now);
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(Plant {
             gateway: "world".to_string(),
             stale_after: Duration::from_secs(1),
             buses: vec![bus.handle.clone()],
             events,
-            writes,
+            command_log,
         }));
         let healthy = dice.chance(0.25);
         let mut world = World {

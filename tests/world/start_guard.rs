@@ -222,8 +222,8 @@ impl Play {
         let (guards, now) = (Guards::default(), self.rig.now);
         let takes = Duration::from_millis(self.dice.within(0..=60));
         self.file.begin(&guards, takes, now);
-        let (events, writes) = (self.rig.plant.events.clone(), self.rig.plant.writes.clone());
-        self.rig.bus.kill(guards, &events, &writes, now);
+        let events = self.rig.plant.events.clone();
+        self.rig.bus.kill(guards, &events, now);
         self.rig.plant.buses = vec![self.rig.bus.handle.clone()];
         (self.stops, self.orders) = (Vec::new(), Vec::new());
     }

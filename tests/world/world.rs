@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate_core::event::{EventKind, Events};
-use drivegate_core::order::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate_core::order::{Authority, CAPACITY, CommandLog, Order, Origin, Outcome, SourceKind, written};
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_core::process_image::{LeaseAction, OnShutdown};
 use drivegate_model::drive::{ModelPoint, Quality, RawWrites, Value};
@@ -96,7 +96,7 @@ pub struct World {
     plant: SharedPlant,
     events: Events,
     heard_events: broadcast::Receiver<Arc<drivegate_core::event::Event>>,
-    writes: Arc<WriteStats>,
+    command_log: Arc<CommandLog>,
     buses: Vec<WorldBus>,
     truths: Vec<Vec<Truth>>,
     clients: Vec<Client>,
@@ -128,14 +128,14 @@ pub struct World {
 impl World {
     pub fn new(scenario: Scenario) -> World {
         let now = Instant::now();
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let (events, command_log) = (Events::default(), Arc::new(CommandLog::default()));
         let buses: Vec<WorldBus> = scenario
             .buses
             .iter()
             .enumerate()
             .map(|(index, line)| {
                 let parts = Parts::of(index, line, scenario.seed);
-                WorldBus::new(index, line, parts, &events, &writes, now)
+                WorldBus::new(index, line, parts, &events, &command_log, now)
             })
             .collect();
         let truth = |bus: &mut WorldBus, address: u8| {
@@ -147,7 +147,7 @@ impl World {
             .iter_mut()
             .map(|bus| (1..=bus.line.drives).map(|address| truth(bus, address)).collect());
         let truths: Vec<Vec<Truth>> = truths.collect();
-        let plant = plant_of(&buses, &events, &writes);
+        let plant = plant_of(&buses, &events, &command_log);
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let servers = Servers::new(plant.clone());
         let clients = scenario.clients.iter().enumerate();
@@ -161,7 +161,7 @@ impl World {
             heard_events: events.subscribe(),
             plant,
             events,
-            writes,
+            command_log,
             truths,
             away: vec![None; buses.len()],
             next_incident: scenario.incidents.map(|mean| now + mean + Duration::from_secs(2)),
@@ -261,12 +261,12 @@ impl World {
     }
 }
 
-fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Plant {
+fn plant_of(buses: &[WorldBus], events: &Events, command_log: &Arc<CommandLog>) -> Plant {
     Plant {
         gateway: "world".to_string(),
         stale_after: Duration::from_secs(1),
         buses: buses.iter().map(|bus| bus.handle.clone()).collect(),
         events: events.clone(),
-        writes: writes.clone(),
+        command_log: command_log.clone(),
     }
 }

@@ -1,7 +1,6 @@
 //! A bus without its thread: the line, the master and their reports. Pure: bytes and time are arguments;
 //! [`BusCore::poll`] returns what to do with the port.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
@@ -15,7 +14,7 @@ use super::report::Report;
 use super::tap::Tap;
 use super::transaction::Ended;
 use drivegate_core::event::Events;
-use drivegate_core::order::{Outcome, Target, Urgency, WriteStats};
+use drivegate_core::order::{Outcome, Target, Urgency};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::Taping;
 use drivegate_core::stalls::Stalls;
@@ -93,7 +92,6 @@ pub struct BusCore {
     server: ClosingServer,
     tap: Option<Tap>,
     counters: DriveCounters,
-    writes: Arc<WriteStats>,
     /// An empty list, kept to reuse its memory.
     news: Vec<News>,
     /// Stalls of the bus thread; `None` before it runs.
@@ -106,14 +104,7 @@ pub struct BusCore {
 
 impl BusCore {
     /// A bus whose port is not open yet; `before` is the handover of the previous bus.
-    pub fn new(
-        bus: BusHandle,
-        options: &BusOptions,
-        events: Events,
-        writes: Arc<WriteStats>,
-        before: &Handover,
-        now: Instant,
-    ) -> BusCore {
+    pub fn new(bus: BusHandle, options: &BusOptions, events: Events, before: &Handover, now: Instant) -> BusCore {
         let spec = &bus.image.spec;
         let silence = spec.protocol.silence(options.silence, &spec.format);
         let mut line = LineState::new(spec.protocol, spec.format, silence, now);
@@ -122,10 +113,9 @@ impl BusCore {
         }
         BusCore {
             line,
-            master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
-            report: Report::new(bus.image.clone(), options, events, writes.clone(), now),
+            master: Master::new(bus.clone(), options, silence, before, now),
+            report: Report::new(&bus, options, events, now),
             counters: DriveCounters::new(&bus, now),
-            writes,
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
@@ -298,8 +288,7 @@ impl BusCore {
         let next = self.master.next(now, &mut news);
         self.report_all(news, now);
         self.report.tick(|| self.master.unanswered(), now);
-        self.counters
-            .poll(&self.bus, &mut self.report.diagnosis, &self.writes, now);
+        self.counters.poll(&self.bus, &mut self.report.diagnosis, now);
         let turn = match next {
             Ok(turn) => turn,
             Err(until) => return Some(until),

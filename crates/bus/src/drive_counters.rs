@@ -1,7 +1,6 @@
 //! The line counters of the drives themselves (function 08), read while transactions with them fail: they show
 //! which direction is disturbed. The reads use only a negligible share of the line.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot::Receiver;
@@ -9,7 +8,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use crate::line_diagnosis::LineDiagnosis;
 use drivegate_core::diagnosis::CountedByDrive;
-use drivegate_core::order::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket, WriteStats};
+use drivegate_core::order::{Answer, BackgroundRequest, Origin, Outcome, Pace, SourceKind, Ticket};
 use drivegate_core::plant::BusHandle;
 use drivegate_model::drive::DriveIndex;
 use drivegate_proto::Reply;
@@ -51,13 +50,7 @@ impl DriveCounters {
     }
 
     /// Requests the counters that are due, and processes what was read.
-    pub(super) fn poll(
-        &mut self,
-        bus: &BusHandle,
-        diagnosis: &mut LineDiagnosis,
-        writes: &Arc<WriteStats>,
-        now: Instant,
-    ) {
+    pub(super) fn poll(&mut self, bus: &BusHandle, diagnosis: &mut LineDiagnosis, now: Instant) {
         if self.drives.is_empty() || now < self.due {
             return;
         }
@@ -70,7 +63,7 @@ impl DriveCounters {
                     let counted = std::mem::take(counted);
                     match online && diagnosis.has_errors(*drive) {
                         true => {
-                            let answer = ask(bus, *drive, &counted, writes, now);
+                            let answer = ask(bus, *drive, &counted, now);
                             State::Reading(counted, answer)
                         }
                         false => State::Idle(now + AGAIN, counted),
@@ -89,7 +82,7 @@ impl DriveCounters {
                                 State::Idle(now + PAUSE, Vec::new())
                             }
                             None => {
-                                let answer = ask(bus, *drive, counted, writes, now);
+                                let answer = ask(bus, *drive, counted, now);
                                 State::Reading(std::mem::take(counted), answer)
                             }
                         }
@@ -109,7 +102,7 @@ impl DriveCounters {
 }
 
 /// Requests the counter that follows those already read.
-fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteStats>, now: Instant) -> Receiver<Answer> {
+fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], now: Instant) -> Receiver<Answer> {
     let name = &bus.image.drives.of(drive).spec.name;
     let origin = Origin::new(SourceKind::Schedule, "diagnosis");
     let (ticket, answer) = Ticket::new(
@@ -118,7 +111,7 @@ fn ask(bus: &BusHandle, drive: DriveIndex, so_far: &[u16], writes: &Arc<WriteSta
         "a counter of the drive".to_string(),
         false,
         now,
-        writes.clone(),
+        bus.command_log.clone(),
     );
     let request = BackgroundRequest {
         target: drive.into(),

@@ -12,7 +12,7 @@ use super::listener::ListenCore;
 use super::master::Handover;
 use super::{BusOptions, Mode};
 use drivegate_core::event::Events;
-use drivegate_core::order::{Outcome, WriteStats};
+use drivegate_core::order::Outcome;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::stalls::Stalls;
 use drivegate_line::{Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
@@ -43,13 +43,8 @@ impl BusTask {
     ///
     /// # Errors
     /// If the system cannot create a thread.
-    pub fn start(
-        handle: BusHandle,
-        options: BusOptions,
-        writes: Arc<WriteStats>,
-        events: Events,
-    ) -> std::io::Result<BusTask> {
-        let mut task = BusTask::prepare(handle, options, writes, events)?;
+    pub fn start(handle: BusHandle, options: BusOptions, events: Events) -> std::io::Result<BusTask> {
+        let mut task = BusTask::prepare(handle, options, events)?;
         task.begin(Handover::default());
         Ok(task)
     }
@@ -59,12 +54,7 @@ impl BusTask {
     ///
     /// # Errors
     /// If the system cannot create a thread.
-    pub fn prepare(
-        handle: BusHandle,
-        options: BusOptions,
-        writes: Arc<WriteStats>,
-        events: Events,
-    ) -> std::io::Result<BusTask> {
+    pub fn prepare(handle: BusHandle, options: BusOptions, events: Events) -> std::io::Result<BusTask> {
         let stop = Arc::new(AtomicBool::new(false));
         let beats = Arc::new(AtomicU64::new(0));
         let worker = Worker {
@@ -81,8 +71,8 @@ impl BusTask {
                 return Handover::default();
             };
             or_end_the_process(|| match worker.options.mode {
-                Mode::Master => worker.run(events, writes, &before),
-                Mode::Listen => worker.listen(events, writes),
+                Mode::Master => worker.run(events, &before),
+                Mode::Listen => worker.listen(events),
             })
         })?;
         Ok(BusTask {
@@ -213,15 +203,15 @@ struct Worker {
 }
 
 impl Worker {
-    fn run(self, events: Events, writes: Arc<WriteStats>, before: &Handover) -> Handover {
+    fn run(self, events: Events, before: &Handover) -> Handover {
         let handle = self.handle.clone();
-        let core = BusCore::new(handle, &self.options, events, writes, before, Instant::now());
+        let core = BusCore::new(handle, &self.options, events, before, Instant::now());
         self.keep_open(core).ended(Instant::now())
     }
 
-    fn listen(self, events: Events, writes: Arc<WriteStats>) -> Handover {
+    fn listen(self, events: Events) -> Handover {
         let handle = self.handle.clone();
-        let core = ListenCore::new(handle, &self.options, events, writes, Instant::now());
+        let core = ListenCore::new(handle, &self.options, events, Instant::now());
         self.keep_open(core);
         // A listening bus has no leases and sent no requests, so there is nothing to hand over.
         Handover::default()

@@ -42,7 +42,7 @@ use super::schedule::{Cadence, Poll, Schedule};
 use super::start_gate::StartGate;
 use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
-use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Target, Urgency, WriteStats};
+use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Target, Urgency};
 use drivegate_core::plant::{BusHandle, turn_away};
 use drivegate_core::process_image::{DriveImage, Timing};
 use drivegate_model::drive::plan::WireTime;
@@ -243,7 +243,6 @@ pub struct Master {
     shutdown: Option<Shutdown>,
     /// Whether this bus, or the one before it, used the line before it was opened.
     successor: bool,
-    writes: Arc<WriteStats>,
     /// Consecutive probes without a reply, by drive.
     probes: PerDrive<u32>,
     /// Whether a late reply was already possible before the transaction that is on the line.
@@ -254,14 +253,7 @@ pub struct Master {
 
 impl Master {
     /// The master of a bus that is not open yet. `silence` is kept before each request.
-    pub fn new(
-        bus: BusHandle,
-        options: &BusOptions,
-        silence: Duration,
-        writes: Arc<WriteStats>,
-        before: &Handover,
-        now: Instant,
-    ) -> Master {
+    pub fn new(bus: BusHandle, options: &BusOptions, silence: Duration, before: &Handover, now: Instant) -> Master {
         let spec = &bus.image.spec;
         let images = &bus.image.drives;
         let cadence = Cadence {
@@ -312,7 +304,6 @@ impl Master {
             passed_on_last: false,
             shutdown: None,
             successor: before.quiet_until.is_some(),
-            writes,
             late_before: false,
             refresh_debt: Duration::ZERO,
             bus,
@@ -417,11 +408,7 @@ impl Master {
     /// Checks what time and samples have changed: leases, confirmations, N2 drives that are due for a poll.
     fn check(&mut self, now: Instant, news: &mut Vec<News>) {
         let Master {
-            bus,
-            drives,
-            schedule,
-            writes,
-            ..
+            bus, drives, schedule, ..
         } = self;
         let has_authority = bus.queue.has_authority();
         for ((index, drive), image) in drives.enumerate_mut().zip(&bus.image.drives) {
@@ -437,22 +424,15 @@ impl Master {
                 news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if drive.has_authority || has_authority {
-                report_control(bus, index, image, drive, has_authority, writes, now);
+                report_control(bus, index, image, drive, has_authority, now);
             }
             if image.spec.supervision.is_some() {
-                supervise(bus, index, image, drive, writes, now, news);
+                supervise(bus, index, image, drive, now, news);
             }
             if drive.repeated_stops.take_due(now) {
                 let origin = Origin::new(SourceKind::Schedule, Origin::REPEATED_STOP);
                 let stop = (ModelPoint::Run, Value::Bool(false));
-                let ordered = bus.own_order(
-                    index,
-                    &image.reading(now, drive.fresh),
-                    stop,
-                    origin,
-                    DEFAULT_EXPIRY,
-                    writes,
-                );
+                let ordered = bus.own_order(index, &image.reading(now, drive.fresh), stop, origin, DEFAULT_EXPIRY);
                 // A drive that accepts no orders any more has no start of the gateway pending.
                 tracing::debug!(target: "drivegate::bus::master", drive = %image.spec.name, ?ordered, "a stop again");
             }
@@ -471,7 +451,6 @@ impl Master {
             bus,
             drives,
             waits,
-            writes,
             background,
             ..
         } = self;
@@ -480,7 +459,7 @@ impl Master {
             if starts.guards(index) {
                 let reading = image.reading(now, drive.fresh);
                 starts.update(index, drive, &reading);
-                starts.check_interlocks(bus, index, image, &drive.words, &reading, writes);
+                starts.check_interlocks(bus, index, image, &drive.words, &reading);
             }
         }
         let mut pending = bus.queue.lock();
@@ -631,7 +610,6 @@ pub(super) fn supervise(
     index: DriveIndex,
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
-    writes: &Arc<WriteStats>,
     now: Instant,
     news: &mut Vec<News>,
 ) {
@@ -660,11 +638,11 @@ pub(super) fn supervise(
         }
         Demand::Write(point, value) => {
             let origin = Origin::new(SourceKind::Supervision, Origin::LEASE);
-            let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
+            let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY);
             if let Some(refusal) = supervision.ordered(ordered, now) {
                 let what = format!("{}={value}", point.name());
                 let outcome = Outcome::Refused(refusal.clone());
-                turn_away(writes, &image.spec.name, &what, outcome, origin, now);
+                turn_away(&bus.command_log, &image.spec.name, &what, outcome, origin, now);
                 news.push(News::ActionRefused {
                     drive: index,
                     what,

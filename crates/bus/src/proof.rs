@@ -13,7 +13,7 @@ use self::drive::{Drive, Start};
 use self::frame::{Fate, Frame, different, in_words};
 use super::command_run::{CommandRun, KnownWords, Next, Step, StepPurpose};
 use drivegate_core::order::{
-    Admitted, Arrival, Command, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, WriteStats, written,
+    Admitted, Arrival, Command, CommandLog, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Window, written,
 };
 use drivegate_model::drive::control::{Control, ControlItem, OwnWord, Run, Setting};
 use drivegate_model::drive::{DriveIndex, ModelPoint, PointIndex, Profile, Value};
@@ -260,7 +260,7 @@ impl<'p> Case<'p> {
 
     fn begin(&self, order: Order, urgency: Urgency, now: Instant, expires: Instant) -> CommandRun {
         let origin = Origin::new(SourceKind::LocalSocket, "proof");
-        let (ticket, _) = Ticket::new(origin, "", String::new(), false, now, Arc::new(WriteStats::default()));
+        let (ticket, _) = Ticket::new(origin, "", String::new(), false, now, Arc::new(CommandLog::default()));
         let admitted = Admitted {
             order,
             urgency,

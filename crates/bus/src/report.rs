@@ -18,7 +18,8 @@ use super::tap::{self, Tap};
 use super::transaction::{CONNECTION_CLOSED, Ended};
 use drivegate_core::diagnosis::own_timeout::Trip;
 use drivegate_core::event::{EventKind, Events};
-use drivegate_core::order::WriteStats;
+use drivegate_core::order::CommandLog;
+use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{
     Access, BusImage, DriveImage, Link, Outcome as Counted, PollCycle, Reading, Snapshot, TapedRead, Verdict,
 };
@@ -36,7 +37,7 @@ const RECENT: Duration = Duration::from_secs(60);
 pub(super) struct Report {
     image: Arc<BusImage>,
     events: Events,
-    writes: Arc<WriteStats>,
+    command_log: Arc<CommandLog>,
     window: Instant,
     busy: Duration,
     /// Fault code of each drive as last reported; `None` means no fault.
@@ -75,13 +76,8 @@ struct Response {
 }
 
 impl Report {
-    pub(super) fn new(
-        image: Arc<BusImage>,
-        options: &BusOptions,
-        events: Events,
-        writes: Arc<WriteStats>,
-        now: Instant,
-    ) -> Report {
+    pub(super) fn new(bus: &BusHandle, options: &BusOptions, events: Events, now: Instant) -> Report {
+        let image = bus.image.clone();
         let drives = image.drives.len();
         let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
         let points = image.drives.iter().map(|drive| &drive.spec.profile.points);
@@ -90,7 +86,7 @@ impl Report {
             diagnosis: LineDiagnosis::new(image.clone(), silence, options.response_timeout, now),
             image,
             events,
-            writes,
+            command_log: bus.command_log.clone(),
             window: now,
             busy: Duration::ZERO,
             responses: vec![Response::default(); drives].into(),

@@ -11,7 +11,7 @@ use super::command_run::KnownWords;
 use super::drive_state::DriveState;
 use super::news::News;
 use super::supervision::written_run;
-use drivegate_core::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate_core::order::{Answer, DEFAULT_EXPIRY, Intent, Origin, Outcome, SourceKind, written};
 use drivegate_core::plant::{BusHandle, turn_away};
 use drivegate_core::process_image::{DriveImage, Reading};
 use drivegate_core::stalls::Stall;
@@ -121,7 +121,6 @@ impl StartGate {
         image: &DriveImage,
         words: &KnownWords,
         reading: &Reading<'_>,
-        writes: &Arc<WriteStats>,
     ) {
         let now = reading.now;
         let Some(trip) = self.trips.get_mut(index).filter(|_| self.guards.trips(index)) else {
@@ -142,11 +141,11 @@ impl StartGate {
         trip.next = Some(now + trip.pause.max(AGAIN.0));
         let origin = Origin::new(SourceKind::Interlock, "interlock");
         let stop = (ModelPoint::Run, Value::Bool(false));
-        match bus.own_order(index, reading, stop, origin.clone(), DEFAULT_EXPIRY, writes) {
+        match bus.own_order(index, reading, stop, origin.clone(), DEFAULT_EXPIRY) {
             Ok(answer) => trip.answer = Some(answer),
             Err(refusal) => {
                 turn_away(
-                    writes,
+                    &bus.command_log,
                     &image.spec.name,
                     "run=false",
                     Outcome::Refused(refusal),

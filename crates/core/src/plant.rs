@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 
 use crate::event::{Event, Events};
-use crate::order::{Answer, Origin, Outcome, Refusal, WriteStats};
+use crate::order::{Answer, CommandLog, Origin, Outcome, Refusal};
 use crate::permit::Priorities;
 use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 use crate::queue::CommandQueue;
@@ -47,9 +47,21 @@ pub struct BusHandle {
     pub queue: Arc<CommandQueue>,
     /// Drives that the names and units of the bus meant before reloads.
     pub formerly: Arc<EarlierMeanings>,
+    /// The log of commands, the same for all buses of a gateway.
+    pub command_log: Arc<CommandLog>,
 }
 
 impl BusHandle {
+    /// A bus whose names and units have meant no other drives so far.
+    pub fn new(image: Arc<BusImage>, queue: Arc<CommandQueue>, command_log: Arc<CommandLog>) -> BusHandle {
+        BusHandle {
+            image,
+            queue,
+            formerly: Arc::default(),
+            command_log,
+        }
+    }
+
     /// Takes over the state of the drives, and their waiting stops, from the buses `before` a reload. A drive is
     /// the same if it is the same machine, whatever its name. The stop counter of an added drive starts at a number
     /// that no drive had before, so that a counter remembered under its name does not match.
@@ -89,8 +101,8 @@ pub struct Plant {
     pub buses: Vec<BusHandle>,
     /// The events of the gateway.
     pub events: Events,
-    /// Counters of commands.
-    pub writes: Arc<WriteStats>,
+    /// The log of commands, which the buses have too.
+    pub command_log: Arc<CommandLog>,
 }
 
 /// Access to one drive.
@@ -103,18 +115,22 @@ pub struct DriveHandle {
     pub image: Arc<DriveImage>,
     stale_after: Duration,
     events: Events,
-    writes: Arc<WriteStats>,
 }
 
 impl Plant {
-    /// A plant without any events so far.
+    /// A plant without any events so far. All its buses get the log of the first one.
     pub fn new(gateway: impl Into<String>, stale_after: Duration, buses: Vec<BusHandle>) -> Plant {
+        let command_log = buses.first().map(|bus| bus.command_log.clone()).unwrap_or_default();
+        let of_plant = |bus| BusHandle {
+            command_log: command_log.clone(),
+            ..bus
+        };
         Plant {
             gateway: gateway.into(),
             stale_after,
-            buses,
+            buses: buses.into_iter().map(of_plant).collect(),
             events: Events::default(),
-            writes: Arc::default(),
+            command_log,
         }
     }
 
@@ -122,13 +138,13 @@ impl Plant {
     /// times a second.
     pub fn report_refusals(&self, now: Instant) {
         self.events.publish_due(now);
-        self.writes.audit().record_due(now);
+        self.command_log.audit().record_due(now);
     }
 
     /// Refuses a command to an unknown drive; audited and counted. `why` names the nearest one.
     pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin, now: Instant) -> Answer {
         let outcome = Outcome::Refused(Refusal::UnknownDrive(why));
-        turn_away(&self.writes, drive, what, outcome, origin, now)
+        turn_away(&self.command_log, drive, what, outcome, origin, now)
     }
 
     /// All drives of the plant, bus by bus in the order of the file.
@@ -159,7 +175,6 @@ impl Plant {
             image: image.clone(),
             stale_after: self.stale_after,
             events: self.events.clone(),
-            writes: self.writes.clone(),
         }
     }
 }
@@ -211,7 +226,7 @@ impl DriveHandle {
 
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
-        let explanation = explain(reading, &self.bus.image, &self.writes);
+        let explanation = explain(reading, &self.bus.image, &self.bus.command_log);
         let mut explanation = self.with_reservation(explanation, reading.now);
         let guards = self.bus.queue.guards().filter(|_| explanation.runs == Some(false));
         if let Some(hindrance) = guards.and_then(|guards| guards.hindrance(self.index, reading.now)) {
@@ -237,6 +252,6 @@ impl DriveHandle {
 
     /// Passes a request on to the line of the drive; see [`BusHandle::ask`].
     pub fn ask_line(&self, question: Question, now: Instant) -> Exchange {
-        self.bus.ask(question, &self.writes, now)
+        self.bus.ask(question, now)
     }
 }

@@ -31,7 +31,7 @@ use drivegate_bus::{BusTask, Mode};
 use drivegate_core::event::{Event, EventKind, Events};
 use drivegate_core::files::Keeper;
 use drivegate_core::history::RecorderTask;
-use drivegate_core::order::{Outcome, WriteStats};
+use drivegate_core::order::{CommandLog, Outcome};
 use drivegate_core::plant::{BusHandle, Plant, SharedPlant, UnusedNames};
 use drivegate_core::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 use drivegate_core::queue::{CommandQueue, NotStopped};
@@ -92,7 +92,7 @@ pub struct Daemon {
     /// Names and unit ids that reloads took from their drives.
     unused_names: UnusedNames,
     events: Events,
-    writes: Arc<WriteStats>,
+    command_log: Arc<CommandLog>,
     north: Arc<NorthState>,
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
     mqtt: ServerSlot<drivegate_mqtt::Mqtt>,
@@ -140,10 +140,10 @@ impl Daemon {
     pub async fn start_with(settings: Settings, control: Option<Control>) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
         let drives = settings.buses.iter().map(|bus| bus.drives.len()).sum();
-        let (events, writes) = (Events::of_drives(drives), Arc::new(WriteStats::default()));
+        let (events, command_log) = (Events::of_drives(drives), Arc::new(CommandLog::default()));
         let plant = Plant {
             events: events.clone(),
-            writes: writes.clone(),
+            command_log: command_log.clone(),
             ..Plant::new(&settings.gateway, settings.stale_after.limit, Vec::new())
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
@@ -158,7 +158,7 @@ impl Daemon {
             unused_names: UnusedNames::default(),
             watcher: tokio::spawn(Watch::of_this_thread().run(events.clone())),
             events,
-            writes,
+            command_log,
             north: north.clone(),
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
@@ -352,7 +352,7 @@ impl Daemon {
         };
         let before = machines(&mut self.plant.load().buses.iter());
         let after = machines(&mut kept.iter().map(|(_, task)| task.handle()));
-        self.writes
+        self.command_log
             .audit()
             .keep_orders_of(|name| before.get(name) == after.get(name));
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
@@ -376,7 +376,7 @@ impl Daemon {
             stale_after: settings.stale_after.limit,
             buses: buses.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
-            writes: self.writes.clone(),
+            command_log: self.command_log.clone(),
         }));
         let of_bus = |image: &Arc<BusImage>| {
             let drives = image.drives.iter();
@@ -410,13 +410,8 @@ impl Daemon {
         let queue = CommandQueue::new().map_err(failed)?.guarded(guards);
         let queue = Arc::new(queue.awaiting(self.north.awaited.clone()));
         BusTask::prepare(
-            BusHandle {
-                formerly: std::sync::Arc::default(),
-                image,
-                queue,
-            },
+            BusHandle::new(image, queue, self.command_log.clone()),
             bus.options.clone(),
-            self.writes.clone(),
             self.events.clone(),
         )
         .map_err(failed)
@@ -470,7 +465,7 @@ impl Daemon {
         }
         self.stop_keeper().await;
         self.stop_starts().await;
-        let audit = self.writes.audit();
+        let audit = self.command_log.audit();
         if let Some(file) = audit.file() {
             within(STOP_AUDIT, "the audit file", file.stop()).await;
         }

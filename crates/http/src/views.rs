@@ -226,7 +226,7 @@ pub(super) async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): Raw
         return Err(no_drive(&plant, drive));
     }
     let _turn = app.turn().await;
-    let records = plant.writes.audit().recent(drive.as_deref());
+    let records = plant.command_log.audit().recent(drive.as_deref());
     let list = format!("[{}]", records.join(","));
     Ok(([(header::CONTENT_TYPE, "application/json")], list).into_response())
 }

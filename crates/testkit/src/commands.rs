@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_core::order::{Answer, Arrival, Audit, Command, Origin, SourceKind, Ticket, Urgency, Window, WriteStats};
+use drivegate_core::order::{Answer, Arrival, Audit, Command, CommandLog, Origin, SourceKind, Ticket, Urgency, Window};
 use drivegate_core::queue::{CommandQueue, Pending, Ready};
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
@@ -42,7 +42,7 @@ pub fn window(now: Instant, expiry: Duration) -> Window {
 }
 
 /// The ticket of a command of an MQTT client to drive `d`, and where its answer arrives.
-pub fn ticket(stats: &Arc<WriteStats>, now: Instant) -> (Ticket, Receiver<Answer>) {
+pub fn ticket(command_log: &Arc<CommandLog>, now: Instant) -> (Ticket, Receiver<Answer>) {
     let origin = Origin::new(SourceKind::Mqtt, "t");
-    Ticket::new(origin, "d", "run=true".to_string(), true, now, stats.clone())
+    Ticket::new(origin, "d", "run=true".to_string(), true, now, command_log.clone())
 }

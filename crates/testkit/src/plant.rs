@@ -56,11 +56,8 @@ pub fn bus_spec(name: &str) -> BusSpec {
 
 /// A bus whose port is not open yet.
 pub fn bus(spec: BusSpec, drives: Vec<Arc<DriveImage>>) -> BusHandle {
-    BusHandle {
-        formerly: std::sync::Arc::default(),
-        image: Arc::new(BusImage::new(spec, drives)),
-        queue: Arc::new(CommandQueue::new().unwrap()),
-    }
+    let image = Arc::new(BusImage::new(spec, drives));
+    BusHandle::new(image, Arc::new(CommandQueue::new().unwrap()), Arc::default())
 }
 
 /// The bus with its port shown as open.

@@ -141,11 +141,8 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         let drives = bus.drives.iter().map(drive).collect();
         let queue = CommandQueue::new()?;
         queue.set_authority(settings.authority.clone());
-        Ok(BusHandle {
-            formerly: std::sync::Arc::default(),
-            image: Arc::new(BusImage::new(bus.spec.clone(), drives)),
-            queue: Arc::new(queue),
-        })
+        let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
+        Ok(BusHandle::new(image, Arc::new(queue), Arc::default()))
     };
     Ok(Plant::new(
         settings.gateway.clone(),

@@ -12,7 +12,6 @@ use super::{ConfigFile, EXIT_CONFIG, EXIT_DATA, report};
 use drivegate_bus::listener::ListenCore;
 use drivegate_core::event::{Event, Events};
 use drivegate_core::history::capture::{self, Packet};
-use drivegate_core::order::WriteStats;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{BusImage, DriveImage, Outcome, public_points, value_or_null};
 use drivegate_core::queue::CommandQueue;
@@ -120,14 +119,10 @@ fn play(bus: &BusSettings, packets: &[Packet], stale_after: Duration) -> Result<
     let drives = bus.drives.iter().cloned().map(image).collect();
     let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
     let queue = CommandQueue::new().map_err(|error| format!("cannot start: {error}; free file descriptors"))?;
-    let handle = BusHandle {
-        formerly: std::sync::Arc::default(),
-        image: image.clone(),
-        queue: Arc::new(queue),
-    };
+    let handle = BusHandle::new(image.clone(), Arc::new(queue), Arc::default());
     let events = Events::default();
     let receiver = events.subscribe();
-    let core = ListenCore::new(handle, &bus.options, events, Arc::new(WriteStats::default()), began);
+    let core = ListenCore::new(handle, &bus.options, events, began);
     let mut player = Player {
         core,
         image,

@@ -184,7 +184,7 @@ pub(crate) fn secretive() -> Arc<DriveImage> {
 
 /// Adds a command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
-    let (ticket, _answer) = ticket(&plant.writes, Instant::now());
+    let (ticket, _answer) = ticket(&plant.command_log, Instant::now());
     ticket.answer(order::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
 }
 

@@ -261,7 +261,7 @@ async fn refusals_are_counted_and_told() {
     client.ask(1, &words(6, &[0x8000, 8])).await;
     client.ask(2, &words(6, &[0x8100, 1])).await;
     client.ask(1, &words(6, &[0x8100, 1])).await;
-    let results = plant.writes.results();
+    let results = plant.command_log.results();
     for (code, count) in [
         ("bad_value", 1),
         ("not_writable", 1),
@@ -297,7 +297,7 @@ async fn a_client_that_leaves_does_not_take_its_command_back() {
     rig.buses[0].pause(false);
     until("the write is done", || !rig.buses[0].seen.lock().unwrap().is_empty()).await;
     until("it was counted", || {
-        let results = rig.plant.load().writes.results();
+        let results = rig.plant.load().command_log.results();
         results.get(&(SourceKind::ModbusTcp, "acknowledged")) == Some(&1)
     })
     .await;

@@ -224,7 +224,10 @@ async fn roles_decide_who_writes() {
     }
     let plant = rig.plant.load_full();
     assert_eq!(
-        plant.writes.results().get(&(SourceKind::ModbusTcp, "acknowledged")),
+        plant
+            .command_log
+            .results()
+            .get(&(SourceKind::ModbusTcp, "acknowledged")),
         Some(&2)
     );
     plant.report_refusals(Instant::now() + Duration::from_secs(1));

@@ -267,7 +267,7 @@ fn a_device_command_is_an_order_like_any_other() {
         ("speed_reference".to_string(), Value::Number(33.3)),
     ];
     assert_eq!((orders.len(), orders[0].1.as_slice()), (1, expected.as_slice()));
-    let record = gateway.plant.load().writes.audit().recent(None).pop().unwrap();
+    let record = gateway.plant.load().command_log.audit().recent(None).pop().unwrap();
     let record: serde_json::Value = serde_json::from_str(&record).unwrap();
     assert_eq!(
         (&record["source"], &record["client"]),

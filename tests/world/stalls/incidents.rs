@@ -125,7 +125,7 @@ impl World {
         self.bus.line.swapped = !self.bus.line.swapped;
         let plant = self.plant.load_full();
         let before = self.bus.handle.clone();
-        self.bus.restart(0, &plant.events, &plant.writes, now);
+        self.bus.restart(0, &plant.events, now);
         let after = std::slice::from_ref(&self.bus.handle);
         self.unused_names.follow(&[before], after, now);
         self.plant.store(Arc::new(Plant {
@@ -133,7 +133,7 @@ impl World {
             stale_after: plant.stale_after,
             buses: vec![self.bus.handle.clone()],
             events: plant.events.clone(),
-            writes: plant.writes.clone(),
+            command_log: plant.command_log.clone(),
         }));
         self.note(|| "a reload swaps names and units".to_string());
     }

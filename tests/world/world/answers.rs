@@ -25,7 +25,7 @@ impl World {
 
     /// Collects answers after a step: clients that wait for a write are checked only when one was answered.
     pub(super) fn collect_news(&mut self) {
-        let before = std::mem::replace(&mut self.answered, self.writes.seconds().count);
+        let before = std::mem::replace(&mut self.answered, self.command_log.seconds().count);
         for client in 0..self.clients.len() {
             self.collect_client(client, self.answered != before);
         }

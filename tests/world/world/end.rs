@@ -62,7 +62,7 @@ impl World {
         self.collect();
         let open: Vec<usize> = self.open.values().flatten().copied().collect();
         assert!(open.is_empty(), "orders without an answer at the end: {open:?}");
-        let reported: u64 = self.writes.results().values().sum();
+        let reported: u64 = self.command_log.results().values().sum();
         let reads = self.records.iter().filter(|record| record.read.is_some()).count();
         assert!(
             reported >= (self.records.len() - reads) as u64,

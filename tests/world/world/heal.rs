@@ -396,9 +396,9 @@ fn sound_ages(bus: &WorldBus, window: Duration) -> (Ages, bool) {
         flips: 0.0,
         ..bus.line.clone()
     };
-    let (events, writes, mut now) = (Events::default(), Arc::new(WriteStats::default()), Instant::now());
+    let (events, command_log, mut now) = (Events::default(), Arc::new(CommandLog::default()), Instant::now());
     let parts = Parts::of(bus.index, &line, 0);
-    let mut twin = WorldBus::new(bus.index, &line, parts, &events, &writes, now);
+    let mut twin = WorldBus::new(bus.index, &line, parts, &events, &command_log, now);
     let warm = now + PROBED;
     let (mut ages, mut probed) = (ages_of(&twin.handle), false);
     let is_dead = |drive: usize| line.dead.iter().any(|address| usize::from(*address) == drive + 1);

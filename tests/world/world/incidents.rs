@@ -123,11 +123,11 @@ impl World {
     /// Restarts the bus, which a reload has changed, when the transaction on its line has ended.
     pub(super) fn restart(&mut self, index: usize) {
         self.note(move || format!("a reload starts line{index} anew"));
-        self.buses[index].restart(index, &self.events, &self.writes, self.now);
+        self.buses[index].restart(index, &self.events, self.now);
         for truth in &mut self.truths[index] {
             truth.online_since = None;
         }
-        let plant = plant_of(&self.buses, &self.events, &self.writes);
+        let plant = plant_of(&self.buses, &self.events, &self.command_log);
         self.plant.store(Arc::new(plant));
         let timeout = self.buses[index]
             .line

@@ -199,10 +199,10 @@ impl World {
         self.note(|| "the gateway is started again".to_string());
         for bus in &mut self.buses {
             bus.open = true;
-            bus.kill(Guards::default(), &self.events, &self.writes, self.now);
+            bus.kill(Guards::default(), &self.events, self.now);
         }
         self.plant
-            .store(Arc::new(plant_of(&self.buses, &self.events, &self.writes)));
+            .store(Arc::new(plant_of(&self.buses, &self.events, &self.command_log)));
         for truth in self.truths.iter_mut().flatten() {
             truth.forget_the_gateway(self.now);
         }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use drivegate_core::order::{Admitted, Answer, Origin, Refusal, SourceKind, WriteStats};
+use drivegate_core::order::{Admitted, Answer, CommandLog, Origin, Refusal, SourceKind};
 use drivegate_model::drive::profile::Profiles;
 use drivegate_model::drive::{DriveIndex, Value};
 use drivegate_proto::{Exception, RequestPdu, Table};
@@ -55,8 +55,8 @@ impl ObedientDrive {
             })
             .collect();
         let origin = Origin::new(SourceKind::Mqtt, "t");
-        let stats = Arc::new(WriteStats::default());
-        let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
+        let command_log = Arc::new(CommandLog::default());
+        let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, command_log);
         let admitted = Admitted {
             order: Order::Points(values),
             urgency,

@@ -4,14 +4,14 @@ use std::sync::Arc;
 use proptest::prelude::*;
 
 use super::*;
-use drivegate_core::order::{Outcome, WriteStats};
+use drivegate_core::order::{CommandLog, Outcome};
 use drivegate_core::process_image::{DriveImage, DriveSpec};
 use drivegate_model::drive::profile::Profiles;
 use drivegate_proto::{Reply, RequestPdu, Table};
 
 struct CommandedDrive {
     drive: DriveImage,
-    stats: Arc<WriteStats>,
+    command_log: Arc<CommandLog>,
     confirmations: Confirmations,
     /// Confirmation of the command that was acknowledged last.
     confirmation: Option<tokio::sync::oneshot::Receiver<Result<Duration, String>>>,
@@ -32,7 +32,7 @@ impl CommandedDrive {
         online(&drive);
         let mut rig = CommandedDrive {
             drive,
-            stats: Arc::default(),
+            command_log: Arc::default(),
             confirmations: Confirmations::default(),
             confirmation: None,
             now: Instant::now(),
@@ -42,7 +42,7 @@ impl CommandedDrive {
     }
 
     fn receipt(&mut self) -> Receipt {
-        let (mut ticket, _) = ticket(&self.stats, self.now);
+        let (mut ticket, _) = ticket(&self.command_log, self.now);
         self.confirmation = Some(ticket.confirmation());
         ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now)
     }
@@ -73,7 +73,7 @@ impl CommandedDrive {
     }
 
     fn results(&self) -> Vec<serde_json::Value> {
-        audited(self.stats.audit())
+        audited(self.command_log.audit())
             .iter()
             .map(|r| r["result"].clone())
             .collect()
@@ -102,7 +102,7 @@ fn only_a_read_after_the_acknowledgement_confirms() {
     assert!(rig.results().is_empty(), "the old sample proves nothing");
     rig.read(2100, &[2]);
     assert_eq!(rig.results(), ["confirmed"]);
-    assert_eq!(audited(rig.stats.audit())[0]["confirmed_ms"], 10.0);
+    assert_eq!(audited(rig.command_log.audit())[0]["confirmed_ms"], 10.0);
     assert!(rig.expired().is_empty());
 }
 
@@ -447,7 +447,7 @@ fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
             told.len() == 1 && told[0].contains("is unknown") && told[0].contains(point),
             "{told:?}"
         );
-        let audited = audited(rig.stats.audit())[0]["text"].to_string();
+        let audited = audited(rig.command_log.audit())[0]["text"].to_string();
         assert!(audited.contains(point), "{audited}");
     }
     let mut rig = CommandedDrive::of("eaton-hvx");

@@ -13,7 +13,7 @@ use crate::news::News;
 use crate::report::Report;
 use crate::transaction::Ended;
 use drivegate_core::event::{EventKind, Events};
-use drivegate_core::order::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
+use drivegate_core::order::{Origin, Outcome, Refusal, SourceKind, Ticket};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{Cadence, Outcome as Counted};
 use drivegate_model::drive::{DriveIndex, PerDrive, Profile};
@@ -46,7 +46,6 @@ pub struct ListenCore {
     bus: BusHandle,
     decoder: Decoder,
     report: Report,
-    writes: Arc<WriteStats>,
     drives: PerDrive<DriveRecord>,
     /// Tries of the other master, after the first, before a drive is offline.
     retries: u32,
@@ -59,13 +58,7 @@ pub struct ListenCore {
 
 impl ListenCore {
     /// A bus whose port is not open yet.
-    pub fn new(
-        bus: BusHandle,
-        options: &BusOptions,
-        events: Events,
-        writes: Arc<WriteStats>,
-        now: Instant,
-    ) -> ListenCore {
+    pub fn new(bus: BusHandle, options: &BusOptions, events: Events, now: Instant) -> ListenCore {
         let known = |drive: &Arc<drivegate_core::process_image::DriveImage>| {
             drive.update(|snapshot| snapshot.heard = Some(Cadence::default()));
             DriveRecord {
@@ -80,9 +73,8 @@ impl ListenCore {
         ListenCore {
             drives: bus.image.drives.iter().map(known).collect(),
             decoder: decoder(&bus),
-            report: Report::new(bus.image.clone(), options, events, writes.clone(), now),
+            report: Report::new(&bus, options, events, now),
             bus,
-            writes,
             retries: options.retries,
             round: (Vec::new(), None),
             heard: Vec::new(),
@@ -369,7 +361,14 @@ impl ListenCore {
             format!("the other master commands {name}: {what}; {outcome}")
         });
         let origin = Origin::new(SourceKind::OtherMaster, self.bus.image.spec.name.clone());
-        let (ticket, _) = Ticket::new(origin, &image.spec.name, what, true, began, self.writes.clone());
+        let (ticket, _) = Ticket::new(
+            origin,
+            &image.spec.name,
+            what,
+            true,
+            began,
+            self.bus.command_log.clone(),
+        );
         ticket.with_changes(changes).answer(outcome, at);
     }
 }

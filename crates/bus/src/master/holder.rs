@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use crate::drive_state::DriveState;
 use crate::supervision::written_run;
-use drivegate_core::order::{DEFAULT_EXPIRY, Origin, SourceKind, WriteStats};
+use drivegate_core::order::{DEFAULT_EXPIRY, Origin, SourceKind};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{DriveImage, Reading};
 use drivegate_model::drive::{DriveIndex, ModelPoint, Value};
@@ -17,7 +17,6 @@ pub(super) fn report_control(
     image: &Arc<DriveImage>,
     drive: &mut DriveState,
     has_authority: bool,
-    writes: &Arc<WriteStats>,
     now: Instant,
 ) {
     drive.has_authority = has_authority;
@@ -43,19 +42,13 @@ pub(super) fn report_control(
     let stops = queue.gate.rules().is_some_and(|rules| rules.stop_at_local);
     drop(queue);
     if stops && before == Some(false) && local == Some(true) {
-        stop_at_local(bus, index, drive, &reading, writes);
+        stop_at_local(bus, index, drive, &reading);
     }
 }
 
 /// Takes the run command away, so that nothing starts when local control returns the drive to the bus. If local
 /// control was already active when the gateway started, nothing is written.
-fn stop_at_local(
-    bus: &BusHandle,
-    index: DriveIndex,
-    drive: &DriveState,
-    reading: &Reading<'_>,
-    writes: &Arc<WriteStats>,
-) {
+fn stop_at_local(bus: &BusHandle, index: DriveIndex, drive: &DriveState, reading: &Reading<'_>) {
     let run = reading.model(ModelPoint::Run).good().map(|run| run.as_bool());
     if !run
         .or_else(|| written_run(&reading.spec.profile, &drive.words))
@@ -65,7 +58,7 @@ fn stop_at_local(
     }
     let origin = Origin::new(SourceKind::Supervision, Origin::LOCAL);
     let stop = (ModelPoint::Run, Value::Bool(false));
-    if let Err(refusal) = bus.own_order(index, reading, stop, origin, DEFAULT_EXPIRY, writes) {
+    if let Err(refusal) = bus.own_order(index, reading, stop, origin, DEFAULT_EXPIRY) {
         tracing::error!(
             target: "drivegate::bus::master", drive = %reading.spec.name,
             "its run command is set while it is under local control, and no stop can be sent: {refusal}"

@@ -1,6 +1,5 @@
 //! The end of the gateway: polling stops, and each drive with `on_shutdown = "stop"` gets its stop.
 
-use std::sync::Arc;
 use std::task::{Context, Waker};
 use std::time::{Duration, Instant};
 
@@ -10,7 +9,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 use super::Master;
 use crate::drive_state::FRESH;
 use crate::stop_of_line::stop_of_line;
-use drivegate_core::order::{Answer, Origin, Outcome, SourceKind, WriteStats};
+use drivegate_core::order::{Answer, Origin, Outcome, SourceKind};
 use drivegate_core::plant::{BusHandle, Exchange, Question};
 use drivegate_core::process_image::{Access, DriveImage, OnShutdown};
 use drivegate_core::queue::{NotStopped, Stopping};
@@ -89,7 +88,7 @@ impl Stop {
 }
 
 impl Shutdown {
-    fn new(stopping: Stopping, bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Shutdown {
+    fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Shutdown {
         let drives = bus.image.drives.enumerate();
         let wanted = drives.filter(|(_, image)| is_to_stop(image));
         let stop = |(drive, _)| Stop {
@@ -100,7 +99,7 @@ impl Shutdown {
         };
         Shutdown {
             stopping: Some(stopping),
-            broadcast: broadcast(bus, writes, now).map(|exchange| (exchange, now + BROADCAST)),
+            broadcast: broadcast(bus, now).map(|exchange| (exchange, now + BROADCAST)),
             stops: wanted.map(stop).collect(),
         }
     }
@@ -143,13 +142,12 @@ impl Master {
         // The lock on the queue must be free again when the broadcast is added.
         let stopping = self.bus.queue.lock().take_stopping();
         if let Some(stopping) = stopping {
-            self.shutdown = Some(Shutdown::new(stopping, &self.bus, &self.writes, now));
+            self.shutdown = Some(Shutdown::new(stopping, &self.bus, now));
         }
         let Master {
             shutdown,
             bus,
             schedule,
-            writes,
             ..
         } = self;
         let Some(shutdown) = shutdown else { return };
@@ -171,7 +169,7 @@ impl Master {
         for stop in &mut shutdown.stops {
             let due = matches!(stop.state, State::Due(at) if at <= now);
             if due && (schedule.is_online(stop.drive) || !others_first) {
-                stop.state = order(bus, stop.drive, deadline, writes, now);
+                stop.state = order(bus, stop.drive, deadline, now);
             }
         }
     }
@@ -183,7 +181,7 @@ fn is_to_stop(image: &DriveImage) -> bool {
 }
 
 /// The broadcast that stops all drives of the bus, if all of them are to be stopped and at least one of them answers.
-fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<Exchange> {
+fn broadcast(bus: &BusHandle, now: Instant) -> Option<Exchange> {
     let drives = &bus.image.drives;
     let all = drives
         .iter()
@@ -191,16 +189,16 @@ fn broadcast(bus: &BusHandle, writes: &Arc<WriteStats>, now: Instant) -> Option<
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let pdu = stop_of_line(&bus.image.spec, drives.iter().map(|image| &image.spec)).filter(|_| all && online)?;
     let question = Question::broadcast(pdu, Origin::new(SourceKind::Shutdown, "on_shutdown"), now, BROADCAST);
-    Some(bus.ask(question, writes, now))
+    Some(bus.ask(question, now))
 }
 
-fn order(bus: &BusHandle, drive: DriveIndex, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {
+fn order(bus: &BusHandle, drive: DriveIndex, deadline: Instant, now: Instant) -> State {
     let image = bus.image.drives.of(drive);
     let origin = Origin::new(SourceKind::Shutdown, "on_shutdown");
     let reading = image.reading(now, FRESH);
     let expiry = deadline.saturating_duration_since(now);
     let stop = Value::Bool(false);
-    match bus.own_order(drive, &reading, (ModelPoint::Run, stop), origin, expiry, writes) {
+    match bus.own_order(drive, &reading, (ModelPoint::Run, stop), origin, expiry) {
         Ok(answer) => State::Ordered(answer),
         Err(refusal) => State::Refused(refusal.to_string()),
     }

@@ -120,7 +120,6 @@ fn options() -> BusOptions {
 struct Rig {
     bus: BusHandle,
     master: Master,
-    stats: Arc<WriteStats>,
     drives: Vec<Registers>,
     /// Whether the drives do not receive a broadcast.
     deaf: bool,
@@ -181,20 +180,12 @@ impl Rig {
             ..bus_spec("b")
         };
         let bus = bus(line, images.collect());
-        let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
-        let mut master = Master::new(
-            bus.clone(),
-            &options(),
-            SILENCE,
-            stats.clone(),
-            &Handover::default(),
-            now,
-        );
+        let now = Instant::now();
+        let mut master = Master::new(bus.clone(), &options(), SILENCE, &Handover::default(), now);
         master.opened(now);
         Rig {
             bus,
             master,
-            stats,
             drives: (0..drives).map(|_| Registers::default()).collect(),
             deaf: false,
             news: Vec::new(),
@@ -205,14 +196,7 @@ impl Rig {
 
     /// Replaces the bus by a new one.
     fn begin_anew(&mut self, before: &Handover) {
-        self.master = Master::new(
-            self.bus.clone(),
-            &options(),
-            SILENCE,
-            self.stats.clone(),
-            before,
-            self.now,
-        );
+        self.master = Master::new(self.bus.clone(), &options(), SILENCE, before, self.now);
         self.master.opened(self.now);
     }
 
@@ -293,7 +277,7 @@ impl Rig {
         let order = Order::Points(vec![(index, value)]);
         let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, who);
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
+        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.bus.command_log.clone());
         let window = window(self.now, DEFAULT_EXPIRY);
         let command = Command::new(DriveIndex::new(drive), admitted, &image.spec.profile, window, ticket);
         self.bus.queue.submit(command, &(), self.now);

@@ -166,7 +166,7 @@ impl Report {
     /// The client that ordered the start or stop of a motor: that of the last order to the drive, if the order fits and had
     /// no other effect before.
     fn who(&self, drive: &str, change: Change, now: Instant) -> Option<String> {
-        let ordered = self.writes.audit().last_ordered(drive)?;
+        let ordered = self.command_log.audit().last_ordered(drive)?;
         let within = if change.value { STARTS_WITHIN } else { STOPS_WITHIN };
         let is_recent = now.saturating_duration_since(ordered.at) <= within;
         let is_new = change.left_out == 0 && change.before.is_none_or(|before| ordered.at > before);

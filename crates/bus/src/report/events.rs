@@ -94,7 +94,7 @@ impl Report {
             });
         }
         let drive = self.image.drives.of(index);
-        let explanation = explain(&drive.reading(now, RECENT), &self.image, &self.writes);
+        let explanation = explain(&drive.reading(now, RECENT), &self.image, &self.command_log);
         let causes = explanation.blocked_by().map(|causes| format!("; blocked by {causes}"));
         self.drive_event(index, EventKind::NotConfirmed, None, |name| {
             format!("drive {name} {}{}", late.text, causes.unwrap_or_default())

@@ -7,10 +7,10 @@ use crate::confirm::Unconfirmed;
 use drivegate_core::process_image::{DriveSpec, LeaseAction};
 use drivegate_model::drive::DriveIndex;
 
-fn image(drives: u8) -> Arc<BusImage> {
+fn bus(drives: u8) -> BusHandle {
     let profile = nx();
     let drive = |address| drivegate_testkit::image(monitored(&format!("d{address}"), "b", address, &profile));
-    Arc::new(BusImage::new(bus_spec("b"), (1..=drives).map(drive).collect()))
+    drivegate_testkit::bus(bus_spec("b"), (1..=drives).map(drive).collect())
 }
 
 fn options() -> BusOptions {
@@ -28,9 +28,10 @@ fn options() -> BusOptions {
 /// on a bus that is down.
 #[test]
 fn whoever_sees_the_bus_down_sees_every_drive_offline() {
-    let image = image(200);
+    let bus = bus(200);
+    let image = bus.image.clone();
     let now = Instant::now();
-    let mut report = Report::new(image.clone(), &options(), Events::default(), Default::default(), now);
+    let mut report = Report::new(&bus, &options(), Events::default(), now);
     for _ in 0..20 {
         report.bus_up(now);
         for index in image.drives.indexes() {
@@ -51,10 +52,11 @@ fn whoever_sees_the_bus_down_sees_every_drive_offline() {
 
 #[test]
 fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
-    let image = image(2);
+    let bus = bus(2);
+    let image = bus.image.clone();
     let now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
+    let mut report = Report::new(&bus, &options(), events.clone(), now);
     report.bus_up(now);
     report.apply(&News::Online(DriveIndex::new(0)), now);
     report.bus_down("unplugged", now);
@@ -111,10 +113,11 @@ fn show_fault(report: &mut Report, image: &BusImage, (fault, code): (bool, u16),
 
 #[test]
 fn a_code_that_goes_before_its_bit_is_no_other_fault() {
-    let image = image(1);
+    let bus = bus(1);
+    let image = bus.image.clone();
     let mut now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
+    let mut report = Report::new(&bus, &options(), events.clone(), now);
     report.apply(&News::Online(DriveIndex::new(0)), now);
     for shown in [
         (false, 0),
@@ -147,8 +150,8 @@ fn a_code_that_goes_before_its_bit_is_no_other_fault() {
 
 #[test]
 fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
-    let mut image = image(1);
-    let drive = &image.drives[0];
+    let mut bus = bus(1);
+    let drive = &bus.image.drives[0];
     let spec = DriveSpec {
         supervision: Some(drivegate_core::process_image::Supervision {
             timeout: Duration::from_secs(5),
@@ -158,10 +161,10 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
         ..drive.spec.clone()
     };
     let drive = Arc::new(DriveImage::new(spec, Duration::from_secs(1)));
-    image = Arc::new(BusImage::new(image.spec.clone(), vec![drive.clone()]));
+    bus.image = Arc::new(BusImage::new(bus.image.spec.clone(), vec![drive.clone()]));
     let now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image, &options(), events.clone(), Default::default(), now);
+    let mut report = Report::new(&bus, &options(), events.clone(), now);
     let failed = |why: Option<&str>| News::ActionFailed {
         drive: DriveIndex::new(0),
         why: why.map(str::to_string),
@@ -208,10 +211,11 @@ fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
 fn an_event_tells_who_started_and_stopped_a_motor() {
     use drivegate_core::order::{Origin, Outcome, SourceKind, Ticket};
     const SECOND: Duration = Duration::from_secs(1);
-    let image = image(1);
-    let (events, writes) = (Events::default(), Arc::<WriteStats>::default());
+    let bus = bus(1);
+    let image = bus.image.clone();
+    let events = Events::default();
     let mut now = Instant::now();
-    let mut report = Report::new(image.clone(), &options(), events.clone(), writes.clone(), now);
+    let mut report = Report::new(&bus, &options(), events.clone(), now);
     let status = image.drives[0]
         .plan
         .reads
@@ -222,7 +226,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     report.apply(&News::Online(DriveIndex::new(0)), now);
     let order = |run: bool, outcome: Outcome, now: Instant| {
         let origin = Origin::new(SourceKind::Mqtt, "operator");
-        let (ticket, _) = Ticket::new(origin, "d1", "run".to_string(), true, now, writes.clone());
+        let (ticket, _) = Ticket::new(origin, "d1", "run".to_string(), true, now, bus.command_log.clone());
         let change = drivegate_core::order::Change {
             point: "run".to_string(),
             old: None,

@@ -8,8 +8,7 @@ use crate::drive_state::{DriveState, NextNeed};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
 use drivegate_core::order::{
-    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, WriteStats,
-    written,
+    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, written,
 };
 use drivegate_core::permit::admit;
 use drivegate_core::plant::BusHandle;
@@ -44,7 +43,6 @@ fn acknowledged() -> Outcome {
 struct SupervisedDrive {
     bus: BusHandle,
     drive: DriveState,
-    stats: Arc<WriteStats>,
     news: Vec<News>,
     now: Instant,
 }
@@ -67,7 +65,6 @@ impl SupervisedDrive {
         SupervisedDrive {
             drive: DriveState::new(&spec, Duration::ZERO),
             bus: handle(bus_spec("b"), image(spec)),
-            stats: Arc::default(),
             news: Vec::new(),
             now: Instant::now(),
         }
@@ -89,7 +86,6 @@ impl SupervisedDrive {
             DriveIndex::new(0),
             &self.image(),
             &mut self.drive,
-            &self.stats,
             now,
             &mut self.news,
         );
@@ -166,7 +162,7 @@ impl SupervisedDrive {
 
     /// Audit results of the gateway's own orders.
     fn own_results(&self) -> Vec<serde_json::Value> {
-        let audit = audited(self.stats.audit());
+        let audit = audited(self.bus.command_log.audit());
         let own = audit.iter().filter(|r| r["source"] == SourceKind::Supervision.name());
         own.map(|r| r["result"].clone()).collect()
     }
@@ -182,7 +178,7 @@ impl SupervisedDrive {
         let index = image.spec.profile.model_index(point).unwrap();
         let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
+        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.bus.command_log.clone());
         let window = window(self.now, DEFAULT_EXPIRY);
         let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
         self.bus.queue.submit(command, &(), self.now);

@@ -266,7 +266,7 @@ impl Run {
 
     /// Starts the drill. If drills are saved, the motor starts once generation `keep` is on disk.
     pub(super) fn start(&mut self, plant: &Plant, keep: Option<u64>, now: Instant, time: SystemTime) {
-        self.records = Some(plant.writes.audit().subscribe());
+        self.records = Some(plant.command_log.audit().subscribe());
         self.stops = self.drive.stops();
         self.lock(None);
         self.report.state = DrillState::Running;
@@ -441,7 +441,7 @@ impl Ended {
         let kinds: Vec<&str> = self.report.steps.iter().map(|step| step.kind.name()).collect();
         let what = format!("drill {} at {} %", kinds.join(", "), self.report.speed);
         let result = (state.name(), self.report.text.as_str());
-        plant.writes.audit().note(&self.who, (drive, &what), result, now);
+        plant.command_log.audit().note(&self.who, (drive, &what), result, now);
         let text = format!(
             "{what} by {}: {}: {}",
             self.report.who,

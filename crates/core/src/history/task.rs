@@ -16,7 +16,7 @@ use super::store::{self, Entry, ReadError, Store};
 use super::trigger::{Trigger, TriggerKind, is_refused_stop};
 use super::{Clock, History, RecorderOptions, Recording};
 use crate::event::{Event, EventKind, Events, RecordingMade};
-use crate::order::{AuditRecord, WriteStats};
+use crate::order::{AuditRecord, CommandLog};
 use crate::process_image::BusImage;
 
 /// Interval at which the tapes of the buses are taken.
@@ -148,7 +148,7 @@ impl RecorderTask {
         recordings: Arc<Recordings>,
         history: Arc<History>,
         events: Events,
-        writes: &Arc<WriteStats>,
+        command_log: &Arc<CommandLog>,
     ) -> std::io::Result<(RecorderTask, oneshot::Receiver<()>)> {
         let (control, orders) = channel();
         let (captures, waiting) = sync_channel(WAITING);
@@ -182,7 +182,7 @@ impl RecorderTask {
             recorder: Recorder::new(options, history),
             events: events.clone(),
             heard: events.subscribe(),
-            commands: writes.audit().subscribe(),
+            commands: command_log.audit().subscribe(),
             captures,
             left_out: 0,
         };

@@ -45,7 +45,7 @@ pub use raw::written;
 pub use right::{Grants, Right};
 pub use slot_write::{Commanded, Entry, SlotWrite};
 pub use target::Target;
-pub use ticket::{Receipt, Ticket, WriteStats};
+pub use ticket::{CommandLog, Receipt, Ticket};
 pub use touched::Touched;
 
 use std::sync::atomic::{AtomicU64, Ordering};

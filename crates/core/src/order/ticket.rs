@@ -10,15 +10,15 @@ use super::audit::{Audit, AuditRecord, Change, Reach, RunOrdered};
 use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind, StopEnd};
 use crate::process_image::{Histogram, HistogramSnapshot};
 
-/// Counters of commands, for the metrics, and the audit.
+/// The log of all commands of a gateway: how many ended with which result, how long that took, and the audit.
 #[derive(Debug, Default)]
-pub struct WriteStats {
+pub struct CommandLog {
     results: Mutex<BTreeMap<(SourceKind, &'static str), u64>>,
     seconds: Histogram,
     audit: Audit,
 }
 
-impl WriteStats {
+impl CommandLog {
     /// Number of commands by source and result code.
     pub fn results(&self) -> BTreeMap<(SourceKind, &'static str), u64> {
         self.results.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -56,7 +56,7 @@ pub struct Ticket {
     runs: Vec<(String, bool)>,
     write: bool,
     accepted: Instant,
-    stats: Arc<WriteStats>,
+    command_log: Arc<CommandLog>,
     sender: Option<oneshot::Sender<Answer>>,
     confirmation: Option<oneshot::Sender<Result<Duration, String>>>,
     answered: Option<(Outcome, Duration)>,
@@ -78,7 +78,7 @@ impl Ticket {
         what: String,
         write: bool,
         accepted: Instant,
-        stats: Arc<WriteStats>,
+        command_log: Arc<CommandLog>,
     ) -> (Ticket, oneshot::Receiver<Answer>) {
         let (sender, receiver) = oneshot::channel();
         let ticket = Ticket {
@@ -89,7 +89,7 @@ impl Ticket {
             runs: Vec::new(),
             write,
             accepted,
-            stats,
+            command_log,
             sender: Some(sender),
             confirmation: None,
             answered: None,
@@ -163,7 +163,7 @@ impl Ticket {
         self.answered = Some((outcome.clone(), latency));
         let answer = Answer { outcome, latency };
         if self.write {
-            self.stats.note(self.origin.kind, &answer);
+            self.command_log.note(self.origin.kind, &answer);
             self.note_run(&answer.outcome, now);
         }
         // The command counts as answered even if the client no longer waits.
@@ -178,7 +178,7 @@ impl Ticket {
         let runs = run.map(|run| (self.drive.as_str(), run)).into_iter().chain(runs);
         for (drive, run) in runs.filter(|_| may_be_done) {
             let who = format!("{} {}", self.origin.kind.name(), self.origin.who);
-            self.stats.audit.ordered(drive, RunOrdered { run, who, at: now });
+            self.command_log.audit.ordered(drive, RunOrdered { run, who, at: now });
         }
     }
 
@@ -208,7 +208,7 @@ impl Ticket {
             confirmed: self.confirmed,
             count: 1,
         };
-        self.stats
+        self.command_log
             .audit
             .record(record, outcome.reach(), self.accepted + latency);
     }
@@ -267,51 +267,51 @@ impl Receipt {
 pub(super) mod tests {
     use super::*;
 
-    pub(crate) fn ticket(stats: &Arc<WriteStats>, now: Instant) -> (Ticket, oneshot::Receiver<Answer>) {
+    pub(crate) fn ticket(command_log: &Arc<CommandLog>, now: Instant) -> (Ticket, oneshot::Receiver<Answer>) {
         let origin = Origin::new(SourceKind::Mqtt, "t");
-        Ticket::new(origin, "d", "run=true".to_string(), true, now, stats.clone())
+        Ticket::new(origin, "d", "run=true".to_string(), true, now, command_log.clone())
     }
 
     #[test]
     fn one_answer_also_when_dropped() {
-        let stats = Arc::new(WriteStats::default());
+        let command_log = Arc::new(CommandLog::default());
         let now = Instant::now();
-        let (first, mut answered) = ticket(&stats, now);
+        let (first, mut answered) = ticket(&command_log, now);
         first.answer(Outcome::TimedOut, now);
         assert_eq!(answered.try_recv().unwrap().outcome, Outcome::TimedOut);
-        let (second, mut dropped) = ticket(&stats, now);
+        let (second, mut dropped) = ticket(&command_log, now);
         drop(second);
         assert_eq!(dropped.try_recv().unwrap().outcome, Outcome::ShuttingDown);
-        assert_eq!(stats.results().values().sum::<u64>(), 2);
-        assert_eq!(stats.seconds().count, 2);
-        let audited = stats.audit().parsed();
+        assert_eq!(command_log.results().values().sum::<u64>(), 2);
+        assert_eq!(command_log.seconds().count, 2);
+        let audited = command_log.audit().parsed();
         let results: Vec<_> = audited.iter().map(|r| &r["result"]).collect();
         assert_eq!(results, ["timeout", "shutting_down"]);
     }
 
     #[test]
     fn a_confirmation_comes_after_the_one_answer() {
-        let stats = Arc::new(WriteStats::default());
+        let command_log = Arc::new(CommandLog::default());
         let now = Instant::now();
         let acknowledged = Outcome::Acknowledged(drivegate_proto::Reply::Written);
-        let (mut ticket, mut answer) = ticket(&stats, now);
+        let (mut ticket, mut answer) = ticket(&command_log, now);
         let mut confirmation = ticket.confirmation();
         let receipt = ticket.acknowledge(acknowledged.clone(), now + Duration::from_millis(5));
         assert_eq!(answer.try_recv().unwrap().outcome, acknowledged);
-        assert!(stats.audit().parsed().is_empty(), "one line has both");
+        assert!(command_log.audit().parsed().is_empty(), "one line has both");
         receipt.confirm(now + Duration::from_millis(9));
         assert_eq!(confirmation.try_recv(), Ok(Ok(Duration::from_millis(9))));
-        let record = &stats.audit().parsed()[0];
+        let record = &command_log.audit().parsed()[0];
         assert_eq!(
             (&record["result"], &record["latency_ms"]),
             (&"confirmed".into(), &5.0.into())
         );
         assert_eq!(record["confirmed_ms"], 9.0);
-        let (mut ticket, _answer) = self::ticket(&stats, now);
+        let (mut ticket, _answer) = self::ticket(&command_log, now);
         let mut confirmation = ticket.confirmation();
         drop(ticket.acknowledge(acknowledged, now));
         assert!(confirmation.try_recv().is_err());
-        assert_eq!(stats.audit().parsed()[1]["result"], "acknowledged");
-        assert_eq!(stats.results().values().sum::<u64>(), 2);
+        assert_eq!(command_log.audit().parsed()[1]["result"], "acknowledged");
+        assert_eq!(command_log.results().values().sum::<u64>(), 2);
     }
 }

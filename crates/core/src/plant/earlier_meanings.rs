@@ -358,6 +358,7 @@ impl DriveHandle {
             image: served.image.upgrade()?,
             queue: served.queue.upgrade()?,
             formerly: served.formerly.upgrade()?,
+            command_log: self.bus.command_log.clone(),
         };
         let index = served.place;
         let image = bus.image.drives.get(index)?.clone();

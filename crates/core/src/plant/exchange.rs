@@ -11,7 +11,7 @@ use super::BusHandle;
 use super::orders::changes;
 use crate::order::{
     Answer, Arrival, BackgroundRequest, Command, Effect, Effects, Intent, Order, Origin, Outcome, Pace, PassedOn,
-    Target, Ticket, Touched, Window, WriteStats, written,
+    Target, Ticket, Touched, Window, written,
 };
 use crate::permit::{Stage, client_access};
 use crate::process_image::DriveImage;
@@ -72,16 +72,16 @@ impl BusHandle {
     /// Passes a request on to the line within the share of background transactions. When this returns the request
     /// is in the queue of the bus, or answered. A request that may write counts as a command to every drive that
     /// receives it, and is ordered among their other commands.
-    pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
-        self.pass_on(question, false, writes, now)
+    pub fn ask(&self, question: Question, now: Instant) -> Exchange {
+        self.pass_on(question, false, now)
     }
 
     /// Sends a broadcast that stops every drive of the bus, ahead of all waiting commands, stops included.
-    pub(crate) fn ask_first(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
-        self.pass_on(question, true, writes, now)
+    pub(crate) fn ask_first(&self, question: Question, now: Instant) -> Exchange {
+        self.pass_on(question, true, now)
     }
 
-    fn pass_on(&self, question: Question, first: bool, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
+    fn pass_on(&self, question: Question, first: bool, now: Instant) -> Exchange {
         let (spec, drives) = (&self.image.spec, &self.image.drives);
         let name = match question.target {
             Target::Drive(index) => drives
@@ -103,7 +103,7 @@ impl BusHandle {
             let run = changes.iter().rev().find_map(|change| change.run)?;
             Some((drive.spec.name.clone(), run))
         });
-        let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, writes.clone());
+        let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, self.command_log.clone());
         let ticket = ticket.with_runs(runs.collect());
         let (sender, frame) = oneshot::channel();
         let passed_on = PassedOn {

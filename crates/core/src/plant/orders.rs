@@ -9,8 +9,8 @@ use super::earlier_meanings::FormerMachine;
 use super::{BusHandle, DriveHandle, Placed};
 use crate::event::RefusedCommand;
 use crate::order::{
-    Answer, Arrival, Authority, BackgroundRequest, Change, Command, DEFAULT_EXPIRY, Haste, Order, Origin, Outcome,
-    Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, WriteStats, written,
+    Answer, Arrival, Authority, BackgroundRequest, Change, Command, CommandLog, DEFAULT_EXPIRY, Haste, Order, Origin,
+    Outcome, Pace, Parts, Refusal, SlotWrite, StopEnd, Ticket, Urgency, Window, Work, written,
 };
 use crate::permit::{DriveFacts, Facts, Stage, Verdict, admit, client_access, meant_another};
 use crate::process_image::{BusImage, Reading};
@@ -188,14 +188,14 @@ pub(super) fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
 
 /// Refuses a command, which is audited and counted.
 pub fn turn_away(
-    writes: &Arc<WriteStats>,
+    command_log: &Arc<CommandLog>,
     drive: &str,
     what: &str,
     outcome: Outcome,
     origin: Origin,
     now: Instant,
 ) -> Answer {
-    let (ticket, _) = Ticket::new(origin, drive, what.to_string(), true, now, writes.clone());
+    let (ticket, _) = Ticket::new(origin, drive, what.to_string(), true, now, command_log.clone());
     ticket.answer(outcome.clone(), now);
     Answer {
         outcome,
@@ -226,7 +226,6 @@ impl BusHandle {
         (point, value): (ModelPoint, Value),
         origin: Origin,
         expiry: Duration,
-        writes: &Arc<WriteStats>,
     ) -> Result<oneshot::Receiver<Answer>, Refusal> {
         let (spec, now) = (reading.spec, reading.now);
         let index = spec.profile.model_index(point).ok_or_else(|| {
@@ -238,7 +237,7 @@ impl BusHandle {
         let mut admitted = admit(order, reading, Authority::Write)?;
         admitted.reference_only = false;
         let what = format!("{}={value}", point.name());
-        let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
+        let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, self.command_log.clone());
         let window = Window {
             arrival: Arrival::now(now),
             expires: now + expiry,
@@ -423,7 +422,7 @@ impl DriveHandle {
         now: Instant,
     ) -> (Ticket, oneshot::Receiver<Answer>) {
         let name = &self.image.spec.name;
-        let (ticket, answer) = Ticket::new(origin, name, what.to_string(), write, now, self.writes.clone());
+        let (ticket, answer) = Ticket::new(origin, name, what.to_string(), write, now, self.bus.command_log.clone());
         (ticket.with_changes(sets), answer)
     }
 
@@ -518,7 +517,7 @@ impl DriveHandle {
             return Outcome::Offline;
         }
         let name = &self.image.spec.name;
-        let (ticket, answer) = Ticket::new(origin, name, String::new(), false, now, self.writes.clone());
+        let (ticket, answer) = Ticket::new(origin, name, String::new(), false, now, self.bus.command_log.clone());
         let request = BackgroundRequest {
             target: self.index.into(),
             pdu,
@@ -536,7 +535,14 @@ impl DriveHandle {
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
         self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
-        turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
+        turn_away(
+            &self.bus.command_log,
+            name,
+            what,
+            Outcome::Refused(refusal),
+            origin,
+            now,
+        )
     }
 
     /// Publishes that a command was refused; many refusals are published as a count.

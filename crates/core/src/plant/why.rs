@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
-use crate::order::{AuditRecord, CONFIRMED, Guarded, Origin, Reason, SourceKind, WriteStats};
+use crate::order::{AuditRecord, CONFIRMED, CommandLog, Guarded, Origin, Reason, SourceKind};
 use crate::process_image::{Access, BusImage, Link, Reading, RestoreLock};
 use drivegate_model::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
 
 /// Whether the drive of `reading`, on this bus, runs, and if not, why.
-pub fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
+pub fn explain(reading: &Reading<'_>, bus: &BusImage, command_log: &CommandLog) -> Explanation {
     let spec = reading.spec;
     let order = || {
-        let (record, ended) = writes.audit().last_run(&spec.name)?;
+        let (record, ended) = command_log.audit().last_run(&spec.name)?;
         run_order(&record, reading.now.saturating_duration_since(ended))
     };
     let situation = Situation {

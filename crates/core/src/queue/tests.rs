@@ -4,7 +4,7 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::order::{Admitted, Answer, Arrival, SourceKind, Ticket, Touched, Window, WriteStats};
+use crate::order::{Admitted, Answer, Arrival, CommandLog, SourceKind, Ticket, Touched, Window};
 use crate::testkit::{next_command, nx, ticket};
 use drivegate_model::drive::{DriveIndex, PointIndex, Value};
 use drivegate_proto::Table;
@@ -19,7 +19,7 @@ const EXPIRY: Duration = Duration::from_secs(2);
 /// Commands of several clients, and the time.
 struct Clients {
     pending: Pending,
-    stats: Arc<WriteStats>,
+    stats: Arc<CommandLog>,
     now: Instant,
 }
 

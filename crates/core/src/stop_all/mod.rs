@@ -187,7 +187,7 @@ impl State {
                 .filter(is_of_bus)
                 .any(|machine| !joins.contains(machine));
             if new && concerned == bus.image.drives.len() {
-                let exchange = broadcast(plant, bus, origin, now);
+                let exchange = broadcast(bus, origin, now);
                 self.broadcasts
                     .extend(exchange.map(|exchange| (exchange, now + BROADCAST)));
             }
@@ -239,17 +239,20 @@ impl State {
 fn note_joined(plant: &Plant, drive: &DriveHandle, origin: &Origin, now: Instant) {
     let text = "a stop is already in progress and now counts for this client too; nothing more was written";
     let what = (drive.image.spec.name.as_str(), "run=false");
-    plant.writes.audit().note(origin, what, ("acknowledged", text), now);
+    plant
+        .command_log
+        .audit()
+        .note(origin, what, ("acknowledged", text), now);
 }
 
 /// The broadcast that stops every drive of the bus, if they are known to obey it and at least one of them answers.
-fn broadcast(plant: &Plant, bus: &BusHandle, origin: &Origin, now: Instant) -> Option<Exchange> {
+fn broadcast(bus: &BusHandle, origin: &Origin, now: Instant) -> Option<Exchange> {
     let drives = &bus.image.drives;
     let online = drives.iter().any(|image| image.snapshot().link.is_online());
     let specs = drives.iter().map(|image| &image.spec);
     let pdu = stop_of_line(&bus.image.spec, specs).filter(|_| online && bus.image.is_up())?;
     let question = Question::broadcast(pdu, origin.clone(), now, BROADCAST);
-    Some(bus.ask_first(question, &plant.writes, now))
+    Some(bus.ask_first(question, now))
 }
 
 /// Number of controlled drives among these that are not known to stand still.

@@ -109,7 +109,7 @@ fn a_second_order_joins_the_one_under_way_unless_the_motor_may_have_started() {
         "bob",
         "the later stop counts"
     );
-    let audited = plant.writes.audit().recent(None);
+    let audited = plant.command_log.audit().recent(None);
     assert!(
         audited
             .iter()

@@ -32,7 +32,7 @@ impl Daemon {
         }
         let (recordings, history) = (self.north.recordings.clone(), self.north.history.clone());
         let options = settings.recordings.clone();
-        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
+        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.command_log);
         let (recorder, opened) = started.map_err(StartError::Recorder)?;
         self.recorder = Some(recorder);
         if patience.wait(opened).await.is_none() {
@@ -172,7 +172,7 @@ impl Daemon {
 
     /// Writes the audit to the configured file. If no thread can be started for it, the gateway runs without this.
     pub(super) async fn apply_audit(&self, settings: &Settings) {
-        let audit = self.writes.audit();
+        let audit = self.command_log.audit();
         let before = audit.file();
         if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
             return;

@@ -221,15 +221,15 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
         assert_eq!(event.kind, drivegate_core::event::EventKind::RefusedCommand);
     }
     assert_eq!(bench.queued(), 0);
-    assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
+    assert_eq!(bench.plant.command_log.results().values().sum::<u64>(), 3);
     let result = json(&bench.take(set("p11/set", r#"{"id": 21, "run": true}"#)).unwrap());
     assert_eq!(
         (&result["error"]["code"], &result["id"]),
         (&"unknown_drive".into(), &21.into())
     );
     let unknown = (drivegate_core::order::SourceKind::Mqtt, "unknown_drive");
-    assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
-    let record = audited(bench.plant.writes.audit()).pop().unwrap();
+    assert_eq!(bench.plant.command_log.results().get(&unknown), Some(&1));
+    let record = audited(bench.plant.command_log.audit()).pop().unwrap();
     assert_eq!(
         (&record["result"], &record["drive"]),
         (&"unknown_drive".into(), &"p11".into())
@@ -501,7 +501,7 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
     let result = stop_alone(&mut bench, r#"{"run": false, "speed_reference": 10}"#);
     assert_eq!(result["rest"], "not_allowed");
     assert!(result["error"]["message"].as_str().unwrap().contains("require_id"));
-    let audit = audited(bench.plant.writes.audit());
+    let audit = audited(bench.plant.command_log.audit());
     let results: Vec<_> = audit.iter().map(|record| record["result"].as_str().unwrap()).collect();
     assert_eq!(
         results.iter().filter(|result| **result == "acknowledged").count(),

@@ -68,7 +68,7 @@ pub fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, now: In
     };
     plant.events.publish_refusal(refused, now);
     let outcome = Outcome::Refused(refusal);
-    turn_away(&plant.writes, DRIVES, STOP_ALL, outcome, origin.clone(), now);
+    turn_away(&plant.command_log, DRIVES, STOP_ALL, outcome, origin.clone(), now);
     why
 }
 

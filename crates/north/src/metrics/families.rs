@@ -101,13 +101,13 @@ impl Gateway<'_> {
 fn command_families<'a>() -> Vec<Row<Gateway<'a>>> {
     rows! { Gateway<'a>;
         Counter "drivegate_writes_total" "Completed commands, by source and result."
-            => |gateway, series| for ((source, result), count) in gateway.plant.writes.results() {
+            => |gateway, series| for ((source, result), count) in gateway.plant.command_log.results() {
                 series.with_both(("source", source.name().into()), ("result", result.into()), count);
             };
         Histogram "drivegate_write_seconds" "Time from the acceptance of a command to its result."
-            => |gateway, series| series.add(gateway.plant.writes.seconds());
+            => |gateway, series| series.add(gateway.plant.command_log.seconds());
         Counter "drivegate_audit_lost_total" "Records missing from the audit file because the disk did not accept them."
-            => |gateway, series| if let Some(file) = gateway.plant.writes.audit().file() {
+            => |gateway, series| if let Some(file) = gateway.plant.command_log.audit().file() {
                 let (sent, not_sent) = file.lost();
                 series.with("kind", "sent", sent);
                 series.with("kind", "not_sent", not_sent);

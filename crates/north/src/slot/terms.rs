@@ -332,7 +332,7 @@ impl Tool {
             expires: case.deadline,
             origin: if may_write { &self.raw } else { &self.origin }.clone(),
         };
-        Work::Exchange(case.bus.ask(question, &case.plant.writes, case.now))
+        Work::Exchange(case.bus.ask(question, case.now))
     }
 
     /// Refuses a request that concerns no drive, one or all of them: audited and published once.
@@ -350,7 +350,14 @@ impl Tool {
         let what = describe::request_on(self.protocol(), pdu);
         let name = format!("address {} of {}", request.address, self.terms.slot.bus);
         let outcome = Outcome::Refused(refusal.clone());
-        turn_away(&case.plant.writes, &name, &what, outcome, self.origin.clone(), case.now);
+        turn_away(
+            &case.plant.command_log,
+            &name,
+            &what,
+            outcome,
+            self.origin.clone(),
+            case.now,
+        );
         Decision::Refuse(Refused::Exception(refusal.exception()))
     }
 

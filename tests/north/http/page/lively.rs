@@ -183,7 +183,7 @@ impl Lively {
             stats.recordings.clone(),
             Arc::default(),
             plant.events.clone(),
-            &plant.writes,
+            &plant.command_log,
         );
         tell(&plant);
         let buses = plant.buses.iter().map(|bus| bus.image.clone()).collect();
@@ -248,8 +248,8 @@ fn tell(plant: &Plant) {
     ] {
         let origin = Origin::new(SourceKind::Mqtt, "scada");
         let at = Instant::now();
-        let stats = plant.writes.clone();
-        let (ticket, _answer) = Ticket::new(origin, "pump-2", what.to_string(), true, at, stats);
+        let command_log = plant.command_log.clone();
+        let (ticket, _answer) = Ticket::new(origin, "pump-2", what.to_string(), true, at, command_log);
         ticket.answer(outcome, at + Duration::from_millis(21));
     }
 }

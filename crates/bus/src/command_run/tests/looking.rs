@@ -162,7 +162,7 @@ fn carries_out(
         String::new(),
         true,
         bench.now,
-        Arc::new(WriteStats::default()),
+        Arc::new(CommandLog::default()),
     );
     let admitted = Admitted {
         order: Order::Points(values),

@@ -14,7 +14,14 @@ impl Rig {
 
     fn ask_for(&self, drive: usize, who: &str, pace: Pace, count: u16) -> Receiver<Answer> {
         let origin = Origin::new(SourceKind::LocalSocket, who);
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), false, self.now, self.stats.clone());
+        let (ticket, answer) = Ticket::new(
+            origin,
+            "d",
+            String::new(),
+            false,
+            self.now,
+            self.bus.command_log.clone(),
+        );
         let request = BackgroundRequest {
             target: DriveIndex::new(drive).into(),
             pdu: RequestPdu::read(Table::Holding, REGISTER, count),

@@ -8,10 +8,7 @@ use drivegate_core::plant::Plant;
 const LIMIT: Duration = Duration::from_secs(2);
 
 fn plant(rig: &Rig) -> (Plant, Drills) {
-    let plant = Plant {
-        writes: rig.stats.clone(),
-        ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
-    };
+    let plant = Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()]);
     let drills = Drills::default();
     drills.set_options(Some(DrillOptions {
         max_speed: 20.0,

@@ -32,10 +32,7 @@ fn guarded(drives: u8, mode: Mode) -> (Rig, Plant) {
     }
     rig.run(Time::from_secs(2));
     rig.bus.image.update_health(|health| health.up = true);
-    let plant = Plant {
-        writes: rig.stats.clone(),
-        ..Plant::new("g", Time::from_secs(1), vec![rig.bus.clone()])
-    };
+    let plant = Plant::new("g", Time::from_secs(1), vec![rig.bus.clone()]);
     (rig, plant)
 }
 

@@ -138,7 +138,7 @@ fn a_sequence_that_a_pause_interrupted_is_not_continued() {
         let order = Order::Points(points.to_vec());
         let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
-        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.stats.clone());
+        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.bus.command_log.clone());
         let window = Window {
             arrival: Arrival::now(rig.now),
             expires: rig.now + 10_000 * MS,
@@ -233,7 +233,7 @@ fn a_start_that_came_in_a_stall_goes_when_what_came_with_it_is_read() {
     let order = Order::Points(vec![(index, Value::Bool(true))]);
     let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
     let origin = Origin::new(SourceKind::Mqtt, "client");
-    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.stats.clone());
+    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.bus.command_log.clone());
     let window = Window {
         arrival: Arrival {
             stall: Some(stall),

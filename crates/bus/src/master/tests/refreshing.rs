@@ -73,7 +73,14 @@ impl Plant {
         let index = |point| image.spec.profile.model_index(point).unwrap();
         let order = Order::Points(sets.iter().map(|(point, value)| (index(*point), *value)).collect());
         let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
-        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, self.rig.now, self.rig.stats.clone());
+        let (ticket, mut answer) = Ticket::new(
+            origin,
+            "d",
+            String::new(),
+            true,
+            self.rig.now,
+            self.rig.bus.command_log.clone(),
+        );
         let window = window(self.rig.now, DEFAULT_EXPIRY);
         let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
         self.rig.bus.queue.submit(command, &(), self.rig.now);

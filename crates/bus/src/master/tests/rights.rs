@@ -28,10 +28,7 @@ impl Client {
 fn rig() -> (Rig, Plant) {
     let rig = Rig::new(1);
     rig.bus.image.update_health(|health| health.up = true);
-    let plant = Plant {
-        writes: rig.stats.clone(),
-        ..Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()])
-    };
+    let plant = Plant::new("g", Duration::from_secs(1), vec![rig.bus.clone()]);
     (rig, plant)
 }
 
@@ -159,7 +156,7 @@ fn asked(rig: &Rig, client: &Client, target: Target, pdu: RequestPdu) -> Exchang
         expires: rig.now + Duration::from_secs(1),
         origin: client.origin.clone(),
     };
-    rig.bus.ask(question, &rig.stats, rig.now)
+    rig.bus.ask(question, rig.now)
 }
 
 fn outcome(exchange: &mut Exchange) -> Option<&'static str> {

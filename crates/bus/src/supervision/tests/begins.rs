@@ -116,7 +116,7 @@ fn a_read_renews_nothing_and_holds_nothing() {
     )
     .unwrap();
     let origin = Origin::new(SourceKind::ModbusTcp, "10.0.0.1:1");
-    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, rig.now, rig.stats.clone());
+    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, rig.now, rig.bus.command_log.clone());
     let window = window(rig.now, DEFAULT_EXPIRY);
     let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
     rig.bus.queue.submit(command, &(), rig.now);

@@ -174,7 +174,7 @@ fn what_was_asked_for_before_a_stop_does_not_go_behind_it() {
 
 #[test]
 fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
-    let stats: Arc<WriteStats> = Arc::default();
+    let stats: Arc<CommandLog> = Arc::default();
     let now = Instant::now();
     let give = |queue: &CommandQueue, drive: usize, urgency: Urgency| {
         let (ticket, receiver) = ticket(&stats, now);
@@ -218,7 +218,7 @@ fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
 /// freed.
 #[test]
 fn a_stop_finds_the_last_of_many_buses_and_keeps_none_between() {
-    let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
+    let (stats, now): (Arc<CommandLog>, _) = (Arc::default(), Instant::now());
     let first = Arc::new(CommandQueue::new().unwrap());
     let (mut last, mut between) = (first.clone(), Vec::new());
     for place in 0..20 {

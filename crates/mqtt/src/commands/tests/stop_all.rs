@@ -121,7 +121,7 @@ fn retained_messages_are_refused_and_told() {
             (0, true),
             "{topic} {payload}"
         );
-        let audit = drivegate_testkit::audited(bench.plant.writes.audit());
+        let audit = drivegate_testkit::audited(bench.plant.command_log.audit());
         if drive.is_empty() {
             assert!(result.is_none() && audit.is_empty(), "{topic} was cleared");
             continue;

@@ -210,7 +210,7 @@ fn what_is_wrong_is_refused_with_its_reason() {
         None,
         "there is no such drive"
     );
-    let seen = audited(bench.plant.writes.audit());
+    let seen = audited(bench.plant.command_log.audit());
     assert!(seen.iter().all(|record| record["source"] == "sparkplug"));
 }
 

@@ -11,7 +11,14 @@ impl Plant {
         let image = &self.rig.bus.image.drives[0];
         let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::ModbusTcp, "client");
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.rig.now, self.rig.stats.clone());
+        let (ticket, answer) = Ticket::new(
+            origin,
+            "d",
+            String::new(),
+            true,
+            self.rig.now,
+            self.rig.bus.command_log.clone(),
+        );
         let window = window(self.rig.now, DEFAULT_EXPIRY);
         let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
         self.rig.bus.queue.submit(command, &(), self.rig.now);
@@ -185,7 +192,8 @@ fn an_order_that_expires_half_done_ends_no_refresh() {
         let admitted = admit(Order::Points(points.to_vec()), &reading, Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
         let now = plant.rig.now;
-        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, now, plant.rig.stats.clone());
+        let (ticket, mut answer) =
+            Ticket::new(origin, "d", String::new(), true, now, plant.rig.bus.command_log.clone());
         let window = window(now, Duration::from_millis(2 + u64::from(number)));
         let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
         plant.rig.bus.queue.submit(command, &(), now);
