@@ -1,6 +1,7 @@
 //! A command on its way through the line, step by step: control words made from the known words, pulses, safe order
 //! of writes. Pure.
 
+mod awaited_state;
 mod control;
 mod ending;
 mod functions;
@@ -10,14 +11,15 @@ mod parameter;
 mod replies;
 mod state_read;
 mod steps;
+mod word;
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-pub use self::control::read_place;
 pub use self::known_words::KnownWords;
 pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
+pub use self::word::read_place;
 
 use self::parameter::ParameterRun;
 use self::steps::{

@@ -2,12 +2,15 @@
 //!
 //! [`Master::next`] chooses among stops, other commands, forwarded reads, polls and background transactions;
 //! [`Master::done`] takes the result of a transaction and returns the changes. The state of one drive is in its
-//! `DriveState`. Choosing is in `choose`, results are in `results`, background transactions in `background`, the end of
-//! the gateway is in `shutdown`.
+//! `DriveState`. Choosing is in `choose`, transactions are in `turn`, their times in `timing`, results in `results`,
+//! background transactions in `background`, leases in `lease`; the end of a bus is in `handover`, that of the gateway in
+//! `shutdown`.
 
 mod background;
 mod choose;
+mod handover;
 mod holder;
+mod lease;
 mod passed_on;
 mod pauses;
 mod permission;
@@ -15,210 +18,41 @@ mod refreshing;
 mod remains;
 mod results;
 mod shutdown;
+mod timing;
+mod turn;
 mod waits;
 
-use self::waits::Waits;
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+pub use self::handover::{CarriedState, Handover};
 pub use self::remains::Remains;
+pub use self::turn::{Before, Purpose, Turn, TurnEnd};
 
 use self::background::ChosenTransaction;
 use self::choose::Turns;
 use self::holder::report_control;
+pub(crate) use self::lease::supervise;
 use self::shutdown::Shutdown;
+use self::turn::LineUse;
+use self::waits::Waits;
 use super::BusOptions;
-use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
-use super::late_replies::{FORGOTTEN_AFTER, LateReplies, are_alike};
-use super::line_state::{Learned, Sending};
+use super::late_replies::are_alike;
+use super::line_state::Sending;
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
-use super::refresh::Repeated;
-use super::repeated_stops::RepeatedStops;
-use super::schedule::{Cadence, Poll, Schedule};
+use super::schedule::{Cadence, Schedule};
 use super::start_gate::StartGate;
-use super::supervision::{Demand, Lease, Orders};
-use super::transaction::Ended;
 use drivegate_core::order::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Target, Urgency};
-use drivegate_core::plant::{BusHandle, turn_away};
-use drivegate_core::process_image::{DriveImage, Timing};
+use drivegate_core::plant::BusHandle;
 use drivegate_model::drive::plan::WireTime;
 use drivegate_model::drive::{DriveIndex, ModelPoint, PerDrive, Plan, PlannedRead, PollClass, Value};
-use drivegate_proto::n2::Session;
 use drivegate_proto::{Protocol, RequestPdu};
 
 /// Longest time between two checks of the bus at its drives and queue.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
-/// Number of response timeouts within which a late N2 reply may arrive.
-const N2_LATE: u32 = 3;
-/// Longest wait for a late reply: a silent drive is probed within 10 s.
-const LONGEST_N2_LATE: Duration = Duration::from_secs(9);
-/// Time for the first byte of the reply to a probe of an offline drive, or to a stop, unless the drive is known to
-/// be slower: probing it every 10 s then costs less than 2 % of the line.
-const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
-/// One in this number of probes waits as long as any other request, because the drive may be slow.
-const PATIENT_PROBES: u32 = 6;
-
-/// A transaction to send: purpose and request.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Turn {
-    /// Purpose of the transaction, with its drive.
-    pub purpose: Purpose,
-    pdu: RequestPdu,
-}
-
-/// The purpose of a transaction.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Purpose {
-    /// A poll of the drive.
-    Poll(Poll),
-    /// A step of the started command in that slot, competing with that rank.
-    Command {
-        /// The drive of the command.
-        drive: DriveIndex,
-        /// The slot of the drive's started command.
-        slot: Urgency,
-        /// Rank with which the command competes for the line.
-        rank: Urgency,
-        /// The purpose of the command's step.
-        step: StepPurpose,
-    },
-    /// The background request that is next to be sent.
-    Background(Target),
-    /// A step of the refresh of the drive.
-    Refresh(DriveIndex),
-    /// A step of the N2 session with the drive, needed before a read of the plan or a step of the started command in
-    /// that slot.
-    Session(DriveIndex, Session, Before),
-}
-
-/// Continuation after a step of an N2 session.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Before {
-    /// A poll of the drive.
-    Poll(Poll),
-    /// A step of a started command: slot and rank.
-    Command(Urgency, Urgency),
-}
-
-impl Turn {
-    /// Receiver of the request.
-    pub fn target(&self) -> Target {
-        match &self.purpose {
-            Purpose::Poll(poll) => poll.drive.into(),
-            Purpose::Command { drive, .. } | Purpose::Refresh(drive) | Purpose::Session(drive, ..) => (*drive).into(),
-            Purpose::Background(target) => *target,
-        }
-    }
-
-    /// The drive that receives the request; `None` if none is configured at its address.
-    pub fn drive(&self) -> Option<DriveIndex> {
-        self.target().drive()
-    }
-
-    /// The request to send.
-    pub fn pdu(&self) -> &RequestPdu {
-        &self.pdu
-    }
-
-    /// The rank of the turn's command; `None` for a poll or a background transaction.
-    pub fn rank(&self) -> Option<Urgency> {
-        match &self.purpose {
-            Purpose::Command { rank, .. } | Purpose::Session(_, _, Before::Command(_, rank)) => Some(*rank),
-            Purpose::Poll(_) | Purpose::Background(_) | Purpose::Refresh(_) | Purpose::Session(..) => None,
-        }
-    }
-}
-
-/// The result of a turn.
-#[derive(Debug)]
-pub struct TurnEnd {
-    /// Result of the transaction.
-    pub ended: Ended,
-    /// When the request was given to the line.
-    pub began: Instant,
-    /// When the transaction ended: no later than a reply can have left the drive.
-    pub at: Instant,
-    /// Whether the thread was stalled meanwhile: the missing reply may be due to that.
-    pub stood: bool,
-    /// Time for which the line was in use.
-    pub took: Duration,
-    /// The invalid bytes were the drive's own reply, damaged.
-    pub mangled: bool,
-    /// Whether a complete reply was rejected because the line could not have carried it so soon.
-    pub doubted: bool,
-    /// The reply frame as the drive sent it, for [`Purpose::Background`].
-    pub frame: Vec<u8>,
-}
-
-/// How a transaction used the line.
-#[derive(Debug, Clone, Copy)]
-struct LineUse {
-    /// When the request was given to the line.
-    began: Instant,
-    /// When the transaction ended: no later than a reply can have left the drive.
-    at: Instant,
-    /// Time for which the line was in use.
-    took: Duration,
-    /// Whether the thread was stalled meanwhile.
-    stood: bool,
-}
-
-impl TurnEnd {
-    fn line_use(&self) -> LineUse {
-        LineUse {
-            began: self.began,
-            at: self.at,
-            took: self.took,
-            stood: self.stood,
-        }
-    }
-}
-
-/// State of a drive that continues over a reload.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct CarriedState {
-    /// Lease of the drive at the handover.
-    pub lease: Lease,
-    /// Refresh of orders for the drive's own timeout.
-    pub repeated: Repeated,
-    /// The stops that are to be written again.
-    pub stops: RepeatedStops,
-}
-
-impl CarriedState {
-    /// The lease without the data for refreshes and repetitions.
-    #[must_use]
-    pub fn alone(self) -> CarriedState {
-        CarriedState {
-            lease: self.lease,
-            ..CarriedState::default()
-        }
-    }
-
-    /// The lease, with the time limit extended by a period in which the gateway did not run.
-    #[must_use]
-    pub fn after(self, stood: Duration) -> CarriedState {
-        CarriedState {
-            lease: self.lease.after(stood),
-            ..self.alone()
-        }
-    }
-}
-
-/// State that an ended bus hands over to the next one on the same line.
-#[derive(Debug, Clone, Default)]
-pub struct Handover {
-    /// The leases of its drives, in their order, with the orders that are refreshed under them.
-    pub leases: Vec<CarriedState>,
-    /// Time until which a reply to its last request may arrive; `None` if no bus used the line before.
-    pub quiet_until: Option<Instant>,
-    /// What the line has shown to the previous bus.
-    pub learned: Option<Learned>,
-}
 
 /// The master of a line: chooses and evaluates all transactions.
 #[derive(Debug)]
@@ -326,61 +160,6 @@ impl Master {
             drive.close(&Outcome::BusDown, Interruption::BusDown, now);
         }
         self.abandon_background(Outcome::BusDown, Interruption::BusDown, now);
-    }
-
-    /// Ends the bus: started commands end. Returns the handover for the next bus. A transaction still on the line is
-    /// aborted; it would have ended at `broken_off`.
-    pub fn ended(&mut self, broken_off: Option<Instant>, now: Instant) -> Handover {
-        if let Some(shutdown) = &mut self.shutdown {
-            shutdown.end(&self.bus);
-        }
-        let mut queue = self.bus.queue.lock();
-        for drive in &mut self.drives {
-            if queue.is_ending()
-                && let Some(stop) = drive.take_stop(now)
-                && let Err(stop) = queue.give_back(stop)
-            {
-                stop.answer(&Outcome::ShuttingDown, now);
-            }
-        }
-        queue.gate.settle(|_| false);
-        drop(queue);
-        for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
-            // A heartbeat that arrived while the port was lost has not been evaluated yet.
-            if let Some(at) = image.take_heartbeat() {
-                drive.supervision.renew(at);
-            }
-        }
-        let close = |drive: &mut DriveState| {
-            drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-            CarriedState {
-                lease: drive.supervision.lease(),
-                repeated: drive.refresh.handed_over(),
-                stops: drive.repeated_stops,
-            }
-        };
-        let leases = self.drives.iter_mut().map(close).collect();
-        self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-        let late = self
-            .drives
-            .iter()
-            .map(|drive| &drive.late)
-            .chain(self.waits.strangers.values());
-        let late = late.filter_map(LateReplies::until);
-        let window = match self.waits.sessions.is_empty() {
-            true => FORGOTTEN_AFTER,
-            false => self.n2_window(),
-        };
-        let broken_off = broken_off.map(|deadline| deadline + window);
-        Handover {
-            leases,
-            learned: None,
-            quiet_until: late
-                .chain(self.waits.n2_late.until())
-                .chain(broken_off)
-                .chain([now])
-                .max(),
-        }
     }
 
     /// The next transaction to send.
@@ -545,54 +324,6 @@ impl Master {
         }
     }
 
-    fn timeout_of(&self, turn: &Turn) -> Duration {
-        if let Some(timeout) = self.passed_on_timeout(turn) {
-            return timeout;
-        }
-        let Target::Drive(index) = turn.target() else {
-            return self.response_timeout;
-        };
-        let probes = *self.probes.of(index);
-        let patient = probes <= self.retries_of(index) || probes.is_multiple_of(PATIENT_PROBES);
-        let timeout = self.response_timeout_of(index);
-        if self.schedule.is_online(index) || patient {
-            return timeout;
-        }
-        timeout.min(PROBE_TIMEOUT.max(2 * self.drives.of(index).answers_within))
-    }
-
-    /// The drive's own times, if it has any configured.
-    fn timing_of(&self, target: Target) -> Timing {
-        let own = |drive| self.bus.image.drives.of(drive).spec.timing;
-        target.drive().map_or_else(Timing::default, own)
-    }
-
-    pub(super) fn response_timeout_of(&self, target: impl Into<Target>) -> Duration {
-        let own = self.timing_of(target.into()).response_timeout;
-        own.unwrap_or(self.response_timeout)
-    }
-
-    pub(super) fn retries_of(&self, drive: DriveIndex) -> u32 {
-        self.timing_of(drive.into()).retries.unwrap_or(self.retries)
-    }
-
-    /// Silence before the request of this turn, and after its reply before a request to another drive.
-    pub(crate) fn silence_of(&self, turn: &Turn) -> Duration {
-        self.timing_of(turn.target()).silence.unwrap_or(self.silence)
-    }
-
-    /// Time within which a late reply may arrive on an N2 line.
-    pub(super) fn n2_window(&self) -> Duration {
-        let own = self
-            .bus
-            .image
-            .drives
-            .iter()
-            .filter_map(|image| image.spec.timing.response_timeout);
-        let longest = own.chain([self.response_timeout]).max().unwrap_or_default();
-        (N2_LATE * longest).min(LONGEST_N2_LATE)
-    }
-
     /// The reads that each drive never answers although it answers others.
     pub(crate) fn unanswered(&self) -> PerDrive<Vec<PlannedRead>> {
         self.schedule.unanswered()
@@ -601,55 +332,6 @@ impl Master {
     /// The late replies that may still arrive on an N2 line, for the bytes of a transaction.
     pub(crate) fn n2_late(&mut self) -> &mut N2LateReplies {
         &mut self.waits.n2_late
-    }
-}
-
-/// Evaluates the lease of a drive.
-pub(super) fn supervise(
-    bus: &BusHandle,
-    index: DriveIndex,
-    image: &Arc<DriveImage>,
-    drive: &mut DriveState,
-    now: Instant,
-    news: &mut Vec<News>,
-) {
-    if let Some(at) = image.take_heartbeat() {
-        drive.supervision.renew(at);
-    }
-    let mut queue = bus.queue.lock();
-    let (renewed, queued) = (queue.take_renewed(index), queue.client_waits_until(index));
-    drop(queue);
-    if renewed {
-        drive.supervision.renew(now);
-    }
-    let orders = Orders {
-        held_until: queued.max(drive.client_holds_until()),
-    };
-    let reading = image.reading(now, drive.fresh);
-    let DriveState { supervision, words, .. } = drive;
-    let demand = supervision.due_action(&reading, words, orders, now, news, index);
-    image.set_unsupervised(supervision.runs_unclaimed());
-    match demand {
-        Demand::None => {}
-        Demand::Withdraw => {
-            bus.queue.lock().withdraw_supervision(index, now);
-            drive.withdraw_supervision(now);
-            drive.supervision.withdrawn(now);
-        }
-        Demand::Write(point, value) => {
-            let origin = Origin::new(SourceKind::Supervision, Origin::LEASE);
-            let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY);
-            if let Some(refusal) = supervision.ordered(ordered, now) {
-                let what = format!("{}={value}", point.name());
-                let outcome = Outcome::Refused(refusal.clone());
-                turn_away(&bus.command_log, &image.spec.name, &what, outcome, origin, now);
-                news.push(News::ActionRefused {
-                    drive: index,
-                    what,
-                    refusal,
-                });
-            }
-        }
     }
 }
 

@@ -2,8 +2,8 @@
 
 use std::time::Instant;
 
-use super::control::Word;
 use super::steps::{Action, Check};
+use super::word::Word;
 use super::{CommandRun, Ending, Phase};
 use crate::confirm::Effect;
 use drivegate_core::order::{Interruption, Outcome, Receipt, Refusal};

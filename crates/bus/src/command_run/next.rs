@@ -2,9 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use super::control::{self, Made, Word};
+use super::control;
 use super::functions::other_function;
 use super::steps::{Action, Step, step_of};
+use super::word::{self, Made, Word};
 use super::{CommandRun, KnownWords, Need, Next, Phase};
 use drivegate_core::order::{Interruption, Outcome};
 use drivegate_core::permit::Repeats;
@@ -112,7 +113,7 @@ impl CommandRun {
                 self.only_last_word(*reverse, profile);
                 return First::Changed;
             }
-            Some(Action::Word(word)) => match control::word(*word, words, profile, self.known, self.look.motor()) {
+            Some(Action::Word(word)) => match word::made(*word, words, profile, self.known, self.look.motor()) {
                 Made::Send(step) => Some(step),
                 Made::Nothing => None,
                 Made::Judge(repeats) if self.is_judged() => return First::Judge(repeats),

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
-use super::control::{LOOK_PAUSE, Word};
+use super::awaited_state::LOOK_PAUSE;
 use super::functions::other_function;
 use super::parameter::Then;
 use super::steps::{Action, Check};
+use super::word::Word;
 use super::{CommandRun, Doubt, Ending, KnownWords, Phase, Step, StepPurpose};
 use drivegate_core::order::{Outcome, Urgency};
 use drivegate_proto::{Exception, Reply, RequestPdu};

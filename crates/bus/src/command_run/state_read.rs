@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use super::control::Word;
 use super::steps::Action;
+use super::word::Word;
 use super::{CommandRun, KnownWords, MotorRead, NextDirection, Step, StepPurpose};
 use drivegate_core::order::Outcome;
 use drivegate_core::permit::{AT_NEXT_START, Motor, not_seen};

@@ -3,9 +3,11 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use super::control::{self, AwaitedState, Ordered, Word};
+use super::awaited_state::AwaitedState;
+use super::control::{self, Ordered};
 use super::known_words::KnownWords;
 use super::parameter::ParameterRun;
+use super::word::Word;
 use drivegate_core::order::{Refusal, written};
 use drivegate_core::permit::Repeats;
 use drivegate_model::drive::control::Setting;

@@ -1,24 +1,28 @@
 //! The master with drives of one family that do as commanded, in virtual time.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use drivegate_testkit::{bus, bus_spec, controlled, image, window};
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
-use crate::transaction::MAY_BE_LATE;
+use crate::supervision::Lease;
+use crate::transaction::{Ended, MAY_BE_LATE};
 use drivegate_core::order::{Answer, Authority, Command, Order, Target, Ticket};
 use drivegate_core::permit::admit;
 use drivegate_core::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use drivegate_line::LineOptions;
 use drivegate_model::drive::{DriveIndex, ModelPoint, PollClass, Value};
+use drivegate_proto::n2::Session;
 use drivegate_proto::wire::Silence;
 use drivegate_proto::{Exception, Reply, Table};
 
 mod background;
 mod chosen;
 mod drill;
+mod exceptions;
 mod family_drive;
 mod holder;
 mod interlocks;
@@ -28,6 +32,7 @@ mod refreshing;
 mod rights;
 mod shutdown;
 mod stop_all;
+mod stops;
 mod timing;
 
 /// Silence before each request in these tests.
@@ -359,161 +364,6 @@ fn a_heartbeat_of_an_outage_is_handed_over_with_the_lease() {
     assert_eq!(handover.leases[0].lease, Lease::held(heard));
 }
 
-#[test]
-fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
-    let mut rig = Rig::new(2);
-    rig.drives[0].silent = true;
-    rig.run(Duration::from_secs(20));
-    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
-    let mut run = rig.switch(0, "a", true);
-    rig.run(Duration::from_millis(50));
-    assert_eq!(outcome(&mut run), Some(Outcome::Offline), "at once, and unsent");
-    // The drive is back, which the gateway does not know yet.
-    rig.drives[0].silent = false;
-    rig.drives[0].holding.insert(2000, 1);
-    let mut stop = rig.switch(0, "a", false);
-    rig.run(Duration::from_millis(200));
-    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
-    assert!(!rig.runs(0));
-    rig.run(Duration::from_millis(200));
-    assert_eq!(
-        rig.news
-            .iter()
-            .rfind(|n| **n == News::Online(DriveIndex::new(0)) || **n == News::Offline(DriveIndex::new(0))),
-        Some(&News::Online(DriveIndex::new(0)))
-    );
-}
-
-#[test]
-fn a_stop_to_a_drive_that_is_away_is_sent_again_after_a_damaged_reply() {
-    let mut rig = Rig::new(2);
-    rig.drives[0].silent = true;
-    rig.run(Duration::from_secs(20));
-    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
-    rig.drives[0].silent = false;
-    rig.drives[0].holding.insert(2000, 1);
-    rig.drives[0].next_write = Some(Ended::Corrupt("checksum"));
-    let mut stop = rig.switch(0, "a", false);
-    rig.run(Duration::from_millis(200));
-    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
-    assert!(!rig.runs(0));
-}
-
-#[test]
-fn stops_at_a_silent_drive_leave_the_line_to_the_others() {
-    let mut rig = Rig::new(2);
-    rig.drives[0].silent = true;
-    rig.run(Duration::from_secs(10));
-    let (from, begin) = (rig.wire.len(), rig.now);
-    let mut answers = Vec::new();
-    while rig.now < begin + Duration::from_secs(20) {
-        answers.push(rig.switch(0, "a", false));
-        rig.step();
-    }
-    let polls: Vec<Instant> = rig.wire[from..]
-        .iter()
-        .filter(|(_, turn)| drive_of(turn) == 1)
-        .map(|(at, _)| *at)
-        .collect();
-    let longest = polls.windows(2).map(|w| w[1] - w[0]).max().unwrap();
-    assert!(longest < Duration::from_millis(400), "{longest:?}");
-    rig.run(Duration::from_secs(3));
-    let open = answers
-        .iter_mut()
-        .filter_map(|a| outcome(a).is_none().then_some(()))
-        .count();
-    assert_eq!(open, 0, "every stop is answered");
-}
-
-#[test]
-fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
-    let mut rig = Rig::new(2);
-    let _first = rig.switch(0, "plc", false);
-    rig.run(Duration::from_secs(1));
-    let mut longest = Duration::ZERO;
-    for round in 0..50 {
-        let begin = rig.now;
-        let mut reference = rig.order(1, "other", ModelPoint::SpeedReference, Value::Number(f64::from(round)));
-        while outcome(&mut reference).is_none() {
-            let _stop = rig.switch(0, "plc", false);
-            let _other = rig.switch(0, "second plc", false);
-            rig.step();
-        }
-        longest = longest.max(rig.now - begin);
-    }
-    // At most eight stops in a row are sent, then polls for as long as those took.
-    assert!(longest < COST * 32, "{longest:?}");
-}
-
-#[test]
-fn cyclic_stops_of_a_drive_that_stands_do_not_make_each_other_urgent() {
-    let mut rig = Rig::new(1);
-    let _first = rig.switch(0, "plc", false);
-    rig.run(Duration::from_secs(1));
-    let from = rig.wire.len();
-    for _ in 0..200 {
-        let _stop = rig.switch(0, "plc", false);
-        rig.step();
-    }
-    let ranks: Vec<Urgency> = rig.wire[from..].iter().filter_map(|(_, turn)| turn.rank()).collect();
-    assert!(
-        ranks.len() > 50 && ranks.iter().all(|rank| *rank == Urgency::Command),
-        "{ranks:?}"
-    );
-    // A stop without an acknowledgement leaves a doubt.
-    rig.drives[0].next_write = Some(Ended::Corrupt("noise"));
-    let _doubtful = rig.switch(0, "plc", false);
-    rig.drives[0].silent = true;
-    rig.step();
-    rig.step();
-    rig.drives[0].silent = false;
-    rig.run(COST * 10);
-    let from = rig.wire.len();
-    let _stop = rig.switch(0, "plc", false);
-    rig.step();
-    assert_eq!(rig.wire[from].1.rank(), Some(Urgency::Stop));
-}
-
-#[test]
-fn stops_without_end_do_not_leave_a_reset_bit_set() {
-    let mut rig = Rig::new(1);
-    let reset = |rig: &Rig| rig.drives[0].holding.get(&2000).is_some_and(|word| word & 4 == 4);
-    let _reset = rig.order(0, "other", ModelPoint::FaultReset, Value::Bool(true));
-    while !reset(&rig) {
-        rig.step();
-    }
-    let from = rig.wire.len();
-    while reset(&rig) {
-        let _stop = rig.switch(0, "plc", false);
-        rig.step();
-        assert!(rig.wire.len() < from + 40, "the reset bit is still set");
-    }
-}
-
-#[test]
-fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
-    let mut rig = Rig::new(2);
-    let from = rig.wire.len();
-    for round in 0..300 {
-        // A run command follows each stop, so that the next stop has an effect again.
-        let _stop = rig.switch(0, "flood", false);
-        let _run = rig.switch(0, "flood", true);
-        let _reference = rig.order(
-            1,
-            "other",
-            ModelPoint::SpeedReference,
-            Value::Number(f64::from(round % 100)),
-        );
-        rig.step();
-    }
-    let ranks: Vec<Option<Urgency>> = rig.wire[from..].iter().map(|(_, turn)| turn.rank()).collect();
-    let others = ranks.split(|rank| *rank == Some(Urgency::Stop));
-    let polls = others.map(|others| others.iter().filter(|rank| rank.is_none()).count());
-    assert!(polls.max() <= Some(2), "{ranks:?}");
-    let before = ranks.split(|rank| *rank == Some(Urgency::Command)).map(<[_]>::len);
-    assert!(before.max() <= Some(32), "{ranks:?}");
-}
-
 /// Index of the drive of a turn.
 fn drive_of(turn: &Turn) -> usize {
     turn.drive().expect("a drive").place()
@@ -548,125 +398,4 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
     rig.master.lost(rig.now);
     assert_eq!(outcome(&mut sent), Some(Outcome::Interrupted(Interruption::BusDown)));
     assert_eq!(outcome(&mut waiting), Some(Outcome::BusDown));
-}
-
-#[test]
-fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_line() {
-    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
-    rig.drives[0].silent = true;
-    rig.run(Duration::from_secs(10));
-    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
-    let from = rig.wire.len();
-    let mut stop = rig.switch(0, "a", false);
-    rig.run(Duration::from_millis(1500));
-    let tries = rig.wire[from..]
-        .iter()
-        .filter(|(_, turn)| turn.rank().is_some())
-        .count();
-    assert!(tries <= 4, "{tries} times Identify for one stop");
-    assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
-}
-
-/// The outcome of an order if the first drive answers its first `times` writes with this exception, and the number
-/// of writes.
-fn excepted(run: bool, times: u32, exception: Exception) -> (Outcome, usize) {
-    let mut rig = Rig::new(2);
-    rig.drives[0].holding.insert(2000, u16::from(!run));
-    rig.run(Duration::from_secs(1));
-    let mut answer = rig.switch(0, "client", run);
-    rig.drives[0].to_writes = Some((times, exception));
-    let (from, end) = (rig.wire.len(), rig.now + 2 * DEFAULT_EXPIRY);
-    let outcome = loop {
-        rig.step();
-        if let Some(outcome) = outcome(&mut answer) {
-            break outcome;
-        }
-        assert!(rig.now < end, "{exception}: no answer");
-    };
-    let writes = rig.wire[from..].iter().filter(|(_, turn)| turn.pdu().is_write());
-    (outcome, writes.count())
-}
-
-#[test]
-fn exceptions_that_refuse_nothing_end_no_command_as_refused() {
-    for run in [true, false] {
-        let (outcome, writes) = excepted(run, 3, Exception::BUSY);
-        assert_eq!((outcome.is_ok(), writes), (true, 4), "run={run}");
-        let (outcome, writes) = excepted(run, u32::MAX, Exception::BUSY);
-        assert_eq!(outcome, Outcome::Exception(Exception::BUSY));
-        assert!(writes >= 5, "{writes}");
-        for open in [
-            Exception::ACKNOWLEDGE,
-            Exception::GATEWAY_PATH,
-            Exception::GATEWAY_TARGET,
-        ] {
-            assert!(excepted(run, 1, open).0.is_ok(), "{open}: it is tried again");
-            let (outcome, writes) = excepted(run, u32::MAX, open);
-            assert_eq!((outcome.code(), writes), ("unknown", 2), "{open}");
-            assert!(outcome.to_string().contains("unknown"), "{outcome}");
-            assert_eq!(outcome.exception(), Some(open));
-        }
-        let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22].map(Exception);
-        for refused in refused {
-            // For a drive that does not know function 06, the write is repeated with function 16.
-            let writes = if refused == Exception::FUNCTION { 2 } else { 1 };
-            assert_eq!(excepted(run, u32::MAX, refused), (Outcome::Exception(refused), writes));
-        }
-    }
-}
-
-#[test]
-fn a_client_that_is_back_suspends_a_stop_of_its_lease_that_the_drive_was_too_busy_for() {
-    let mut rig = Rig::new(1);
-    let mut run = rig.switch(0, "client", true);
-    rig.run(Duration::from_millis(100));
-    assert!(outcome(&mut run).is_some_and(|o| o.is_ok()));
-    rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));
-    rig.run(Duration::from_millis(1000));
-    rig.drives[0].to_writes = None;
-    rig.bus.image.drives[0].renew_lease(rig.now);
-    rig.run(Duration::from_millis(400));
-    assert!(rig.runs(0), "the drive never took it, and its client is back");
-}
-
-#[test]
-fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
-    for exception in [Exception::GATEWAY_PATH, Exception::GATEWAY_TARGET] {
-        let mut rig = Rig::new(2);
-        rig.drives[0].to_reads = Some(exception);
-        rig.run(Duration::from_secs(1));
-        assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))), "{exception}");
-        assert!(!rig.master.schedule.is_online(DriveIndex::new(0)), "{exception}");
-        assert!(rig.master.schedule.is_online(DriveIndex::new(1)));
-        rig.drives[0].to_reads = None;
-        rig.run(Duration::from_secs(3));
-        assert!(
-            rig.master.schedule.is_online(DriveIndex::new(0)),
-            "{exception}: it is back"
-        );
-    }
-    // Any other exception shows that the drive is present, and only one about the request itself splits the read.
-    for code in (1..=9).map(Exception) {
-        let mut rig = Rig::new(1);
-        rig.drives[0].to_reads = Some(code);
-        rig.news.clear();
-        rig.run(Duration::from_secs(3));
-        assert!(rig.master.schedule.is_online(DriveIndex::new(0)), "{code}");
-        let unavailable = rig.news.iter().any(|news| matches!(news, News::Unavailable(..)));
-        assert_eq!(unavailable, matches!(code.0, 1..=3), "{code}");
-    }
-}
-
-#[test]
-fn a_slow_request_that_the_drive_is_too_busy_for_is_not_repeated_at_once() {
-    let mut rig = Rig::new(1);
-    rig.drives[0].to_reads = Some(Exception::BUSY);
-    rig.run(Duration::from_secs(2));
-    let (from, begin) = (rig.wire.len(), rig.now);
-    rig.run(Duration::from_secs(10));
-    let slow = |(_, turn): &&(Instant, Turn)| matches!(&turn.purpose, Purpose::Poll(poll) if poll.read.class == PollClass::Slow);
-    let items = rig.bus.image.drives[0].plan.reads.iter();
-    let items = items.filter(|read| read.class == PollClass::Slow).count();
-    let asked = rig.wire[from..].iter().filter(slow).count();
-    assert!(asked <= items * 11, "{asked} of {items} in {:?}", rig.now - begin);
 }

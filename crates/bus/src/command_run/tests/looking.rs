@@ -1,7 +1,7 @@
 //! An order that does not say whether the motor is to run reads the motor state before it writes a remembered run
 //! command: checked for every family whose drive is commanded, stopped or restarted by another source.
 
-use super::super::control::Made;
+use super::super::word::{self, Made};
 use super::*;
 use drivegate_core::order::{Arrival, Window, written};
 use drivegate_model::drive::control::{Control, ControlItem, OwnWord, Run};
@@ -289,7 +289,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
                     masks: false,
                     permit: None,
                 };
-                let Made::Send(step) = control::word(word, &words, &profile, known, None) else {
+                let Made::Send(step) = word::made(word, &words, &profile, known, None) else {
                     continue;
                 };
                 for (address, word) in written(&step.pdu).unwrap().1 {

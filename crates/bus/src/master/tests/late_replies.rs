@@ -1,6 +1,8 @@
 //! Late replies: requests whose replies could be confused wait.
 
+use super::super::timing::N2_LATE;
 use super::*;
+use crate::late_replies::FORGOTTEN_AFTER;
 
 #[test]
 fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() {

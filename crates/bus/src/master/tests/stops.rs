@@ -1,0 +1,175 @@
+//! Stops on the line: to a drive that does not answer, cyclic ones, and ones that meet a command or a reset in progress.
+
+use super::*;
+
+#[test]
+fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(20));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
+    let mut run = rig.switch(0, "a", true);
+    rig.run(Duration::from_millis(50));
+    assert_eq!(outcome(&mut run), Some(Outcome::Offline), "at once, and unsent");
+    // The drive is back, which the gateway does not know yet.
+    rig.drives[0].silent = false;
+    rig.drives[0].holding.insert(2000, 1);
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(200));
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+    assert!(!rig.runs(0));
+    rig.run(Duration::from_millis(200));
+    assert_eq!(
+        rig.news
+            .iter()
+            .rfind(|n| **n == News::Online(DriveIndex::new(0)) || **n == News::Offline(DriveIndex::new(0))),
+        Some(&News::Online(DriveIndex::new(0)))
+    );
+}
+
+#[test]
+fn a_stop_to_a_drive_that_is_away_is_sent_again_after_a_damaged_reply() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(20));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
+    rig.drives[0].silent = false;
+    rig.drives[0].holding.insert(2000, 1);
+    rig.drives[0].next_write = Some(Ended::Corrupt("checksum"));
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(200));
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+    assert!(!rig.runs(0));
+}
+
+#[test]
+fn stops_at_a_silent_drive_leave_the_line_to_the_others() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(10));
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let mut answers = Vec::new();
+    while rig.now < begin + Duration::from_secs(20) {
+        answers.push(rig.switch(0, "a", false));
+        rig.step();
+    }
+    let polls: Vec<Instant> = rig.wire[from..]
+        .iter()
+        .filter(|(_, turn)| drive_of(turn) == 1)
+        .map(|(at, _)| *at)
+        .collect();
+    let longest = polls.windows(2).map(|w| w[1] - w[0]).max().unwrap();
+    assert!(longest < Duration::from_millis(400), "{longest:?}");
+    rig.run(Duration::from_secs(3));
+    let open = answers
+        .iter_mut()
+        .filter_map(|a| outcome(a).is_none().then_some(()))
+        .count();
+    assert_eq!(open, 0, "every stop is answered");
+}
+
+#[test]
+fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
+    let mut rig = Rig::new(2);
+    let _first = rig.switch(0, "plc", false);
+    rig.run(Duration::from_secs(1));
+    let mut longest = Duration::ZERO;
+    for round in 0..50 {
+        let begin = rig.now;
+        let mut reference = rig.order(1, "other", ModelPoint::SpeedReference, Value::Number(f64::from(round)));
+        while outcome(&mut reference).is_none() {
+            let _stop = rig.switch(0, "plc", false);
+            let _other = rig.switch(0, "second plc", false);
+            rig.step();
+        }
+        longest = longest.max(rig.now - begin);
+    }
+    // At most eight stops in a row are sent, then polls for as long as those took.
+    assert!(longest < COST * 32, "{longest:?}");
+}
+
+#[test]
+fn cyclic_stops_of_a_drive_that_stands_do_not_make_each_other_urgent() {
+    let mut rig = Rig::new(1);
+    let _first = rig.switch(0, "plc", false);
+    rig.run(Duration::from_secs(1));
+    let from = rig.wire.len();
+    for _ in 0..200 {
+        let _stop = rig.switch(0, "plc", false);
+        rig.step();
+    }
+    let ranks: Vec<Urgency> = rig.wire[from..].iter().filter_map(|(_, turn)| turn.rank()).collect();
+    assert!(
+        ranks.len() > 50 && ranks.iter().all(|rank| *rank == Urgency::Command),
+        "{ranks:?}"
+    );
+    // A stop without an acknowledgement leaves a doubt.
+    rig.drives[0].next_write = Some(Ended::Corrupt("noise"));
+    let _doubtful = rig.switch(0, "plc", false);
+    rig.drives[0].silent = true;
+    rig.step();
+    rig.step();
+    rig.drives[0].silent = false;
+    rig.run(COST * 10);
+    let from = rig.wire.len();
+    let _stop = rig.switch(0, "plc", false);
+    rig.step();
+    assert_eq!(rig.wire[from].1.rank(), Some(Urgency::Stop));
+}
+
+#[test]
+fn stops_without_end_do_not_leave_a_reset_bit_set() {
+    let mut rig = Rig::new(1);
+    let reset = |rig: &Rig| rig.drives[0].holding.get(&2000).is_some_and(|word| word & 4 == 4);
+    let _reset = rig.order(0, "other", ModelPoint::FaultReset, Value::Bool(true));
+    while !reset(&rig) {
+        rig.step();
+    }
+    let from = rig.wire.len();
+    while reset(&rig) {
+        let _stop = rig.switch(0, "plc", false);
+        rig.step();
+        assert!(rig.wire.len() < from + 40, "the reset bit is still set");
+    }
+}
+
+#[test]
+fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
+    let mut rig = Rig::new(2);
+    let from = rig.wire.len();
+    for round in 0..300 {
+        // A run command follows each stop, so that the next stop has an effect again.
+        let _stop = rig.switch(0, "flood", false);
+        let _run = rig.switch(0, "flood", true);
+        let _reference = rig.order(
+            1,
+            "other",
+            ModelPoint::SpeedReference,
+            Value::Number(f64::from(round % 100)),
+        );
+        rig.step();
+    }
+    let ranks: Vec<Option<Urgency>> = rig.wire[from..].iter().map(|(_, turn)| turn.rank()).collect();
+    let others = ranks.split(|rank| *rank == Some(Urgency::Stop));
+    let polls = others.map(|others| others.iter().filter(|rank| rank.is_none()).count());
+    assert!(polls.max() <= Some(2), "{ranks:?}");
+    let before = ranks.split(|rank| *rank == Some(Urgency::Command)).map(<[_]>::len);
+    assert!(before.max() <= Some(32), "{ranks:?}");
+}
+
+#[test]
+fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_line() {
+    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(10));
+    assert!(rig.news.contains(&News::Offline(DriveIndex::new(0))));
+    let from = rig.wire.len();
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(1500));
+    let tries = rig.wire[from..]
+        .iter()
+        .filter(|(_, turn)| turn.rank().is_some())
+        .count();
+    assert!(tries <= 4, "{tries} times Identify for one stop");
+    assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
+}
