@@ -6,6 +6,7 @@ use super::command_run::{CommandRun, KnownWords, Need, Next, Step, read_place};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
+use super::per_rank::PerRank;
 use super::refresh::{End, OrderEnd, Refresh};
 use super::repeated_stops::RepeatedStops;
 use super::supervision::Supervision;
@@ -41,7 +42,7 @@ pub(super) struct DriveState {
     /// Commands that the drive acknowledged but whose effect it has not shown yet.
     pub(super) confirmations: Confirmations,
     /// Started commands, one of each rank, so that commands of a rank keep their order.
-    runs: [Option<CommandRun>; 3],
+    runs: PerRank<Option<CommandRun>>,
     /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
     /// Stops that the drive left without a reply.
@@ -69,10 +70,6 @@ pub(super) enum NextNeed {
     /// Nothing is sent before this time.
     Wait(Instant),
     Nothing,
-}
-
-fn slot(urgency: Urgency) -> usize {
-    urgency as usize
 }
 
 fn commanded(profile: &Profile) -> Vec<(Table, u16)> {
@@ -104,7 +101,7 @@ impl DriveState {
             refresh: Refresh::new(profile, refresh_of(spec)),
             refresh_ended: None,
             confirmations: Confirmations::default(),
-            runs: [None, None, None],
+            runs: PerRank::default(),
             stopped: None,
             vain_stops: VainStops::default(),
             answers_within: Duration::ZERO,
@@ -125,12 +122,12 @@ impl DriveState {
 
     /// The started command of this rank.
     pub(super) fn run(&mut self, urgency: Urgency) -> Option<&mut CommandRun> {
-        self.runs.get_mut(slot(urgency))?.as_mut()
+        self.runs.of_mut(urgency).as_mut()
     }
 
     /// Whether a command of that rank has started.
     pub(super) fn is_busy(&self, urgency: Urgency) -> bool {
-        self.runs.get(slot(urgency)).is_some_and(Option::is_some)
+        self.runs.of(urgency).is_some()
     }
 
     /// Whether any command has started.
@@ -139,9 +136,8 @@ impl DriveState {
     }
 
     pub(super) fn begin(&mut self, run: CommandRun) {
-        if let Some(place) = self.runs.get_mut(slot(run.urgency())) {
-            *place = Some(run);
-        }
+        let place = self.runs.of_mut(run.urgency());
+        *place = Some(run);
     }
 
     /// Time until which a started client command holds the lease.
@@ -165,7 +161,7 @@ impl DriveState {
                 // The motor state of a faulted drive may be from before the fault; the drive then does not run by
                 // its run command.
                 let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
-                let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
+                let Some(run) = self.runs.of_mut(urgency) else {
                     break;
                 };
                 let next = match run.need(&self.words, profile, running, now) {
@@ -202,7 +198,7 @@ impl DriveState {
 
     /// Whether stops were sent repeatedly before the end of a pulse, and the next stop is not on the wire yet.
     fn pulse_is_put_off(&self) -> bool {
-        let [stop, command, _] = &self.runs;
+        let PerRank { stop, command, .. } = &self.runs;
         let waits = command.as_ref().is_some_and(CommandRun::is_deferred);
         waits && !stop.as_ref().is_some_and(CommandRun::reached_the_wire)
     }
@@ -210,13 +206,13 @@ impl DriveState {
     /// The drive replied to a step of a started command. Returns the outcome when the command has ended.
     pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply, now: Instant) -> Option<Outcome> {
         self.words.advance_to(now);
-        let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
+        let run = self.runs.of_mut(urgency).as_mut()?;
         run.answered(step, reply, &mut self.words)
     }
 
     /// Ends a started command with its outcome.
     pub(super) fn end(&mut self, urgency: Urgency, outcome: &Outcome, image: &DriveImage, now: Instant) {
-        let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) else {
+        let Some(run) = self.runs.of_mut(urgency).take() else {
             return;
         };
         if run.in_doubt() {
@@ -299,7 +295,7 @@ impl DriveState {
 
     /// A step of a started command is sent.
     pub(super) fn sent(&mut self, urgency: Urgency, step: &Step, now: Instant) {
-        let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
+        let Some(run) = self.runs.of_mut(urgency) else {
             return;
         };
         run.sent(step);
@@ -328,7 +324,7 @@ impl DriveState {
     /// Whether a further stop is redundant: the drive acknowledged one, a later sample shows the motor stopped, and
     /// no command in progress may start it.
     pub(super) fn stands_by_stop(&self, reading: &Reading<'_>) -> bool {
-        let begun = self.runs.get(slot(Urgency::Command)).and_then(Option::as_ref);
+        let begun = self.runs.command.as_ref();
         let running = reading.model(ModelPoint::Running);
         let stands = running.good().is_some_and(|running| !running.as_bool());
         begun.is_none_or(CommandRun::is_reference_only)
@@ -358,7 +354,7 @@ impl DriveState {
 
     /// Withdraws a supervision action that was started but not sent: a client commands the drive again.
     pub(super) fn withdraw_supervision(&mut self, now: Instant) {
-        for run in &mut self.runs {
+        for run in self.runs.iter_mut() {
             if let Some(run) = run.take_if(|run| run.is_of_supervision() && run.is_owed()) {
                 let outcome = run.taken_back();
                 run.finish(&outcome, now);
@@ -378,7 +374,7 @@ impl DriveState {
         self.words.forget();
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
-            if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
+            if let Some(run) = self.runs.of_mut(urgency).take() {
                 self.abandon(run, Outcome::Offline, Interruption::Offline, now);
             }
         }
@@ -416,7 +412,7 @@ impl DriveState {
 
     /// A client's started stop, for the bus that replaces this one.
     pub(super) fn take_stop(&mut self, now: Instant) -> Option<Command> {
-        let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
+        let run = self.runs.stop.take()?;
         if run.is_heard() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
@@ -431,7 +427,8 @@ impl DriveState {
 
     /// Ends all started commands; acknowledged ones stay acknowledged.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
-        for run in std::mem::take(&mut self.runs).into_iter().flatten() {
+        let PerRank { stop, command, read } = std::mem::take(&mut self.runs);
+        for run in [stop, command, read].into_iter().flatten() {
             self.abandon(run, unbegun.clone(), why, now);
         }
         self.confirmations.clear();

@@ -36,6 +36,7 @@ pub mod master;
 pub mod n2_late_replies;
 pub mod n2_session;
 pub mod news;
+mod per_rank;
 pub mod predict;
 pub mod prober;
 pub mod proof;

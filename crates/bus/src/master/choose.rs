@@ -7,6 +7,7 @@ use super::permission::{AtTurn, next_need};
 use super::{Before, Master, Purpose, Turn};
 use crate::command_run::{CommandRun, Step};
 use crate::drive_state::{DriveState, NextNeed};
+use crate::per_rank::{PerRank, RANKS};
 use crate::schedule::{Decision, Poll};
 use drivegate_core::order::{Command, DEFAULT_EXPIRY, Interruption, Order, Outcome, StopEnd, Urgency, Work};
 use drivegate_core::queue::{Chosen, Ready};
@@ -19,20 +20,19 @@ const IN_A_ROW: u32 = 8;
 /// one are answered.
 const MOST_DECISIONS: usize = 1000;
 
-/// The ranks of commands, highest first.
-const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
-
 /// How often each rank went before waiting lower ones, and queued commands before repetitions of their rank.
 #[derive(Debug, Default)]
-pub(super) struct Turns([u32; 3], u32);
+pub(super) struct Turns {
+    in_a_row: PerRank<u32>,
+    queued_first: u32,
+}
 
 impl Turns {
     /// Which of the waiting ranks is served next: the highest, unless it had eight transactions in a row.
     fn rank(&self, waits: impl Fn(Urgency) -> bool) -> Option<Urgency> {
         let mut waiting = RANKS.into_iter().filter(|rank| waits(*rank)).peekable();
         while let Some(rank) = waiting.next() {
-            let often = self.0.get(rank as usize).copied().unwrap_or(0);
-            if often < IN_A_ROW || waiting.peek().is_none() {
+            if *self.in_a_row.of(rank) < IN_A_ROW || waiting.peek().is_none() {
                 return Some(rank);
             }
         }
@@ -42,19 +42,18 @@ impl Turns {
     /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy:
     /// several such drives must not keep a stop from the others.
     fn begins_before(&mut self, repetition: bool) -> bool {
-        let Turns(_, began) = self;
-        let begins = repetition && *began < IN_A_ROW;
-        match begins {
-            true => *began += 1,
-            false if repetition => *began = 0,
-            false => {}
+        let begins = repetition && self.queued_first < IN_A_ROW;
+        if begins {
+            self.queued_first += 1;
+        } else if repetition {
+            self.queued_first = 0;
         }
         begins
     }
 
     /// Counts a transaction of this rank, with lower ranks waiting or not.
     fn served(&mut self, rank: Urgency, lower_waits: bool) {
-        for (of, count) in RANKS.into_iter().zip(&mut self.0) {
+        for (of, count) in RANKS.into_iter().zip(self.in_a_row.iter_mut()) {
             if of < rank {
                 *count = 0;
             } else if of == rank {
@@ -78,8 +77,8 @@ struct NextStep {
 #[derive(Default)]
 struct Commands {
     /// Next steps of commands by rank.
-    ready: [Option<NextStep>; 3],
-    queued: [Option<Chosen>; 3],
+    ready: PerRank<Option<NextStep>>,
+    queued: PerRank<Option<Chosen>>,
     /// When further commands may be sent.
     wake_at: Option<Instant>,
 }
@@ -90,8 +89,7 @@ impl Commands {
     }
 
     fn waits(&self, rank: Urgency) -> bool {
-        let index = rank as usize;
-        self.ready.get(index).is_some_and(Option::is_some) || self.queued.get(index).is_some_and(Option::is_some)
+        self.ready.of(rank).is_some() || self.queued.of(rank).is_some()
     }
 }
 
@@ -261,11 +259,8 @@ impl Master {
                     }
                     let rank = drive.run(slot).map_or(slot, |run| run.rank);
                     let repeats_since = drive.run(slot).and_then(|run| run.repeats_since());
-                    let place = commands.ready.get_mut(rank as usize);
-                    let is_next = |other: &NextStep| repeats_since < other.repeats_since;
-                    if let Some(place) = place
-                        && place.as_ref().is_none_or(is_next)
-                    {
+                    let place = commands.ready.of_mut(rank);
+                    if place.as_ref().is_none_or(|other| repeats_since < other.repeats_since) {
                         *place = Some(NextStep {
                             drive: index,
                             slot,
@@ -308,9 +303,7 @@ impl Master {
         for rank in RANKS {
             let ready = |command: &Command| is_ready(command, schedule, waits, drives, now);
             let choice = pending.next(rank, now, &facts, ready, redundant);
-            if let Some(place) = commands.queued.get_mut(rank as usize) {
-                *place = choice.chosen;
-            }
+            *commands.queued.of_mut(rank) = choice.chosen;
             if let Some(until) = choice.wake_at {
                 commands.wait(until);
             }
@@ -320,8 +313,8 @@ impl Master {
     /// Serves a command of this rank: a started one, or the next one of the queue, which is then started.
     fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Decided {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
-        let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
-        let queued = commands.queued.get(rank as usize).copied().flatten();
+        let ready = commands.ready.of_mut(rank).take();
+        let queued = *commands.queued.of(rank);
         let mut goes = |ready: &NextStep| queued.is_none() || !self.turns.begins_before(ready.repeats_since.is_some());
         if let Some(ready) = ready.filter(|ready| goes(ready)) {
             self.turns.served(rank, lower_waits);
