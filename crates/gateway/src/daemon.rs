@@ -18,12 +18,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
+use tokio::task::JoinHandle;
 
 use self::leases::RemovedDrives;
 pub use self::pulse::BusHeartbeats;
 use self::reservations::ReservationsFile;
 use self::server::{ServerSlot, within};
-use self::servers::PreparedServers;
+use self::servers::{ListeningServers, PreparedServers};
 use crate::config::{BusSettings, Settings};
 use drivegate_bus::line_state::Learned;
 use drivegate_bus::master::Handover;
@@ -41,7 +42,7 @@ use drivegate_http::local;
 use drivegate_http::local::Control;
 use drivegate_model::drive::DriveIndex;
 use drivegate_north::reading::Watch;
-use drivegate_north::{NorthState, ServerError, bacnet, modbus_tcp, slot};
+use drivegate_north::{NorthState, ServerError, modbus_tcp};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -94,14 +95,11 @@ pub struct Daemon {
     events: Events,
     command_log: Arc<CommandLog>,
     north: Arc<NorthState>,
-    modbus_tcp: ServerSlot<modbus_tcp::Server>,
+    listening: ListeningServers,
     mqtt: ServerSlot<drivegate_mqtt::Mqtt>,
-    http: ServerSlot<drivegate_http::Http>,
-    slots: ServerSlot<slot::Server>,
-    bacnet: ServerSlot<bacnet::Server>,
     local: ServerSlot<local::Local>,
     /// Task that reads parameters at intervals.
-    reader: Option<tokio::task::JoinHandle<()>>,
+    reader: Option<JoinHandle<()>>,
     recorder: Option<RecorderTask>,
     /// Keeps events and counters on disk.
     keeper: Option<Keeper>,
@@ -109,16 +107,11 @@ pub struct Daemon {
     guards: Arc<Guards>,
     /// Keeps the starts of drives on disk.
     starts: Option<Keeper>,
-    /// Task that reports refusals whose count is due.
-    reporter: tokio::task::JoinHandle<()>,
-    /// Watches the serving threads, and reports their pauses.
-    watcher: tokio::task::JoinHandle<()>,
-    stopper: tokio::task::JoinHandle<()>,
-    driller: tokio::task::JoinHandle<()>,
+    /// Tasks that run until the buses have ended.
+    tasks: Vec<JoinHandle<()>>,
+    driller: JoinHandle<()>,
     drills: drills::DrillsFile,
     reservations: ReservationsFile,
-    /// Task that saves reservations on disk.
-    reserver: tokio::task::JoinHandle<()>,
     pulse: BusHeartbeats,
     /// Receiver of reload requests, and the file that the gateway runs with.
     control: Option<Control>,
@@ -150,32 +143,32 @@ impl Daemon {
         let reservations = ReservationsFile::default();
         let drills_file = drills::DrillsFile::default();
         let north = Arc::<NorthState>::default();
+        let tasks = vec![
+            tokio::spawn(Watch::of_this_thread().run(events.clone())),
+            report_refusals(shared.clone()),
+            stop_all(shared.clone(), north.stop_all.clone()),
+            reservations::keep(shared.clone(), reservations.clone(), north.awaited.clone()),
+        ];
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
             parted: RemovedDrives::default(),
             unused_names: UnusedNames::default(),
-            watcher: tokio::spawn(Watch::of_this_thread().run(events.clone())),
             events,
             command_log,
             north: north.clone(),
-            modbus_tcp: ServerSlot::default(),
+            listening: ListeningServers::default(),
             mqtt: ServerSlot::default(),
-            http: ServerSlot::default(),
-            slots: ServerSlot::default(),
-            bacnet: ServerSlot::default(),
             local: ServerSlot::default(),
             reader: None,
             recorder: None,
             keeper: None,
             guards: Arc::default(),
             starts: None,
-            reporter: report_refusals(shared.clone()),
-            stopper: stop_all(shared.clone(), north.stop_all.clone()),
-            driller: drills::watch(shared.clone(), north.drills.clone(), drills_file.clone()),
+            tasks,
+            driller: drills::watch(shared, north.drills.clone(), drills_file.clone()),
             drills: drills_file,
-            reserver: reservations::keep(shared, reservations.clone(), north.awaited.clone()),
             reservations,
             pulse: BusHeartbeats::default(),
             control,
@@ -193,7 +186,7 @@ impl Daemon {
         daemon.apply_mqtt(&settings).await;
         // The servers that report readiness start last.
         let servers = daemon.prepare_servers(&settings).await?;
-        daemon.commit_servers(servers).await;
+        daemon.listening.commit(servers).await;
         daemon.apply_local(&settings).await;
         Ok(daemon)
     }
@@ -205,12 +198,12 @@ impl Daemon {
 
     /// The address that the HTTP server listens on.
     pub fn http_address(&self) -> Option<SocketAddr> {
-        self.http.server().and_then(drivegate_http::Http::address)
+        self.listening.http.server().and_then(drivegate_http::Http::address)
     }
 
     /// The addresses that the Modbus TCP server listens on without TLS.
     pub fn modbus_tcp_addresses(&self) -> Vec<SocketAddr> {
-        let server = self.modbus_tcp.server();
+        let server = self.listening.modbus_tcp.server();
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }
 
@@ -259,7 +252,7 @@ impl Daemon {
         self.apply_params(settings);
         self.hold_unfinished(settings).await;
         self.end_rights(settings);
-        self.commit_servers(servers).await;
+        self.listening.commit(servers).await;
         self.end_drill_of_changed_bus(settings).await;
         self.replace_buses(settings, buses).await;
         self.void_slots();
@@ -423,9 +416,15 @@ impl Daemon {
         // Orders received over the local socket are answered when the buses have ended.
         let local = self.local.server().map(local::Local::connections);
         self.local.stop().await;
-        self.slots.stop().await;
-        self.bacnet.stop().await;
-        self.modbus_tcp.stop().await;
+        let ListeningServers {
+            mut modbus_tcp,
+            mut slots,
+            mut bacnet,
+            mut http,
+        } = std::mem::take(&mut self.listening);
+        slots.stop().await;
+        bacnet.stop().await;
+        modbus_tcp.stop().await;
         drills::end(
             &self.plant,
             &self.north.drills,
@@ -446,19 +445,13 @@ impl Daemon {
             }
         })
         .await;
-        self.reporter.abort();
-        self.watcher.abort();
-        self.stopper.abort();
-        self.reserver.abort();
-        if let Some(reader) = &self.reader {
-            reader.abort();
-        }
+        self.tasks.iter().chain(&self.reader).for_each(JoinHandle::abort);
         // Refusals that are held back are reported now, even those that are due later.
         self.plant
             .load()
             .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
-        self.http.stop().await;
+        http.stop().await;
         if let Some(connections) = local {
             connections.close();
             within(STOP_LOCAL, "local clients", connections.wait()).await;
@@ -562,7 +555,7 @@ fn unserved(bus: &BusHandle, settings: &Settings) -> Vec<DriveIndex> {
 }
 
 /// Watches the commands that stop all drives.
-fn stop_all(plant: SharedPlant, orders: Arc<StopAll>) -> tokio::task::JoinHandle<()> {
+fn stop_all(plant: SharedPlant, orders: Arc<StopAll>) -> JoinHandle<()> {
     tokio::spawn(async move {
         loop {
             orders.begun().await;
@@ -574,7 +567,7 @@ fn stop_all(plant: SharedPlant, orders: Arc<StopAll>) -> tokio::task::JoinHandle
 }
 
 /// Reports refusals of the plant whose count is due.
-fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
+fn report_refusals(plant: SharedPlant) -> JoinHandle<()> {
     tokio::spawn(async move {
         let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
         loop {

@@ -1,54 +1,71 @@
 //! Starts, changes and stops the servers of the gateway.
 
-use super::Daemon;
-use super::server::Prepared;
-use crate::config::Settings;
-use drivegate_north::{ServerError, bacnet, modbus_tcp, slot};
+use std::sync::Arc;
 
-/// The servers that listen on the network, prepared.
-#[derive(Default)]
-pub(super) struct PreparedServers {
-    modbus_tcp: Prepared<modbus_tcp::Server>,
-    slots: Prepared<slot::Server>,
-    bacnet: Prepared<bacnet::Server>,
-    http: Prepared<drivegate_http::Http>,
+use super::Daemon;
+use super::server::{Prepared, ServerSlot};
+use crate::config::Settings;
+use drivegate_core::plant::SharedPlant;
+use drivegate_north::{NorthState, ServerError, bacnet, modbus_tcp, slot};
+
+/// Declares the servers that listen on the network, each by the name of its settings, in the order in which they are
+/// prepared and committed.
+macro_rules! listening_servers {
+    ($($name:ident: $server:ty,)*) => {
+        /// The servers that listen on the network.
+        #[derive(Debug, Default)]
+        pub(super) struct ListeningServers {
+            $(pub(super) $name: ServerSlot<$server>,)*
+        }
+
+        /// What a reload has prepared for the servers that listen on the network.
+        #[derive(Default)]
+        pub(super) struct PreparedServers {
+            $($name: Prepared<$server>,)*
+        }
+
+        impl ListeningServers {
+            async fn prepare_each(
+                &mut self,
+                settings: &Settings,
+                (plant, north): (&SharedPlant, &Arc<NorthState>),
+                prepared: &mut PreparedServers,
+            ) -> Result<(), ServerError> {
+                $(prepared.$name = self.$name.prepare(settings.$name.as_ref(), plant, north).await?;)*
+                Ok(())
+            }
+
+            async fn abort(&mut self, prepared: PreparedServers) {
+                $(self.$name.abort(prepared.$name).await;)*
+            }
+
+            /// Makes the servers run as prepared.
+            pub(super) async fn commit(&mut self, prepared: PreparedServers) {
+                $(self.$name.commit(prepared.$name).await;)*
+            }
+        }
+    };
+}
+
+listening_servers! {
+    modbus_tcp: modbus_tcp::Server,
+    slots: slot::Server,
+    bacnet: bacnet::Server,
+    http: drivegate_http::Http,
 }
 
 impl Daemon {
     /// Prepares the servers that listen on the network: either all of them or none.
     pub(super) async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let mut prepared = PreparedServers::default();
-        match self.prepare_each(settings, &mut prepared).await {
+        let common = (&self.plant, &self.north);
+        match self.listening.prepare_each(settings, common, &mut prepared).await {
             Ok(()) => Ok(prepared),
             Err(error) => {
-                self.abort_servers(prepared).await;
+                self.listening.abort(prepared).await;
                 Err(error)
             }
         }
-    }
-
-    async fn prepare_each(&mut self, settings: &Settings, prepared: &mut PreparedServers) -> Result<(), ServerError> {
-        let (plant, stats) = (&self.plant, &self.north);
-        let modbus_tcp = settings.modbus_tcp.as_ref();
-        prepared.modbus_tcp = self.modbus_tcp.prepare(modbus_tcp, plant, stats).await?;
-        prepared.slots = self.slots.prepare(settings.slots.as_ref(), plant, stats).await?;
-        prepared.bacnet = self.bacnet.prepare(settings.bacnet.as_ref(), plant, stats).await?;
-        prepared.http = self.http.prepare(settings.http.as_ref(), plant, stats).await?;
-        Ok(())
-    }
-
-    pub(super) async fn abort_servers(&mut self, prepared: PreparedServers) {
-        self.modbus_tcp.abort(prepared.modbus_tcp).await;
-        self.slots.abort(prepared.slots).await;
-        self.bacnet.abort(prepared.bacnet).await;
-        self.http.abort(prepared.http).await;
-    }
-
-    pub(super) async fn commit_servers(&mut self, prepared: PreparedServers) {
-        self.modbus_tcp.commit(prepared.modbus_tcp).await;
-        self.slots.commit(prepared.slots).await;
-        self.bacnet.commit(prepared.bacnet).await;
-        self.http.commit(prepared.http).await;
     }
 
     /// Starts, replaces or stops the MQTT client. If it cannot start, the gateway runs without it, and the next reload tries
