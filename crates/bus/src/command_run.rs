@@ -63,8 +63,17 @@ struct Scope {
     whole: bool,
     /// Whether the command sets references only.
     reference_only: bool,
-    /// Whether the command is acknowledged only when the drive shows its effect.
-    reads_back: bool,
+}
+
+/// What shows that the drive carries out a command, once the command is acknowledged.
+#[derive(Debug)]
+enum Shown {
+    /// Later reads show these effects.
+    ByReads(Vec<Effect>),
+    /// The command is acknowledged only when the drive has shown its effect.
+    ReadBack,
+    /// Nothing until the next start: the direction that the command orders takes effect then.
+    AtNextStart,
 }
 
 /// How much of a command was sent.
@@ -109,10 +118,18 @@ struct Tries {
     doubt: Doubt,
     /// Number of consecutive "busy" replies.
     busy: u32,
-    /// Pause before the next attempt; `None` without one.
-    pause: Option<Duration>,
-    /// When the last pause ends, or has ended.
+    /// When the last pause before a repetition ends, or has ended.
     due: Option<Instant>,
+}
+
+/// The pause before the next step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Pause {
+    No,
+    /// The step is repeated after this time, which begins when the next step is asked for.
+    Repeat(Duration),
+    /// Nothing is sent before this time.
+    Until(Instant),
 }
 
 /// How a command ends when nothing is left to send.
@@ -172,10 +189,8 @@ enum NextDirection {
     Unchanged,
     /// The command sets the direction, or starts the motor: a kept direction is dropped.
     Dropped,
-    /// The direction that a stop orders, where no word of the family has it while the motor stands.
-    OfStop(bool),
-    /// The ordered direction takes effect at the next start.
-    Ordered(bool),
+    /// The direction that the command orders is kept, because no word of the family has it while the motor stands.
+    Kept(bool),
 }
 
 /// A command that the bus has started.
@@ -186,11 +201,13 @@ pub struct CommandRun {
     pub rank: Urgency,
     scope: Scope,
     actions: VecDeque<Action>,
-    not_before: Option<Instant>,
+    pause: Pause,
     expires: Instant,
-    /// Tickets of all clients that wait for the result: the client that sent the command, then those that joined.
-    tickets: Vec<Ticket>,
-    effects: Vec<Effect>,
+    /// The ticket of the client that gave the command.
+    ticket: Ticket,
+    /// The tickets of clients that joined the command, and wait for its result too.
+    joined: Vec<Ticket>,
+    shown: Shown,
     tries: Tries,
     ending: Ending,
     phase: Phase,
@@ -229,11 +246,13 @@ impl CommandRun {
             Work::Read | Work::PassedOn(_) => (false, false, false, Vec::new()),
         };
         let expires = intent.window.expires;
-        let effects = confirm::effects(profile, &order);
+        let shown = match &order {
+            Order::Parameter(order) if order.from.is_some() => Shown::ReadBack,
+            order => Shown::ByReads(confirm::effects(profile, order)),
+        };
         let scope = Scope {
             whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
             reference_only,
-            reads_back: matches!(&order, Order::Parameter(order) if order.from.is_some()),
         };
         let known = RequestContext {
             check: Check::NotYet,
@@ -246,7 +265,7 @@ impl CommandRun {
         };
         let of_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
         let next_direction = match of_stop {
-            Some(reverse) => NextDirection::OfStop(reverse),
+            Some(reverse) => NextDirection::Kept(reverse),
             None if starts_or_sets_direction(profile, &order) => NextDirection::Dropped,
             None => NextDirection::Unchanged,
         };
@@ -277,19 +296,16 @@ impl CommandRun {
             rank: urgency,
             scope,
             actions,
-            not_before: None,
+            pause: Pause::No,
             expires: joined.iter().map(|(_, joined)| *joined).fold(expires, Instant::max),
-            tickets: [ticket]
-                .into_iter()
-                .chain(joined.into_iter().map(|(ticket, _)| ticket))
-                .collect(),
-            effects,
+            ticket,
+            joined: joined.into_iter().map(|(ticket, _)| ticket).collect(),
+            shown,
             tries: Tries {
                 failures: 0,
                 unanswered: Outcome::TimedOut,
                 doubt: Doubt::No,
                 busy: 0,
-                pause: None,
                 due: None,
             },
             ending: match unsendable {
@@ -319,13 +335,10 @@ impl CommandRun {
         if self.urgency != Urgency::Stop || !self.is_of_client() {
             return Err(Box::new(self));
         }
-        let Some(ticket) = self.tickets.pop() else {
-            return Err(Box::new(self));
-        };
         let (expires, was_begun) = (self.expires, self.has_begun());
-        let joined = self.tickets.into_iter().map(|ticket| (ticket, expires)).collect();
+        let joined = self.joined.into_iter().map(|ticket| (ticket, expires)).collect();
         self.intent.window.expires = expires;
-        Ok(Command::begun_stop(self.intent, was_begun, ticket, joined))
+        Ok(Command::begun_stop(self.intent, was_begun, self.ticket, joined))
     }
 
     /// The command in the form in which it was ordered.
@@ -334,8 +347,13 @@ impl CommandRun {
     }
 
     /// The ticket of the client that gave the command.
-    pub fn first_ticket(&self) -> Option<&Ticket> {
-        self.tickets.first()
+    pub fn ticket(&self) -> &Ticket {
+        &self.ticket
+    }
+
+    /// The tickets of all clients that wait for the result.
+    fn tickets(&self) -> impl Iterator<Item = &Ticket> {
+        std::iter::once(&self.ticket).chain(&self.joined)
     }
 
     /// Rank of the command.
@@ -367,7 +385,7 @@ impl CommandRun {
     /// Whether a client gave the command, and not the gateway itself.
     pub fn is_of_client(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
-        self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| kind(ticket).is_client())
+        self.urgency != Urgency::Read && self.tickets().any(|ticket| kind(ticket).is_client())
     }
 
     /// Whether the command renews the lease of its drive.
@@ -377,19 +395,17 @@ impl CommandRun {
 
     /// The clients that wait for the command.
     pub fn origins(&self) -> impl Iterator<Item = &Origin> {
-        self.tickets.iter().map(Ticket::origin)
+        self.tickets().map(Ticket::origin)
     }
 
     /// Whether a tool sent the command, which then has the line share of background transactions.
     pub fn is_of_tool(&self) -> bool {
-        self.tickets
-            .iter()
-            .any(|ticket| ticket.origin().kind == SourceKind::Slot)
+        self.tickets().any(|ticket| ticket.origin().kind == SourceKind::Slot)
     }
 
     /// Whether all parts of the command come from supervision.
     pub fn is_of_supervision(&self) -> bool {
-        self.tickets.iter().all(|ticket| ticket.origin().is_lease())
+        self.tickets().all(|ticket| ticket.origin().is_lease())
     }
 
     /// Whether the rules judge the frames of the command: stops and the ends of pulses are always sent.
@@ -458,11 +474,6 @@ impl CommandRun {
         };
         let place = (raw.table, raw.address);
         (raw.table == Table::Holding && self.control != Some(place)).then_some(place)
-    }
-
-    /// Whether the drive showed the effect before the command was acknowledged.
-    pub fn was_read_back(&self) -> bool {
-        self.scope.reads_back
     }
 
     /// Records that a step of the command is on the wire.

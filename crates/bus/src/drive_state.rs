@@ -11,7 +11,7 @@ use super::refresh::{End, OrderEnd, Refresh};
 use super::repeated_stops::RepeatedStops;
 use super::supervision::Supervision;
 use super::unanswered_stops::VainStops;
-use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Receipt, Urgency};
+use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Urgency};
 use drivegate_core::permit::LastWritten;
 use drivegate_core::process_image::{Access, DriveImage, DriveSpec, Reading};
 use drivegate_model::drive::control::Control;
@@ -243,20 +243,7 @@ impl DriveState {
                 Urgency::Command | Urgency::Read => {}
             }
             run.note_direction(&mut self.words);
-            let (was_read_back, waits, begun) = (run.was_read_back(), run.waits_for_start(), run.has_begun());
             let (effects, receipts) = run.acknowledge(outcome, now);
-            if let Some(why) = waits {
-                let tell = |receipt: Receipt| match begun {
-                    true => receipt.cannot_be_seen(why),
-                    false => receipt.waits(why),
-                };
-                receipts.into_iter().for_each(tell);
-                return;
-            }
-            if was_read_back {
-                receipts.into_iter().for_each(|receipt| receipt.confirm(now));
-                return;
-            }
             self.confirmations
                 .watch(effects, receipts, &image.reading(now, self.fresh), now);
         } else {

@@ -4,10 +4,10 @@ use std::time::Instant;
 
 use super::steps::{Action, Check};
 use super::word::Word;
-use super::{CommandRun, Ending, Phase};
+use super::{CommandRun, Ending, Pause, Phase, Shown};
 use crate::confirm::Effect;
 use drivegate_core::order::{Interruption, Outcome, Receipt, Refusal};
-use drivegate_core::permit::right_lost;
+use drivegate_core::permit::{AT_NEXT_START, right_lost};
 use drivegate_proto::Exception;
 
 impl CommandRun {
@@ -18,7 +18,7 @@ impl CommandRun {
             self.ending = Ending::Cut(outcome);
         }
         let phase = std::mem::replace(&mut self.phase, Phase::OnlyEnds);
-        self.tries.pause = None;
+        self.drop_repeat();
         (self.tries.failures, self.known.check) = (0, Check::NotYet);
         self.look.forget();
         if phase == Phase::MotorStarted {
@@ -82,6 +82,13 @@ impl CommandRun {
         }
     }
 
+    /// The step that was to be repeated is not sent any more.
+    fn drop_repeat(&mut self) {
+        if let Pause::Repeat(_) = self.pause {
+            self.pause = Pause::No;
+        }
+    }
+
     pub(super) fn cut_off(&mut self, outcome: Outcome) {
         let before = self.actions.len();
         // A bit whose setting was sent and not answered may be set.
@@ -100,7 +107,7 @@ impl CommandRun {
         if phase == Phase::MotorStarted && before > left {
             self.actions.push_back(Action::Word(Word::Stop(None)));
         }
-        self.tries.pause = None;
+        self.drop_repeat();
         self.look.forget();
         if before != left {
             self.ending = Ending::Cut(outcome);
@@ -116,21 +123,25 @@ impl CommandRun {
         }
     }
 
-    /// Reports the acknowledgement. Returns the effects that a read must show, and the receipts of the clients that
-    /// wait for it.
+    /// Reports the acknowledgement, and the confirmation as far as it is known already. Returns the effects that reads
+    /// must still show, and the receipts of the clients that wait for that; both empty without such effects.
     pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
-        let receipts = self.tickets.into_iter();
-        let receipts = receipts
-            .map(|ticket| ticket.acknowledge(outcome.clone(), now))
-            .collect();
-        (self.effects, receipts)
+        let begun = self.has_begun();
+        let tickets = std::iter::once(self.ticket).chain(self.joined);
+        let receipts = tickets.map(|ticket| ticket.acknowledge(outcome.clone(), now));
+        match self.shown {
+            Shown::ByReads(effects) => return (effects, receipts.collect()),
+            Shown::ReadBack => receipts.for_each(|receipt| receipt.confirm(now)),
+            Shown::AtNextStart if begun => receipts.for_each(|receipt| receipt.cannot_be_seen(AT_NEXT_START)),
+            Shown::AtNextStart => receipts.for_each(|receipt| receipt.waits(AT_NEXT_START)),
+        }
+        (Vec::new(), Vec::new())
     }
 
     /// Ends the command with this outcome.
     pub fn finish(self, outcome: &Outcome, now: Instant) {
-        self.tickets
-            .into_iter()
-            .for_each(|ticket| ticket.answer(outcome.clone(), now));
+        let tickets = std::iter::once(self.ticket).chain(self.joined);
+        tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));
     }
 
     /// Ends a command that cannot continue; with the outcome `unbegun` if nothing of it was sent.

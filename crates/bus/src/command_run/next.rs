@@ -6,7 +6,7 @@ use super::control;
 use super::functions::other_function;
 use super::steps::{Action, Step, step_of};
 use super::word::{self, Made, Word};
-use super::{CommandRun, KnownWords, Need, Next, Phase};
+use super::{CommandRun, KnownWords, Need, Next, Pause, Phase};
 use drivegate_core::order::{Interruption, Outcome};
 use drivegate_core::permit::Repeats;
 use drivegate_model::drive::Profile;
@@ -86,19 +86,25 @@ impl CommandRun {
 
     /// Until when the command sends nothing; `None` if it may send now.
     fn pauses_until(&mut self, now: Instant) -> Option<Instant> {
-        if let Some(pause) = self.tries.pause.take() {
-            let end = if self.may_write_on() { self.expires } else { now + pause };
-            self.not_before = Some((now + pause).min(end));
-            self.tries.due = self.not_before;
-        }
-        self.not_before = self.not_before.filter(|at| now < *at);
-        self.not_before
+        let until = match self.pause {
+            Pause::No => None,
+            Pause::Repeat(pause) => {
+                let expires = self.may_write_on().then_some(self.expires);
+                let at = expires.map_or(now + pause, |expires| expires.min(now + pause));
+                self.tries.due = Some(at);
+                Some(at)
+            }
+            Pause::Until(at) => Some(at),
+        };
+        let until = until.filter(|at| now < *at);
+        self.pause = until.map_or(Pause::No, Pause::Until);
+        until
     }
 
     /// Removes the pause at the front, which ends at `until`.
     fn hold_until(&mut self, until: Instant) -> Next {
         self.actions.pop_front();
-        self.not_before = Some(until);
+        self.pause = Pause::Until(until);
         Next::Wait(until)
     }
 

@@ -7,7 +7,7 @@ use super::functions::other_function;
 use super::parameter::Then;
 use super::steps::{Action, Check};
 use super::word::Word;
-use super::{CommandRun, Doubt, Ending, KnownWords, Phase, Step, StepPurpose};
+use super::{CommandRun, Doubt, Ending, KnownWords, Pause, Phase, Step, StepPurpose};
 use drivegate_core::order::{Outcome, Urgency};
 use drivegate_proto::{Exception, Reply, RequestPdu};
 
@@ -99,7 +99,7 @@ impl CommandRun {
             self.pop();
             return self.actions.is_empty().then(|| self.success());
         }
-        self.tries.pause = Some(LOOK_PAUSE);
+        self.pause = Pause::Repeat(LOOK_PAUSE);
         None
     }
 
@@ -131,7 +131,7 @@ impl CommandRun {
             Urgency::Stop => (BUSY_PAUSE.0, BUSY_STOP),
             Urgency::Command | Urgency::Read => BUSY_PAUSE,
         };
-        self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
+        self.pause = Pause::Repeat((first * (1 << self.tries.busy.min(5))).min(longest));
         self.tries.busy = self.tries.busy.saturating_add(1);
         if self.known.check == Check::Read {
             // The word may have changed again by the next attempt.

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 
 use super::steps::Action;
 use super::word::Word;
-use super::{CommandRun, KnownWords, MotorRead, NextDirection, Step, StepPurpose};
+use super::{CommandRun, KnownWords, MotorRead, NextDirection, Shown, Step, StepPurpose};
 use drivegate_core::order::Outcome;
-use drivegate_core::permit::{AT_NEXT_START, Motor, not_seen};
+use drivegate_core::permit::{Motor, not_seen};
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{Derived, ModelPoint, Profile, Raw, Source, Value};
 use drivegate_proto::{Protocol, Reply, RequestPdu, Table};
@@ -235,23 +235,24 @@ impl CommandRun {
             self.pop();
         }
         self.look.forget();
-        self.next_direction = NextDirection::Ordered(reverse);
-        // The remaining effects would be taken for the effect of the direction.
-        self.effects.clear();
+        self.next_direction = NextDirection::Kept(reverse);
+        // The effects of the rest of the command would be taken for the effect of the direction.
+        self.shown = Shown::AtNextStart;
     }
 
     /// Keeps the direction that the command ordered; if it set another one, drops the kept one.
     pub(crate) fn note_direction(&self, words: &mut KnownWords) {
         match self.next_direction {
-            NextDirection::Ordered(reverse) | NextDirection::OfStop(reverse) => words.keep_direction(reverse),
+            NextDirection::Kept(reverse) => words.keep_direction(reverse),
             NextDirection::Dropped => words.forget_direction(),
             NextDirection::Unchanged => {}
         }
     }
 
-    /// Note on an order whose direction waits for the next start.
-    pub(crate) fn waits_for_start(&self) -> Option<&'static str> {
-        matches!(self.next_direction, NextDirection::Ordered(_)).then_some(AT_NEXT_START)
+    /// Whether the direction that the command orders waits for the next start.
+    #[cfg(test)]
+    pub(crate) fn waits_for_start(&self) -> bool {
+        matches!(self.shown, Shown::AtNextStart)
     }
 }
 

@@ -67,15 +67,15 @@ fn at_write<'a>(drive: &DriveState, image: &'a DriveImage, repeats: Option<Repea
 
 /// Whether the next frame of a started command may be sent. A stop and the end of a pulse are always sent.
 fn may_write(bus: &BusHandle, index: DriveIndex, run: &CommandRun, seen: &DriveFacts<'_>, now: Instant) -> Verdict {
-    let Some(origin) = run.origins().next().filter(|_| run.is_judged()) else {
+    if !run.is_judged() {
         return Verdict::Go;
-    };
+    }
     let ask = Ask {
         stage: Stage::Write,
         now,
         drive: index,
         intent: run.intent(),
-        origin,
+        origin: run.ticket().origin(),
         seen: Some(seen),
     };
     bus.queue.lock().gate.ask(&ask)
@@ -115,11 +115,11 @@ pub(super) fn next_need(
 
 /// Ends a started command; its refusal is reported like an immediate one.
 fn deny(bus: &BusHandle, drive: DriveIndex, run: &mut CommandRun, outcome: Outcome) {
-    if let (Outcome::Refused(refusal), Some(ticket)) = (&outcome, run.first_ticket()) {
+    if let Outcome::Refused(refusal) = &outcome {
         let denied = Denied {
             drive,
-            origin: ticket.origin().clone(),
-            what: ticket.what().to_string(),
+            origin: run.ticket().origin().clone(),
+            what: run.ticket().what().to_string(),
             refusal: refusal.clone(),
         };
         bus.queue.lock().note_denied(denied);
@@ -131,11 +131,10 @@ impl Master {
     /// Whether a chosen frame of a started command may still be sent.
     pub(super) fn may_still_write(&mut self, index: DriveIndex, slot: Urgency, now: Instant) -> bool {
         let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
-        if !drive.run(slot).is_some_and(|run| run.is_judged()) {
-            return true;
-        }
         let seen = at_write(drive, image, None, now);
-        let Some(run) = drive.run(slot) else { return true };
+        let Some(run) = drive.run(slot).filter(|run| run.is_judged()) else {
+            return true;
+        };
         // A denied command is refused, or made to wait, at the next choice.
         matches!(
             may_write(&self.bus, index, run, &seen, now),

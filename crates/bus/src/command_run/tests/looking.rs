@@ -224,7 +224,7 @@ fn no_order_without_run_starts_a_motor_that_has_ceased_to_run() {
                 assert_eq!(started, [], "{}: {since:?}, {order:?}", profile.name);
                 let turns = order.iter().any(|(point, _)| *point == ModelPoint::Reverse);
                 assert!(outcome.is_ok(), "{}: {since:?}, {order:?}: {outcome:?}", profile.name);
-                let waits = run.waits_for_start().is_some();
+                let waits = run.waits_for_start();
                 assert!(turns || !waits, "{}: {since:?}, {order:?}", profile.name);
             }
         }
@@ -242,7 +242,7 @@ fn a_motor_that_is_seen_to_run_is_turned() {
                 continue;
             };
             assert!(
-                outcome.is_ok() && run.waits_for_start().is_none(),
+                outcome.is_ok() && !run.waits_for_start(),
                 "{}: {outcome:?}",
                 profile.name
             );
@@ -261,7 +261,7 @@ fn the_next_start_has_the_direction_that_was_kept() {
             continue;
         };
         assert!(outcome.is_ok(), "{}", profile.name);
-        if run.waits_for_start().is_none() {
+        if !run.waits_for_start() {
             continue;
         }
         let control = profile.control.as_ref().unwrap();
@@ -358,5 +358,5 @@ fn nothing_goes_between_the_look_and_the_write() {
     looks(&mut bench, &mut command);
     let next = command.next(&bench.words, &bench.profile, true, bench.now);
     assert_eq!(next, Next::Done);
-    assert!(command.waits_for_start().is_some());
+    assert!(command.waits_for_start());
 }
