@@ -123,9 +123,10 @@ impl StartGate {
         reading: &Reading<'_>,
     ) {
         let now = reading.now;
-        let Some(trip) = self.trips.get_mut(index).filter(|_| self.guards.trips(index)) else {
+        if !self.guards.trips(index) {
             return;
-        };
+        }
+        let trip = self.trips.of_mut(index);
         trip.note_answer(now);
         // The first reading after the stall decides.
         let stood = self.stood.filter(|until| now < *until + FIRST_READ);

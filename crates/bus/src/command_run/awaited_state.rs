@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::steps::{Step, StepPurpose};
-use drivegate_model::drive::control::{self, Mask, Until};
+use drivegate_model::drive::control::{self, Mask};
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::{Profile, Raw};
 use drivegate_proto::{Reply, RequestPdu};
@@ -19,41 +19,50 @@ pub(super) struct AwaitedState {
     name: String,
     mask: Mask,
     /// Time after which the sequence is given up.
-    pub(super) timeout: Duration,
+    timeout: Duration,
     /// The step as text, with its word.
     step: String,
     /// When the wait for this state began.
-    pub(super) since: Option<Instant>,
+    since: Option<Instant>,
     /// The value last read from the register.
     seen: Option<u64>,
 }
 
 impl AwaitedState {
-    pub(super) fn of(profile: &Profile, steps: &[control::Step], number: usize) -> Option<AwaitedState> {
-        let step = steps.get(number)?;
-        let Until::State(mask) = step.until else {
-            return None;
-        };
+    /// The state that ends this step, which has this number among so many; `None` if no register shows it.
+    pub(super) fn of(
+        profile: &Profile,
+        mask: Mask,
+        step: &control::Step,
+        (number, count): (usize, usize),
+    ) -> Option<AwaitedState> {
         let point = profile.points.get(mask.point)?;
         Some(AwaitedState {
             raw: point.raw()?.clone(),
             name: point.name.clone(),
             mask,
             timeout: step.timeout,
-            step: format!("step {} of {} ({:#06x})", number + 1, steps.len(), step.write.value),
+            step: format!("step {number} of {count} ({:#06x})", step.write.value),
             since: None,
             seen: None,
         })
     }
 
     /// The read of the awaited state.
-    pub(super) fn state_read(&self) -> Step {
+    ///
+    /// # Errors
+    /// If the time limit has passed at `now`; contains the state that was not seen, as text.
+    pub(super) fn state_read(&mut self, now: Instant) -> Result<Step, String> {
+        let since = *self.since.get_or_insert(now);
+        if now.saturating_duration_since(since) >= self.timeout {
+            return Err(self.not_reached());
+        }
         let pdu = RequestPdu::Read {
             table: self.raw.table,
             start: self.raw.address,
             count: self.raw.form.items(),
         };
-        Step::new(StepPurpose::AskState, pdu)
+        Ok(Step::new(StepPurpose::AskState, pdu))
     }
 
     /// Whether the reply shows the awaited state.
@@ -66,7 +75,7 @@ impl AwaitedState {
     }
 
     /// The state that was not seen in time, as text.
-    pub(super) fn not_reached(&self) -> String {
+    fn not_reached(&self) -> String {
         let AwaitedState {
             name,
             mask,

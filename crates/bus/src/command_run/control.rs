@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::awaited_state::AwaitedState;
 use super::known_words::KnownWords;
 use super::steps::Action;
-use super::word::Word;
+use super::word::{SequenceWord, Word};
 use drivegate_model::drive::control::{Control, ControlItem, Run, Setting, Until};
 use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
 use drivegate_proto::{RequestPdu, Table};
@@ -182,14 +182,21 @@ fn runs(control: &Control, profile: &Profile, reverse: Option<bool>) -> Vec<Acti
             let mut actions = Vec::new();
             for (number, step) in steps.iter().enumerate() {
                 match step.write.place {
-                    None => actions.push(Action::Word(Word::Sequence(number, reverse))),
+                    None => {
+                        let word = SequenceWord {
+                            write: step.write,
+                            is_first: number == 0,
+                            is_last: number + 1 == steps.len(),
+                        };
+                        actions.push(Action::Word(Word::Sequence(word, reverse)));
+                    }
                     Some(place) => actions.push(Action::Send(write(place, step.write.applied(0), profile))),
                 }
                 match step.until {
                     Until::Written => {}
                     Until::Time(time) => actions.push(Action::Wait(time)),
-                    Until::State(_) => {
-                        let state = AwaitedState::of(profile, steps, number);
+                    Until::State(mask) => {
+                        let state = AwaitedState::of(profile, mask, step, (number + 1, steps.len()));
                         actions.extend(state.map(|state| Action::Await(Box::new(state))));
                     }
                 }
@@ -218,10 +225,4 @@ pub(super) fn is_prepared(profile: &Profile, words: &KnownWords, running: bool) 
     };
     let own = words.get(control.at.table, control.at.address);
     own.is_some_and(|own| control.is_run(control.at, own))
-}
-
-/// Whether the word with this number is the last of the sequence, which starts the motor.
-pub(super) fn is_last(profile: &Profile, number: usize) -> bool {
-    let run = profile.control.as_ref().map(|control| &control.run);
-    matches!(run, Some(Run::Steps(steps)) if number + 1 == steps.len())
 }

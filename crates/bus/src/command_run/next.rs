@@ -109,14 +109,20 @@ impl CommandRun {
     }
 
     fn first(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> First {
-        let step = match self.actions.front() {
+        let step = match self.actions.front_mut() {
             None => None,
-            Some(Action::Await(_)) => match self.awaits(now) {
-                Some(step) => Some(step),
-                None => return First::Changed,
+            Some(Action::Await(state)) => match state.state_read(now) {
+                Ok(step) => Some(step),
+                Err(why) => {
+                    self.give_up(Outcome::NotTaken(why));
+                    return First::Changed;
+                }
             },
-            Some(Action::Word(Word::Sequence(0, reverse))) if control::is_prepared(profile, words, running) => {
-                self.only_last_word(*reverse, profile);
+            Some(Action::Word(Word::Sequence(word, reverse)))
+                if word.is_first && control::is_prepared(profile, words, running) =>
+            {
+                let reverse = *reverse;
+                self.only_last_word(reverse);
                 return First::Changed;
             }
             Some(Action::Word(word)) => match word::made(*word, words, profile, self.known, self.look.motor()) {
@@ -147,10 +153,10 @@ impl CommandRun {
         if let Some(other) = other_function(&step.pdu).filter(|_| self.by_other_function) {
             step.pdu = other;
         }
-        if let Some(Action::Word(Word::Sequence(number, _))) = self.actions.front()
+        if let Some(Action::Word(Word::Sequence(word, _))) = self.actions.front()
             && self.phase == Phase::Steps
             && step.pdu.is_write()
-            && control::is_last(profile, *number)
+            && word.is_last
         {
             self.phase = Phase::MotorStarted;
         }
@@ -186,33 +192,20 @@ impl CommandRun {
         }
     }
 
-    /// The read of the state that a sequence waits for, while its time limit has not passed.
-    fn awaits(&mut self, now: Instant) -> Option<Step> {
-        let Some(Action::Await(state)) = self.actions.front_mut() else {
-            return None;
-        };
-        let since = *state.since.get_or_insert(now);
-        if now.saturating_duration_since(since) < state.timeout {
-            return Some(state.state_read());
-        }
-        let why = state.not_reached();
-        self.give_up(Outcome::NotTaken(why));
-        None
-    }
-
     /// The motor already runs by this command: only the last word of the sequence is sent, which changes nothing or
     /// only the direction.
-    fn only_last_word(&mut self, reverse: Option<bool>, profile: &Profile) {
-        let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(number, _)) if control::is_last(profile, *number));
+    fn only_last_word(&mut self, reverse: Option<bool>) {
+        let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(word, _)) if word.is_last);
         while self.actions.front().is_some_and(|action| !last(action)) {
             self.pop();
         }
-        if let Some(Action::Word(word @ Word::Sequence(..))) = self.actions.front_mut() {
-            let Word::Sequence(number, _) = *word else { return };
+        if let Some(Action::Word(word)) = self.actions.front_mut()
+            && let Word::Sequence(last, _) = *word
+        {
             // A sequence of one word must not begin again with its first word.
-            *word = match number {
-                0 => Word::Run(reverse),
-                number => Word::Sequence(number, reverse),
+            *word = match last.is_first {
+                true => Word::Run(reverse),
+                false => Word::Sequence(last, reverse),
             };
         }
     }

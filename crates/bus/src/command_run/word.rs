@@ -22,8 +22,8 @@ pub(super) enum Word {
     KeptDirection,
     /// A run, with a direction where the order has one.
     Run(Option<bool>),
-    /// The word with this number in the start sequence.
-    Sequence(usize, Option<bool>),
+    /// A word of the start sequence, with a direction where the order has one.
+    Sequence(SequenceWord, Option<bool>),
     /// Prepares a pulse of these bits, usually a reset: clears the bits, and the run command if the motor is at standstill.
     ResetLow(Setting),
     /// Sets the bits of a reset pulse.
@@ -32,6 +32,16 @@ pub(super) enum Word {
     ResetEnd(Setting),
     /// Bits that belong to no command of `[control]`.
     Others(Setting),
+}
+
+/// A word of a start sequence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct SequenceWord {
+    /// The bits that the word sets and clears.
+    pub(super) write: Setting,
+    pub(super) is_first: bool,
+    /// The last word starts the motor.
+    pub(super) is_last: bool,
 }
 
 impl Word {
@@ -157,13 +167,7 @@ pub(super) fn made(
             let (place, word) = run_word(control, stays, reverse, words);
             sent(place.unwrap_or(at), word)
         }
-        Word::Sequence(number, reverse) => {
-            let Run::Steps(steps) = &control.run else {
-                return Made::Nothing;
-            };
-            let Some(step) = steps.get(number) else {
-                return Made::Nothing;
-            };
+        Word::Sequence(step, reverse) => {
             let reverse = reverse.or(words.at_next_start());
             let reverse = reverse.or_else(|| own.and_then(|own| control.direction_of(own)));
             let word = step.write.applied(stays);

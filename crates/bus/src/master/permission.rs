@@ -20,7 +20,7 @@ const RANGE_AGE: Duration = Duration::from_secs(60);
 
 /// State of the drives when a command is about to be sent.
 pub(super) struct AtTurn {
-    images: Vec<Arc<DriveImage>>,
+    images: PerDrive<Arc<DriveImage>>,
     written: PerDrive<LastWritten>,
     run: PerDrive<Option<bool>>,
     now: Instant,
@@ -43,13 +43,10 @@ impl AtTurn {
 
 impl Facts for AtTurn {
     fn seen(&self, drive: DriveIndex) -> Option<DriveFacts<'_>> {
-        let reading = self.images.get(drive.place())?.reading(self.now, RANGE_AGE);
-        let written = self.written.get(drive).copied();
-        let run = self.run.get(drive).copied().flatten();
         Some(DriveFacts {
-            reading,
-            written,
-            run,
+            reading: self.images.of(drive).reading(self.now, RANGE_AGE),
+            written: Some(*self.written.of(drive)),
+            run: *self.run.of(drive),
             repeats: None,
         })
     }

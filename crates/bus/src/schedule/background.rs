@@ -9,11 +9,34 @@ use drivegate_core::order::Pace;
 /// longer than it had earned.
 #[derive(Debug, Default)]
 pub(super) struct BackgroundShare {
-    balance: [f64; 2],
+    balance: Balance,
     /// The longest transaction that was requested. This time limits the credit.
     longest: Duration,
     /// By how much recent transactions took longer than calculated, because drives are slower than their profiles state.
     overrun: Duration,
+}
+
+/// Time that the share of each pace has earned and not used, in seconds.
+#[derive(Debug, Default)]
+struct Balance {
+    brisk: f64,
+    slow: f64,
+}
+
+impl Balance {
+    fn of(&self, pace: Pace) -> f64 {
+        match pace {
+            Pace::Brisk => self.brisk,
+            Pace::Slow => self.slow,
+        }
+    }
+
+    fn of_mut(&mut self, pace: Pace) -> &mut f64 {
+        match pace {
+            Pace::Brisk => &mut self.brisk,
+            Pace::Slow => &mut self.slow,
+        }
+    }
 }
 
 /// Whether a background transaction may be sent now.
@@ -31,20 +54,17 @@ impl BackgroundShare {
     /// Earns shares from the time of process data, so that they are proportional to it: time of commands and slow
     /// polls does not count.
     pub(super) fn earn(&mut self, passed: Duration) {
-        for (pace, balance) in Pace::ALL.into_iter().zip(&mut self.balance) {
+        for pace in Pace::ALL {
+            let balance = self.balance.of_mut(pace);
             // Share not used in an hour does not become a burst later.
             let most = self.longest.as_secs_f64().max(*balance);
             *balance = (*balance + passed.as_secs_f64() * pace.share()).min(most);
         }
     }
 
-    fn balance(&self, pace: Pace) -> f64 {
-        self.balance.get(pace as usize).copied().unwrap_or(0.0)
-    }
-
     /// Time until the share of this pace has earned `wanted`.
     fn missing(&self, pace: Pace, wanted: f64) -> Duration {
-        Duration::from_secs_f64(((wanted - self.balance(pace)) / pace.share()).max(0.0))
+        Duration::from_secs_f64(((wanted - self.balance.of(pace)) / pace.share()).max(0.0))
     }
 }
 
@@ -57,7 +77,7 @@ impl Schedule {
         let cost = cost + share.overrun;
         share.longest = share.longest.max(cost);
         let fits = self.round_started.is_none() || now + cost <= self.round_due;
-        let owes_nothing = share.balance(pace) >= 0.0;
+        let owes_nothing = share.balance.of(pace) >= 0.0;
         if idle && fits && owes_nothing {
             return Admission::InIdleTime(cost);
         }
@@ -72,9 +92,7 @@ impl Schedule {
 
     /// Charges a transaction that was not a background one to the share of this pace.
     pub(crate) fn background_owes(&mut self, pace: Pace, took: Duration) {
-        if let Some(balance) = self.background.balance.get_mut(pace as usize) {
-            *balance -= took.as_secs_f64();
-        }
+        *self.background.balance.of_mut(pace) -= took.as_secs_f64();
     }
 
     /// A background transaction has ended, for which the line was taken for `took`. `answered`: the drive replied.
@@ -92,13 +110,12 @@ impl Schedule {
             let over = (took + share.overrun).saturating_sub(cost);
             share.overrun = over.max(share.overrun.mul_f64(0.9));
         }
-        if let Some(balance) = share.balance.get_mut(pace as usize) {
-            // There was room for this request, so there will be room for the next one too.
-            let before = match admission {
-                Admission::InIdleTime(_) => balance.min(0.0),
-                Admission::InShare | Admission::NotBefore(_) => *balance,
-            };
-            *balance = before - paid.as_secs_f64();
-        }
+        let balance = share.balance.of_mut(pace);
+        // There was room for this request, so there will be room for the next one too.
+        let before = match admission {
+            Admission::InIdleTime(_) => balance.min(0.0),
+            Admission::InShare | Admission::NotBefore(_) => *balance,
+        };
+        *balance = before - paid.as_secs_f64();
     }
 }

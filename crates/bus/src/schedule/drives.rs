@@ -251,12 +251,11 @@ impl DriveSchedule {
 
     /// Reads the items of a read singly, and tries the whole read again after the pause.
     pub(super) fn take_apart(&mut self, read: &PlannedRead, now: Instant, pause: Duration) {
-        let Some(index) = self.items.iter().position(|item| item.read == *read && read.count > 1) else {
+        let mut items = self.items.iter().enumerate();
+        let Some((index, whole)) = items.find(|(_, item)| item.read == *read && read.count > 1) else {
             return;
         };
-        let Some(whole) = self.items.get(index).cloned() else {
-            return;
-        };
+        let whole = whole.clone();
         let parts = singles(*read).into_iter().map(|part| Item {
             read: part,
             due: whole.due.min(now),
@@ -375,16 +374,14 @@ impl DriveSchedule {
 
     fn divide(&mut self, read: PlannedRead, now: Instant) {
         let retries = self.retries;
-        let Some(index) = self.items.iter().position(|item| item.read == read) else {
+        let mut items = self.items.iter_mut().enumerate();
+        let Some((index, item)) = items.find(|(_, item)| item.read == read) else {
             // The block was split meanwhile: any of its parts may be the unanswered one.
             let parts = self
                 .items
                 .iter_mut()
                 .filter(|item| read.covers(item.read.table, item.read.start));
             parts.for_each(|part| part.never_answers = true);
-            return;
-        };
-        let Some(item) = self.items.get_mut(index) else {
             return;
         };
         item.never_answers = true;
@@ -448,10 +445,8 @@ impl DriveSchedule {
     /// Splits a refused block until the bad point is found, which is retried slowly.
     pub(super) fn refused(&mut self, read: PlannedRead, exception: Exception, now: Instant) -> Change {
         let addressed = exception.is_about_request();
-        let Some(index) = self.items.iter().position(|i| i.read == read) else {
-            return Change::None;
-        };
-        let Some(item) = self.items.get_mut(index) else {
+        let mut items = self.items.iter_mut().enumerate();
+        let Some((index, item)) = items.find(|(_, item)| item.read == read) else {
             return Change::None;
         };
         if !addressed {
