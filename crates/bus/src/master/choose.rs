@@ -472,7 +472,8 @@ pub(super) fn may_begin(drive: &mut DriveState, command: &Command, online: bool,
         return Ready::No;
     }
     if urgency == Urgency::Stop {
-        return drive.vain_stops.waits_until(now).map_or(Ready::Now, Ready::At);
+        let ready = if online { Ready::Now } else { Ready::Last };
+        return drive.vain_stops.waits_until(now).map_or(ready, Ready::At);
     }
     // A command to an offline drive is answered at once.
     if let Order::Read(pdu) | Order::Write(pdu) = &command.intent.order

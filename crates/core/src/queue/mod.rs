@@ -89,6 +89,8 @@ pub struct Denied {
 pub enum Ready {
     /// The drive is ready for the command.
     Now,
+    /// The command may be sent after those of its rank whose drives are ready: its drive does not answer.
+    Last,
     /// The drive is busy with another command.
     No,
     /// The drive is not ready before this time.
@@ -265,18 +267,18 @@ impl Pending {
         redundant: &impl Fn(DriveIndex) -> bool,
         choice: &mut Choice,
     ) -> Option<u64> {
-        let mut is_ready = |command: &Command| match ready(command) {
-            Ready::Now => !passed_over.contains(&command.intent.number),
-            Ready::No => false,
+        let mut readiness = |command: &Command| match ready(command) {
             Ready::At(until) => {
                 choice.wait(until);
-                false
+                Ready::No
             }
+            _ if passed_over.contains(&command.intent.number) => Ready::No,
+            ready => ready,
         };
         let pressed = self.pressed();
         let passed_on = match pressed.is_empty() || rank != Urgency::Command {
             true => Vec::new(),
-            false => self.passed_on(&mut is_ready),
+            false => self.passed_on(&mut |command: &Command| readiness(command) != Ready::No),
         };
         // Drives whose later commands must wait: for an older command, or for a stop.
         let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);
@@ -300,13 +302,18 @@ impl Pending {
             keep_order(command, &mut behind);
             let number = command.intent.number;
             let goes = || pressed.contains(&number) && passed_on.contains(&number);
-            if own != rank || (is_passed_on && !goes()) || !is_ready(command) {
+            if own != rank || (is_passed_on && !goes()) {
+                continue;
+            }
+            let ready = readiness(command);
+            if ready == Ready::No {
                 continue;
             }
             let (client, of_client) = self.served(command);
             // A client that was never served sorts first (`None`). A command that was overtaken often enough goes
             // before all others.
-            let key = (command.overtaken < CAPACITY, client, of_client, index);
+            let is_last = ready == Ready::Last;
+            let key = (command.overtaken < CAPACITY, is_last, client, of_client, index);
             if best.is_none_or(|(best, _)| key < best) {
                 best = Some((key, number));
             }

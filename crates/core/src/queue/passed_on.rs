@@ -63,7 +63,7 @@ impl Pending {
         let rank = Urgency::Command;
         let mut choice = Choice::default();
         let numbers = self.passed_on(&mut |command: &Command| match ready(command) {
-            Ready::Now => true,
+            Ready::Now | Ready::Last => true,
             Ready::No => false,
             Ready::At(until) => {
                 choice.wait(until);

@@ -108,3 +108,30 @@ fn a_stop_does_not_wait_until_other_drives_are_no_longer_busy() {
         "{tries:?}"
     );
 }
+
+/// A drive that does not answer holds the line for its response timeout at each try.
+#[test]
+fn a_stop_goes_before_those_of_drives_that_do_not_answer() {
+    let mut rig = Rig::new(10);
+    let silent = 0..5;
+    for (index, drive) in rig.drives.iter_mut().enumerate() {
+        drive.holding.insert(2000, 1);
+        drive.silent = silent.contains(&index);
+    }
+    rig.run(Duration::from_secs(5));
+    let (from, asked) = (rig.wire.len(), rig.now);
+    let _stops: Vec<_> = (0..10).map(|k| rig.switch(k, "client", false)).collect();
+    rig.run(Duration::from_secs(2));
+    let first = |drive: usize| {
+        let to = |(_, turn): &&(Instant, Turn)| turn.pdu().is_write() && turn.target() == DriveIndex::new(drive);
+        rig.wire[from..].iter().find(to).map(|(at, _)| *at - asked)
+    };
+    let answering: Vec<_> = (5..10).map(first).collect();
+    let others: Vec<_> = silent.map(first).collect();
+    assert!(others.iter().all(Option::is_some), "{others:?}");
+    assert!(
+        answering.iter().all(|sent| sent.is_some_and(|sent| sent <= 12 * COST)),
+        "{answering:?}"
+    );
+    assert!(answering.iter().max() < others.iter().min(), "{answering:?} {others:?}");
+}
