@@ -132,9 +132,10 @@ fn instructions(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<f64
             .args(arguments)
             .arg(&process)
             .output()?;
-        match done.status.success() {
-            true => Ok(()),
-            false => Err(format!("callgrind_control: {}", String::from_utf8_lossy(&done.stderr)).into()),
+        if done.status.success() {
+            Ok(())
+        } else {
+            Err(format!("callgrind_control: {}", String::from_utf8_lossy(&done.stderr)).into())
         }
     };
     std::thread::sleep(Duration::from_secs(5));

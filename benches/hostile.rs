@@ -149,9 +149,10 @@ async fn command(modbus: SocketAddr, value: u16) -> io::Result<()> {
     stream.write_all(&request).await?;
     let mut answer = [0; 12];
     stream.read_exact(&mut answer).await?;
-    match answer == request {
-        true => Ok(()),
-        false => Err(io::ErrorKind::InvalidData.into()),
+    if answer == request {
+        Ok(())
+    } else {
+        Err(io::ErrorKind::InvalidData.into())
     }
 }
 

@@ -112,9 +112,10 @@ impl Rig {
     fn exchange(&self, order: &Order) -> Answer {
         let pdu = order.pdu();
         let hidden = !matches!(order, Order::Model(..)) && pdu[1] >= 0x80;
-        match hidden {
-            true => self.by_slot(1, &pdu),
-            false => self.by_modbus_tcp(&pdu),
+        if hidden {
+            self.by_slot(1, &pdu)
+        } else {
+            self.by_modbus_tcp(&pdu)
         }
     }
 

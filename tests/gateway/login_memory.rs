@@ -46,9 +46,10 @@ fn guess(site: &Site, address: usize) -> usize {
         format!("http://127.0.0.1:{}/api/v1/drives/pump-1/commands", site.http),
     );
     // Guesses of one user by many addresses are slowed down, so most addresses name a user that does not exist.
-    let user = match address.is_multiple_of(10) {
-        true => "alice:guess".to_string(),
-        false => format!("guest-{address}:guess"),
+    let user = if address.is_multiple_of(10) {
+        "alice:guess".to_string()
+    } else {
+        format!("guest-{address}:guess")
     };
     let mut arguments = vec!["-sS", "--interface", &from, "-u", &user, "-d", "{\"run\": false}"];
     arguments.extend(["-w", "\n%{http_code}\n"]);

@@ -321,9 +321,10 @@ impl Plant {
                 let arguments = [&["write", "--config", &config, drive][..], values].concat();
                 let output = drivegate(&arguments).output().unwrap();
                 let errors = String::from_utf8_lossy(&output.stderr).into_owned();
-                match errors.contains(word) && !output.status.success() {
-                    true => (*word).to_string(),
-                    false => format!("{output:?}"),
+                if errors.contains(word) && !output.status.success() {
+                    (*word).to_string()
+                } else {
+                    format!("{output:?}")
                 }
             }
             Way::Bacnet(writes, _) => self.bacpypes(writes),
@@ -388,9 +389,12 @@ impl Plant {
             UdpSocket::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port()
         );
         let gateway = format!("127.0.0.10:{}", self.bacnet);
-        let write = |(object, value): &(&str, f64)| match object.starts_with("binary") {
-            true => json!([object, "present-value", *value != 0.0, 8]),
-            false => json!([object, "present-value", value, 8]),
+        let write = |(object, value): &(&str, f64)| {
+            if object.starts_with("binary") {
+                json!([object, "present-value", *value != 0.0, 8])
+            } else {
+                json!([object, "present-value", value, 8])
+            }
         };
         let mut order = vec![json!("several"), json!(1)];
         order.extend(writes.iter().map(write));

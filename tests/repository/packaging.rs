@@ -420,9 +420,10 @@ fn make_install_keeps_the_configuration_and_uninstall_removes_the_rest() {
     while let Some(directory) = open.pop() {
         for entry in fs::read_dir(directory).unwrap() {
             let path = entry.unwrap().path();
-            match path.is_dir() {
-                true => open.push(path),
-                false => left.push(path),
+            if path.is_dir() {
+                open.push(path)
+            } else {
+                left.push(path)
             }
         }
     }

@@ -51,9 +51,10 @@ const OWN_SOCKET: &str = "socket = \"own.sock\"\n";
 /// The configuration with a local socket of its own, unless it names another one.
 fn with_own_socket(text: &str) -> String {
     let without = text.replacen(OWN_SOCKET, "", 1);
-    match without.contains("\nsocket = ") {
-        true => without,
-        false => without.replacen("[gateway]\n", &format!("[gateway]\n{OWN_SOCKET}"), 1),
+    if without.contains("\nsocket = ") {
+        without
+    } else {
+        without.replacen("[gateway]\n", &format!("[gateway]\n{OWN_SOCKET}"), 1)
     }
 }
 
@@ -63,9 +64,10 @@ const PATIENT: &str = "stale_after = \"1min\"\n";
 /// The configuration as the gateway reads it: a local socket of its own, and patience where Modbus TCP shows values.
 fn completed(text: &str) -> String {
     let text = with_own_socket(text);
-    match text.contains("[modbus_tcp]") && !text.contains("\nstale_after = ") {
-        true => text.replacen("[gateway]\n", &format!("[gateway]\n{PATIENT}"), 1),
-        false => text,
+    if text.contains("[modbus_tcp]") && !text.contains("\nstale_after = ") {
+        text.replacen("[gateway]\n", &format!("[gateway]\n{PATIENT}"), 1)
+    } else {
+        text
     }
 }
 

@@ -209,9 +209,10 @@ fn a_drive_that_is_off_takes_no_connection_from_the_others() {
         for _ in 0..20 {
             let of_dead = |seen: &Seen| matches!(seen, Seen::Sent(asked) if asked.drive == 1);
             let over = |seen: &Seen| matches!(seen, Seen::Over(asked) if asked.drive == 1);
-            let closed = match in_mid_exchange {
-                true => close_on(&mut rig, of_dead, true),
-                false => close_on(&mut rig, over, false),
+            let closed = if in_mid_exchange {
+                close_on(&mut rig, of_dead, true)
+            } else {
+                close_on(&mut rig, over, false)
             };
             assert_ne!(closed, Closed::Lost);
             assert_eq!(rig.state(1), State::Ready);

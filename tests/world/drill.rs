@@ -191,9 +191,10 @@ fn a_standstill_that_was_not_read_in_time_is_not_proven() {
         }
         let since = *silent.get_or_insert(rig.now);
         let lost = rig.now < since + LIMIT + 3 * SECOND;
-        rig.set_faults(match lost {
-            true => FaultPlan::new("drop=1.0".parse().unwrap(), 1),
-            false => FaultPlan::default(),
+        rig.set_faults(if lost {
+            FaultPlan::new("drop=1.0".parse().unwrap(), 1)
+        } else {
+            FaultPlan::default()
         });
         if !lost && turns(rig) {
             rig.with_drive(1, |drive, _| drive.trip(9));

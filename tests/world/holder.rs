@@ -31,8 +31,8 @@ const RANKS: [usize; 6] = [2, 1, 3, 0, 2, usize::MAX];
 
 /// The drives of every second world are guarded as well: that changes who is refused with what, and nothing of who holds.
 fn works(guarded: bool) -> Line {
-    let spec: fn(&mut DriveSpec) = match guarded {
-        true => |spec| {
+    let spec: fn(&mut DriveSpec) = if guarded {
+        |spec| {
             spec.guard = Some(Guard {
                 starts_per_hour: Some(60),
                 min_off: SECOND,
@@ -40,8 +40,9 @@ fn works(guarded: bool) -> Line {
                 stagger: Duration::from_millis(500),
             });
             spec.staggers = true;
-        },
-        false => |_| {},
+        }
+    } else {
+        |_| {}
     };
     Line {
         cycle: Duration::from_millis(100),

@@ -189,9 +189,10 @@ impl ToolRig {
             &mut frame,
         );
         assert!(!frame.is_empty(), "{pdu:?}");
-        let patience = match self.dice.chance(self.impatient) {
-            true => Duration::from_millis(self.dice.within(1..=40)),
-            false => TIMEOUT,
+        let patience = if self.dice.chance(self.impatient) {
+            Duration::from_millis(self.dice.within(1..=40))
+        } else {
+            TIMEOUT
         };
         self.figures.asked += 1;
         let now = self.rig.now;

@@ -253,9 +253,10 @@ impl Play {
             self.rig.now,
         );
         self.rig.bus.command_came(self.rig.now);
-        match stop {
-            true => self.stops.push((placed, self.rig.now)),
-            false => self.orders.push(placed),
+        if stop {
+            self.stops.push((placed, self.rig.now))
+        } else {
+            self.orders.push(placed)
         }
     }
 

@@ -189,13 +189,14 @@ fn forty_four_drives_are_stopped_as_fast_as_the_line_can() {
     const MANY: u8 = 44;
     for monitored in [false, true] {
         let works = Line {
-            spec: match monitored {
-                true => |spec| {
+            spec: if monitored {
+                |spec| {
                     if spec.address == MANY {
                         spec.access = Access::Monitor;
                     }
-                },
-                false => |_| {},
+                }
+            } else {
+                |_| {}
             },
             ..line("vacon-nx", Protocol::ModbusRtu, 19_200, MANY)
         };

@@ -74,14 +74,15 @@ pub fn decode(bytes: &[u8]) -> Option<Npdu<'_>> {
             Some((network, mac, *hops))
         }
     };
-    let payload = match control & 0x80 != 0 {
-        false => Payload::Application(rest),
-        true => match rest {
+    let payload = if control & 0x80 != 0 {
+        match rest {
             // Proprietary message types carry a vendor identifier before their content.
             [kind @ 0x80..=0xFF, _, _, rest @ ..] => Payload::Network(*kind, rest),
             [kind @ 0..=0x7F, rest @ ..] => Payload::Network(*kind, rest),
             _ => return None,
-        },
+        }
+    } else {
+        Payload::Application(rest)
     };
     Some(Npdu {
         to,

@@ -58,9 +58,10 @@ impl Range {
             return Ok(Range(None));
         };
         let high = reader.context_u32(1)?;
-        match low <= high && high <= crate::types::WILDCARD {
-            true => Ok(Range(Some((low, high)))),
-            false => Err(Reject::ParameterOutOfRange),
+        if low <= high && high <= crate::types::WILDCARD {
+            Ok(Range(Some((low, high))))
+        } else {
+            Err(Reject::ParameterOutOfRange)
         }
     }
 }
@@ -92,9 +93,10 @@ pub enum Sought {
 pub fn who_has(data: &[u8]) -> Read<(Range, Sought)> {
     let mut reader = Reader::new(data);
     let range = Range::read(&mut reader)?;
-    let sought = match reader.is_context(2) {
-        true => Sought::Object(reader.context_object(2)?),
-        false => Sought::Name(text_of(reader.context(3)?)?),
+    let sought = if reader.is_context(2) {
+        Sought::Object(reader.context_object(2)?)
+    } else {
+        Sought::Name(text_of(reader.context(3)?)?)
     };
     reader.end()?;
     Ok((range, sought))
@@ -139,9 +141,10 @@ pub fn read_property_multiple(data: &[u8]) -> Read<Vec<(ObjectId, Vec<PropertyRe
         }
         all.push((object, properties));
     }
-    match all.is_empty() {
-        true => Err(Reject::MissingRequiredParameter),
-        false => Ok(all),
+    if all.is_empty() {
+        Err(Reject::MissingRequiredParameter)
+    } else {
+        Ok(all)
     }
 }
 
@@ -200,9 +203,10 @@ pub fn write_property_multiple(data: &[u8]) -> Read<Vec<WriteItem>> {
         }
         reader.close(1)?;
     }
-    match all.is_empty() {
-        true => Err(Reject::MissingRequiredParameter),
-        false => Ok(all),
+    if all.is_empty() {
+        Err(Reject::MissingRequiredParameter)
+    } else {
+        Ok(all)
     }
 }
 

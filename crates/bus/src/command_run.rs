@@ -481,9 +481,10 @@ impl CommandRun {
         if let Some(run) = self.parameter().filter(|_| step.purpose == StepPurpose::Execute) {
             run.written();
         }
-        let sent = match step.pdu.is_write() || self.urgency == Urgency::Read {
-            true => OnWire::Command,
-            false => OnWire::Reads,
+        let sent = if step.pdu.is_write() || self.urgency == Urgency::Read {
+            OnWire::Command
+        } else {
+            OnWire::Reads
         };
         self.on_wire = self.on_wire.max(sent);
         if step.pdu.is_write() {

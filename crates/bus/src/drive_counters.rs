@@ -61,12 +61,11 @@ impl DriveCounters {
                 State::Idle(_, counted) => {
                     let online = bus.image.drives.of(*drive).snapshot().link.is_online();
                     let counted = std::mem::take(counted);
-                    match online && diagnosis.has_errors(*drive) {
-                        true => {
-                            let answer = ask(bus, *drive, &counted, now);
-                            State::Reading(counted, answer)
-                        }
-                        false => State::Idle(now + AGAIN, counted),
+                    if online && diagnosis.has_errors(*drive) {
+                        let answer = ask(bus, *drive, &counted, now);
+                        State::Reading(counted, answer)
+                    } else {
+                        State::Idle(now + AGAIN, counted)
                     }
                 }
                 State::Reading(counted, answer) => match answer.try_recv() {

@@ -266,9 +266,10 @@ impl Worker {
             let Err(lost) = core.serve(self, &line) else {
                 return Ok(());
             };
-            let closed = match lost.closed {
-                true => core.closed(Instant::now()),
-                false => Closed::Lost,
+            let closed = if lost.closed {
+                core.closed(Instant::now())
+            } else {
+                Closed::Lost
             };
             // Some servers accept a single connection, so the old one is closed first.
             drop(line);

@@ -307,10 +307,13 @@ impl Master {
             .chain(self.waits.strangers.values());
         self.late_before = self.waits.n2_late.may_come(now) || late.any(|late| late.may_come(now));
         let n2 = !self.waits.sessions.is_empty();
-        let is_alike = |(of, answered): &(Target, RequestPdu)| match n2 {
-            // An N2 reply does not even show its drive.
-            true => n2_look_alike(answered, &turn.pdu),
-            false => *of == turn.target() && are_alike(answered, &turn.pdu),
+        let is_alike = |(of, answered): &(Target, RequestPdu)| {
+            if n2 {
+                // An N2 reply does not even show its drive.
+                n2_look_alike(answered, &turn.pdu)
+            } else {
+                *of == turn.target() && are_alike(answered, &turn.pdu)
+            }
         };
         Sending {
             silence: self.silence_of(turn),

@@ -129,9 +129,10 @@ impl N2Sessions {
     /// was just identified.
     pub fn transaction_ended(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
-            return match self.drives.is_empty() {
-                true => Progress::Going,
-                false => Progress::Failed,
+            return if self.drives.is_empty() {
+                Progress::Going
+            } else {
+                Progress::Failed
             };
         }
         let Some(drive) = self.drives.get_mut(drive) else {

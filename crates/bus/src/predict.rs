@@ -440,9 +440,10 @@ impl Shortage {
             ));
         }
         let remedies: Vec<String> = self.remedies.iter().map(Remedy::to_string).collect();
-        let remedy = match remedies.is_empty() {
-            true => "use fewer drives or longer cycles".to_string(),
-            false => remedies.join(", or "),
+        let remedy = if remedies.is_empty() {
+            "use fewer drives or longer cycles".to_string()
+        } else {
+            remedies.join(", or ")
         };
         let (cadences, rounds) = (cadences.join(" and "), rounds.join(", "));
         Finding::new(format!("the line cannot carry {cadences}: {rounds}"), remedy)

@@ -67,9 +67,10 @@ impl Counterexample {
         let Counterexample {
             what, state, command, ..
         } = self;
-        match frames.is_empty() {
-            true => format!("{what} (drive {state}; command {command})"),
-            false => format!("{what} (drive {state}; command {command}; {frames})"),
+        if frames.is_empty() {
+            format!("{what} (drive {state}; command {command})")
+        } else {
+            format!("{what} (drive {state}; command {command}; {frames})")
         }
     }
 }
@@ -544,9 +545,10 @@ impl<'p> Case<'p> {
     }
 
     fn wrong(&self, what: &str, progress: &Progress<'p>) -> Box<Counterexample> {
-        let known = match self.known {
-            true => "",
-            false => "; the gateway does not know its control word",
+        let known = if self.known {
+            ""
+        } else {
+            "; the gateway does not know its control word"
         };
         let sets = self.sets.iter().map(|(point, on)| format!("{} = {on}", point.name()));
         let command = match &self.order {

@@ -231,9 +231,10 @@ impl Refresh {
         };
         let ordered = self.repeated.ordered;
         let by_reference = self.is_fed_by_reference(control, repeats);
-        let fits = match by_reference {
-            true => ordered.reference.is_some(),
-            false => ordered.word.is_some_and(|word| word & !control.known_bits() == 0),
+        let fits = if by_reference {
+            ordered.reference.is_some()
+        } else {
+            ordered.word.is_some_and(|word| word & !control.known_bits() == 0)
         };
         let due = ordered.fed.unwrap_or(now) + every;
         // Orders that only set a reference do not change the observed state of the motor, however often they come.

@@ -325,9 +325,10 @@ fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict 
     let (low, high) = (around.0.min(around.1), around.0.max(around.1));
     let count = |point: &Point| point.raw().map_or(0.0, |raw| raw.scale.abs());
     let most = low.abs().max(high.abs()).max(monitored.abs());
-    let slack = match is_code(point) {
-        true => 0.0,
-        false => (most * TOLERANCE).max(COUNTS * count(point).max(count(monitor))),
+    let slack = if is_code(point) {
+        0.0
+    } else {
+        (most * TOLERANCE).max(COUNTS * count(point).max(count(monitor)))
     };
     if (low - slack..=high + slack).contains(&monitored) {
         let least = low.abs().min(high.abs()).min(monitored.abs());
@@ -338,9 +339,10 @@ fn compare(of: (&Point, &Point), around: (f64, f64), monitored: f64) -> Verdict 
         };
     }
     // A register that only other documents name, and that reads 0, is perhaps not there.
-    match monitored == 0.0 && !monitor.verified {
-        true => Verdict::Nothing,
-        false => Verdict::Differs,
+    if monitored == 0.0 && !monitor.verified {
+        Verdict::Nothing
+    } else {
+        Verdict::Differs
     }
 }
 

@@ -244,10 +244,13 @@ impl Transaction {
                     self.state = Received::Open;
                     continue;
                 }
-                Taken::Doubtful => match self.awaits_another() {
-                    true if self.held.is_none() && self.hold_doubtful() => return self.on_time(now),
-                    _ => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
-                },
+                Taken::Doubtful => {
+                    return if self.awaits_another() && self.held.is_none() && self.hold_doubtful() {
+                        self.on_time(now)
+                    } else {
+                        Step::Done(Ended::Corrupt(MAY_BE_LATE))
+                    };
+                }
             }
             match self.protocol.decode(&self.request, &self.received) {
                 Decoded::Reply { .. } if self.may_go_on() => {

@@ -56,9 +56,10 @@ impl Access {
             return Ok(());
         };
         let token = tokens.find(bearer(headers)?).ok_or(AccessError::UnknownToken)?;
-        match token.scopes.contains(&scope) {
-            true => Ok(()),
-            false => Err(AccessError::MissingScope(scope)),
+        if token.scopes.contains(&scope) {
+            Ok(())
+        } else {
+            Err(AccessError::MissingScope(scope))
         }
     }
 
@@ -103,9 +104,10 @@ fn bearer(headers: &HeaderMap) -> Result<&str, AccessError> {
         .ok()
         .and_then(|text| text.split_once(' '))
         .ok_or(AccessError::NoToken)?;
-    match scheme.eq_ignore_ascii_case("bearer") {
-        true => Ok(token.trim()),
-        false => Err(AccessError::NoToken),
+    if scheme.eq_ignore_ascii_case("bearer") {
+        Ok(token.trim())
+    } else {
+        Err(AccessError::NoToken)
     }
 }
 

@@ -90,8 +90,9 @@ impl<C: Credential> Credentials<C> {
 /// A name that a token or a user can have.
 pub(super) fn checked_name(name: &str) -> Result<String, CredentialError> {
     let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    match !name.is_empty() && name.len() <= 64 && name.chars().all(sound) {
-        true => Ok(name.to_string()),
-        false => Err(CredentialError::Name(name.chars().take(64).collect())),
+    if !name.is_empty() && name.len() <= 64 && name.chars().all(sound) {
+        Ok(name.to_string())
+    } else {
+        Err(CredentialError::Name(name.chars().take(64).collect()))
     }
 }

@@ -326,23 +326,22 @@ impl HttpConnections {
         );
         let ended = tokio::select! {
             ended = connection.as_mut() => ended,
-            () = ended(place.closing(), &terms.replaced) => match place.is_in_use() {
-                true => {
-                    connection.as_mut().graceful_shutdown();
-                    commands.close();
-                    let last = async {
-                        let answered = timeout(ANSWERED_WITHIN, commands.wait());
-                        // The wait has ended by cancellation or by new terms; both are handled here.
-                        let _ = self.stopping.run_until_cancelled(answered).await;
-                        tokio::time::sleep(GRACE).await;
-                    };
-                    tokio::select! {
-                        ended = connection => ended,
-                        () = last => Ok(()),
-                    }
+            () = ended(place.closing(), &terms.replaced) => if place.is_in_use() {
+                connection.as_mut().graceful_shutdown();
+                commands.close();
+                let last = async {
+                    let answered = timeout(ANSWERED_WITHIN, commands.wait());
+                    // The wait has ended by cancellation or by new terms; both are handled here.
+                    let _ = self.stopping.run_until_cancelled(answered).await;
+                    tokio::time::sleep(GRACE).await;
+                };
+                tokio::select! {
+                    ended = connection => ended,
+                    () = last => Ok(()),
                 }
+            } else {
                 // No request is in progress, so there is no reply to finish.
-                false => Ok(()),
+                Ok(())
             }
         };
         // Clients that disconnect or send invalid data are normal operation.

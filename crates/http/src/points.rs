@@ -148,9 +148,12 @@ async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin
         quality: if value.is_some() { Quality::Good } else { Quality::Bad },
         at: None,
     };
-    PointValue::new(point, &sample, || match was_read {
-        true => NO_NUMBER.to_string(),
-        false => outcome.to_string(),
+    PointValue::new(point, &sample, || {
+        if was_read {
+            NO_NUMBER.to_string()
+        } else {
+            outcome.to_string()
+        }
     })
 }
 

@@ -303,9 +303,10 @@ async fn guard(
     let is_on = app.operating.is_on() || (is_local && !operating::is_session(path));
     // A command from an address of a user is also served on the reserved connections.
     let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
-    let access = match is_local {
-        true => Ok(()),
-        false => reached.access.check(request.uri(), request.headers(), reached.address),
+    let access = if is_local {
+        Ok(())
+    } else {
+        reached.access.check(request.uri(), request.headers(), reached.address)
     };
     let refusal = match access {
         Ok(()) => None,
@@ -322,9 +323,10 @@ async fn guard(
     } else if (is_on && operating::may_change(method, path)) || (is_local && path == RELOAD) {
         next.run(request).await
     } else if !matches!(*method, Method::GET | Method::HEAD) {
-        let text = match is_on {
-            true => "this is read-only: use GET or HEAD",
-            false => "this interface is read-only: use GET or HEAD",
+        let text = if is_on {
+            "this is read-only: use GET or HEAD"
+        } else {
+            "this interface is read-only: use GET or HEAD"
         };
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
         (allow, replies::refused(StatusCode::METHOD_NOT_ALLOWED, text)).into_response()

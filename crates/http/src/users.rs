@@ -141,12 +141,13 @@ impl FromStr for User {
         let (Some(name), Some(hash), None) = (words.next(), words.next(), words.next()) else {
             return Err(FORM);
         };
-        match is_affordable(hash) {
-            true => Ok(User {
+        if is_affordable(hash) {
+            Ok(User {
                 name: checked_name(name)?,
                 hash: hash.to_string(),
-            }),
-            false => Err(NOT_A_HASH),
+            })
+        } else {
+            Err(NOT_A_HASH)
         }
     }
 }

@@ -88,9 +88,10 @@ fn steps(port: &Path) -> Vec<(PathBuf, PathBuf)> {
 fn step(path: &Path) -> Option<(PathBuf, PathBuf)> {
     let mut name = path.file_name()?;
     for directory in path.ancestors().skip(1) {
-        let directory = match directory.as_os_str().is_empty() {
-            true => Path::new("."),
-            false => directory,
+        let directory = if directory.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            directory
         };
         if directory.is_dir() {
             return Some((directory.to_path_buf(), PathBuf::from(name)));

@@ -387,10 +387,13 @@ fn read_greeting(one: &mut Pending) -> Greeting {
             one.said.extend(byte);
             Greeting::Text
         }
-        Err(error) if error.kind() == io::ErrorKind::WouldBlock => match one.said.is_empty() {
-            true => Greeting::Nothing,
-            false => Greeting::Text,
-        },
+        Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+            if one.said.is_empty() {
+                Greeting::Nothing
+            } else {
+                Greeting::Text
+            }
+        }
         Err(_) => Greeting::Gone,
     }
 }

@@ -96,9 +96,12 @@ impl Names {
                 asked.and_then(|asked| self.wait(asked, self.patience, go_on))
             }
         };
-        let found = found.and_then(|found| match found.is_empty() {
-            true => Err(io::Error::new(io::ErrorKind::NotFound, "the name has no address")),
-            false => Ok(found),
+        let found = found.and_then(|found| {
+            if found.is_empty() {
+                Err(io::Error::new(io::ErrorKind::NotFound, "the name has no address"))
+            } else {
+                Ok(found)
+            }
         });
         match found {
             Ok(found) => {

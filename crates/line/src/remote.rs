@@ -162,11 +162,12 @@ impl Remote {
             remote.receive(&mut buffer).map_err(|lost| failed(lost.why))?;
         }
         let (took, asked) = (remote.session.borrow().took(), settings.format.to_string());
-        let warnings = match took == asked {
-            true => Vec::new(),
-            false => vec![format!(
+        let warnings = if took == asked {
+            Vec::new()
+        } else {
+            vec![format!(
                 "{port} reports {took} instead of {asked}; check that the device server supports it"
-            )],
+            )]
         };
         Ok((remote, warnings))
     }

@@ -54,9 +54,10 @@ fn differences(asked: &SerialRs485, took: &SerialRs485) -> Vec<String> {
     if has(RTS_ON_SEND) == has(RTS_AFTER_SEND) {
         found.push("RTS has the same level while sending and receiving, so the direction is not switched".to_string());
     } else if changed(RTS_ON_SEND) {
-        let (level, key) = match has(RTS_ON_SEND) {
-            true => ("high", "kernel"),
-            false => ("low", "kernel-inverted"),
+        let (level, key) = if has(RTS_ON_SEND) {
+            ("high", "kernel")
+        } else {
+            ("low", "kernel-inverted")
         };
         found.push(format!("RTS is {level} while sending, which is rs485 = \"{key}\""));
     }
@@ -73,15 +74,17 @@ fn differences(asked: &SerialRs485, took: &SerialRs485) -> Vec<String> {
         }
     }
     if changed(RX_DURING_TX) {
-        found.push(match has(RX_DURING_TX) {
-            true => "it receives what it sends (rx_during_tx)".to_string(),
-            false => "it receives nothing while it sends (rx_during_tx)".to_string(),
+        found.push(if has(RX_DURING_TX) {
+            "it receives what it sends (rx_during_tx)".to_string()
+        } else {
+            "it receives nothing while it sends (rx_during_tx)".to_string()
         });
     }
     if changed(TERMINATE_BUS) {
-        found.push(match has(TERMINATE_BUS) {
-            true => "the terminating resistor stays on (termination)".to_string(),
-            false => "it has no terminating resistor to switch on (termination): fit one".to_string(),
+        found.push(if has(TERMINATE_BUS) {
+            "the terminating resistor stays on (termination)".to_string()
+        } else {
+            "it has no terminating resistor to switch on (termination): fit one".to_string()
         });
     }
     found

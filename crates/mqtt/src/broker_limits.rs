@@ -101,9 +101,10 @@ impl WillForm {
 
     /// The last will in this form.
     pub(super) fn will(self, will: Will) -> LastWill {
-        let qos = match self.unacknowledged {
-            true => QoS::AtMostOnce,
-            false => QoS::AtLeastOnce,
+        let qos = if self.unacknowledged {
+            QoS::AtMostOnce
+        } else {
+            QoS::AtLeastOnce
         };
         LastWill::new(will.topic, will.payload, qos, will.retain && !self.not_retained, None)
     }

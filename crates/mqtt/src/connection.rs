@@ -185,9 +185,10 @@ impl Connection {
             Step::Subscribed(_) if self.silence.answered() => Step::Nothing,
             Step::Subscribed(answers) => {
                 self.answers.extend(answers);
-                match self.answers.len() < self.wanted {
-                    true => Step::Nothing,
-                    false => Step::Subscribed(std::mem::take(&mut self.answers)),
+                if self.answers.len() < self.wanted {
+                    Step::Nothing
+                } else {
+                    Step::Subscribed(std::mem::take(&mut self.answers))
                 }
             }
             event => event,
@@ -240,9 +241,10 @@ impl Connection {
             message_expiry_interval: message.expiry,
             ..PublishProperties::default()
         };
-        let qos = match message.acknowledged && limits.acknowledges {
-            true => QoS::AtLeastOnce,
-            false => QoS::AtMostOnce,
+        let qos = if message.acknowledged && limits.acknowledges {
+            QoS::AtLeastOnce
+        } else {
+            QoS::AtMostOnce
         };
         let retain = message.retain && limits.retains;
         let known = alias.is_some_and(|(_, known)| known);
@@ -268,18 +270,20 @@ impl Connection {
     /// Disconnects in order, so that the broker does not publish the last will. Messages that the broker does not
     /// acknowledge are sent before.
     pub(super) fn disconnect(&self, limits: BrokerLimits) -> bool {
-        match limits.acknowledges {
-            true => self.client.try_disconnect_now().is_ok(),
-            false => self.client.try_disconnect().is_ok(),
+        if limits.acknowledges {
+            self.client.try_disconnect_now().is_ok()
+        } else {
+            self.client.try_disconnect().is_ok()
         }
     }
 
     /// Ends the connection without waiting, and sends the broker the reason if it still reads. The last will is
     /// published if it is `true_now`, that is, if other clients still assume that the gateway is online.
     pub(super) fn give_up(mut self, why: &str, true_now: bool) {
-        let reason = match true_now {
-            true => DisconnectReasonCode::DisconnectWithWillMessage,
-            false => DisconnectReasonCode::NormalDisconnection,
+        let reason = if true_now {
+            DisconnectReasonCode::DisconnectWithWillMessage
+        } else {
+            DisconnectReasonCode::NormalDisconnection
         };
         let properties = DisconnectProperties {
             session_expiry_interval: None,

@@ -92,9 +92,10 @@ impl Recorder {
     pub(super) fn ripe(&mut self, now: Instant) -> Vec<Update> {
         let old = |begun| now.saturating_duration_since(begun) >= COMPLETE;
         let complete = self.entries >= ENTRIES || self.array.len() >= BYTES || self.begun.is_some_and(old);
-        match complete {
-            true => self.take_all(),
-            false => std::mem::take(&mut self.complete),
+        if complete {
+            self.take_all()
+        } else {
+            std::mem::take(&mut self.complete)
         }
     }
 

@@ -208,10 +208,13 @@ impl BrokerLink {
             {
                 Due::GiveUp("the broker does not reply to the subscription")
             }
-            State::Up(connection, phase) => match connection.is_silent(phase.limits().copied(), now) {
-                true => Due::GiveUp("the broker is silent"),
-                false => Due::Nothing,
-            },
+            State::Up(connection, phase) => {
+                if connection.is_silent(phase.limits().copied(), now) {
+                    Due::GiveUp("the broker is silent")
+                } else {
+                    Due::Nothing
+                }
+            }
         }
     }
 
@@ -323,13 +326,15 @@ impl BrokerLink {
             .get_mut(place)
             .is_some_and(|outages| outages.permit(kind, now))
         {
-            let hint = match why.contains("SessionTakenOver") {
-                true => "; another client has the same client id: give each gateway its own name or `client_id`",
-                false => "",
+            let hint = if why.contains("SessionTakenOver") {
+                "; another client has the same client id: give each gateway its own name or `client_id`"
+            } else {
+                ""
             };
-            let next = match self.rotation.is_single() {
-                true => "reconnecting".to_string(),
-                false => format!("the next one is {}", self.broker()),
+            let next = if self.rotation.is_single() {
+                "reconnecting".to_string()
+            } else {
+                format!("the next one is {}", self.broker())
             };
             tracing::warn!(target: "drivegate::north::mqtt", "{prefix}no connection to the broker at {broker}: {why}{hint}; {next}");
         } else {

@@ -274,9 +274,10 @@ impl Outbox {
     /// Number of messages of this kind that may be loaded from disk now.
     pub(super) fn room(&self, kind: MqttKind) -> usize {
         let queue = self.queue(kind);
-        match queue.bytes < LOADED_BYTES {
-            true => LOADED.saturating_sub(queue.entries.len()),
-            false => 0,
+        if queue.bytes < LOADED_BYTES {
+            LOADED.saturating_sub(queue.entries.len())
+        } else {
+            0
         }
     }
 

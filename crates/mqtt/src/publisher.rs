@@ -208,9 +208,10 @@ impl Publisher {
 
     /// The topics to clear, once per connection.
     pub(super) fn cleared(&mut self) -> Vec<Arc<str>> {
-        match std::mem::replace(&mut self.vanished_cleared, true) {
-            true => Vec::new(),
-            false => self.vanished.iter().cloned().collect(),
+        if std::mem::replace(&mut self.vanished_cleared, true) {
+            Vec::new()
+        } else {
+            self.vanished.iter().cloned().collect()
         }
     }
 

@@ -17,9 +17,10 @@ pub(super) fn refusal(error: &ConnectionError) -> String {
         ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(io))) if is_of_tls(io) => reason(error),
         ConnectionError::Io(io)
         | ConnectionError::MqttState(StateError::Io(io) | StateError::Deserialization(PacketError::Io(io))) => {
-            match is_closed(error) {
-                true => format!("{io}: the broker did not accept the connection; {SCHEME}"),
-                false => format!("there is no MQTT at this port ({io}); {SCHEME}"),
+            if is_closed(error) {
+                format!("{io}: the broker did not accept the connection; {SCHEME}")
+            } else {
+                format!("there is no MQTT at this port ({io}); {SCHEME}")
             }
         }
         ConnectionError::Timeout(_) => format!("timed out: the broker did not accept the connection; {SCHEME}"),

@@ -138,9 +138,10 @@ pub struct Rights(Arc<AtomicBool>);
 impl Rights {
     /// The present authority of the client.
     pub(super) fn authority(&self) -> Authority {
-        match self.0.load(Ordering::Relaxed) {
-            true => Authority::Write,
-            false => Authority::ReadOnly,
+        if self.0.load(Ordering::Relaxed) {
+            Authority::Write
+        } else {
+            Authority::ReadOnly
         }
     }
 

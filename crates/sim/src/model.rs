@@ -41,10 +41,7 @@ impl Command {
 
     /// A frequency with the sign of the direction.
     pub(super) fn directed(self, frequency: f64) -> f64 {
-        match self.is_reverse() {
-            true => -frequency,
-            false => frequency,
-        }
+        if self.is_reverse() { -frequency } else { frequency }
     }
 }
 
@@ -102,10 +99,12 @@ impl Body {
 
     /// What feeds the motor of a healthy drive: its target while it runs, then the ramp down to standstill.
     pub(super) fn feed(&self, target: f64) -> Feed {
-        match self.motor.fed && self.motor.output != 0.0 {
-            _ if self.running => Feed::To(target),
-            true => Feed::To(0.0),
-            false => Feed::Off,
+        if self.running {
+            Feed::To(target)
+        } else if self.motor.fed && self.motor.output != 0.0 {
+            Feed::To(0.0)
+        } else {
+            Feed::Off
         }
     }
 

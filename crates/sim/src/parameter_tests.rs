@@ -176,9 +176,10 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
         // The counters are read one after the other, and count these reads too.
         let (received, own) = (known.len() + 1, known.len() + 4);
         let of = format!("{received} messages received, 0 damaged, {own} to this drive");
-        match profile.counts_messages {
-            true => assert!(file.counters.starts_with(&of), "{}: {}", profile.name, file.counters),
-            false => assert_eq!(file.counters, "", "{}", profile.name),
+        if profile.counts_messages {
+            assert!(file.counters.starts_with(&of), "{}: {}", profile.name, file.counters);
+        } else {
+            assert_eq!(file.counters, "", "{}", profile.name);
         }
         assert_eq!(ParameterFile::parse(&file.text()), Ok(file.clone()), "{}", profile.name);
 

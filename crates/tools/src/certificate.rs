@@ -47,9 +47,10 @@ enum Action {
 }
 
 fn host(text: &str) -> Result<String, String> {
-    match is_host(text) {
-        true => Ok(text.trim_start_matches('[').trim_end_matches(']').to_string()),
-        false => Err("it is not a host name or an address; write it without scheme and port".to_string()),
+    if is_host(text) {
+        Ok(text.trim_start_matches('[').trim_end_matches(']').to_string())
+    } else {
+        Err("it is not a host name or an address; write it without scheme and port".to_string())
     }
 }
 

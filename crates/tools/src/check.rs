@@ -108,9 +108,10 @@ pub(super) fn run(args: &Args) -> Outcome {
     if let Some(settings) = &loaded.settings {
         loaded.warnings.extend(orphaned_journals(settings));
         loaded.warnings.extend(unproven_stops(settings));
-        let capable = match args.as_service {
-            true => as_service::may_listen_on_privileged_ports(),
-            false => privileged::may(),
+        let capable = if args.as_service {
+            as_service::may_listen_on_privileged_ports()
+        } else {
+            privileged::may()
         };
         loaded.warnings.extend(privileged::problems(path, settings, capable));
     }
@@ -450,12 +451,11 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         demand if demand > 1.0 => format!(" (the configured cycles would need {:.0} %)", demand * 100.0),
         _ => String::new(),
     };
-    let behind = match bus.spec.port.starts_with("tcp://") {
-        true => {
-            "  baud        used only for timing, not set in the device server; `drivegate diagnose` reports replies \
-             that come\n              too soon, and which rate fits\n"
-        }
-        false => "",
+    let behind = if bus.spec.port.starts_with("tcp://") {
+        "  baud        used only for timing, not set in the device server; `drivegate diagnose` reports replies \
+         that come\n              too soon, and which rate fits\n"
+    } else {
+        ""
     };
     cycle("fast", prediction.fast_cycle, bus.spec.cycle)
         + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)

@@ -88,9 +88,10 @@ pub(crate) struct NotFound {
 impl NotFound {
     fn describe(&self) -> String {
         let reasons: Vec<&str> = self.closed.iter().chain(&self.others).map(String::as_str).collect();
-        let why = match reasons.is_empty() {
-            true => "no gateway listens".to_string(),
-            false => reasons.join(", "),
+        let why = if reasons.is_empty() {
+            "no gateway listens".to_string()
+        } else {
+            reasons.join(", ")
         };
         match &self.file {
             Some(file) => format!("{why}; {}", file.display()),

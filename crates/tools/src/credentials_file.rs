@@ -67,9 +67,10 @@ impl<C: Filed> CredentialsFile<C> {
         let (mut is_known, line) = (false, new.to_string());
         self.change(|text| {
             is_known = parsed::<C>(&self.path, text)?.named(new.name()).is_some();
-            let text = match is_known && may_replace {
-                true => replaced(text, new.name(), Some(&line)),
-                false => with_line(text, &line),
+            let text = if is_known && may_replace {
+                replaced(text, new.name(), Some(&line))
+            } else {
+                with_line(text, &line)
             };
             let remedy = if is_known { "choose another name" } else { "remove one" };
             match Credentials::<C>::parse(&text) {
@@ -103,9 +104,10 @@ impl<C: Filed> CredentialsFile<C> {
         // A symbolic link is kept: the file that it points to is changed.
         let file = self.path.canonicalize().unwrap_or_else(|_| self.path.clone());
         let _lock = self.lock(&file)?;
-        let text = match self.path.exists() {
-            true => self.read()?,
-            false => String::new(),
+        let text = if self.path.exists() {
+            self.read()?
+        } else {
+            String::new()
         };
         self.write(&file, &change(&text)?)
     }
@@ -201,9 +203,12 @@ fn with_line(text: &str, line: &str) -> String {
 
 /// The text with the line of this name replaced by another line, or removed.
 fn replaced(text: &str, name: &str, by: Option<&str>) -> String {
-    let line = |line| match str::split_whitespace(line).next() == Some(name) {
-        true => by,
-        false => Some(line),
+    let line = |line| {
+        if str::split_whitespace(line).next() == Some(name) {
+            by
+        } else {
+            Some(line)
+        }
     };
     text.lines().filter_map(line).flat_map(|line| [line, "\n"]).collect()
 }

@@ -204,10 +204,11 @@ async fn watch(client: &Client, gateway: &Gateway, started: DrillReport) -> Resu
             () = tokio::time::sleep(LOOK) => false,
             () = interrupted() => true,
         };
-        let next = match ends {
-            true => GatewayRequest::delete(path(&now.id))
-                .if_lost("it is unknown whether the drill ended: stop the motor at its switch"),
-            false => GatewayRequest::view(path(&now.id)),
+        let next = if ends {
+            GatewayRequest::delete(path(&now.id))
+                .if_lost("it is unknown whether the drill ended: stop the motor at its switch")
+        } else {
+            GatewayRequest::view(path(&now.id))
         };
         now = asked(client, &next).await?;
     }

@@ -50,9 +50,10 @@ pub(super) fn run(args: &Args) -> Outcome {
             Ok(hold) => hold,
             Err(why) => return documented(args.json, Err(why.into())),
         };
-        let printed = match args.json {
-            true => report::json(&document),
-            false => report::print(&line(&hold)),
+        let printed = if args.json {
+            report::json(&document)
+        } else {
+            report::print(&line(&hold))
         };
         match hold.error {
             None => Ok(printed),

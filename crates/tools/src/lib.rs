@@ -232,8 +232,9 @@ fn profiles_of(dirs: &[PathBuf]) -> Result<Profiles, Failure> {
 
 fn add_profiles(profiles: &mut Profiles, dirs: &[PathBuf]) -> Result<(), Failure> {
     let problems: Vec<_> = dirs.iter().flat_map(|dir| profiles.load(dir)).collect();
-    match problems.is_empty() {
-        true => Ok(()),
-        false => Err(Failure::Invalid(problems)),
+    if problems.is_empty() {
+        Ok(())
+    } else {
+        Err(Failure::Invalid(problems))
     }
 }

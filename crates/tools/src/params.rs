@@ -273,9 +273,10 @@ fn read_written(path: &Path) -> Result<ParameterFile, Failure> {
 
 /// A parameter file if one exists at this path, otherwise the parameters read from the drive with this name.
 fn file_or_drive(gateway: &Gateway, of: &str) -> Result<ParameterFile, Failure> {
-    match Path::new(of).is_file() {
-        true => read_written(Path::new(of)),
-        false => Ok(read_from_drive(gateway, of, ReadParameters::default())?.0),
+    if Path::new(of).is_file() {
+        read_written(Path::new(of))
+    } else {
+        Ok(read_from_drive(gateway, of, ReadParameters::default())?.0)
     }
 }
 
@@ -290,10 +291,7 @@ fn diff(gateway: &Gateway, before: &str, after: &str) -> Outcome {
     let found = differences(&before, &after);
     let text: String = found.iter().map(|difference| difference.line() + "\n").collect();
     let printed = report::print(&text);
-    match found.is_empty() {
-        true => Ok(printed),
-        false => negative(),
-    }
+    if found.is_empty() { Ok(printed) } else { negative() }
 }
 
 fn names(path: Option<&Path>) -> Result<Option<Names>, Failure> {

@@ -236,9 +236,10 @@ fn show(profile: &Profile) -> String {
         ),
         (
             "scan says",
-            match profile.identify.is_empty() {
-                true => String::new(),
-                false => profile.identified.clone(),
+            if profile.identify.is_empty() {
+                String::new()
+            } else {
+                profile.identified.clone()
             },
         ),
         (
@@ -398,9 +399,10 @@ fn remarks(profile: &Profile, point: &Point) -> String {
 
 /// The note that the profile is not tested on hardware; empty otherwise.
 fn unverified(profile: &Profile) -> &'static str {
-    match profile.verified {
-        true => "",
-        false => "no: nobody has confirmed it on hardware yet; docs/verifying.md explains how",
+    if profile.verified {
+        ""
+    } else {
+        "no: nobody has confirmed it on hardware yet; docs/verifying.md explains how"
     }
 }
 

@@ -160,16 +160,15 @@ fn open(args: &Args, id: &str) -> Result<Recording, Failure> {
     if let Some(client) = args.gateway.network().filter(|_| !is_file) {
         return fetched(&client, &args.gateway, id);
     }
-    let path = match is_file {
-        true => PathBuf::from(id),
-        false => {
-            let dir = directory(args)?;
-            let path = store::path_of(&dir, id);
-            if !path.is_file() {
-                return Err(unknown(args, &dir, id)?.into());
-            }
-            path
+    let path = if is_file {
+        PathBuf::from(id)
+    } else {
+        let dir = directory(args)?;
+        let path = store::path_of(&dir, id);
+        if !path.is_file() {
+            return Err(unknown(args, &dir, id)?.into());
         }
+        path
     };
     let unreadable = |error| format!("{error}; choose a recording from `{}`", listing(args));
     Ok(store::read(&path).map_err(unreadable)?)

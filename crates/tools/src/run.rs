@@ -117,9 +117,10 @@ struct Wanted {
 
 impl Wanted {
     fn add(&mut self, signal: SignalKind) {
-        match signal == SignalKind::hangup() {
-            true => self.reload = true,
-            false => self.stop = true,
+        if signal == SignalKind::hangup() {
+            self.reload = true;
+        } else {
+            self.stop = true;
         }
     }
 }

@@ -31,14 +31,12 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> Outcome {
     let outcome = super::block_on(async {
         let stopped = stop_all(args).await?;
-        let printed = match args.json {
-            true => report::json(&stopped),
-            false => report::print(&shown(&stopped)),
+        let printed = if args.json {
+            report::json(&stopped)
+        } else {
+            report::print(&shown(&stopped))
         };
-        match stopped.ok {
-            true => Ok(printed),
-            false => negative(),
-        }
+        if stopped.ok { Ok(printed) } else { negative() }
     });
     documented(args.json, outcome)
 }

@@ -77,9 +77,10 @@ fn add(file: &UsersFile, name: &str) -> Result<String, String> {
     }
     let user =
         User::new(name, &password()?).map_err(|error| format!("{error}; {}; choose another", file.path.display()))?;
-    Ok(match file.put(&user, true)? {
-        true => format!("{name} has a new password; reload the gateway\n"),
-        false => format!("{name} was added; reload the gateway\n{}", lines(&file.path)),
+    Ok(if file.put(&user, true)? {
+        format!("{name} has a new password; reload the gateway\n")
+    } else {
+        format!("{name} was added; reload the gateway\n{}", lines(&file.path))
     })
 }
 
@@ -106,9 +107,10 @@ fn password() -> Result<String, String> {
     }
     let first = typed("Password: ").map_err(failed)?;
     let again = typed("Again: ").map_err(failed)?;
-    match first == again {
-        true => Ok(first),
-        false => Err("the passwords differ; standard input; try again".to_string()),
+    if first == again {
+        Ok(first)
+    } else {
+        Err("the passwords differ; standard input; try again".to_string())
     }
 }
 

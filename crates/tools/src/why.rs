@@ -27,9 +27,10 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let why = why(&args.drive.target()?)?;
-    Ok(report::print(&match args.json {
-        true => serde_json::to_string_pretty(&why).unwrap_or_default() + "\n",
-        false => text(&args.drive.name, &why),
+    Ok(report::print(&if args.json {
+        serde_json::to_string_pretty(&why).unwrap_or_default() + "\n"
+    } else {
+        text(&args.drive.name, &why)
     }))
 }
 

@@ -143,9 +143,10 @@ fn of_profile(profile: &Profile, name: &str, text: &str) -> Result<Setting, Stri
     let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text);
     Ok(Setting {
         point: point.name.clone(),
-        value: match is_meaning {
-            true => text.into(),
-            false => value_or_null(Some(value)),
+        value: if is_meaning {
+            text.into()
+        } else {
+            value_or_null(Some(value))
         },
         shown: shown.trim_end().to_string(),
     })

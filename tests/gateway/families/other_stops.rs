@@ -47,9 +47,10 @@ impl Rig {
             (Way::Alone, _) => self.by_modbus_tcp(&pdu),
             (Way::Block, None) => return false,
             (Way::Block, Some(other)) => {
-                let block = match other < address {
-                    true => Pair(other, 0, word),
-                    false => Pair(address, word, 0),
+                let block = if other < address {
+                    Pair(other, 0, word)
+                } else {
+                    Pair(address, word, 0)
                 };
                 self.by_modbus_tcp(&Raw(block).pdu())
             }

@@ -373,9 +373,12 @@ async fn requests_in_one_segment_keep_their_order() {
     let seen: Vec<String> = rig.bus.orders().iter().map(shown).collect();
     let wanted: Vec<String> = bodies
         .iter()
-        .map(|body| match body.contains("run") {
-            true => "stop".to_string(),
-            false => body.trim_matches(['{', '}']).split(": ").nth(1).unwrap().to_string(),
+        .map(|body| {
+            if body.contains("run") {
+                "stop".to_string()
+            } else {
+                body.trim_matches(['{', '}']).split(": ").nth(1).unwrap().to_string()
+            }
         })
         .collect();
     assert_eq!(seen, wanted);

@@ -307,9 +307,10 @@ fn a_mosquitto_without_qos_1_or_retained_messages_is_served() {
         let broker = Broker::with(&format!("allow_anonymous true\n{settings}"));
         let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
         gateway.wait_connected(true);
-        let said = match settings.contains("retain") {
-            true => "keeps no retained messages",
-            false => "has no QoS 1",
+        let said = if settings.contains("retain") {
+            "keeps no retained messages"
+        } else {
+            "has no QoS 1"
         };
         wait_log(broker.port, said);
         // QoS 0 is used because with more, the clients of mosquitto refuse messages themselves.

@@ -135,9 +135,10 @@ fn command(broker: &Broker, topic: &str, metrics: Json, more: &[&str]) {
 
 fn go(gateway: &Gateway, drive: &str, online: bool) {
     gateway.plant.load().drive(drive).unwrap().image.update(|s| {
-        s.link = match online {
-            true => Link::Online(SystemTime::now()),
-            false => Link::Offline(SystemTime::now()),
+        s.link = if online {
+            Link::Online(SystemTime::now())
+        } else {
+            Link::Offline(SystemTime::now())
         };
     });
 }

@@ -297,9 +297,10 @@ fn writes(profile: &Profile) -> String {
         .iter()
         .map(|(when, ranges)| format!("{}: {when}", ranges.join(", ")))
         .collect();
-    match rules.is_empty() {
-        true => String::new(),
-        false => format!("\nWrites: {}.\n", rules.join("; ")),
+    if rules.is_empty() {
+        String::new()
+    } else {
+        format!("\nWrites: {}.\n", rules.join("; "))
     }
 }
 

@@ -88,9 +88,10 @@ impl World {
             let noisy = self.buses[record.bus].line.is_noisy();
             let most = if noisy { 3 * most } else { most };
             // A stop does not expire: its time limit begins at its turn.
-            let expires = match record.wish.is_stop() {
-                true => record.expires.max(record.accepted + 2 * STOP_TIME),
-                false => record.expires,
+            let expires = if record.wish.is_stop() {
+                record.expires.max(record.accepted + 2 * STOP_TIME)
+            } else {
+                record.expires
             };
             assert!(
                 self.now < expires + most,

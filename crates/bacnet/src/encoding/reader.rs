@@ -41,9 +41,10 @@ impl<'a> Reader<'a> {
     /// # Errors
     /// If bytes are left over.
     pub fn end(&self) -> Read<()> {
-        match self.is_empty() {
-            true => Ok(()),
-            false => Err(Reject::TooManyArguments),
+        if self.is_empty() {
+            Ok(())
+        } else {
+            Err(Reject::TooManyArguments)
         }
     }
 
@@ -96,9 +97,10 @@ impl<'a> Reader<'a> {
             },
             len => usize::from(len),
         };
-        Ok(match context {
-            true => Tag::Context(number, len),
-            false => Tag::App(number, len),
+        Ok(if context {
+            Tag::Context(number, len)
+        } else {
+            Tag::App(number, len)
         })
     }
 
@@ -164,9 +166,10 @@ impl<'a> Reader<'a> {
     /// # Errors
     /// If the encoding is not valid.
     pub fn optional(&mut self, number: u8) -> Read<Option<&'a [u8]>> {
-        match self.is_context(number) {
-            true => self.context(number).map(Some),
-            false => Ok(None),
+        if self.is_context(number) {
+            self.context(number).map(Some)
+        } else {
+            Ok(None)
         }
     }
 

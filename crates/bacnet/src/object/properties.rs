@@ -240,13 +240,13 @@ pub(crate) fn property(
             asked.property,
         ),
     };
-    match known {
-        false => Err(Error::UNKNOWN_PROPERTY),
-        true if asked.index.is_some() => Err(Error::NOT_AN_ARRAY),
-        true => {
-            out.raw(value.bytes());
-            Ok(())
-        }
+    if !known {
+        Err(Error::UNKNOWN_PROPERTY)
+    } else if asked.index.is_some() {
+        Err(Error::NOT_AN_ARRAY)
+    } else {
+        out.raw(value.bytes());
+        Ok(())
     }
 }
 

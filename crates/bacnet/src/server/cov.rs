@@ -110,10 +110,7 @@ impl Cov {
     }
 
     fn most_of_device(&self) -> usize {
-        match self.one_device {
-            true => MOST_OF_HOST,
-            false => MOST_OF_DEVICE,
-        }
+        if self.one_device { MOST_OF_HOST } else { MOST_OF_DEVICE }
     }
 
     /// Adds or renews a subscription; returns false if no room is left.

@@ -68,17 +68,19 @@ impl Server {
             Some(one) => {
                 let mut value = Writer::default();
                 property(&mut value, of, one, &self.environment)?;
-                match value.bytes().len() <= LONGEST {
-                    true => Ok(()),
-                    false => Err(Error::NOT_COV_PROPERTY),
+                if value.bytes().len() <= LONGEST {
+                    Ok(())
+                } else {
+                    Err(Error::NOT_COV_PROPERTY)
                 }
             }
         });
         known.unwrap_or(Err(Error::UNKNOWN_OBJECT))?;
         let increment = asked.property.and_then(|(_, increment)| increment);
-        match self.cov.subscribe(device.instance, key, terms, increment, now) {
-            true => Ok(()),
-            false => Err(Error::NO_SPACE_TO_ADD_LIST_ELEMENT.into()),
+        if self.cov.subscribe(device.instance, key, terms, increment, now) {
+            Ok(())
+        } else {
+            Err(Error::NO_SPACE_TO_ADD_LIST_ELEMENT.into())
         }
     }
 

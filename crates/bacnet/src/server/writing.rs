@@ -168,15 +168,16 @@ impl Server {
                 if *known.request == *data && known.service == service && !stops =>
             {
                 let answer = answer.clone();
-                return match *orders == app.orders(instance) {
-                    true => self.send(from, instance, &answer, now),
-                    false => self.refuse(
+                return if *orders == app.orders(instance) {
+                    self.send(from, instance, &answer, now)
+                } else {
+                    self.refuse(
                         from,
                         device,
                         (invoke, service),
                         Error::SERVICE_REQUEST_DENIED.into(),
                         now,
-                    ),
+                    )
                 };
             }
             _ => {}
@@ -300,9 +301,10 @@ impl Server {
             at: now,
             orders: app.orders(device),
         };
-        match refused {
-            true => self.counters.refused += 1,
-            false => self.counters.done += 1,
+        if refused {
+            self.counters.refused += 1;
+        } else {
+            self.counters.done += 1;
         }
         if !mute {
             self.send(from, device, &answer, now);
@@ -366,9 +368,10 @@ fn stops_first(items: VecDeque<WriteItem>, stops: impl Fn(&WriteItem) -> bool) -
     let mut ordered: Vec<WriteItem> = Vec::with_capacity(items.len());
     for item in items {
         let same = |other: &WriteItem| other.object == item.object;
-        let place = match stops(&item) {
-            true => ordered.iter().rposition(same).map_or(0, |place| place + 1),
-            false => ordered.len(),
+        let place = if stops(&item) {
+            ordered.iter().rposition(same).map_or(0, |place| place + 1)
+        } else {
+            ordered.len()
         };
         ordered.insert(place, item);
     }

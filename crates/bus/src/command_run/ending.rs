@@ -55,9 +55,10 @@ impl CommandRun {
 
     /// Outcome of a command that is withdrawn before it is sent.
     pub fn taken_back(&self) -> Outcome {
-        match self.has_begun() {
-            true => Outcome::Exception(Exception::BUSY),
-            false => Outcome::Withdrawn,
+        if self.has_begun() {
+            Outcome::Exception(Exception::BUSY)
+        } else {
+            Outcome::Withdrawn
         }
     }
 

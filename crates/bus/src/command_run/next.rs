@@ -203,9 +203,10 @@ impl CommandRun {
             && let Word::Sequence(last, _) = *word
         {
             // A sequence of one word must not begin again with its first word.
-            *word = match last.is_first {
-                true => Word::Run(reverse),
-                false => Word::Sequence(last, reverse),
+            *word = if last.is_first {
+                Word::Run(reverse)
+            } else {
+                Word::Sequence(last, reverse)
             };
         }
     }

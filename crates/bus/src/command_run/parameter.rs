@@ -190,14 +190,15 @@ impl ParameterRun {
             return self.asks_running();
         }
         let shown = shown(value);
-        Then::Over(match self.in_doubt {
-            true => Outcome::NotTaken(shown),
-            false => Outcome::Refused(Refusal::OtherValue(format!(
+        Then::Over(if self.in_doubt {
+            Outcome::NotTaken(shown)
+        } else {
+            Outcome::Refused(Refusal::OtherValue(format!(
                 "{shown}, neither its value when the restore started ({}) nor the one to restore ({}): someone \
                  changed it; nothing was written",
                 before.map_or(f64::NAN, RawValue::number),
                 self.order.to.number()
-            ))),
+            )))
         })
     }
 

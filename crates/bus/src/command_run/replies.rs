@@ -182,9 +182,10 @@ impl CommandRun {
 
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
         // The answer to a read does not show whether an earlier write was taken.
-        let refused = match self.in_doubt() {
-            true => self.tries.unanswered.clone(),
-            false => Outcome::Exception(code),
+        let refused = if self.in_doubt() {
+            self.tries.unanswered.clone()
+        } else {
+            Outcome::Exception(code)
         };
         if let Some((table, address)) = self.settings()
             && words.is_reported(table, address)

@@ -214,9 +214,10 @@ impl CommandRun {
 
     /// This outcome, unless an earlier attempt that was not answered determines the outcome.
     pub(super) fn unless_in_doubt(&self, outcome: Outcome) -> Outcome {
-        match self.in_doubt() {
-            true => self.tries.unanswered.clone(),
-            false => outcome,
+        if self.in_doubt() {
+            self.tries.unanswered.clone()
+        } else {
+            outcome
         }
     }
 
@@ -309,9 +310,10 @@ mod tests {
             asked.push((start, count));
             let word = |address| at.iter().find(|(of, _)| *of == address).map_or(0, |(_, word)| *word);
             let words = (start..start + count).map(word);
-            let reply = match table.is_bits() {
-                true => Reply::Bits(words.map(|word| word != 0).collect()),
-                false => Reply::Registers(words.collect()),
+            let reply = if table.is_bits() {
+                Reply::Bits(words.map(|word| word != 0).collect())
+            } else {
+                Reply::Registers(words.collect())
             };
             if look.take_reply(&reply) {
                 return (look.motor(), asked);

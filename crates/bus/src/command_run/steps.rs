@@ -224,9 +224,10 @@ pub(super) fn actions(
             Form::Bit { bit, invert } if point.pulse => {
                 if value.as_bool() {
                     let length = 2 * profile.update_period;
-                    pulses.extend(match is_control {
-                        true => control::pulse(setting_of(&[(bit, !invert)]), length),
-                        false => pulse(raw, bit, invert, length),
+                    pulses.extend(if is_control {
+                        control::pulse(setting_of(&[(bit, !invert)]), length)
+                    } else {
+                        pulse(raw, bit, invert, length)
                     });
                 }
             }
@@ -251,12 +252,13 @@ pub(super) fn actions(
             }
         }
     }
-    let others = words
-        .into_iter()
-        .map(|(place, (raw, changes))| match Some(place) == at {
-            true if raw.table == Table::Holding => Action::Word(Word::Others(setting_of(&changes))),
-            _ => Action::Bits { raw, changes },
-        });
+    let others = words.into_iter().map(|(place, (raw, changes))| {
+        if Some(place) == at && raw.table == Table::Holding {
+            Action::Word(Word::Others(setting_of(&changes)))
+        } else {
+            Action::Bits { raw, changes }
+        }
+    });
     // A stop goes first, a run command last. Without either, nothing is written before a read has shown whether the
     // words may be written.
     let commands = control.actions(profile, stop, stopped);

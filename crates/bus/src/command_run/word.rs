@@ -127,9 +127,10 @@ pub(super) fn made(
         },
     };
     let runs = form == Form::AsItStands;
-    let stays = match runs {
-        true => control.always.applied(base),
-        false => control.resting(base),
+    let stays = if runs {
+        control.always.applied(base)
+    } else {
+        control.resting(base)
     };
     let sent = |place: ControlItem, word: u16| Made::Send(Step::new(StepPurpose::Execute, write(place, word, profile)));
     match word {
@@ -144,10 +145,11 @@ pub(super) fn made(
         Word::Direction(reverse) => match &control.run {
             Run::Pair { forward, reverse: back } => {
                 let run = if reverse { back } else { forward };
-                match runs && run.place.is_none() {
-                    true => sent(at, run.applied(stays)),
+                if runs && run.place.is_none() {
+                    sent(at, run.applied(stays))
+                } else {
                     // While the motor is at standstill, no bit of the drive stores the direction.
-                    false => Made::AtNextStart(reverse),
+                    Made::AtNextStart(reverse)
                 }
             }
             Run::One(_) | Run::Steps(_) => sent(at, control.with_direction(stays, reverse)),

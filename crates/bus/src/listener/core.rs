@@ -98,9 +98,10 @@ impl ListenCore {
     /// Handles a device server that closed the connection. If bytes were received over it, the gateway connects
     /// again at once.
     pub fn closed(&mut self) -> Closed {
-        match std::mem::take(&mut self.heard_any) {
-            true => Closed::Reconnect,
-            false => Closed::Lost,
+        if std::mem::take(&mut self.heard_any) {
+            Closed::Reconnect
+        } else {
+            Closed::Lost
         }
     }
 

@@ -137,9 +137,10 @@ impl Master {
         for passed_on in [!self.passed_on_last, self.passed_on_last] {
             let paces = if passed_on { &Pace::ALL[..1] } else { &Pace::ALL[..] };
             for pace in paces {
-                let begun = match passed_on {
-                    true => self.pass_on(idle, now),
-                    false => self.begin_background(*pace, idle, now),
+                let begun = if passed_on {
+                    self.pass_on(idle, now)
+                } else {
+                    self.begin_background(*pace, idle, now)
                 };
                 match begun {
                     Ok(turn) => {
@@ -317,9 +318,10 @@ impl Master {
         }
         let frame = std::mem::take(&mut end.frame);
         let at = end.at;
-        let outcome = match self.is_broadcast(begun.target()) && end.ended == Ended::Silent {
-            true => Outcome::Acknowledged(Reply::Written),
-            false => self.background_outcome(turn, end, now),
+        let outcome = if self.is_broadcast(begun.target()) && end.ended == Ended::Silent {
+            Outcome::Acknowledged(Reply::Written)
+        } else {
+            self.background_outcome(turn, end, now)
         };
         if begun.passed_on().is_some_and(|passed_on| passed_on.may_write) {
             self.unchecked_write(&begun, turn, &outcome, now);
@@ -429,9 +431,10 @@ impl Master {
         // The reply to an earlier try shows the value of that time.
         let older = drive.late.asked_by(&turn.pdu, now) < end.began;
         drive.late.answered(&turn.pdu, end.began, now);
-        match proves_nothing || older {
-            true => Outcome::Garbled,
-            false => Outcome::Acknowledged(reply),
+        if proves_nothing || older {
+            Outcome::Garbled
+        } else {
+            Outcome::Acknowledged(reply)
         }
     }
 

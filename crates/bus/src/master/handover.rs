@@ -93,9 +93,10 @@ impl Master {
             .map(|drive| &drive.late)
             .chain(self.waits.strangers.values());
         let late = late.filter_map(LateReplies::until);
-        let window = match self.waits.sessions.is_empty() {
-            true => FORGOTTEN_AFTER,
-            false => self.n2_window(),
+        let window = if self.waits.sessions.is_empty() {
+            FORGOTTEN_AFTER
+        } else {
+            self.n2_window()
         };
         let broken_off = broken_off.map(|deadline| deadline + window);
         Handover {

@@ -25,9 +25,10 @@ impl Master {
         }
         drop(queue);
         for (drive, image) in self.drives.iter_mut().zip(&self.bus.image.drives) {
-            match stall.is_pause() {
-                true => drive.refresh.after_stall(stall.length(), now),
-                false => drive.refresh.others_go_first(false, &image.spec.profile),
+            if stall.is_pause() {
+                drive.refresh.after_stall(stall.length(), now);
+            } else {
+                drive.refresh.others_go_first(false, &image.spec.profile);
             }
             if let Some(run) = drive.run(Urgency::Command) {
                 run.others_go_first();

@@ -186,9 +186,10 @@ impl Master {
         let facts = AtTurn::of(&self.drives, &self.bus.image.drives, now);
         let seen = facts.seen(index);
         let origin = Origin::new(SourceKind::Supervision, "refresh");
-        let origin = match drive.refresh.is_of_drill() {
-            true => origin.of_drill("refresh".to_string()),
-            false => origin,
+        let origin = if drive.refresh.is_of_drill() {
+            origin.of_drill("refresh".to_string())
+        } else {
+            origin
         };
         let ask = Ask {
             stage,

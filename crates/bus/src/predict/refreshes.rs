@@ -91,9 +91,10 @@ impl Line<'_> {
         let (mut short, mut long) = (0.0, all.iter().map(|one| one.round).sum::<f64>() / room);
         for _ in 0..HALVINGS {
             let middle = (short + long) / 2.0;
-            match share(middle) > room {
-                true => short = middle,
-                false => long = middle,
+            if share(middle) > room {
+                short = middle;
+            } else {
+                long = middle;
             }
         }
         Some(seconds(long))

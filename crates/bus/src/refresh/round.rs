@@ -308,9 +308,10 @@ fn reads_of_motor(profile: &Profile) -> Option<StateRead> {
 
 /// The first read of a refresh round.
 fn first_read(profile: &Profile) -> Stage {
-    match profile.control.as_ref().is_some_and(Control::is_read) && profile.repeats().is_ok_and(|r| r.word) {
-        true => Stage::Own,
-        false => Stage::Look,
+    if profile.control.as_ref().is_some_and(Control::is_read) && profile.repeats().is_ok_and(|r| r.word) {
+        Stage::Own
+    } else {
+        Stage::Look
     }
 }
 

@@ -76,9 +76,10 @@ impl Report {
             drive.spec.profile.name,
             differ.join(", ")
         );
-        match self.selections.report_first(index) {
-            true => self.drive_event(index, EventKind::SelectionDiffers, None, |_| text),
-            false => tracing::warn!(target: "drivegate::bus::report", bus = %self.image.spec.name, "{text}"),
+        if self.selections.report_first(index) {
+            self.drive_event(index, EventKind::SelectionDiffers, None, |_| text)
+        } else {
+            tracing::warn!(target: "drivegate::bus::report", bus = %self.image.spec.name, "{text}")
         }
     }
 }

@@ -14,9 +14,10 @@ impl Schedule {
         let passed = now.saturating_duration_since(self.earned_until);
         self.earned_until = now;
         let of_polls = passed.saturating_sub(std::mem::take(&mut self.commanded));
-        let earned = match self.drives.iter().any(DriveSchedule::has_unread) {
-            true => of_polls.mul_f64(FIRST_SHARE),
-            false => passed.mul_f64(self.slow_share),
+        let earned = if self.drives.iter().any(DriveSchedule::has_unread) {
+            of_polls.mul_f64(FIRST_SHARE)
+        } else {
+            passed.mul_f64(self.slow_share)
         };
         self.slow_credit = (self.slow_credit + earned).min(self.most_credit);
         let of_slow_polls = std::mem::take(&mut self.slow_took);

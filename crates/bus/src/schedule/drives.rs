@@ -309,9 +309,10 @@ impl DriveSchedule {
             return item.due;
         };
         let sound = troubled + SOUND_FOR;
-        match failed_at <= sound && item.due > failed_at + SOUND_FOR {
-            true => item.due.min(sound),
-            false => item.due,
+        if failed_at <= sound && item.due > failed_at + SOUND_FOR {
+            item.due.min(sound)
+        } else {
+            item.due
         }
     }
 
@@ -332,9 +333,10 @@ impl DriveSchedule {
         let Some(item) = self.items.iter().find(|item| item.read == *read) else {
             return false;
         };
-        match self.items.iter().any(Item::is_process_data) {
-            true => item.is_process_data(),
-            false => !item.never_answers || self.items.iter().all(|item| item.never_answers),
+        if self.items.iter().any(Item::is_process_data) {
+            item.is_process_data()
+        } else {
+            !item.never_answers || self.items.iter().all(|item| item.never_answers)
         }
     }
 
@@ -459,9 +461,10 @@ impl DriveSchedule {
             return Change::None;
         }
         let Some((low, high)) = Plan::halves(read) else {
-            let change = match item.refused {
-                true => Change::None,
-                false => Change::Unavailable(read, exception),
+            let change = if item.refused {
+                Change::None
+            } else {
+                Change::Unavailable(read, exception)
             };
             item.refused = true;
             item.is_pending = !matches!(item.read.class, PollClass::Fault | PollClass::Monitor);

@@ -39,12 +39,11 @@ pub fn finding(drive: DriveIndex, profile: &Profile, trip: Trip) -> Option<Findi
         text if text == trip.fault.to_string() => format!("fault {text}"),
         text => format!("fault {} ({text})", trip.fault),
     };
-    let remedy = match unfed {
-        true => "the drive's own timeout counts only writes: set refresh = \"1s\" for this drive, with supervision",
-        false => {
-            "compare the time of the drive's own timeout with the cycle of the bus and with outages of the line: \
-             `drivegate profiles show` says what the timeout counts"
-        }
+    let remedy = if unfed {
+        "the drive's own timeout counts only writes: set refresh = \"1s\" for this drive, with supervision"
+    } else {
+        "compare the time of the drive's own timeout with the cycle of the bus and with outages of the line: \
+         `drivegate profiles show` says what the timeout counts"
     };
     Some(Finding {
         cause: Cause::OwnTimeout,

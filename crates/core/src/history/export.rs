@@ -149,8 +149,9 @@ pub(super) fn time(start: Option<SystemTime>, t: f64) -> String {
 /// The time of day `t` seconds after `start`.
 pub(super) fn moment(start: Option<SystemTime>, t: f64) -> Option<SystemTime> {
     let apart = Duration::try_from_secs_f64(t.abs()).ok()?;
-    match t >= 0.0 {
-        true => start?.checked_add(apart),
-        false => start?.checked_sub(apart),
+    if t >= 0.0 {
+        start?.checked_add(apart)
+    } else {
+        start?.checked_sub(apart)
     }
 }

@@ -121,9 +121,10 @@ impl LineHistory {
         let first = (now + 1) as i64 - STEPS as i64;
         let apart = STEP * u32::try_from(first.unsigned_abs()).unwrap_or(u32::MAX);
         let begin = clock.wall_at(self.epoch);
-        let from = match first < 0 {
-            true => begin.checked_sub(apart).unwrap_or(SystemTime::UNIX_EPOCH),
-            false => begin + apart,
+        let from = if first < 0 {
+            begin.checked_sub(apart).unwrap_or(SystemTime::UNIX_EPOCH)
+        } else {
+            begin + apart
         };
         LastHour {
             from,

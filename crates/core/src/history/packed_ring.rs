@@ -215,9 +215,10 @@ fn nanoseconds(start: Instant, at: Instant) -> i64 {
 
 fn instant(start: Instant, nanoseconds: i64) -> Instant {
     let apart = Duration::from_nanos(nanoseconds.unsigned_abs());
-    let at = match nanoseconds < 0 {
-        true => start.checked_sub(apart),
-        false => start.checked_add(apart),
+    let at = if nanoseconds < 0 {
+        start.checked_sub(apart)
+    } else {
+        start.checked_add(apart)
     };
     at.unwrap_or(start)
 }

@@ -188,9 +188,10 @@ impl Recorder {
             if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
                 self.lines
                     .push(LineRing::new(bus, &self.options, (&self.history, reach), clock));
-                bus.tape.switch(match self.options.is_on() {
-                    true => Taping::Everything,
-                    false => Taping::Reads,
+                bus.tape.switch(if self.options.is_on() {
+                    Taping::Everything
+                } else {
+                    Taping::Reads
                 });
             }
         }

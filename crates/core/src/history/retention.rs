@@ -54,9 +54,10 @@ pub fn surplus(all: &[Kept], max_bytes: u64, max_count: usize) -> Vec<usize> {
         let too_many = firsts().count() > max_count / 2 || their_bytes > max_bytes / 2;
         let older = left.len() - 1;
         let oldest = |wanted: bool| left.iter().take(older).position(|(_, kept)| kept.first == wanted);
-        let victim = match too_many {
-            true => oldest(true).or_else(|| oldest(false)),
-            false => oldest(false).or_else(|| oldest(true)),
+        let victim = if too_many {
+            oldest(true).or_else(|| oldest(false))
+        } else {
+            oldest(false).or_else(|| oldest(true))
         };
         let (place, ..) = left.remove(victim.unwrap_or(0));
         gone.push(place);

@@ -377,9 +377,10 @@ impl Writer {
 
     fn run(mut self, waiting: &Receiver<Capture>) {
         loop {
-            let next = match self.refused.is_empty() {
-                true => waiting.recv().map_err(|_| RecvTimeoutError::Disconnected),
-                false => waiting.recv_timeout(AGAIN),
+            let next = if self.refused.is_empty() {
+                waiting.recv().map_err(|_| RecvTimeoutError::Disconnected)
+            } else {
+                waiting.recv_timeout(AGAIN)
             };
             match next {
                 Ok(capture) => self.take(assemble(&capture)),
@@ -436,9 +437,10 @@ impl Writer {
 
     fn written(&self, recording: &Recording, entry: &Entry) {
         self.show(|shared| *shared.made.entry(entry.trigger).or_default() += 1);
-        let text = match entry.trigger.has_event() {
-            true => format!("recording {}", entry.id),
-            false => format!("recording {}: {}", entry.id, entry.summary),
+        let text = if entry.trigger.has_event() {
+            format!("recording {}", entry.id)
+        } else {
+            format!("recording {}: {}", entry.id, entry.summary)
         };
         let made = RecordingMade {
             id: entry.id.clone(),

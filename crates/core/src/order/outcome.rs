@@ -119,9 +119,10 @@ impl Outcome {
 
     /// The outcome of a write refused with that exception.
     pub fn of_exception(code: Exception) -> Outcome {
-        match code.leaves_open() {
-            true => Outcome::Unknown(code),
-            false => Outcome::Exception(code),
+        if code.leaves_open() {
+            Outcome::Unknown(code)
+        } else {
+            Outcome::Exception(code)
         }
     }
 

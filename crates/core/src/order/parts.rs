@@ -67,9 +67,10 @@ fn of_points(values: Vec<(PointIndex, Value)>, profile: &Profile) -> Parts {
     };
     let other = |(index, value): &(PointIndex, Value)| role(profile, *index, *value) == Role::Other;
     let rest: Vec<(PointIndex, Value)> = values.into_iter().filter(other).collect();
-    match rest.is_empty() {
-        true => Parts::One(Order::Points(stop)),
-        false => Parts::Two(Order::Points(stop), Order::Points(rest)),
+    if rest.is_empty() {
+        Parts::One(Order::Points(stop))
+    } else {
+        Parts::Two(Order::Points(stop), Order::Points(rest))
     }
 }
 

@@ -80,9 +80,10 @@ impl Reading {
         if reading.profile.counts_messages {
             reading.counters = Counters::Reading(Vec::new(), 0);
         }
-        let first: BTreeSet<u16> = match reading.known.is_empty() {
-            true => reading.everywhere(),
-            false => reading.known.clone(),
+        let first: BTreeSet<u16> = if reading.known.is_empty() {
+            reading.everywhere()
+        } else {
+            reading.known.clone()
         };
         reading.ask(&first);
         reading
@@ -161,9 +162,10 @@ impl Reading {
             [one] => one.clone(),
             [first, .., last] => format!("{first} to {last}"),
         };
-        Some(match self.names(block) {
-            true => format!("parameters {ids}"),
-            false => format!("looking for others: {ids}"),
+        Some(if self.names(block) {
+            format!("parameters {ids}")
+        } else {
+            format!("looking for others: {ids}")
         })
     }
 

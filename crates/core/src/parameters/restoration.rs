@@ -241,9 +241,10 @@ impl Restoration {
 
     /// Ends the restore from outside because it cannot continue.
     pub fn give_up(&mut self, why: String) {
-        self.state = match self.touched {
-            true => State::Over(End::Unfinished(why)),
-            false => State::Removing(End::NothingWritten(why)),
+        self.state = if self.touched {
+            State::Over(End::Unfinished(why))
+        } else {
+            State::Removing(End::NothingWritten(why))
         };
     }
 
@@ -324,9 +325,10 @@ impl Restoration {
     /// Once a value was written, the restore waits for conditions that someone at the drive can fix; before the
     /// first write it gives up instead.
     fn wait_for_people(&mut self, waits: String, why: &str, now: Instant) -> Then {
-        match self.touched {
-            true => self.pause(PAUSE, &waits, now),
-            false => self.stop(why.to_string()),
+        if self.touched {
+            self.pause(PAUSE, &waits, now)
+        } else {
+            self.stop(why.to_string())
         }
     }
 

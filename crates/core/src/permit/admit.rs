@@ -37,9 +37,10 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
         Order::Write(pdu) => {
             authority(drive, client)?;
             let ranges = raw_write(drive, &pdu)?;
-            let urgency = match stops(drive, &pdu) {
-                true => Urgency::Stop,
-                false => Urgency::Command,
+            let urgency = if stops(drive, &pdu) {
+                Urgency::Stop
+            } else {
+                Urgency::Command
             };
             let order = Order::Write(pdu);
             keeps_limits(drive, &order)?;

@@ -150,17 +150,19 @@ impl DriveHandle {
 
     /// The published state of the hold, and whether this client has the hold; `None` while `[authority]` is off.
     pub fn hold_view(&self, origin: Option<&Origin>, now: Instant) -> Option<(HoldView, bool)> {
-        match self.bus.queue.has_authority() {
-            true => self.bus.queue.lock().gate.hold_view(self.index, origin, now),
-            false => None,
+        if self.bus.queue.has_authority() {
+            self.bus.queue.lock().gate.hold_view(self.index, origin, now)
+        } else {
+            None
         }
     }
 
     /// The client's name as a principal, and the ranks below its own; `None` if the client is not a principal.
     pub fn rank_of(&self, origin: &Origin) -> Option<(String, Vec<String>)> {
-        let rules = match self.bus.queue.has_authority() {
-            true => self.bus.queue.lock().gate.rules().cloned()?,
-            false => return None,
+        let rules = if self.bus.queue.has_authority() {
+            self.bus.queue.lock().gate.rules().cloned()?
+        } else {
+            return None;
         };
         let claim = rules.claim_of(origin)?;
         let below = rules.ranks.iter().skip(claim.rank + 1).map(ToString::to_string);

@@ -295,9 +295,10 @@ impl DriveHandle {
         let reading = self.reading(now);
         let OrderRequest { order, rest, .. } = request.clone();
         if let Some((what, refusal)) = rest {
-            return match self.may_go(&order, &reading, request.authority) {
-                true => self.place_parts(order, (&what, Err(refusal)), request, &reading),
-                false => self.place_one(order, request, &reading),
+            return if self.may_go(&order, &reading, request.authority) {
+                self.place_parts(order, (&what, Err(refusal)), request, &reading)
+            } else {
+                self.place_one(order, request, &reading)
             };
         }
         match Parts::of(order.clone(), &self.image.spec.profile) {

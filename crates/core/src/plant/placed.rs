@@ -101,9 +101,10 @@ impl Placed {
     /// Waits for the read that shows the effect: returns the time from acceptance to that read, or `None` if the
     /// order was refused or no read showed the effect within the profile's time.
     pub async fn confirmed(&mut self) -> Option<Duration> {
-        match self.answered().await.outcome.is_ok() {
-            true => poll_fn(|cx| self.poll_confirmation(cx)).await,
-            false => None,
+        if self.answered().await.outcome.is_ok() {
+            poll_fn(|cx| self.poll_confirmation(cx)).await
+        } else {
+            None
         }
     }
 

@@ -126,9 +126,10 @@ mod tests {
         ];
         for (place, (right, is_controlled, rules, expected)) in table.into_iter().enumerate() {
             let profile = profile("vacon-nx");
-            let spec = match is_controlled {
-                true => controlled("p1", "line1", 1, &profile),
-                false => monitored("p1", "line1", 1, &profile),
+            let spec = if is_controlled {
+                controlled("p1", "line1", 1, &profile)
+            } else {
+                monitored("p1", "line1", 1, &profile)
             };
             let (bus, events) = (bus(bus_spec("line1"), vec![image(spec)]), Events::of_drives(1));
             bus.queue.set_authority(rules);

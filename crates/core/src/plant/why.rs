@@ -54,10 +54,13 @@ fn contact(reading: &Reading<'_>, bus: &BusImage) -> Contact {
 
 fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
     let by = match record.source {
-        source if source == SourceKind::Supervision.name() => match &*record.client == Origin::LOCAL {
-            true => Giver::LocalControl,
-            false => Giver::Supervision,
-        },
+        source if source == SourceKind::Supervision.name() => {
+            if &*record.client == Origin::LOCAL {
+                Giver::LocalControl
+            } else {
+                Giver::Supervision
+            }
+        }
         source if source == SourceKind::Shutdown.name() => Giver::Shutdown,
         source if source == SourceKind::Interlock.name() => Giver::Interlock,
         _ => Giver::Client,

@@ -172,9 +172,10 @@ impl Reading<'_> {
     /// The point whose register gives the value: the point itself, or its monitoring register.
     fn selected(&self, point: PointIndex) -> Option<&Point> {
         let points = &self.spec.profile.points;
-        match self.snapshot.monitored.contains(&point) {
-            true => points.get(points.get(point)?.monitor?),
-            false => points.get(point),
+        if self.snapshot.monitored.contains(&point) {
+            points.get(points.get(point)?.monitor?)
+        } else {
+            points.get(point)
         }
     }
 
@@ -242,9 +243,10 @@ impl Reading<'_> {
                 power.and_then(|power| raw.decode_scaled(words, kind, power as i64))
             }
         };
-        let value = match raw.factor_from.is_empty() {
-            true => value,
-            false => value.and_then(|value| self.multiplied(value, raw, &mut quality)),
+        let value = if raw.factor_from.is_empty() {
+            value
+        } else {
+            value.and_then(|value| self.multiplied(value, raw, &mut quality))
         };
         Sample {
             value,

@@ -51,12 +51,11 @@ impl Pending {
     /// # Errors
     /// If no bus replaces this one.
     pub fn give_back(&mut self, stop: Command) -> Result<(), Box<Command>> {
-        match self.ending {
-            true => {
-                self.waiting.push_front(stop);
-                Ok(())
-            }
-            false => Err(Box::new(stop)),
+        if self.ending {
+            self.waiting.push_front(stop);
+            Ok(())
+        } else {
+            Err(Box::new(stop))
         }
     }
 

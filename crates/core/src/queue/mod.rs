@@ -143,9 +143,10 @@ impl Pending {
                 _ => None,
             };
         }
-        match is_stop {
-            true => self.push_stop(command, now),
-            false => self.take_other(command, now),
+        if is_stop {
+            self.push_stop(command, now);
+        } else {
+            self.take_other(command, now);
         }
         None
     }
@@ -276,9 +277,10 @@ impl Pending {
             ready => ready,
         };
         let pressed = self.pressed();
-        let passed_on = match pressed.is_empty() || rank != Urgency::Command {
-            true => Vec::new(),
-            false => self.passed_on(&mut |command: &Command| readiness(command) != Ready::No),
+        let passed_on = if pressed.is_empty() || rank != Urgency::Command {
+            Vec::new()
+        } else {
+            self.passed_on(&mut |command: &Command| readiness(command) != Ready::No)
         };
         // Drives whose later commands must wait: for an older command, or for a stop.
         let mut behind: Vec<DriveIndex> = self.drives_of(Urgency::Stop);

@@ -229,9 +229,10 @@ fn later_commands_wait_behind_the_oldest_of_their_drive_that_cannot_begin() {
         &(),
         |command: &Command| {
             asked.push(command.intent.order.clone());
-            match command.intent.target == DriveIndex::new(1) {
-                true => Ready::No,
-                false => Ready::Now,
+            if command.intent.target == DriveIndex::new(1) {
+                Ready::No
+            } else {
+                Ready::Now
             }
         },
         |_| false,

@@ -36,9 +36,10 @@ impl Interlock {
     pub(super) fn trips(&self, around: &DrivesByName, stood: Option<Instant>, now: Instant) -> Option<Unmet> {
         self.of(around, |watched, index| {
             let is_only_old = stood.is_some_and(|until| self.met_before(watched, index, around, (until, now)));
-            match is_only_old {
-                true => None,
-                false => self.differed(watched, index, around, (now, now)),
+            if is_only_old {
+                None
+            } else {
+                self.differed(watched, index, around, (now, now))
             }
         })
     }

@@ -225,16 +225,15 @@ impl Ledger {
         if guard.stagger.is_zero() {
             return None;
         }
-        let retry_after = match self.awaits_word(name) {
+        let retry_after = if self.awaits_word(name) {
             // The cleared start may be sent at any time, so the full interval applies.
-            true => guard.stagger,
-            false => {
-                let last = self
-                    .members(name)
-                    .filter_map(|entry| entry.motor.starts().max())
-                    .max()?;
-                (last + guard.stagger).saturating_duration_since(now)
-            }
+            guard.stagger
+        } else {
+            let last = self
+                .members(name)
+                .filter_map(|entry| entry.motor.starts().max())
+                .max()?;
+            (last + guard.stagger).saturating_duration_since(now)
         };
         (!retry_after.is_zero()).then(|| Guarded {
             reason: Reason::Stagger,

@@ -128,9 +128,10 @@ impl StartAttempt {
             return StartEffect::Another(None);
         }
         // The run command was on all the time, so the expected start happened.
-        match at > self.counted + STARTS_WITHIN {
-            true => StartEffect::StartedLate,
-            false => StartEffect::Started,
+        if at > self.counted + STARTS_WITHIN {
+            StartEffect::StartedLate
+        } else {
+            StartEffect::Started
         }
     }
 

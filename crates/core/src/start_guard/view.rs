@@ -286,9 +286,12 @@ impl BusGuards {
     /// The drive acknowledged a start or a stop.
     pub fn acknowledged(&self, drive: DriveIndex, run: bool, now: Instant) {
         if let Some(of) = self.of_drive(drive).filter(|of| !of.tells_running) {
-            self.shared.lock().with(&of.machine, |motor| match run {
-                true => motor.start_acknowledged(now),
-                false => motor.stop_acknowledged(now),
+            self.shared.lock().with(&of.machine, |motor| {
+                if run {
+                    motor.start_acknowledged(now)
+                } else {
+                    motor.stop_acknowledged(now)
+                }
             });
         }
     }
@@ -309,10 +312,14 @@ impl BusGuards {
         let started = match seen {
             Some(seen) => ledger.seen(&of.machine, seen),
             None => {
-                ledger.with(&of.machine, |motor| match is_away {
-                    true => motor.note_offline(),
-                    false if !of.tells_running => motor.begin_unreported(reading.now),
-                    false => motor.unseen(),
+                ledger.with(&of.machine, |motor| {
+                    if is_away {
+                        motor.note_offline()
+                    } else if !of.tells_running {
+                        motor.begin_unreported(reading.now)
+                    } else {
+                        motor.unseen()
+                    }
                 });
                 false
             }

@@ -214,9 +214,10 @@ impl State {
                 // The client may have disconnected, so an error is ignored.
                 let _ = acknowledged.send(all);
             }
-            match over {
-                true => self.answer(order, plant, now),
-                false => self.orders.push(order),
+            if over {
+                self.answer(order, plant, now)
+            } else {
+                self.orders.push(order)
             }
         }
         let orders = &self.orders;

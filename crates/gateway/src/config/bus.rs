@@ -40,9 +40,10 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, faulty
     if let Some(port) = &port {
         port::check_keys(reader, port, protocol);
     }
-    let format = match is_modbus_tcp {
-        true => Some(LineFormat::NETWORK),
-        false => read_format(reader, protocol),
+    let format = if is_modbus_tcp {
+        Some(LineFormat::NETWORK)
+    } else {
+        read_format(reader, protocol)
     };
     let (cycle, slow_cycle) = read_cadence(reader);
     let options = read_options(reader, protocol, format.as_ref(), port.as_deref());

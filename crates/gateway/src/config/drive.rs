@@ -57,10 +57,12 @@ pub(super) struct Surroundings<'a> {
 pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let name = DRIVE.name.placed(reader);
     let address = Key {
-        form: match around.is_modbus_tcp {
-            true => &UNIT_IDS,
-            false if is_reserved(reader) && around.protocol != Protocol::N2 => &WITH_RESERVED,
-            false => address_form(around.protocol),
+        form: if around.is_modbus_tcp {
+            &UNIT_IDS
+        } else if is_reserved(reader) && around.protocol != Protocol::N2 {
+            &WITH_RESERVED
+        } else {
+            address_form(around.protocol)
         },
         ..DRIVE.address
     };
@@ -233,9 +235,10 @@ fn read_unit(reader: &Reader<'_>, address: Option<u8>) -> Option<u8> {
             "add `unit`, 1 to 254",
         );
     }
-    match reader.has(DRIVE.unit.name) {
-        true => DRIVE.unit.read(reader),
-        false => address,
+    if reader.has(DRIVE.unit.name) {
+        DRIVE.unit.read(reader)
+    } else {
+        address
     }
 }
 
@@ -243,12 +246,15 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
     let key = DRIVE.profile.name;
     let name = DRIVE.profile.read(reader)?;
     let known = around.profiles.get(&name);
-    let profile = known.ok_or_else(|| match around.faulty.contains(&name) {
-        true => Finding::new(
-            format!("the file of profile `{name}` has errors"),
-            "correct it: its errors are listed here, too",
-        ),
-        false => unknown_profile(&name, around.profiles),
+    let profile = known.ok_or_else(|| {
+        if around.faulty.contains(&name) {
+            Finding::new(
+                format!("the file of profile `{name}` has errors"),
+                "correct it: its errors are listed here, too",
+            )
+        } else {
+            unknown_profile(&name, around.profiles)
+        }
     });
     let profile = reader.accept(key, profile)?;
     if !profile.protocols.contains(&around.protocol) {

@@ -387,15 +387,16 @@ pub(super) struct Size(pub(super) RangeInclusive<u64>);
 impl Form<u64> for Size {
     fn read(&self, reader: &Reader<'_>, key: &str) -> Option<u64> {
         let text: String = of_type(reader, key, &format!("{}, in quotes", self.range()))?;
-        let size = parse_size(&text)
-            .map_err(Finding::from)
-            .and_then(|bytes| match self.0.contains(&bytes) {
-                true => Ok(bytes),
-                false => Err(Finding::new(
+        let size = parse_size(&text).map_err(Finding::from).and_then(|bytes| {
+            if self.0.contains(&bytes) {
+                Ok(bytes)
+            } else {
+                Err(Finding::new(
                     format!("{text} is out of range"),
                     format!("write {}", self.range()),
-                )),
-            });
+                ))
+            }
+        });
         reader.accept(key, size)
     }
 

@@ -290,11 +290,14 @@ const PRIVATE: [&str; 8] = [
 /// Warns if the share of one address is probably too small: fewer connections are possible than requested, or
 /// clients share an address because of a NAT.
 fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_address: usize) {
-    let hosts = |network: &IpNet| match network.network().is_loopback() {
-        true => 1,
-        false => 1_usize
-            .checked_shl(u32::from(network.max_prefix_len() - network.prefix_len()))
-            .unwrap_or(usize::MAX),
+    let hosts = |network: &IpNet| {
+        if network.network().is_loopback() {
+            1
+        } else {
+            1_usize
+                .checked_shl(u32::from(network.max_prefix_len() - network.prefix_len()))
+                .unwrap_or(usize::MAX)
+        }
     };
     let hosts = allowed
         .iter()

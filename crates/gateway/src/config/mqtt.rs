@@ -239,9 +239,12 @@ fn is_readable(path: &Path) -> bool {
 /// Path of a PEM file that can be read now.
 fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<PathBuf> {
     let path = values::resolved(base, key.read(reader)?);
-    let readable = File::open(&path).and_then(|file| match file.metadata()?.is_file() {
-        true => Ok(()),
-        false => Err(std::io::Error::other("not a file")),
+    let readable = File::open(&path).and_then(|file| {
+        if file.metadata()?.is_file() {
+            Ok(())
+        } else {
+            Err(std::io::Error::other("not a file"))
+        }
     });
     reader.accept(key.name, readable.map_err(|error| files::cannot_read(&path, &error)));
     Some(path)

@@ -23,10 +23,7 @@ impl StaleAfter {
     /// The lowest limit for a bus with this achievable cycle: unless configured, data of a slow bus becomes stale only
     /// after three rounds.
     pub fn floor(&self, cycle: Duration) -> Duration {
-        match self.written {
-            true => Duration::ZERO,
-            false => 3 * cycle,
-        }
+        if self.written { Duration::ZERO } else { 3 * cycle }
     }
 }
 

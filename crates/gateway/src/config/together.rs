@@ -227,16 +227,15 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
             .into_iter()
             .filter(|p| spec.profile.point_index(p).is_some())
             .collect();
-        let own = match known.is_empty() {
-            true if spec.profile.may_stop_by_itself => {
-                "whether the drive itself stops when its master goes silent cannot be read over this protocol"
-                    .to_string()
-            }
-            true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
-            false => format!(
+        let own = if !known.is_empty() {
+            format!(
                 "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",
                 known.join(" and ")
-            ),
+            )
+        } else if spec.profile.may_stop_by_itself {
+            "whether the drive itself stops when its master goes silent cannot be read over this protocol".to_string()
+        } else {
+            "the profile has no parameter for the drive's own response to a silent master".to_string()
         };
         reader.document().warning(
             place,

@@ -68,9 +68,10 @@ pub(super) fn socket<const PORT: u16>(text: &str) -> Result<SocketAddr, Finding>
 }
 
 fn with_port(address: &str, port: u16) -> String {
-    match address.contains(':') {
-        true => format!("[{address}]:{port}"),
-        false => format!("{address}:{port}"),
+    if address.contains(':') {
+        format!("[{address}]:{port}")
+    } else {
+        format!("{address}:{port}")
     }
 }
 

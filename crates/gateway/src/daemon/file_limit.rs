@@ -89,9 +89,10 @@ impl FileDemand {
         let (mut fewest, mut most) = (0, 1000);
         while fewest + 1 < most {
             let middle = (fewest + most) / 2;
-            match self.scaled(middle).files() <= limit {
-                true => fewest = middle,
-                false => most = middle,
+            if self.scaled(middle).files() <= limit {
+                fewest = middle;
+            } else {
+                most = middle;
             }
         }
         self.scaled(fewest)

@@ -140,9 +140,12 @@ impl Leases {
                 });
             }
             // A refresh continues only where the drive is commanded as before.
-            let left = left.map(|left| match left.control == drive.profile.control {
-                true => left.carried,
-                false => left.carried.alone(),
+            let left = left.map(|left| {
+                if left.control == drive.profile.control {
+                    left.carried
+                } else {
+                    left.carried.alone()
+                }
             });
             let back = |(at, carried): (Instant, CarriedState)| carried.after(now.saturating_duration_since(at));
             left.or_else(|| self.parted.remove(&machine).map(back))

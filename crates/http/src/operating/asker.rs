@@ -51,9 +51,10 @@ impl<const MOST_BYTES: usize> FromRequest<Arc<AppState>> for Ordered<MOST_BYTES>
         let (mut parts, body) = request.into_parts();
         let Commander(operator) = Commander::from_request_parts(&mut parts, app).await?;
         let body = body::read(body, &Reached::of(&parts)?, MOST_BYTES).await?;
-        match operator.is_still_one() {
-            true => Ok(Ordered(operator, body)),
-            false => Err(Denied::RightLost.into()),
+        if operator.is_still_one() {
+            Ok(Ordered(operator, body))
+        } else {
+            Err(Denied::RightLost.into())
         }
     }
 }

@@ -111,9 +111,10 @@ pub(crate) async fn log_in(
 fn credentials(headers: &HeaderMap, body: &[u8]) -> Option<Credentials> {
     let kind = headers.get(header::CONTENT_TYPE)?.to_str().ok()?;
     let kind = kind.split(';').next()?.trim();
-    match kind.eq_ignore_ascii_case("application/json") {
-        true => serde_json::from_slice(body).ok(),
-        false => None,
+    if kind.eq_ignore_ascii_case("application/json") {
+        serde_json::from_slice(body).ok()
+    } else {
+        None
     }
 }
 

@@ -191,9 +191,10 @@ impl Operating {
         }
         let state = self.state();
         let used = state.operators.get(&address).map(|(_, used)| *used);
-        match used.is_some_and(|used| now.saturating_duration_since(used) < IDLE) {
-            true => Authority::Write,
-            false => Authority::ReadOnly,
+        if used.is_some_and(|used| now.saturating_duration_since(used) < IDLE) {
+            Authority::Write
+        } else {
+            Authority::ReadOnly
         }
     }
 
@@ -281,9 +282,10 @@ impl Operating {
     pub(super) fn check_csrf(&self, headers: &HeaderMap, cookie: &str) -> Result<(), Denied> {
         let session = self.session(cookie, Instant::now()).ok_or(Denied::SessionEnded)?;
         let given = headers.get(CSRF).map_or(&[][..], |value| value.as_bytes());
-        match bool::from(given.ct_eq(session.csrf.as_bytes())) {
-            true => Ok(()),
-            false => Err(Denied::NoToken),
+        if bool::from(given.ct_eq(session.csrf.as_bytes())) {
+            Ok(())
+        } else {
+            Err(Denied::NoToken)
         }
     }
 
@@ -438,9 +440,10 @@ pub(super) fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
         !authority.is_empty() && bare(authority) == bare(host)
     };
     let mut site = text(header::HeaderName::from_static("sec-fetch-site"));
-    match text(header::ORIGIN).all(is_host) && site.all(|site| matches!(site, "same-origin" | "none")) {
-        true => Ok(()),
-        false => Err(Denied::OtherOrigin),
+    if text(header::ORIGIN).all(is_host) && site.all(|site| matches!(site, "same-origin" | "none")) {
+        Ok(())
+    } else {
+        Err(Denied::OtherOrigin)
     }
 }
 

@@ -69,9 +69,10 @@ pub(crate) fn render_login(plant: &Plant) -> String {
 }
 
 fn document(plant: &Plant, operating: bool, tables: &str) -> String {
-    let (head, mode) = match operating {
-        true => (OPERATE_HEAD, "commands after login"),
-        false => ("", "read-only"),
+    let (head, mode) = if operating {
+        (OPERATE_HEAD, "commands after login")
+    } else {
+        ("", "read-only")
     };
     DOCUMENT
         .replace("{{operate}}", head)

@@ -300,9 +300,10 @@ impl Control {
     /// The word from which the next one is made if the drive has `own`: after a stop by another word this is the
     /// normal stop word, so that no later write runs the motor.
     pub fn standing(&self, own: u16) -> u16 {
-        match self.is_also_stop(self.at, own) {
-            true => self.stop_word(own),
-            false => own,
+        if self.is_also_stop(self.at, own) {
+            self.stop_word(own)
+        } else {
+            own
         }
     }
 

@@ -150,23 +150,25 @@ pub struct WriteFunctions {
 impl WriteFunctions {
     /// The write of one register.
     pub fn write_register(self, address: u16, value: u16) -> RequestPdu {
-        match self.registers_by_16 {
-            true => RequestPdu::WriteRegisters {
+        if self.registers_by_16 {
+            RequestPdu::WriteRegisters {
                 start: address,
                 values: vec![value],
-            },
-            false => RequestPdu::WriteRegister { address, value },
+            }
+        } else {
+            RequestPdu::WriteRegister { address, value }
         }
     }
 
     /// The write of one coil.
     pub fn write_coil(self, address: u16, on: bool) -> RequestPdu {
-        match self.coils_by_15 {
-            true => RequestPdu::WriteCoils {
+        if self.coils_by_15 {
+            RequestPdu::WriteCoils {
                 start: address,
                 bits: vec![on],
-            },
-            false => RequestPdu::WriteCoil { address, on },
+            }
+        } else {
+            RequestPdu::WriteCoil { address, on }
         }
     }
 
@@ -273,13 +275,14 @@ impl Profile {
 
     /// The title for display, including any doubt about the profile.
     pub fn described(&self) -> Cow<'_, str> {
-        match self.verified {
-            true => Cow::Borrowed(&self.title),
-            false => Cow::Owned(
+        if self.verified {
+            Cow::Borrowed(&self.title)
+        } else {
+            Cow::Owned(
                 format!("{} (not verified on hardware)", self.title)
                     .trim_start()
                     .to_string(),
-            ),
+            )
         }
     }
 

@@ -58,9 +58,12 @@ pub struct Explanation {
 impl Explanation {
     /// The causes with their evidence as one line; `None` if there are none.
     pub fn blocked_by(&self) -> Option<String> {
-        let cause = |Cause { cause, evidence, .. }: &Cause| match evidence.starts_with(cause.as_str()) {
-            true => evidence.clone(),
-            false => format!("{cause} ({evidence})"),
+        let cause = |Cause { cause, evidence, .. }: &Cause| {
+            if evidence.starts_with(cause.as_str()) {
+                evidence.clone()
+            } else {
+                format!("{cause} ({evidence})")
+            }
         };
         let causes: Vec<String> = self.causes.iter().map(cause).collect();
         (!causes.is_empty()).then(|| causes.join(", "))
@@ -384,9 +387,10 @@ impl Examination<'_> {
             .profile
             .model_point(ModelPoint::Ready)
             .map_or("", |point| &point.note);
-        let remedy = match note.is_empty() {
-            true => remedy.to_string(),
-            false => format!("{remedy}; of this family: ready {note}"),
+        let remedy = if note.is_empty() {
+            remedy.to_string()
+        } else {
+            format!("{remedy}; of this family: ready {note}")
         };
         Some(self.cause("not_ready", evidence, at, &remedy))
     }
@@ -503,9 +507,10 @@ impl Examination<'_> {
 
     fn no_order(&self, at: Option<Instant>) -> Cause {
         let evidence = "run is off in the drive, and this gateway sent no command".to_string();
-        let remedy = match self.situation.is_commandable {
-            true => "send run",
-            false => "this gateway only monitors it: its controller must start it",
+        let remedy = if self.situation.is_commandable {
+            "send run"
+        } else {
+            "this gateway only monitors it: its controller must start it"
         };
         self.cause("no_run_order", evidence, at, remedy)
     }

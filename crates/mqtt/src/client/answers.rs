@@ -10,19 +10,18 @@ impl PlainClient {
     pub(super) fn refused(&mut self, packet: u16, why: PubAckReason) {
         let for_now = matches!(why, PubAckReason::QuotaExceeded | PubAckReason::PacketIdentifierInUse);
         let (now, root) = (Instant::now(), self.topics.root());
-        let remedy = match for_now {
-            true => "raise its limits if this persists".to_string(),
-            false => {
-                let discovery = self
-                    .announcer
-                    .as_ref()
-                    .map(|announcer| format!(", {}", announcer.own_topics()));
-                format!(
-                    "it must let client {} publish to {root}/#{} and to the response topics in use",
-                    self.options.client_id,
-                    discovery.unwrap_or_default()
-                )
-            }
+        let remedy = if for_now {
+            "raise its limits if this persists".to_string()
+        } else {
+            let discovery = self
+                .announcer
+                .as_ref()
+                .map(|announcer| format!(", {}", announcer.own_topics()));
+            format!(
+                "it must let client {} publish to {root}/#{} and to the response topics in use",
+                self.options.client_id,
+                discovery.unwrap_or_default()
+            )
         };
         let why = format!("{}; {remedy}", refusal(why));
         if let Some(topic) = self.outbox.put_back(packet, for_now) {

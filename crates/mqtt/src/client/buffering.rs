@@ -60,9 +60,10 @@ impl PlainClient {
     fn plant_of(&self, event: &Event) -> Arc<Plant> {
         let newest = self.common.plant.load_full();
         let has_bus = |plant: &Plant| plant.buses.iter().any(|bus| bus.image.spec.name == event.bus);
-        match event.bus.is_empty() || has_bus(&newest) {
-            true => newest,
-            false => self.common.observed.clone(),
+        if event.bus.is_empty() || has_bus(&newest) {
+            newest
+        } else {
+            self.common.observed.clone()
         }
     }
 

@@ -62,15 +62,16 @@ pub(super) fn of_gateway_availability(sources: &Sources) -> Value {
 
 /// Available while the gateway is connected and the drive is not offline.
 pub(super) fn of_drive_availability(sources: &Sources, spec: &DriveSpec) -> Value {
-    let (topic, template) = match sources.telemetry.points {
-        true => (
+    let (topic, template) = if sources.telemetry.points {
+        (
             sources.topics.point(&spec.name, "state"),
             "{{ 'offline' if value == 'offline' else 'online' }}",
-        ),
-        false => (
+        )
+    } else {
+        (
             sources.topics.drive(&spec.name, "state"),
             "{{ 'offline' if value_json is defined and value_json['state'] == 'offline' else 'online' }}",
-        ),
+        )
     };
     json!([{ "t": sources.topics.status() }, { "t": topic, "val_tpl": template }])
 }
@@ -247,9 +248,10 @@ impl DriveEntities<'_> {
     /// The topic of a published value and the template that shows it.
     fn show(&self, name: &str, shown: &Shown<'_>) -> Value {
         let points = self.sources.telemetry.points;
-        let topic = match points {
-            true => self.sources.topics.point(&self.spec.name, name),
-            false => self.sources.topics.drive(&self.spec.name, "state"),
+        let topic = if points {
+            self.sources.topics.point(&self.spec.name, name)
+        } else {
+            self.sources.topics.drive(&self.spec.name, "state")
         };
         json!({ "stat_t": topic, "val_tpl": shown.template(name, points) })
     }
@@ -265,13 +267,14 @@ impl DriveEntities<'_> {
     /// The state always has its text in a second entity, even if the code is zero: the topic of the text is then empty.
     fn fault_text(&self) -> (String, Value) {
         let topics = &self.sources.topics;
-        let (topic, template) = match self.sources.telemetry.state {
-            true => (
+        let (topic, template) = if self.sources.telemetry.state {
+            (
                 topics.drive(&self.spec.name, "state"),
                 "{{ (value_json['fault_text'] or 'no fault') if value_json is defined and value_json['fault_code'] is \
                  not none else none }}",
-            ),
-            false => (topics.point(&self.spec.name, "fault_text"), "{{ value or none }}"),
+            )
+        } else {
+            (topics.point(&self.spec.name, "fault_text"), "{{ value or none }}")
         };
         let shown = json!({ "stat_t": topic, "val_tpl": template });
         self.entity(Platform::Sensor, "fault_text", [shown])
@@ -329,9 +332,10 @@ enum Shown<'p> {
 impl Shown<'_> {
     /// The template for a topic with the bare value, or for the object of the state.
     fn template(&self, name: &str, bare: bool) -> String {
-        let value = match bare {
-            true => "value or none".to_string(),
-            false => format!("value_json['{name}'] if value_json is defined else none"),
+        let value = if bare {
+            "value or none".to_string()
+        } else {
+            format!("value_json['{name}'] if value_json is defined else none")
         };
         let then = match self {
             Shown::Plain => return format!("{{{{ {value} }}}}"),

@@ -320,9 +320,10 @@ fn a_flood_of_births_announces_everything_twice() {
 fn meter(points: &[(&str, &str, &str, &str)]) -> DriveSpec {
     let point = |(place, (name, form, unit, more)): (usize, &(&str, &str, &str, &str))| {
         let at = 2 * place;
-        let unit = match unit.is_empty() {
-            true => String::new(),
-            false => format!("unit = \"{unit}\"\n"),
+        let unit = if unit.is_empty() {
+            String::new()
+        } else {
+            format!("unit = \"{unit}\"\n")
         };
         format!("[[point]]\nname = \"{name}\"\nat = \"holding {at}\"\ntype = \"{form}\"\n{unit}{more}\n")
     };

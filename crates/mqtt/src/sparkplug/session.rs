@@ -128,9 +128,10 @@ impl Session {
             name(&mut device, before.as_ref(), self.rules.alias, &mut self.last_alias);
             if let Some(before) = before {
                 (device.born, device.gone) = (before.born, before.gone);
-                match before.definitions == device.definitions {
-                    true => device.history = before.history,
-                    false => self.lost += before.history.len() as u64,
+                if before.definitions == device.definitions {
+                    device.history = before.history;
+                } else {
+                    self.lost += before.history.len() as u64;
                 }
             }
             self.devices.push(device);
@@ -176,9 +177,10 @@ impl Session {
     /// Notes that the broker granted the subscriptions.
     pub(super) fn subscribed(&mut self) {
         if self.phase == Phase::Away {
-            self.phase = match self.may_be_born() {
-                true => Phase::NodeBirth(None),
-                false => Phase::Waiting,
+            self.phase = if self.may_be_born() {
+                Phase::NodeBirth(None)
+            } else {
+                Phase::Waiting
             };
         }
     }

@@ -20,9 +20,10 @@ pub struct Ede {
 /// A field of the EDE file, in quotes where the format requires them.
 fn field(text: &str) -> String {
     let text = text.replace(['\n', '\r'], " ");
-    match text.contains([';', '"']) {
-        true => format!("\"{}\"", text.replace('"', "\"\"")),
-        false => text,
+    if text.contains([';', '"']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text
     }
 }
 

@@ -233,9 +233,10 @@ impl Reconfigure for Server {
     /// # Errors
     /// If the address cannot be bound: the server continues as before.
     async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
-        let sockets = match options.listen == self.options.listen {
-            true => None,
-            false => Some(bind(options.listen).await?),
+        let sockets = if options.listen == self.options.listen {
+            None
+        } else {
+            Some(bind(options.listen).await?)
         };
         Ok(Change { options, sockets })
     }

@@ -353,9 +353,10 @@ fn describe(spec: &DriveSpec, index: PointIndex) -> String {
     } else {
         "; not confirmed by a manual"
     };
-    match point.note.is_empty() {
-        true => format!("{words}{unverified}"),
-        false => format!("{words}: {}{unverified}", point.note),
+    if point.note.is_empty() {
+        format!("{words}{unverified}")
+    } else {
+        format!("{words}: {}{unverified}", point.note)
     }
 }
 

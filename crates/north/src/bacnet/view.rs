@@ -382,9 +382,10 @@ impl Application for View {
         let Some((drive, _)) = self.owner(device, write.object) else {
             return;
         };
-        let why = match self.options.commands {
-            true => "the address is not in `write` of [bacnet]",
-            false => "`commands` of [bacnet] is off",
+        let why = if self.options.commands {
+            "the address is not in `write` of [bacnet]"
+        } else {
+            "`commands` of [bacnet] is off"
         };
         let (what, now) = (write.object.to_string(), self.now.get().0);
         let refusal = Refusal::NotAllowed(why.to_string());

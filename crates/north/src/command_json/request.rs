@@ -182,11 +182,12 @@ pub fn order(payload: &[u8], profile: &Profile) -> Result<ParsedCommand, Refusal
 /// # Errors
 /// If the payload is longer than [`MAX_PAYLOAD`].
 pub fn check_size(size: usize) -> Result<(), Refusal> {
-    match size > MAX_PAYLOAD {
-        true => Err(Refusal::BadValue(format!(
+    if size > MAX_PAYLOAD {
+        Err(Refusal::BadValue(format!(
             "the payload has {size} bytes, at most {MAX_PAYLOAD} are allowed"
-        ))),
-        false => Ok(()),
+        )))
+    } else {
+        Ok(())
     }
 }
 

@@ -47,9 +47,10 @@ impl<'a> DriveFigures<'a> {
             values: points
                 .filter_map(|(index, name)| Some((index, name, good(index)?)))
                 .collect(),
-            proofs: match drills {
-                true => north.drills.proofs(&handle.machine()),
-                false => Vec::new(),
+            proofs: if drills {
+                north.drills.proofs(&handle.machine())
+            } else {
+                Vec::new()
             },
             hold: hold.map(|(view, _)| (view, unheld())),
             totals: counts_runs.then(|| north.history.totals(&image.spec.name)),

@@ -270,9 +270,10 @@ fn authority_of(listeners: &[Listener], address: IpAddr) -> Option<Authority> {
     let mut of = listeners.iter().filter(|listener| contains(&listener.allow, address));
     let first = of.next()?;
     let writes = |listener: &Listener| contains(&listener.write, address);
-    Some(match writes(first) || of.any(writes) {
-        true => Authority::Write,
-        false => Authority::ReadOnly,
+    Some(if writes(first) || of.any(writes) {
+        Authority::Write
+    } else {
+        Authority::ReadOnly
     })
 }
 

@@ -176,13 +176,14 @@ impl PlantView {
             return;
         }
         let moved = (&before.view.default_drive, before.view.registers) != (&view.default_drive, view.registers);
-        let earlier = match moved {
-            true => Some(EarlierView {
+        let earlier = if moved {
+            Some(EarlierView {
                 view: before.view.clone(),
                 since: before.before.as_ref().map(|earlier| earlier.until),
                 until: now,
-            }),
-            false => before.before.clone(),
+            })
+        } else {
+            before.before.clone()
         };
         self.shown.store(Arc::new(Shown { view, before: earlier }));
     }

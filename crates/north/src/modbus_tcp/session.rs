@@ -156,10 +156,12 @@ impl ClientSession {
                     return None;
                 }
                 Progress::Stopped(header, request, all) => {
-                    match all {
-                        true if stops_all_only(&request) => self.put(header, &request, &Reply::Written, out),
-                        true => self.put_exception(header, request.function(), Exception::ADDRESS, out),
-                        false => self.put_exception(header, request.function(), Exception::DEVICE_FAILURE, out),
+                    if !all {
+                        self.put_exception(header, request.function(), Exception::DEVICE_FAILURE, out);
+                    } else if stops_all_only(&request) {
+                        self.put(header, &request, &Reply::Written, out);
+                    } else {
+                        self.put_exception(header, request.function(), Exception::ADDRESS, out);
                     }
                     return None;
                 }
@@ -213,9 +215,10 @@ impl ClientSession {
         let writes = WRITES.contains(&frame.function);
         // A reload since the first byte may have given the unit id or the address to another drive or register.
         if writes && let Some(earlier) = self.routes.meaning_at(unit, arrival.asked) {
-            return match unit == GATEWAY_UNIT && !earlier.is_default {
-                true => self.gateway(frame, now).unwrap_or_else(Decision::from),
-                false => self.to_former(frame, &earlier),
+            return if unit == GATEWAY_UNIT && !earlier.is_default {
+                self.gateway(frame, now).unwrap_or_else(Decision::from)
+            } else {
+                self.to_former(frame, &earlier)
             };
         }
         let is_default = self.routes.has_default_drive() && [0, GATEWAY_UNIT].contains(&unit);
@@ -447,9 +450,10 @@ fn stop_of_default(header: Header, drive: &DriveHandle, request: RequestPdu) -> 
     };
     let stop = Order::Points(vec![(run, Value::Bool(false))]);
     let alone = stops_all_only(&request);
-    let work = match alone {
-        true => BusWork::Order(stop),
-        false => BusWork::Stop(stop, not_readable(Exception::ADDRESS, STOP_ALL)),
+    let work = if alone {
+        BusWork::Order(stop)
+    } else {
+        BusWork::Stop(stop, not_readable(Exception::ADDRESS, STOP_ALL))
     };
     forwarded(header, drive, request, work)
 }

@@ -72,9 +72,10 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
     let (name, machine) = (&spec.name, &drive.machine());
     let names = vault.names(&spec.profile.name);
     // Parameters missing in the file are not written, so they need not be read, unless the drive has another application.
-    let known = match wanted.family == spec.profile.name {
-        true => Reading::addresses_of(&spec.profile, &wanted),
-        false => Default::default(),
+    let known = if wanted.family == spec.profile.name {
+        Reading::addresses_of(&spec.profile, &wanted)
+    } else {
+        Default::default()
     };
     let seen = |looks: ReadProgress| {
         vault.update_restore(machine, |restore| {

@@ -86,13 +86,14 @@ impl Reader {
     pub fn note_read(&self, now: Instant, all: bool, has_gone: impl FnOnce() -> bool) {
         let mut state = self.state();
         let boot = state.waited.then(|| self.watch.since_boot());
-        let dated = match self.watch.turn(now, boot) {
-            true => self.watch.date(state.floor, state.waited, now),
-            false => Dated {
+        let dated = if self.watch.turn(now, boot) {
+            self.watch.date(state.floor, state.waited, now)
+        } else {
+            Dated {
                 earliest: if state.waited { now } else { state.floor.min(now) },
                 stall: None,
                 pause: None,
-            },
+            }
         };
         if dated.stall.is_some() && has_gone() {
             self.connection.hang_up();

@@ -82,9 +82,10 @@ fn understood(profile: &Profile, start: u16, values: &[u16], before: CommandCont
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
     if let Some((address, _)) = writes.iter().find(|(a, _)| outside(a)) {
-        let hint = match *address == u32::from(HOLD) {
-            true => "; a hold (0x8104) is written alone or with 0x8103",
-            false => "",
+        let hint = if *address == u32::from(HOLD) {
+            "; a hold (0x8104) is written alone or with 0x8103"
+        } else {
+            ""
         };
         return Err(Refusal::NotWritable(format!(
             "register 0x{address:04X} is not writable; commands are written to 0x8100 to 0x8103{hint}"

@@ -94,12 +94,11 @@ impl ConnectionHandler for SlotListener {
             tracing::debug!(target: "drivegate::north::slot", "tool slot: cannot set TCP_NODELAY: {error}");
         }
         let slot = &served.terms.slot;
-        let (port, greeting) = match served.telnet {
-            true => {
-                let (port, greeting) = ServedPort::new(slot.format);
-                (Some(port), greeting)
-            }
-            false => (None, Vec::new()),
+        let (port, greeting) = if served.telnet {
+            let (port, greeting) = ServedPort::new(slot.format);
+            (Some(port), greeting)
+        } else {
+            (None, Vec::new())
         };
         let tool = Tool::new(
             served.terms.clone(),

@@ -278,10 +278,12 @@ impl Tool {
     /// configured drive.
     fn raw(&self, case: &Case<'_>, request: &ToolRequest, drives: &[DriveHandle], pdu: &RequestPdu) -> Decision {
         let now = case.now;
-        let why = match request.is_broadcast(self.protocol()) {
-            true => "it is a broadcast",
-            false if drives.is_empty() => "no drive is configured at its address",
-            false => "what it writes cannot be checked",
+        let why = if request.is_broadcast(self.protocol()) {
+            "it is a broadcast"
+        } else if drives.is_empty() {
+            "no drive is configured at its address"
+        } else {
+            "what it writes cannot be checked"
         };
         if self.terms.slot.access != SlotAccess::Raw {
             let text = format!("{why}; only a slot with access = \"raw\" forwards it");

@@ -141,9 +141,10 @@ pub(super) fn revocation_lists(file: &Path) -> Result<Vec<CertificateRevocationL
     }
     let read: Result<Vec<_>, _> = CertificateRevocationListDer::pem_slice_iter(&bytes).collect();
     let lists = read.map_err(|error| pem_error(file, CRL, &bytes, &error))?;
-    match lists.is_empty() {
-        true => Err(pem_error(file, CRL, &bytes, &pem::Error::NoItemsFound)),
-        false => Ok(lists),
+    if lists.is_empty() {
+        Err(pem_error(file, CRL, &bytes, &pem::Error::NoItemsFound))
+    } else {
+        Ok(lists)
     }
 }
 

@@ -164,9 +164,10 @@ impl ProfileDrive {
 
     /// How many words of the start sequence the status shows as received.
     fn shown_position(&self, now: SimTime) -> usize {
-        match now >= self.shows_at {
-            true => self.position,
-            false => self.position.saturating_sub(1),
+        if now >= self.shows_at {
+            self.position
+        } else {
+            self.position.saturating_sub(1)
         }
     }
 
@@ -411,12 +412,11 @@ impl Model for ProfileDrive {
     }
 
     fn command(&mut self, command: Command) {
-        match command.run {
-            true => {
-                (self.run, self.reverse, self.coasts) = (Some(command.reverse), command.reverse, false);
-                self.position = self.steps().saturating_sub(1);
-            }
-            false => self.stop_motor(),
+        if command.run {
+            (self.run, self.reverse, self.coasts) = (Some(command.reverse), command.reverse, false);
+            self.position = self.steps().saturating_sub(1);
+        } else {
+            self.stop_motor();
         }
         let percent = f64::from(command.reference) / 100.0;
         self.set_reference(percent);

@@ -115,9 +115,10 @@ impl ProfileDrive {
                 self.show(now);
                 let table = self.options.profile.canonical(*table);
                 let words = self.read(table, *start, *count)?;
-                Ok(match table.is_bits() {
-                    true => Reply::Bits(words.into_iter().map(|bit| bit != 0).collect()),
-                    false => Reply::Registers(words),
+                Ok(if table.is_bits() {
+                    Reply::Bits(words.into_iter().map(|bit| bit != 0).collect())
+                } else {
+                    Reply::Registers(words)
                 })
             }
             RequestPdu::WriteCoil { address, on } => self.write(Table::Coil, *address, &[u16::from(*on)], now),
@@ -169,9 +170,10 @@ impl ProfileDrive {
     }
 
     fn write_extra(&mut self, address: u16, value: u16) {
-        match address == self.options.trip_address() {
-            true => self.trip(value),
-            false => self.give_to_bus(value == 0),
+        if address == self.options.trip_address() {
+            self.trip(value)
+        } else {
+            self.give_to_bus(value == 0)
         }
     }
 
@@ -179,10 +181,14 @@ impl ProfileDrive {
         let end = start
             .checked_add(count.checked_sub(1).ok_or(Exception::VALUE)?)
             .ok_or(Exception::ADDRESS)?;
-        let one = |address: u16| match self.is_extra(table, address) {
-            true if address == self.options.trip_address() => Ok(self.body.latch.fault()),
-            true => Ok(u16::from(!self.remote)),
-            false => self.registers.get(table, address).ok_or(Exception::ADDRESS),
+        let one = |address: u16| {
+            if !self.is_extra(table, address) {
+                self.registers.get(table, address).ok_or(Exception::ADDRESS)
+            } else if address == self.options.trip_address() {
+                Ok(self.body.latch.fault())
+            } else {
+                Ok(u16::from(!self.remote))
+            }
         };
         let words = (start..=end).map(one).collect::<Result<Vec<u16>, Exception>>()?;
         let limit = |address: u16| self.options.profile.range(table, address).map(|range| range.read);

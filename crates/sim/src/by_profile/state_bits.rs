@@ -58,18 +58,17 @@ fn search(fixed: &Fixed, wishes: &[&Wish], base: &impl Fn(Key) -> u16, tries: &m
 
 /// Every way to satisfy a wish in addition to what is fixed, those that change least of `base` first.
 fn ways(fixed: &Fixed, wish: &Wish, base: &impl Fn(Key) -> u16) -> Vec<Fixed> {
-    match wish.want {
-        true => {
-            let mut ways: Vec<Fixed> = wish.any.iter().filter_map(|bits| with(fixed, bits)).collect();
-            ways.sort_by_key(|way| changes(way, base));
-            ways
-        }
-        false => wish.any.iter().fold(vec![fixed.clone()], |ways, bits| {
+    if wish.want {
+        let mut ways: Vec<Fixed> = wish.any.iter().filter_map(|bits| with(fixed, bits)).collect();
+        ways.sort_by_key(|way| changes(way, base));
+        ways
+    } else {
+        wish.any.iter().fold(vec![fixed.clone()], |ways, bits| {
             let mut next: Vec<Fixed> = ways.iter().flat_map(|way| without(way, bits)).collect();
             next.sort_by_key(|way| changes(way, base));
             next.truncate(MOST_WAYS);
             next
-        }),
+        })
     }
 }
 

@@ -141,17 +141,19 @@ impl TecoDrive {
 
     /// Whether the bus or the terminals order the motor to run.
     fn is_told_to_run(&self) -> bool {
-        match self.run_from_bus() {
-            true => self.control.operation & operation::RUN != 0,
-            false => (self.terminals & terminal::FORWARD != 0) != (self.terminals & terminal::REVERSE != 0),
+        if self.run_from_bus() {
+            self.control.operation & operation::RUN != 0
+        } else {
+            (self.terminals & terminal::FORWARD != 0) != (self.terminals & terminal::REVERSE != 0)
         }
     }
 
     /// Whether the present command turns the motor in reverse.
     fn is_told_to_reverse(&self) -> bool {
-        match self.run_from_bus() {
-            true => self.control.operation & operation::REVERSE != 0,
-            false => self.terminals & terminal::REVERSE != 0,
+        if self.run_from_bus() {
+            self.control.operation & operation::REVERSE != 0
+        } else {
+            self.terminals & terminal::REVERSE != 0
         }
     }
 

@@ -126,9 +126,10 @@ fn authorization(file: &Path) -> Result<String, ClientError> {
         ))
     })?;
     let text = text.trim();
-    Ok(match text.contains(':') {
-        true => basic_authorization(text),
-        false => format!("Bearer {text}"),
+    Ok(if text.contains(':') {
+        basic_authorization(text)
+    } else {
+        format!("Bearer {text}")
     })
 }
 
@@ -137,9 +138,10 @@ impl Network {
         let socket = TcpStream::connect((self.url.host.as_str(), self.url.port))
             .await
             .map_err(|error| NotConnected::Because(error.to_string()))?;
-        Ok(match self.url.tls {
-            false => Box::new(socket),
-            true => Box::new(self.with_tls(socket).await.map_err(NotConnected::Final)?),
+        Ok(if self.url.tls {
+            Box::new(self.with_tls(socket).await.map_err(NotConnected::Final)?)
+        } else {
+            Box::new(socket)
         })
     }
 

@@ -232,9 +232,10 @@ impl Reply {
     /// # Errors
     /// If the gateway refuses the request, or the server is not a gateway.
     pub(crate) fn accepted<T: DeserializeOwned>(self, asked: &GatewayRequest) -> Result<T, ClientError> {
-        match self.status.is_success() {
-            true => self.document(),
-            false => Err(self.refusal(asked)),
+        if self.status.is_success() {
+            self.document()
+        } else {
+            Err(self.refusal(asked))
         }
     }
 
@@ -262,9 +263,10 @@ impl Reply {
     }
 
     pub(crate) fn strange(&self, why: String) -> ClientError {
-        match self.over_network {
-            true => ClientError::Strange(self.place.clone(), why),
-            false => ClientError::Refused(format!("{why}; {}; restart the gateway", self.place)),
+        if self.over_network {
+            ClientError::Strange(self.place.clone(), why)
+        } else {
+            ClientError::Refused(format!("{why}; {}; restart the gateway", self.place))
         }
     }
 

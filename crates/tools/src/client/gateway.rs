@@ -52,9 +52,10 @@ impl Gateway {
         ];
         let given = options.into_iter().filter_map(|(name, value)| Some((name, value?)));
         given.fold(format!("drivegate {words}"), |line, (name, value)| {
-            match value.contains(char::is_whitespace) {
-                true => format!("{line} {name} '{value}'"),
-                false => format!("{line} {name} {value}"),
+            if value.contains(char::is_whitespace) {
+                format!("{line} {name} '{value}'")
+            } else {
+                format!("{line} {name} {value}")
             }
         })
     }

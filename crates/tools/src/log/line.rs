@@ -111,12 +111,13 @@ impl LogLine {
             return write!(writer, "<{}>{target}: ", priority(*level));
         }
         let time = humantime::format_rfc3339_micros(SystemTime::now());
-        match writer.has_ansi_escapes() {
-            true => write!(
+        if writer.has_ansi_escapes() {
+            write!(
                 writer,
                 "\x1b[2m{time}\x1b[0m \x1b[{colour}m{level:>5}\x1b[0m \x1b[2m{target}:\x1b[0m "
-            ),
-            false => write!(writer, "{time} {level:>5} {target}: "),
+            )
+        } else {
+            write!(writer, "{time} {level:>5} {target}: ")
         }
     }
 }

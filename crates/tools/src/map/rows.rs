@@ -280,9 +280,10 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes:
         notes.push(point.note.clone());
     }
     if has_writable_range(profile, raw) && !is_written_raw(profile, raw_writes, raw) {
-        notes.push(match shares_a_block_with_the_control_word(profile, raw) {
-            true => "written raw only in one request with the control word".to_string(),
-            false => "raw writes refused, see raw_writes".to_string(),
+        notes.push(if shares_a_block_with_the_control_word(profile, raw) {
+            "written raw only in one request with the control word".to_string()
+        } else {
+            "raw writes refused, see raw_writes".to_string()
         });
     }
     let both = raw.table == Table::Holding && profile.input_is_holding;

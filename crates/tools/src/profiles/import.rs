@@ -214,9 +214,10 @@ fn words(text: &str, joint: char) -> String {
         .split(|c: char| !c.is_ascii_alphanumeric())
         .filter(|part| !part.is_empty());
     let joined = parts.collect::<Vec<_>>().join(&joint.to_string());
-    match joined.starts_with(|c: char| c.is_ascii_digit()) {
-        true => format!("p{joint}{joined}"),
-        false => joined,
+    if joined.starts_with(|c: char| c.is_ascii_digit()) {
+        format!("p{joint}{joined}")
+    } else {
+        joined
     }
 }
 

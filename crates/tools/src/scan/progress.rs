@@ -105,9 +105,10 @@ impl Progress {
 fn left(steps: &VecDeque<(Duration, Duration)>, patience: Duration) -> Duration {
     let took: Duration = steps.iter().map(|(took, _)| *took).sum();
     let most: Duration = steps.iter().map(|(_, most)| *most).sum();
-    match most.is_zero() {
-        true => patience,
-        false => patience.mul_f64(took.as_secs_f64() / most.as_secs_f64()),
+    if most.is_zero() {
+        patience
+    } else {
+        patience.mul_f64(took.as_secs_f64() / most.as_secs_f64())
     }
 }
 

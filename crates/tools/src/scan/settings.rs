@@ -90,15 +90,14 @@ pub(super) fn parts(options: &Options, settings: &[Setting], exhaustive: bool) -
         setting: *setting,
         addresses: addresses(options, *setting).filter(wanted).collect(),
     };
-    let mut parts: Vec<Part> = match exhaustive || options.addresses.0.len() <= FEW_ADDRESSES {
-        true => settings.iter().map(|setting| part(setting, &|_| true)).collect(),
-        false => {
-            let first = settings.iter().map(|setting| part(setting, &likely));
-            let then = settings
-                .iter()
-                .map(|setting| part(setting, &|address| !likely(address)));
-            first.chain(then).collect()
-        }
+    let mut parts: Vec<Part> = if exhaustive || options.addresses.0.len() <= FEW_ADDRESSES {
+        settings.iter().map(|setting| part(setting, &|_| true)).collect()
+    } else {
+        let first = settings.iter().map(|setting| part(setting, &likely));
+        let then = settings
+            .iter()
+            .map(|setting| part(setting, &|address| !likely(address)));
+        first.chain(then).collect()
     };
     parts.retain(|part| !part.addresses.is_empty());
     parts
@@ -109,9 +108,10 @@ pub(super) fn settings(args: &Options, port: &str) -> Result<Vec<Setting>, Strin
     if port.starts_with("modbus-tcp://") {
         return network_settings(args);
     }
-    let protocols = match port.starts_with("udp://") {
-        true => vec![Protocol::ModbusRtu],
-        false => protocols(&args.protocol)?,
+    let protocols = if port.starts_with("udp://") {
+        vec![Protocol::ModbusRtu]
+    } else {
+        protocols(&args.protocol)?
     };
     let by_server = ["tcp://", "udp://"].iter().any(|scheme| port.starts_with(scheme));
     let mut settings: Vec<Setting> = Vec::new();

@@ -147,9 +147,10 @@ impl Snippet<'_> {
             ),
             _ => String::new(),
         };
-        let note = match drive.chosen {
-            true => "# Named, not identified: compare its values with the drive's panel.\n".to_string(),
-            false => note,
+        let note = if drive.chosen {
+            "# Named, not identified: compare its values with the drive's panel.\n".to_string()
+        } else {
+            note
         };
         let identified = drive.identified(self.profiles);
         let note = note + &identified.map_or(String::new(), |text| format!("# This is {text}.\n"));

@@ -101,8 +101,9 @@ fn figures(reading: &Reading<'_>) -> String {
         fault,
     ];
     let parts: Vec<String> = parts.into_iter().flatten().collect();
-    match parts.is_empty() {
-        true => "no values yet".to_string(),
-        false => parts.join(", "),
+    if parts.is_empty() {
+        "no values yet".to_string()
+    } else {
+        parts.join(", ")
     }
 }

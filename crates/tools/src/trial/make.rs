@@ -65,9 +65,10 @@ fn addresses(found: &[&Found]) -> Option<String> {
 fn nameplates(found: &[&Found]) -> String {
     let plates = found.iter().map(|found| found.nameplate.as_str());
     let plates: BTreeSet<&str> = plates.filter(|plate| !plate.is_empty()).collect();
-    match plates.is_empty() {
-        true => String::new(),
-        false => format!(" ({})", plates.into_iter().collect::<Vec<_>>().join(", ")),
+    if plates.is_empty() {
+        String::new()
+    } else {
+        format!(" ({})", plates.into_iter().collect::<Vec<_>>().join(", "))
     }
 }
 

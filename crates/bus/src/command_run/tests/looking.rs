@@ -90,9 +90,10 @@ impl<'p> AnyDrive<'p> {
         if let RequestPdu::Read { table, start, count } = pdu {
             self.reads += 1;
             let words = (*start..start + count).map(|address| self.words.get(&(*table, address)).copied().unwrap_or(0));
-            return match table.is_bits() {
-                true => Reply::Bits(words.map(|word| word != 0).collect()),
-                false => Reply::Registers(words.collect()),
+            return if table.is_bits() {
+                Reply::Bits(words.map(|word| word != 0).collect())
+            } else {
+                Reply::Registers(words.collect())
             };
         }
         let Some((table, items)) = written(pdu) else {

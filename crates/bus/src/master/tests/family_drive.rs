@@ -58,10 +58,13 @@ impl FamilyDrive {
     pub(super) fn show(&mut self, point: ModelPoint, on: bool) {
         let profile = self.profile.clone();
         match profile.model_point(point).map(|point| &point.source) {
-            Some(Source::Derived(Derived::State { any })) => match on {
-                true => self.state(any[0], true),
-                false => any.iter().for_each(|mask| self.state(*mask, false)),
-            },
+            Some(Source::Derived(Derived::State { any })) => {
+                if on {
+                    self.state(any[0], true)
+                } else {
+                    any.iter().for_each(|mask| self.state(*mask, false))
+                }
+            }
             Some(Source::Raw(raw)) => self.bit(raw, on),
             _ => {}
         }

@@ -24,9 +24,10 @@ impl PolledLine {
 }
 
 fn refused_if(refused: bool) -> Polled {
-    match refused {
-        true => Polled::Refused(Exception::ADDRESS),
-        false => Polled::Ok,
+    if refused {
+        Polled::Refused(Exception::ADDRESS)
+    } else {
+        Polled::Ok
     }
 }
 

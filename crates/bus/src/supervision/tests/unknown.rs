@@ -98,12 +98,11 @@ fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     let (heard, mut answered) = (rig.now, Duration::ZERO);
     while rig.later(100).is_none() {
         assert!(rig.now - heard < Duration::from_secs(20));
-        match rig.image().snapshot().link.is_online() {
-            true => {
-                answered += Duration::from_millis(100);
-                offline(&rig);
-            }
-            false => online(&rig),
+        if rig.image().snapshot().link.is_online() {
+            answered += Duration::from_millis(100);
+            offline(&rig);
+        } else {
+            online(&rig);
         }
     }
     assert!(answered >= Duration::from_millis(1_800), "{answered:?}");

@@ -163,9 +163,10 @@ impl Run {
             self.step = Step::Ending(state, stop);
             return;
         }
-        self.report.last_stop = Some(match stop.is_acknowledged() {
-            true => "acknowledged".to_string(),
-            false => stop.why_not(),
+        self.report.last_stop = Some(if stop.is_acknowledged() {
+            "acknowledged".to_string()
+        } else {
+            stop.why_not()
         });
         let text = std::mem::take(&mut self.report.text);
         self.finish(state, text, time);

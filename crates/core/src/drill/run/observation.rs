@@ -64,12 +64,11 @@ impl Run {
                 self.report.text.clone_from(&step.seen);
                 let stop = OneStop::place(&self.drive, self.machine.clone(), &self.own, now);
                 self.stops = self.drive.stops();
-                match self.at + 1 < self.report.steps.len() {
-                    true => self.go(Step::Clearing(stop), now),
-                    false => {
-                        self.report.text = "the motor stopped in time each way".to_string();
-                        self.go(Step::Ending(DrillState::Passed, stop), now);
-                    }
+                if self.at + 1 < self.report.steps.len() {
+                    self.go(Step::Clearing(stop), now);
+                } else {
+                    self.report.text = "the motor stopped in time each way".to_string();
+                    self.go(Step::Ending(DrillState::Passed, stop), now);
                 }
             }
             // The stop that the drill should have given or observed may be late for this reason.

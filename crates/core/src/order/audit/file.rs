@@ -181,13 +181,15 @@ impl AuditFile {
             lost,
             ..
         } = &mut *queues;
-        let (queue, room, lost) = match sent {
-            true => (first, WAITING.0, &mut lost.0),
-            false => (unsent, WAITING.1, &mut lost.1),
+        let (queue, room, lost) = if sent {
+            (first, WAITING.0, &mut lost.0)
+        } else {
+            (unsent, WAITING.1, &mut lost.1)
         };
-        match queue.len() < room {
-            true => queue.push_back(record),
-            false => *lost += 1,
+        if queue.len() < room {
+            queue.push_back(record);
+        } else {
+            *lost += 1;
         }
         self.shared.wake.notify_one();
     }

@@ -51,11 +51,12 @@ keys! {
 
 fn parse_rank(text: &str) -> Result<String, Finding> {
     let is_name = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
-    match !text.is_empty() && text.len() <= 64 && text.chars().all(is_name) {
-        true => Ok(text.to_string()),
-        false => Err(Finding::new(
+    if !text.is_empty() && text.len() <= 64 && text.chars().all(is_name) {
+        Ok(text.to_string())
+    } else {
+        Err(Finding::new(
             format!("`{text}` is not a valid rank name"),
             "use letters, digits, - and _",
-        )),
+        ))
     }
 }

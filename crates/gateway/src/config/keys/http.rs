@@ -33,11 +33,12 @@ keys! {
 }
 
 fn parse_host(text: &str) -> Result<String, Finding> {
-    match drivegate_http::is_host(text) {
-        true => Ok(text.to_string()),
-        false => Err(Finding::new(
+    if drivegate_http::is_host(text) {
+        Ok(text.to_string())
+    } else {
+        Err(Finding::new(
             format!("`{text}` is not a host name or an address"),
             "write it without scheme and port, such as \"gateway.example.com\"",
-        )),
+        ))
     }
 }

@@ -260,9 +260,10 @@ fn read_order(reader: &Reader<'_>, form: Form) -> Order {
         reader.problem("order", "bits of one register have no order", "leave the key out");
     }
     if form.items() == 1 && reader.has("words") {
-        let what = match bits {
-            true => "bits of one register have no word order".to_string(),
-            false => format!("a {} is one register and has no word order", form.name()),
+        let what = if bits {
+            "bits of one register have no word order".to_string()
+        } else {
+            format!("a {} is one register and has no word order", form.name())
         };
         reader.problem("words", what, "leave the key out");
     }

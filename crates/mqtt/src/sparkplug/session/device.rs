@@ -83,9 +83,10 @@ impl Device {
         let published = self.now_is.len().min(self.most);
         let mut places: Vec<usize> = (0..published).filter(|place| differs(*place)).collect();
         let figures = |place: &usize| self.definitions.get(*place).is_some_and(|d| d.pace == Pace::Figure);
-        let least = match places.iter().all(figures) && self.repeat.is_empty() {
-            true => least.max(FIGURES),
-            false => least,
+        let least = if places.iter().all(figures) && self.repeat.is_empty() {
+            least.max(FIGURES)
+        } else {
+            least
         };
         places.extend(self.repeat.iter().copied().filter(|place| *place < published));
         places.sort_unstable();

@@ -102,9 +102,12 @@ impl Order {
 
     /// The registers of a value of that many.
     pub(super) fn split(self, bits: u64, registers: u16) -> Vec<u16> {
-        let place = |register: u16| match self.low_word_first() {
-            true => register,
-            false => registers - 1 - register,
+        let place = |register: u16| {
+            if self.low_word_first() {
+                register
+            } else {
+                registers - 1 - register
+            }
         };
         let word = |register| self.word((bits >> (16 * u32::from(place(register)))) as u16);
         (0..registers.min(4)).map(word).collect()
@@ -113,10 +116,7 @@ impl Order {
     /// The bytes of a text in their order.
     pub(in crate::drive) fn bytes(self, words: &[u16]) -> impl Iterator<Item = u8> {
         let last = words.len();
-        let at = move |place: usize| match self.low_word_first() {
-            true => last - 1 - place,
-            false => place,
-        };
+        let at = move |place: usize| if self.low_word_first() { last - 1 - place } else { place };
         let words = (0..last).filter_map(move |place| words.get(at(place)));
         words.flat_map(move |word| self.word(*word).to_be_bytes())
     }
