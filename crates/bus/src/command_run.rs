@@ -7,6 +7,7 @@ mod ending;
 mod functions;
 mod known_words;
 mod next;
+mod next_direction;
 mod parameter;
 mod replies;
 mod state_read;
@@ -21,18 +22,16 @@ pub(crate) use self::state_read::StateRead;
 pub use self::steps::{Step, StepPurpose};
 pub use self::word::read_place;
 
+use self::next_direction::NextDirection;
 use self::parameter::ParameterRun;
 use self::steps::{
     Action, Check, Permit, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change,
 };
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
-use drivegate_core::order::{
-    Command, Intent, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Work, written,
-};
+use drivegate_core::order::{Command, Intent, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Work};
 use drivegate_core::permit::{Motor, Repeats, Verdict, running_unknown};
-use drivegate_model::drive::control::Run;
-use drivegate_model::drive::{ModelPoint, Profile};
+use drivegate_model::drive::Profile;
 use drivegate_proto::{Reply, Table};
 
 /// Maximum number of stops to a drive that are sent before the end of a pulse in progress.
@@ -183,16 +182,6 @@ impl MotorRead {
     }
 }
 
-/// Effect of a command on the direction that is kept for the next start.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum NextDirection {
-    Unchanged,
-    /// The command sets the direction, or starts the motor: a kept direction is dropped.
-    Dropped,
-    /// The direction that the command orders is kept, because no word of the family has it while the motor stands.
-    Kept(bool),
-}
-
 /// A command that the bus has started.
 #[derive(Debug)]
 pub struct CommandRun {
@@ -254,6 +243,7 @@ impl CommandRun {
             whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
             reference_only,
         };
+        let next_direction = NextDirection::of(profile, &order, urgency);
         let known = RequestContext {
             check: Check::NotYet,
             blind: false,
@@ -262,12 +252,6 @@ impl CommandRun {
             running: true,
             masks: false,
             permit: None,
-        };
-        let of_stop = direction_at_stop(profile, &order).filter(|_| urgency == Urgency::Stop);
-        let next_direction = match of_stop {
-            Some(reverse) => NextDirection::Kept(reverse),
-            None if starts_or_sets_direction(profile, &order) => NextDirection::Dropped,
-            None => NextDirection::Unchanged,
         };
         let parameter = match &order {
             Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
@@ -562,50 +546,6 @@ impl CommandRun {
     /// Whether the command has expired while steps remain that were not cancelled yet.
     pub fn is_late(&self, now: Instant) -> bool {
         now >= self.expires && self.may_write_on()
-    }
-}
-
-/// The direction that an order names, where the family has it in its run commands only.
-fn direction_at_stop(profile: &Profile, order: &Order) -> Option<bool> {
-    let control = profile.control.as_ref()?;
-    let (Order::Points(values), Run::Pair { .. }) = (order, &control.run) else {
-        return None;
-    };
-    let index = profile.model_index(ModelPoint::Reverse)?;
-    let written = profile.points.get(index)?.write_to.unwrap_or(index);
-    let mut values = values.iter();
-    values.find(|(of, _)| *of == written).map(|(_, value)| value.as_bool())
-}
-
-/// Whether an order sets the direction or starts the motor. A raw write to one of the places of these commands
-/// counts as well.
-fn starts_or_sets_direction(profile: &Profile, order: &Order) -> bool {
-    match order {
-        Order::Points(values) => {
-            let says = |point: ModelPoint, on: Option<bool>| {
-                let index = profile.model_index(point);
-                let written = index.and_then(|index| profile.points.get(index)?.write_to).or(index);
-                values
-                    .iter()
-                    .any(|(of, value)| Some(*of) == written && on.is_none_or(|on| value.as_bool() == on))
-            };
-            says(ModelPoint::Reverse, None) || says(ModelPoint::Run, Some(true))
-        }
-        Order::Write(pdu) => {
-            let control = profile.control.as_ref();
-            let places = control.map(|control| {
-                let reverse = control.reverse.and_then(|setting| setting.place);
-                [Some(control.at), Some(control.run_place()), reverse]
-            });
-            let reaches = |table: Table, address: u16| {
-                let places = places.into_iter().flatten().flatten();
-                places
-                    .into_iter()
-                    .any(|place| (place.table, place.address) == (table, address))
-            };
-            written(pdu).is_none_or(|(table, items)| items.iter().any(|(address, _)| reaches(table, *address)))
-        }
-        Order::Read(_) | Order::Parameter(_) => false,
     }
 }
 

@@ -3,9 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use super::steps::Action;
-use super::word::Word;
-use super::{CommandRun, KnownWords, MotorRead, NextDirection, Shown, Step, StepPurpose};
+use super::{CommandRun, MotorRead, Step, StepPurpose};
 use drivegate_core::order::Outcome;
 use drivegate_core::permit::{Motor, not_seen};
 use drivegate_model::drive::model::Kind;
@@ -219,41 +217,6 @@ impl CommandRun {
         } else {
             outcome
         }
-    }
-
-    /// Keeps the direction for the next start and leaves out its write.
-    pub(super) fn keep_direction(&mut self, reverse: bool) {
-        if self.in_doubt() {
-            self.give_up(self.tries.unanswered.clone());
-            return;
-        }
-        let elsewhere = matches!(self.actions.front(), Some(Action::Word(Word::DirectionElsewhere(_))));
-        self.pop();
-        if elsewhere {
-            self.pop();
-        }
-        if matches!(self.actions.front(), Some(Action::Release(_))) {
-            self.pop();
-        }
-        self.look.forget();
-        self.next_direction = NextDirection::Kept(reverse);
-        // The effects of the rest of the command would be taken for the effect of the direction.
-        self.shown = Shown::AtNextStart;
-    }
-
-    /// Keeps the direction that the command ordered; if it set another one, drops the kept one.
-    pub(crate) fn note_direction(&self, words: &mut KnownWords) {
-        match self.next_direction {
-            NextDirection::Kept(reverse) => words.keep_direction(reverse),
-            NextDirection::Dropped => words.forget_direction(),
-            NextDirection::Unchanged => {}
-        }
-    }
-
-    /// Whether the direction that the command orders waits for the next start.
-    #[cfg(test)]
-    pub(crate) fn waits_for_start(&self) -> bool {
-        matches!(self.shown, Shown::AtNextStart)
     }
 }
 

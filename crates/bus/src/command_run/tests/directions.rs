@@ -1,6 +1,7 @@
 //! Stops that name a direction, and resets of drives whose commands are coils.
 
 use super::*;
+use drivegate_core::order::written;
 
 fn bench(profile: &str) -> ObedientDrive {
     ObedientDrive {

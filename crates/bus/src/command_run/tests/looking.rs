@@ -5,7 +5,7 @@ use super::super::word::{self, Made};
 use super::*;
 use drivegate_core::order::{Arrival, Window, written};
 use drivegate_model::drive::control::{Control, ControlItem, OwnWord, Run};
-use drivegate_model::drive::{Derived, PointIndex, Raw, Source};
+use drivegate_model::drive::{Derived, ModelPoint, PointIndex, Raw, Source};
 
 /// What happened at a drive since its last poll, when its motor ran by a word of the gateway.
 #[derive(Debug, Clone, Copy, PartialEq)]
