@@ -191,6 +191,25 @@ mod tests {
         );
     }
 
+    /// Bytes that do not come from this code, since files of earlier versions are read.
+    #[test]
+    fn the_form_of_the_first_version_is_read_and_written() {
+        let first_version = [
+            &b"\xD7GJ\xFEM\x07\0\0\0\0\0\0\0\x06\0\0\0e\xDC\x11s\x03\0a/bx"[..],
+            b"\xD7GJ\xFEA\x06\0\0\0\0\0\0\0\0\0\0\0L\xABR\x80",
+        ]
+        .concat();
+        let mut bytes = Vec::new();
+        message(
+            MessageNumber::new(7),
+            &Message::not_retained("a/b", b"x".to_vec()),
+            &mut bytes,
+        );
+        bytes.extend(mark(MessageNumber::new(6)));
+        assert_eq!(bytes, first_version);
+        assert_eq!(numbers(&first_version), [7, 106]);
+    }
+
     #[test]
     fn one_flipped_bit_costs_one_record() {
         let whole = three();
