@@ -76,6 +76,15 @@ struct Chosen {
     since: Instant,
 }
 
+/// The transaction on the line.
+#[derive(Debug)]
+struct OnLine {
+    turn: Turn,
+    tap: Option<Tap>,
+    /// Whether the thread was stalled since the request was sent.
+    stood: bool,
+}
+
 /// A bus without the thread that runs it.
 #[derive(Debug)]
 pub struct BusCore {
@@ -87,10 +96,9 @@ pub struct BusCore {
     /// Until when a reply to a request of the previous bus may arrive; nothing is sent before.
     quiet_until: Option<Instant>,
     /// The transaction on the line.
-    asked: Option<Turn>,
+    asked: Option<OnLine>,
     connection: Connection,
     server: ClosingServer,
-    tap: Option<Tap>,
     counters: DriveCounters,
     /// An empty list, kept to reuse its memory.
     news: Vec<News>,
@@ -98,8 +106,6 @@ pub struct BusCore {
     stalls: Option<Stalls>,
     /// When the threads that read orders were last checked for a stall.
     deaf_checked: Instant,
-    /// Whether the thread was stalled since the request on the line was sent.
-    stood: bool,
 }
 
 impl BusCore {
@@ -122,11 +128,9 @@ impl BusCore {
             asked: None,
             connection: Connection::default(),
             server: ClosingServer::default(),
-            tap: None,
             news: Vec::new(),
             stalls: None,
             deaf_checked: now,
-            stood: false,
         }
     }
 
@@ -140,7 +144,9 @@ impl BusCore {
             return false;
         };
         self.deaf_checked = now;
-        self.stood = true;
+        if let Some(asked) = &mut self.asked {
+            asked.stood = true;
+        }
         self.master.after_stall(stall, now);
         self.report.after_stall(stall);
         // The chosen frame may rest on what was read before the stall.
@@ -230,7 +236,7 @@ impl BusCore {
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.bus.queue.close(Outcome::BusDown, now);
         self.forget_late_replies();
-        (self.chosen, self.asked, self.tap) = (None, None, None);
+        (self.chosen, self.asked) = (None, None);
         self.master.lost(now);
         self.server.lost();
         self.report.bus_down(why, now);
@@ -341,7 +347,7 @@ impl BusCore {
 
     /// The turn whose transaction is on the line.
     pub fn asked(&self) -> Option<&Turn> {
-        self.asked.as_ref()
+        self.asked.as_ref().map(|asked| &asked.turn)
     }
 
     /// A command arrived while the line was idle: the next request is chosen again, unless it is a stop.
@@ -372,14 +378,17 @@ impl BusCore {
         let needed = self.line.silence_before(self.master.silence_of(&turn));
         let paused = now.saturating_duration_since(quiet_since + needed.saturating_sub(self.line.silence()));
         self.report.diagnosis.sending(paused);
-        self.tap = self
+        let tap = self
             .report
             .tape_request(turn.drive(), &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         self.line.send(request, frame, sending, now);
         self.connection.asked = true;
-        self.stood = false;
-        self.asked = Some(turn);
+        self.asked = Some(OnLine {
+            turn,
+            tap,
+            stood: false,
+        });
         self.line.frame()
     }
 
@@ -393,7 +402,7 @@ impl BusCore {
             }
             return;
         }
-        if let Some(tap) = &mut self.tap {
+        if let Some(tap) = self.asked.as_mut().and_then(|asked| asked.tap.as_mut()) {
             tap.received(bytes, now);
         }
         if let Some(exchanged) = self.line.received(bytes, self.master.n2_late(), now) {
@@ -402,7 +411,9 @@ impl BusCore {
     }
 
     fn over(&mut self, exchanged: Exchanged, now: Instant) {
-        let Some(turn) = self.asked.take() else { return };
+        let Some(OnLine { turn, tap, stood }) = self.asked.take() else {
+            return;
+        };
         if matches!(exchanged.ended, Ended::Reply(_)) {
             self.connection = Connection {
                 answered: true,
@@ -414,7 +425,7 @@ impl BusCore {
         self.report.exchanged(drive, &exchanged, now);
         let heard = exchanged.transaction.seen();
         self.report.tape_reply(drive, heard, &exchanged.ended, now);
-        if let Some(tap) = self.tap.take() {
+        if let Some(tap) = tap {
             tap.ended(&exchanged.ended, now);
         }
         let mangled = exchanged.transaction.is_mangled_reply();
@@ -436,7 +447,7 @@ impl BusCore {
             ended,
             began,
             at,
-            stood: self.stood,
+            stood,
             took,
             mangled,
             doubted,

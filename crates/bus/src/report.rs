@@ -103,7 +103,10 @@ impl Report {
         match news {
             News::FastRound(cycle) => self.fast_round(*cycle),
             News::SlowRound(cycle) => self.slow_round(*cycle),
-            News::Read { drive, read, words, at } => self.read(*drive, read, words, *at),
+            News::Read { drive, read, words, at } => {
+                self.read(*drive, read, words, *at);
+                return self.required_after(*drive, read, words, *at, now);
+            }
             News::Online(drive) => self.online(*drive),
             News::Offline(drive) => self.offline(*drive),
             News::Restarted(drive) => self.restarted(*drive),
@@ -150,12 +153,20 @@ impl Report {
                 format!("an interlock of {name} is not satisfied: {why}; the drive is being stopped")
             }),
         }
-        let News::Read { drive, read, words, at } = news else {
-            return RequiredReads::default();
-        };
-        let index = *drive;
+        RequiredReads::default()
+    }
+
+    /// Evaluates what a read has shown of the drive.
+    fn required_after(
+        &mut self,
+        index: DriveIndex,
+        read: &PlannedRead,
+        words: &[u16],
+        at: Instant,
+        now: Instant,
+    ) -> RequiredReads {
         let drive = self.drive(index);
-        let monitors = self.compare_selection(index, &drive, read, words, *at);
+        let monitors = self.compare_selection(index, &drive, read, words, at);
         let reading = drive.reading(now, RECENT);
         let new_fault = self.check_fault(index, &reading);
         self.report_state(index, &reading);

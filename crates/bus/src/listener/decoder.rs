@@ -91,6 +91,13 @@ impl Exchange {
     }
 }
 
+/// The bytes of a piece, and when its first and its last character were on the wire.
+struct Frame {
+    bytes: Vec<u8>,
+    began: Instant,
+    ended: Instant,
+}
+
 /// A request whose reply may still arrive.
 #[derive(Debug)]
 struct Open {
@@ -169,38 +176,49 @@ impl Decoder {
                 return;
             };
             let quiet_since = self.quiet_since.replace(piece.ended).unwrap_or(piece.began);
-            match &piece.cut {
-                Cut::Request { .. } => self.asked(piece, quiet_since, heard),
-                Cut::Reply { .. } => self.answered(piece, heard),
-                Cut::Garbage => self.garbage(piece, quiet_since, heard),
+            let Piece {
+                cut,
+                bytes,
+                began,
+                ended,
+            } = piece;
+            let frame = Frame { bytes, began, ended };
+            match cut {
+                Cut::Request { address, pdu } => self.asked(address, pdu, frame, quiet_since, heard),
+                Cut::Reply { reply, ambiguous } => self.answered(reply, ambiguous, &frame, heard),
+                Cut::Garbage => self.garbage(frame, quiet_since, heard),
             }
         }
     }
 
-    fn asked(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Traffic>) {
-        self.give_up(piece.began, heard);
-        let Cut::Request { address, pdu } = piece.cut else {
-            return;
-        };
+    fn asked(
+        &mut self,
+        address: u8,
+        pdu: Option<RequestPdu>,
+        frame: Frame,
+        quiet_since: Instant,
+        heard: &mut Vec<Traffic>,
+    ) {
+        self.give_up(frame.began, heard);
         let garbage = std::mem::take(&mut self.garbage);
         if may_be_request(self.protocol, garbage.len()) && !are_sound(self.protocol, &garbage) {
-            self.mangled_until = Some(piece.began + FORGOTTEN_AFTER);
+            self.mangled_until = Some(frame.began + FORGOTTEN_AFTER);
         }
         let n2 = self.n2.get(&address).copied().unwrap_or_default();
         let open = Open {
             address,
             ambiguous: pdu.as_ref().is_some_and(|pdu| self.could_be_reply(pdu)),
             request: pdu.map(|pdu| Request { address, pdu, n2 }),
-            frame: piece.bytes,
+            frame: frame.bytes,
             quiet_since,
-            began: piece.began,
-            sent: piece.ended,
+            began: frame.began,
+            sent: frame.ended,
             garbage: Vec::new(),
         };
         let is_broadcast = open.address == 0;
         self.open = Some(open);
         if is_broadcast {
-            self.over(None, piece.ended, None, None, heard);
+            self.over(None, frame.ended, None, None, heard);
         }
     }
 
@@ -217,17 +235,14 @@ impl Decoder {
         }
     }
 
-    fn answered(&mut self, piece: Piece, heard: &mut Vec<Traffic>) {
-        let Cut::Reply { reply, ambiguous } = piece.cut else {
-            return;
-        };
+    fn answered(&mut self, reply: Reply, ambiguous: bool, frame: &Frame, heard: &mut Vec<Traffic>) {
         let Some(open) = &mut self.open else { return };
-        open.garbage.extend_from_slice(&piece.bytes);
-        let (began, at) = (piece.began, piece.ended);
+        open.garbage.extend_from_slice(&frame.bytes);
+        let (began, at) = (frame.began, frame.ended);
         let doubt = match () {
             () if ambiguous || open.ambiguous => Some(AMBIGUOUS),
             () if self.mangled_until.is_some_and(|until| began < until) => Some(BEHIND_MANGLED),
-            () => self.late(&piece.bytes, at),
+            () => self.late(&frame.bytes, at),
         };
         self.over(Some(Ended::Reply(reply)), at, Some(began), doubt, heard);
     }
@@ -245,17 +260,17 @@ impl Decoder {
         may_be_late.then_some(MAY_BE_LATE)
     }
 
-    fn garbage(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Traffic>) {
+    fn garbage(&mut self, frame: Frame, quiet_since: Instant, heard: &mut Vec<Traffic>) {
         if let Some(open) = &mut self.open {
             let room = KEPT.saturating_sub(open.garbage.len());
-            open.garbage.extend(piece.bytes.iter().take(room));
+            open.garbage.extend(frame.bytes.iter().take(room));
             return;
         }
         let room = KEPT.saturating_sub(self.garbage.len());
-        self.garbage.extend(piece.bytes.iter().take(room));
+        self.garbage.extend(frame.bytes.iter().take(room));
         heard.push(Traffic::Stray {
-            bytes: piece.bytes,
-            at: piece.ended,
+            bytes: frame.bytes,
+            at: frame.ended,
             quiet_since,
         });
     }

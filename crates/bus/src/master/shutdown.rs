@@ -21,11 +21,20 @@ const BROADCAST: Duration = Duration::from_millis(500);
 /// Wait before a stop that was not acknowledged is ordered again.
 const AGAIN: Duration = Duration::from_millis(20);
 
+/// The end of the gateway, as a bus carries it out.
+#[derive(Debug)]
+pub(super) enum Shutdown {
+    /// The drives get their stops.
+    Stops(Stops),
+    /// The end was reported; nothing more is ordered.
+    Over,
+}
+
 /// The stops of a shutdown.
 #[derive(Debug)]
-pub(super) struct Shutdown {
-    /// The request of the shutdown; `None` once its end was reported.
-    stopping: Option<Stopping>,
+pub(super) struct Stops {
+    /// The request of the shutdown.
+    stopping: Stopping,
     /// The broadcast that goes before all stops, and until when the stops wait for it.
     broadcast: Option<(Exchange, Instant)>,
     stops: Vec<Stop>,
@@ -88,7 +97,16 @@ impl Stop {
 }
 
 impl Shutdown {
-    fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Shutdown {
+    /// Reports the drives that were not stopped, unless that was done before.
+    pub(super) fn end(&mut self, bus: &BusHandle) {
+        if let Shutdown::Stops(stops) = std::mem::replace(self, Shutdown::Over) {
+            stops.report(bus);
+        }
+    }
+}
+
+impl Stops {
+    fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Stops {
         let drives = bus.image.drives.enumerate();
         let wanted = drives.filter(|(_, image)| is_to_stop(image));
         let stop = |(drive, _)| Stop {
@@ -97,8 +115,8 @@ impl Shutdown {
             in_vain: false,
             last: None,
         };
-        Shutdown {
-            stopping: Some(stopping),
+        Stops {
+            stopping,
             broadcast: broadcast(bus, now).map(|exchange| (exchange, now + BROADCAST)),
             stops: wanted.map(stop).collect(),
         }
@@ -118,8 +136,7 @@ impl Shutdown {
     }
 
     /// Reports the drives that were not stopped, in words.
-    pub(super) fn end(&mut self, bus: &BusHandle) {
-        let Some(stopping) = self.stopping.take() else { return };
+    fn report(self, bus: &BusHandle) {
         let name = |index: DriveIndex| bus.image.drives.of(index).spec.name.as_str();
         let missing = self.stops.iter().filter_map(|stop| {
             let why = match (&stop.state, &stop.last) {
@@ -131,8 +148,7 @@ impl Shutdown {
             let drive = name(stop.drive).to_string();
             Some(NotStopped { drive, why })
         });
-        stopping.report(missing.collect());
-        self.stops.clear();
+        self.stopping.report(missing.collect());
     }
 }
 
@@ -142,7 +158,7 @@ impl Master {
         // The lock on the queue must be free again when the broadcast is added.
         let stopping = self.bus.queue.lock().take_stopping();
         if let Some(stopping) = stopping {
-            self.shutdown = Some(Shutdown::new(stopping, &self.bus, now));
+            self.shutdown = Some(Shutdown::Stops(Stops::new(stopping, &self.bus, now)));
         }
         let Master {
             shutdown,
@@ -150,23 +166,23 @@ impl Master {
             schedule,
             ..
         } = self;
-        let Some(shutdown) = shutdown else { return };
-        let Some(deadline) = shutdown.stopping.as_ref().map(Stopping::deadline) else {
-            return;
-        };
-        if shutdown.waits_for_broadcast(now) {
+        let Some(Shutdown::Stops(stops)) = shutdown else { return };
+        let deadline = stops.stopping.deadline();
+        if stops.waits_for_broadcast(now) {
             return;
         }
-        shutdown.stops.iter_mut().for_each(|stop| stop.check_answer(now));
-        if shutdown.stops.iter().all(Stop::is_over) || now >= deadline {
-            shutdown.end(bus);
+        stops.stops.iter_mut().for_each(|stop| stop.check_answer(now));
+        if stops.stops.iter().all(Stop::is_over) || now >= deadline {
+            if let Some(shutdown) = shutdown {
+                shutdown.end(bus);
+            }
             return;
         }
         // Silent drives come last, because each of them costs a whole timeout. Without polls, a drive that was
         // online before it went silent keeps counting as online.
         let answers = |stop: &Stop| schedule.is_online(stop.drive) && !stop.in_vain;
-        let others_first = shutdown.stops.iter().any(|stop| !stop.is_over() && answers(stop));
-        for stop in &mut shutdown.stops {
+        let others_first = stops.stops.iter().any(|stop| !stop.is_over() && answers(stop));
+        for stop in &mut stops.stops {
             let due = matches!(stop.state, State::Due(at) if at <= now);
             if due && (schedule.is_online(stop.drive) || !others_first) {
                 stop.state = order(bus, stop.drive, deadline, now);
