@@ -1,11 +1,13 @@
 //! The number of the session (bdSeq), which links the death of a node to its birth, kept over restarts in a file.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use std::{fs, io};
 
 use drivegate_core::files::{self, names::SPARKPLUG};
 use drivegate_north::patience::Patience;
+use tokio::task::{JoinHandle, spawn_blocking};
+use tokio::time::{Instant, timeout_at};
 
 /// Longest wait for writing the file.
 const WRITE: Duration = Duration::from_secs(1);
@@ -19,6 +21,8 @@ pub(super) struct BdSeq {
     used: bool,
     /// Whether the number is in the file.
     kept: bool,
+    /// The write in progress, which may take longer than [`WRITE`].
+    writing: Option<JoinHandle<io::Result<()>>>,
 }
 
 impl BdSeq {
@@ -36,6 +40,7 @@ impl BdSeq {
             number: last.map_or(0, |last| last.wrapping_add(1)),
             used: false,
             kept: false,
+            writing: None,
         }
     }
 
@@ -51,14 +56,22 @@ impl BdSeq {
         if self.kept {
             return (self.number, Ok(()));
         }
-        let (path, number) = (self.path.clone(), self.number);
-        let work = tokio::task::spawn_blocking(move || files::replace(&path, format!("{number}\n").as_bytes()));
-        let written = match tokio::time::timeout(WRITE, work).await {
-            Ok(Ok(written)) => written.map_err(|error| error.to_string()),
-            _ => Err("the disk does not respond".to_string()),
-        };
+        let written = self.write(Instant::now() + WRITE).await;
         self.kept = written.is_ok();
-        (number, written)
+        (self.number, written.map_err(|error| error.to_string()))
+    }
+
+    async fn write(&mut self, until: Instant) -> io::Result<()> {
+        let slow = || io::Error::new(io::ErrorKind::TimedOut, "the disk does not respond");
+        if let Some(older) = &mut self.writing {
+            // An older number must not replace a newer one; whether the disk took it does not matter.
+            let _ = timeout_at(until, older).await.map_err(|_| slow())?;
+        }
+        let (path, number) = (self.path.clone(), self.number);
+        let work = spawn_blocking(move || files::replace(&path, format!("{number}\n").as_bytes()));
+        let ended = timeout_at(until, self.writing.insert(work)).await.map_err(|_| slow())?;
+        self.writing = None;
+        ended?
     }
 
     /// A broker accepted the connection with the last number, which is returned.
@@ -74,12 +87,17 @@ impl BdSeq {
 
 #[cfg(test)]
 mod tests {
+    use rustix::fs::{CWD, FileType, Mode, mknodat};
+
     use super::*;
 
     async fn next(bd_seq: &mut BdSeq) -> u8 {
-        let (number, written) = bd_seq.next().await;
-        written.unwrap();
-        number
+        // A slow disk takes more than one attempt.
+        loop {
+            if let (number, Ok(())) = bd_seq.next().await {
+                return number;
+            }
+        }
     }
 
     async fn reopened(state: &Path) -> u8 {
@@ -107,6 +125,25 @@ mod tests {
         assert_eq!(reopened(&state).await, 2);
         fs::write(state.join(SPARKPLUG), "damaged").unwrap();
         assert_eq!(reopened(&state).await, 0);
+    }
+
+    #[tokio::test]
+    async fn a_number_that_is_written_late_replaces_no_newer_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(SPARKPLUG);
+        let partial = path.with_extension(files::PARTIAL);
+        // A named pipe without a reader hangs as a disk does.
+        let mode = Mode::from_raw_mode(0o600);
+        mknodat(CWD, &partial, FileType::Fifo, mode, 0).unwrap();
+        let mut bd_seq = BdSeq::open(dir.path(), &Patience::default()).await;
+        for expected in 0..2 {
+            let (number, written) = bd_seq.next().await;
+            assert_eq!((number, written.is_err()), (expected, true));
+            bd_seq.accepted();
+        }
+        assert_eq!(fs::read_to_string(&partial).unwrap(), "0\n", "the second did not begin");
+        assert_eq!(next(&mut bd_seq).await, 2);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "2\n");
     }
 
     #[tokio::test]
