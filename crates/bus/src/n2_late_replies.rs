@@ -111,7 +111,15 @@ impl N2LateReplies {
             late.address != address || late.form.is_like(form) || form.is_like(late.form) || is_behind(late)
         });
         if let Some(late) = self.of(address, pdu).filter(|late| !late.answered) {
-            (late.until, late.answered) = (now + window, true);
+            late.answered = true;
+            self.take_as_long_again(&[address], now);
+        }
+    }
+
+    /// Another reply of these drives came, perhaps a late one: each of the replies behind it may take as long again.
+    fn take_as_long_again(&mut self, addresses: &[u8], now: Instant) {
+        for late in self.0.iter_mut().filter(|late| addresses.contains(&late.address)) {
+            late.until = late.until.max(now + late.window);
         }
     }
 
@@ -184,7 +192,6 @@ impl N2LateReplies {
         }
     }
 
-    /// Notes that a late reply came: each of the other replies of its drive may take as long again.
     fn one_came(&mut self, index: usize, now: Instant) {
         let Some(late) = self.0.get_mut(index) else { return };
         let address = late.address;
@@ -192,9 +199,7 @@ impl N2LateReplies {
         if late.count == 0 {
             self.0.remove(index);
         }
-        for late in self.0.iter_mut().filter(|late| late.address == address) {
-            late.until = late.until.max(now + late.window);
-        }
+        self.take_as_long_again(&[address], now);
     }
 
     /// Notes that the frame, which arrived by `now`, was a late reply; that one is then no longer expected.
@@ -208,10 +213,12 @@ impl N2LateReplies {
 
     /// Notes a doubtful answer: if it was a late one, the reply itself may still arrive; otherwise the late one may.
     pub(crate) fn doubted(&mut self, asked: LateRequest<'_>, window: Duration, now: Instant) {
-        let alike = |late: &&mut Late| Some(late.form) == form(asked.pdu);
-        if let Some(late) = self.0.iter_mut().find(alike) {
-            late.until = late.until.max(now + window);
-        }
+        let has_form = |late: &&Late| Some(late.form) == form(asked.pdu);
+        // A refusal may be that of any request.
+        let is_refusal = !self.0.iter().any(|late| has_form(&late));
+        let from = self.0.iter().filter(|late| is_refusal || has_form(late));
+        let from: Vec<u8> = from.map(|late| late.address).collect();
+        self.take_as_long_again(&from, now);
         self.given_up(asked, window, now);
     }
 }
@@ -410,6 +417,33 @@ mod tests {
             Some(now + WINDOW),
             "another drive is not slower"
         );
+    }
+
+    #[test]
+    fn replies_behind_one_that_may_have_been_late_take_as_long_again() {
+        let now = Instant::now();
+        let came = now + WINDOW * 9 / 10;
+        let (state, on) = (
+            read(Table::DiscreteInput, 1, 1),
+            RequestPdu::WriteCoil { address: 0, on: true },
+        );
+        let owed = || {
+            let mut late = N2LateReplies::default();
+            late.given_up(asked(1, &on, now), WINDOW, now);
+            late.given_up(asked(1, &state, now), WINDOW, now);
+            late.given_up(asked(2, &read(Table::Input, 0, 2), now), WINDOW, now);
+            late
+        };
+        // The acknowledgement may be that of the write before, or a refusal that of any request.
+        let (mut acknowledged, mut refused, mut answered) = (owed(), owed(), owed());
+        acknowledged.doubted(asked(1, &on, came), WINDOW, came);
+        refused.doubted(asked(3, &read(Table::Input, 0x4000, 1), came), WINDOW, came);
+        answered.answered(1, &state, WINDOW, came);
+        for (mut late, others) in [(acknowledged, now), (refused, came), (answered, now)] {
+            assert_eq!(late.of(1, &state).unwrap().until, came + WINDOW);
+            let float = read(Table::Input, 0, 2);
+            assert_eq!(late.of(2, &float).unwrap().until, others + WINDOW, "another drive");
+        }
     }
 
     #[test]
