@@ -427,14 +427,16 @@ impl World {
             let drive = self.bus.wire.slaves().drive(machine).unwrap();
             drive.advance(sim);
             let running = drive.state().running;
-            if self.promised.runs(machine, running) {
+            if self.promised.runs(machine, running, now) {
                 self.note(move || {
                     format!(
                         "the motor of drive {machine} {}",
                         if running { "starts" } else { "stands" }
                     )
                 });
-                self.promised.must_want_start(machine, now);
+                let control = self.bus.profile.control.as_ref();
+                let hides_word = control.is_some_and(|control| !control.is_read());
+                self.promised.must_want_start(machine, hides_word, now);
             }
         }
     }

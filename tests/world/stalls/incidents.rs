@@ -108,7 +108,7 @@ impl World {
             }
         };
         drive.advance(sim);
-        self.promised.runs(machine, drive.state().running);
+        self.promised.runs(machine, drive.state().running, self.now);
         self.befell(machine);
         self.note(move || format!("drive {machine} {what}"));
     }

@@ -55,7 +55,7 @@ impl World {
                     reference: 0,
                 });
             }
-            self.promised.runs(machine, drive.state().running);
+            self.promised.runs(machine, drive.state().running, now);
             self.befell(machine);
             self.note(move || format!("drive {machine} stops by its own timeout"));
         }

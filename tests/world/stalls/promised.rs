@@ -18,6 +18,10 @@ const FOLLOWS: Duration = Duration::from_millis(400);
 /// Time between a write and the reading on which it depends: one transaction.
 const LOOKED: Duration = Duration::from_millis(60);
 
+/// Writes of two rounds of the refresh, reference and word: before that, the speed does not show the stop of another
+/// master.
+const TWO_ROUNDS: usize = 4;
+
 /// Effect of an order on a motor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Does {
@@ -50,6 +54,10 @@ pub struct Promised {
     /// When each write that a drive carried out was sent to it.
     told: BTreeMap<u8, Vec<Instant>>,
     running: Vec<bool>,
+    /// When each motor started last.
+    started: BTreeMap<u8, Instant>,
+    /// When each motor began to run before it stood last, and since when it stood.
+    ran: BTreeMap<u8, (Instant, Instant)>,
     /// When each drive was last stopped by an incident and not by a command on the line.
     befell: BTreeMap<u8, Instant>,
 }
@@ -60,6 +68,8 @@ impl Promised {
             orders: Vec::new(),
             told: BTreeMap::new(),
             running: vec![false; usize::from(drives)],
+            started: BTreeMap::new(),
+            ran: BTreeMap::new(),
             befell: BTreeMap::new(),
         }
     }
@@ -120,12 +130,31 @@ impl Promised {
     }
 
     /// Whether the motor of the machine has just started or stopped.
-    pub fn runs(&mut self, machine: u8, running: bool) -> bool {
-        std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running
+    pub fn runs(&mut self, machine: u8, running: bool, now: Instant) -> bool {
+        let changed = std::mem::replace(&mut self.running[usize::from(machine) - 1], running) != running;
+        if changed && running {
+            self.started.insert(machine, now);
+        } else if changed && let Some(started) = self.started.get(&machine) {
+            self.ran.insert(machine, (*started, now));
+        }
+        changed
     }
 
-    /// Checks a motor that has started: a client must have wanted the causing write when it was sent.
-    pub fn must_want_start(&self, machine: u8, now: Instant) {
+    /// Whether the refresh could not know at `at` that another master had stopped the motor, where the drive does not show its
+    /// word: the motor still turned at the last reading, and its speed was seen at the reference in fewer than two
+    /// rounds before the stop.
+    fn slowed_down_unseen(&self, machine: u8, at: Instant) -> bool {
+        let (Some((started, stood)), Some(befell)) = (self.ran.get(&machine), self.befell.get(&machine)) else {
+            return false;
+        };
+        let told = self.told.get(&machine).into_iter().flatten();
+        let before = told.filter(|told| (started..=befell).contains(told)).count();
+        (started..=stood).contains(&befell) && at.saturating_duration_since(*stood) < LOOKED && before < TWO_ROUNDS
+    }
+
+    /// Checks a motor that has started: a client must have wanted the causing write when it was sent. `hides_word`: the drive
+    /// does not show its control word.
+    pub fn must_want_start(&self, machine: u8, hides_word: bool, now: Instant) {
         let told = self.told.get(&machine).into_iter().flatten().rev();
         // The motor follows its drive after one or two updates.
         let told: Vec<Instant> = told.take_while(|at| now - **at < FOLLOWS).copied().collect();
@@ -139,6 +168,9 @@ impl Promised {
             .get(&machine)
             .is_some_and(|befell| at.saturating_duration_since(*befell) < LOOKED)
         {
+            return;
+        }
+        if hides_word && self.slowed_down_unseen(machine, at) {
             return;
         }
         let runs = self
