@@ -192,7 +192,7 @@ impl Drive {
     }
 
     /// The drive must be identified again. A device type that nothing has confirmed is forgotten: late replies to
-    /// Identify would be recognised by it, and the states of other drives taken for them.
+    /// Identify would be recognised by it, and the states of other drives mistaken for them.
     fn unproved(&mut self) {
         self.proved = false;
         if !self.device_proved {

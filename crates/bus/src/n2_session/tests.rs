@@ -177,7 +177,7 @@ fn a_device_type_that_no_other_reply_has_confirmed_is_forgotten() {
     rig.sessions.transaction_ended(drive, &Ended::Silent);
     rig.sessions.gone(drive);
     assert_eq!(rig.sessions.device(drive), 0x10);
-    // A late refusal after a late state.
+    // A late refusal makes it forgotten, too.
     rig.done(IDENTIFY, &other);
     rig.sessions.transaction_ended(drive, &restarted());
     assert_eq!(rig.sessions.device(drive), 0x10);
