@@ -112,14 +112,15 @@ impl N2LateReplies {
         });
         if let Some(late) = self.of(address, pdu).filter(|late| !late.answered) {
             late.answered = true;
-            self.take_as_long_again(&[address], now);
+            self.take_as_long_again(&[address], now + window);
         }
     }
 
-    /// Another reply of these drives came, perhaps a late one: each of the replies behind it may take as long again.
-    fn take_as_long_again(&mut self, addresses: &[u8], now: Instant) {
+    /// Another reply of these drives came, perhaps a late one: each of the replies behind it may take as long again, and
+    /// arrive until then.
+    fn take_as_long_again(&mut self, addresses: &[u8], until: Instant) {
         for late in self.0.iter_mut().filter(|late| addresses.contains(&late.address)) {
-            late.until = late.until.max(now + late.window);
+            late.until = late.until.max(until);
         }
     }
 
@@ -194,12 +195,12 @@ impl N2LateReplies {
 
     fn one_came(&mut self, index: usize, now: Instant) {
         let Some(late) = self.0.get_mut(index) else { return };
-        let address = late.address;
+        let (address, until) = (late.address, now + late.window);
         late.count = late.count.saturating_sub(1);
         if late.count == 0 {
             self.0.remove(index);
         }
-        self.take_as_long_again(&[address], now);
+        self.take_as_long_again(&[address], until);
     }
 
     /// Notes that the frame, which arrived by `now`, was a late reply; that one is then no longer expected.
@@ -218,7 +219,7 @@ impl N2LateReplies {
         let is_refusal = !self.0.iter().any(|late| has_form(&late));
         let from = self.0.iter().filter(|late| is_refusal || has_form(late));
         let from: Vec<u8> = from.map(|late| late.address).collect();
-        self.take_as_long_again(&from, now);
+        self.take_as_long_again(&from, now + window);
         self.given_up(asked, window, now);
     }
 }
