@@ -129,6 +129,9 @@ impl N2Sessions {
     /// was just identified.
     pub fn transaction_ended(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
+            if *ended == Ended::Silent && self.seemed_identified(drive) {
+                self.gone(drive);
+            }
             return if self.drives.is_empty() {
                 Progress::Going
             } else {
@@ -151,6 +154,13 @@ impl N2Sessions {
                 Progress::Going
             }
         }
+    }
+
+    /// Whether the drive was identified, and has not replied to anything since: the identity may have been the late reply
+    /// of another drive.
+    fn seemed_identified(&self, drive: DriveIndex) -> bool {
+        let drive = self.drives.get(drive);
+        drive.is_some_and(|drive| !drive.proved && matches!(drive.phase, Phase::Reporting { .. }))
     }
 
     /// Drives that are due for a poll and would get no other request, because none of their points is read often enough.

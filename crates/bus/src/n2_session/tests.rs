@@ -192,3 +192,25 @@ fn a_device_type_that_no_other_reply_has_confirmed_is_forgotten() {
     rig.sessions.gone(drive);
     assert_eq!(rig.sessions.device(drive), 0x10);
 }
+
+#[test]
+fn a_drive_that_only_seemed_to_be_identified_is_identified_again() {
+    let mut rig = rig();
+    rig.done(IDENTIFY, &identity());
+    assert_eq!(rig.before(None), Some(POLL));
+    assert_eq!(rig.done(POLL, &Ended::Silent), Progress::Failed);
+    assert_eq!(
+        rig.before(None),
+        Some(IDENTIFY),
+        "a poll looks like the reads of the others"
+    );
+    // A stop needs no poll.
+    rig.done(IDENTIFY, &identity());
+    rig.sessions.transaction_ended(DriveIndex::new(0), &Ended::Silent);
+    assert_eq!(rig.before(Some(Urgency::Stop)), Some(IDENTIFY));
+    // One lost reply of a drive that has replied to more shows nothing.
+    rig.done(IDENTIFY, &identity());
+    rig.done(POLL, &changes(b"11"));
+    rig.done(AGAIN, &Ended::Silent);
+    assert_eq!(rig.before(None), Some(AGAIN));
+}
