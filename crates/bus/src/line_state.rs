@@ -40,6 +40,9 @@ const REGULAR_ON_N2: u32 = 8;
 /// like that, the line stays as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
+/// Bytes without a request that may belong to one N2 reply.
+const MOST_UNASKED: usize = 512;
+
 /// How a request is to be sent.
 #[derive(Debug, Clone, Copy)]
 pub struct Sending {
@@ -103,6 +106,8 @@ pub struct LineState {
     left_alone: Instant,
     learned: Learned,
     underway: Option<Underway>,
+    /// Bytes received on an N2 line since the last transaction: late replies come then, too.
+    unasked: Vec<u8>,
     /// The memory of the last transaction.
     buffers: Buffers,
 }
@@ -136,6 +141,7 @@ impl LineState {
                 early_weight: 0,
             },
             underway: None,
+            unasked: Vec::new(),
             buffers: Buffers::default(),
         }
     }
@@ -236,6 +242,7 @@ impl LineState {
             }
         }
         self.quiet_since = sent;
+        self.unasked.clear();
         self.owed = sending.silence;
         self.underway = Some(Underway {
             transaction,
@@ -281,10 +288,29 @@ impl LineState {
         if !bytes.is_empty() {
             self.begin_silence(now);
         }
-        let underway = self.underway.as_mut()?;
+        let Some(underway) = self.underway.as_mut() else {
+            self.received_unasked(bytes, late, now);
+            return None;
+        };
         match underway.transaction.receive(now, bytes, late) {
             Step::Wait(_) => None,
             Step::Done(ended) => self.over(ended, now),
+        }
+    }
+
+    /// Notes the late replies of an N2 line that arrive while no request is on it.
+    fn received_unasked(&mut self, bytes: &[u8], late: &mut N2LateReplies, now: Instant) {
+        if self.protocol != Protocol::N2 || !late.may_come(now) {
+            return;
+        }
+        self.unasked.extend_from_slice(bytes);
+        while let Some(end) = self.unasked.iter().position(|byte| *byte == b'\r') {
+            let frame: Vec<u8> = self.unasked.drain(..=end).collect();
+            late.has_arrived(&frame, now);
+        }
+        // More than a reply without an end is noise.
+        if self.unasked.len() > MOST_UNASKED {
+            self.unasked.clear();
         }
     }
 

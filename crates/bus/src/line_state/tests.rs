@@ -1,4 +1,5 @@
 use super::*;
+use crate::n2_late_replies::LateRequest;
 use drivegate_proto::{RequestPdu, Table, rtu};
 
 /// A line at 9600 baud on which every reply may be a duplicate of the previous one.
@@ -278,4 +279,32 @@ fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
         assert!(deadline <= sent + Duration::from_millis(100 + 10), "timeout and reply");
         assert!(over.heard_at <= deadline && over.took <= deadline - now + Duration::from_millis(4));
     }
+}
+
+#[test]
+fn a_late_reply_of_n2_that_comes_between_two_requests_is_noted() {
+    const WINDOW: Duration = Duration::from_millis(750);
+    let mut rig = DoublingLine::of(Protocol::N2);
+    let (now, state) = (rig.now, RequestPdu::read(Table::DiscreteInput, 2, 1));
+    let mut late = N2LateReplies::default();
+    for _ in 0..2 {
+        let asked = LateRequest {
+            address: 1,
+            pdu: &state,
+            device: 0x10,
+            at: now,
+        };
+        late.given_up(asked, WINDOW, now);
+    }
+    let came = now + WINDOW * 9 / 10;
+    for piece in [b"A40".as_slice(), b"64\r"] {
+        assert!(rig.line.received(piece, &mut late, came).is_none());
+    }
+    assert_eq!(
+        late.until(),
+        Some(came + WINDOW),
+        "the other one may take as long again"
+    );
+    assert!(rig.line.received(b"A4064\r", &mut late, came).is_none());
+    assert!(!late.may_come(came), "both came");
 }
