@@ -351,12 +351,12 @@ impl World {
 fn bits_on_n2(said: &[u16], stored: &[u16]) -> u32 {
     let digits = |words: &[u16]| -> String { words.iter().map(|word| format!("{word:04X}")).collect() };
     let (said, stored) = (digits(said), digits(stored));
-    match said.len() == stored.len() {
-        true => said
-            .bytes()
+    if said.len() == stored.len() {
+        said.bytes()
             .zip(stored.bytes())
             .map(|(a, b)| (a ^ b).count_ones())
-            .sum(),
-        false => u32::MAX,
+            .sum()
+    } else {
+        u32::MAX
     }
 }
