@@ -3,8 +3,14 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate_core::order::{Answer, Arrival, Audit, Command, CommandLog, Origin, SourceKind, Ticket, Urgency, Window};
+use drivegate_core::order::{
+    Answer, Arrival, Audit, Authority, Command, CommandLog, DEFAULT_EXPIRY, Order, Origin, SourceKind, Ticket, Urgency,
+    Window,
+};
+use drivegate_core::permit::admit;
+use drivegate_core::plant::BusHandle;
 use drivegate_core::queue::{CommandQueue, Pending, Ready};
+use drivegate_model::drive::DriveIndex;
 use serde_json::Value;
 use tokio::sync::oneshot::Receiver;
 
@@ -45,4 +51,23 @@ pub fn window(now: Instant, expiry: Duration) -> Window {
 pub fn ticket(command_log: &Arc<CommandLog>, now: Instant) -> (Ticket, Receiver<Answer>) {
     let origin = Origin::new(SourceKind::Mqtt, "t");
     Ticket::new(origin, "d", "run=true".to_string(), true, now, command_log.clone())
+}
+
+/// Submits an order of a client that may write to a drive of a bus, and where its answer arrives. The order is admitted by
+/// what the drive shows at `now`.
+pub fn submit(
+    bus: &BusHandle,
+    drive: DriveIndex,
+    origin: Origin,
+    order: Order,
+    window: Window,
+    now: Instant,
+) -> Receiver<Answer> {
+    let image = bus.image.drives.of(drive);
+    let writes = !matches!(order, Order::Read(_));
+    let admitted = admit(order, &image.reading(now, DEFAULT_EXPIRY), Authority::Write).unwrap();
+    let (ticket, answer) = Ticket::new(origin, "d", String::new(), writes, now, bus.command_log.clone());
+    let command = Command::new(drive, admitted, &image.spec.profile, window, ticket);
+    bus.queue.submit(command, &(), now);
+    answer
 }

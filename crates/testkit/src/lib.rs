@@ -9,7 +9,7 @@ mod families;
 pub mod mqtt;
 mod plant;
 
-pub use commands::{audited, next_command, take_next, ticket, window};
+pub use commands::{audited, next_command, submit, take_next, ticket, window};
 pub use families::{Family, Order, families, number, orders, rows};
 pub use plant::{
     STALE_AFTER, bus, bus_spec, controlled, image, monitored, nx, nx_bus, nx_plant, online, profile, read, read_all,

@@ -4,14 +4,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use drivegate_testkit::{bus, bus_spec, controlled, image, window};
+use drivegate_testkit::{bus, bus_spec, controlled, image, submit, window};
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::supervision::Lease;
 use crate::transaction::{Ended, MAY_BE_LATE};
-use drivegate_core::order::{Answer, Authority, Command, Order, Target, Ticket};
-use drivegate_core::permit::admit;
+use drivegate_core::order::{Answer, Authority, Order, Target, Ticket};
 use drivegate_core::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use drivegate_line::LineOptions;
 use drivegate_model::drive::{DriveIndex, ModelPoint, PollClass, Value};
@@ -280,13 +279,9 @@ impl Rig {
         let image = &self.bus.image.drives[drive];
         let index = image.spec.profile.model_index(point).unwrap();
         let order = Order::Points(vec![(index, value)]);
-        let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, who);
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.bus.command_log.clone());
         let window = window(self.now, DEFAULT_EXPIRY);
-        let command = Command::new(DriveIndex::new(drive), admitted, &image.spec.profile, window, ticket);
-        self.bus.queue.submit(command, &(), self.now);
-        answer
+        submit(&self.bus, DriveIndex::new(drive), origin, order, window, self.now)
     }
 
     fn switch(&self, drive: usize, who: &str, run: bool) -> Receiver<Answer> {

@@ -1,4 +1,4 @@
-use drivegate_testkit::{audited, bus_spec, controlled, next_command, nx, online, window};
+use drivegate_testkit::{audited, bus_spec, controlled, next_command, nx, online, submit, window};
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -8,9 +8,8 @@ use crate::drive_state::{DriveState, NextNeed};
 use crate::master::supervise;
 use crate::n2_late_replies::N2LateReplies;
 use drivegate_core::order::{
-    Authority, Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, written,
+    Command, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Urgency, written,
 };
-use drivegate_core::permit::admit;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::process_image::{Access, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 use drivegate_model::drive::profile::Profiles;
@@ -174,15 +173,11 @@ impl SupervisedDrive {
 
     fn order_of(&self, point: ModelPoint, value: Value) -> Receiver<Answer> {
         let image = self.image();
-        let reading = image.reading(self.now, DEFAULT_EXPIRY);
         let index = image.spec.profile.model_index(point).unwrap();
-        let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
+        let order = Order::Points(vec![(index, value)]);
         let origin = Origin::new(SourceKind::Mqtt, "client");
-        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.bus.command_log.clone());
         let window = window(self.now, DEFAULT_EXPIRY);
-        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
-        self.bus.queue.submit(command, &(), self.now);
-        answer
+        submit(&self.bus, DriveIndex::new(0), origin, order, window, self.now)
     }
 
     /// Starts the waiting command on the line.

@@ -136,16 +136,13 @@ fn a_sequence_that_a_pause_interrupted_is_not_continued() {
         let points = [("speed_reference", Value::Number(50.0)), (last, value)];
         let points = points.map(|(point, value)| (image.spec.profile.point_index(point).unwrap(), value));
         let order = Order::Points(points.to_vec());
-        let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
-        let (ticket, mut answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.bus.command_log.clone());
         let window = Window {
             arrival: Arrival::now(rig.now),
             expires: rig.now + 10_000 * MS,
             waits: false,
         };
-        let command = Command::new(FIRST, admitted, &image.spec.profile, window, ticket);
-        rig.bus.queue.submit(command, &(), rig.now);
+        let mut answer = submit(&rig.bus, FIRST, origin, order, window, rig.now);
         let turn = rig.next_turn(|turn| turn.pdu().is_write());
         let began = rig.now;
         rig.stands(MS * time);
@@ -231,9 +228,7 @@ fn a_start_that_came_in_a_stall_goes_when_what_came_with_it_is_read() {
     let image = &rig.bus.image.drives[0];
     let index = image.spec.profile.model_index(ModelPoint::Run).unwrap();
     let order = Order::Points(vec![(index, Value::Bool(true))]);
-    let admitted = admit(order, &image.reading(rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
     let origin = Origin::new(SourceKind::Mqtt, "client");
-    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), true, rig.now, rig.bus.command_log.clone());
     let window = Window {
         arrival: Arrival {
             stall: Some(stall),
@@ -242,8 +237,7 @@ fn a_start_that_came_in_a_stall_goes_when_what_came_with_it_is_read() {
         expires: began + DEFAULT_EXPIRY,
         waits: false,
     };
-    let command = Command::new(FIRST, admitted, &image.spec.profile, window, ticket);
-    rig.bus.queue.submit(command, &(), rig.now);
+    let _answer = submit(&rig.bus, FIRST, origin, order, window, rig.now);
     while !rig.runs(0) {
         rig.step();
         assert!(rig.now < stall.read_by() + 100 * MS);

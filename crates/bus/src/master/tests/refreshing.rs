@@ -72,19 +72,16 @@ impl Plant {
         let image = &self.rig.bus.image.drives[0];
         let index = |point| image.spec.profile.model_index(point).unwrap();
         let order = Order::Points(sets.iter().map(|(point, value)| (index(*point), *value)).collect());
-        let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
-        let (ticket, mut answer) = Ticket::new(
+        let now = self.rig.now;
+        let mut answer = submit(
+            &self.rig.bus,
+            DriveIndex::new(0),
             origin,
-            "d",
-            String::new(),
-            true,
-            self.rig.now,
-            self.rig.bus.command_log.clone(),
+            order,
+            window(now, DEFAULT_EXPIRY),
+            now,
         );
-        let window = window(self.rig.now, DEFAULT_EXPIRY);
-        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
-        self.rig.bus.queue.submit(command, &(), self.rig.now);
-        let until = self.rig.now + DEFAULT_EXPIRY;
+        let until = now + DEFAULT_EXPIRY;
         let outcome = loop {
             self.rig.step();
             if let Some(outcome) = outcome(&mut answer) {

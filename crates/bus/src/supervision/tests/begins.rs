@@ -108,18 +108,9 @@ fn a_read_renews_nothing_and_holds_nothing() {
     rig.heartbeat();
     rig.look(4_900, true);
     let pdu = RequestPdu::read(Table::Holding, 0, 1);
-    let image = rig.image();
-    let admitted = admit(
-        Order::Read(pdu),
-        &image.reading(rig.now, DEFAULT_EXPIRY),
-        Authority::Write,
-    )
-    .unwrap();
     let origin = Origin::new(SourceKind::ModbusTcp, "10.0.0.1:1");
-    let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, rig.now, rig.bus.command_log.clone());
     let window = window(rig.now, DEFAULT_EXPIRY);
-    let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
-    rig.bus.queue.submit(command, &(), rig.now);
+    let _answer = submit(&rig.bus, DriveIndex::new(0), origin, Order::Read(pdu), window, rig.now);
     rig.look(50, true);
     rig.begin();
     rig.send();

@@ -8,21 +8,16 @@ impl Plant {
     fn writes_word(&mut self, word: u16) -> Receiver<Answer> {
         let at = self.profile.control.as_ref().unwrap().at;
         let order = Order::Write(self.profile.functions.write_register(at.address, word));
-        let image = &self.rig.bus.image.drives[0];
-        let admitted = admit(order, &image.reading(self.rig.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::ModbusTcp, "client");
-        let (ticket, answer) = Ticket::new(
+        let now = self.rig.now;
+        submit(
+            &self.rig.bus,
+            DriveIndex::new(0),
             origin,
-            "d",
-            String::new(),
-            true,
-            self.rig.now,
-            self.rig.bus.command_log.clone(),
-        );
-        let window = window(self.rig.now, DEFAULT_EXPIRY);
-        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
-        self.rig.bus.queue.submit(command, &(), self.rig.now);
-        answer
+            order,
+            window(now, DEFAULT_EXPIRY),
+            now,
+        )
     }
 
     fn that_takes_raw_writes(name: &'static str) -> Plant {
@@ -188,15 +183,11 @@ fn an_order_that_expires_half_done_ends_no_refresh() {
             ),
             (index(ModelPoint::Run), Value::Bool(true)),
         ];
-        let reading = image.reading(plant.rig.now, DEFAULT_EXPIRY);
-        let admitted = admit(Order::Points(points.to_vec()), &reading, Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, "client");
         let now = plant.rig.now;
-        let (ticket, mut answer) =
-            Ticket::new(origin, "d", String::new(), true, now, plant.rig.bus.command_log.clone());
         let window = window(now, Duration::from_millis(2 + u64::from(number)));
-        let command = Command::new(DriveIndex::new(0), admitted, &image.spec.profile, window, ticket);
-        plant.rig.bus.queue.submit(command, &(), now);
+        let order = Order::Points(points.to_vec());
+        let mut answer = submit(&plant.rig.bus, DriveIndex::new(0), origin, order, window, now);
         plant.rig.run(Duration::from_millis(330));
         matches!(outcome(&mut answer), Some(Outcome::Interrupted(_)))
     });
