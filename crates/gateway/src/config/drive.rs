@@ -6,14 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::key::{Key, Number};
-use super::keys::{
-    ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, RESERVED, SUPERVISION, TRIGGER, UNIT_IDS,
-    WITH_RESERVED,
-};
+use super::keys::{DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, RESERVED, TRIGGER, UNIT_IDS, WITH_RESERVED};
 use super::start_guard::Guards;
-use super::{raw_writes, start_guard};
+use super::{raw_writes, start_guard, supervision};
 use drivegate_core::process_image::{
-    Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
+    Access, DriveSpec, OnShutdown, ParamsAccess, PointTrigger, Supervision, Timing, TriggerLimit,
 };
 use drivegate_model::document::{Finding, Place, Raw as Node, Reader, nearest};
 use drivegate_model::drive::model::Kind;
@@ -24,7 +21,8 @@ use drivegate_proto::Protocol;
 /// Maximum number of points that a message names.
 const MOST_NAMED: usize = 4;
 
-type Limits = BTreeMap<String, RangeInclusive<f64>>;
+/// Allowed values of points, by the name of the point.
+pub(super) type Limits = BTreeMap<String, RangeInclusive<f64>>;
 
 /// The valid settings of a `[[bus.drive]]`.
 pub(super) struct Found {
@@ -74,7 +72,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let guards = start_guard::read(reader, access, profile.as_deref());
     let frequency_range = read_frequencies(reader);
     let limits = read_limits(reader, profile.as_deref(), frequency_range.as_ref());
-    let supervision = read_supervision(reader, profile.as_deref(), &limits);
+    let supervision = supervision::read(reader, profile.as_deref(), &limits);
     let timing = Timing {
         response_timeout: DRIVE.response_timeout.read(reader),
         silence: DRIVE.silence.read(reader),
@@ -506,97 +504,4 @@ fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Findi
         _ => return Ok(point),
     };
     Err(Finding::new(format!("`{key}` {what}, so it has no limits"), known()))
-}
-
-fn read_supervision(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<Supervision> {
-    if let Some(Node::Integer(_) | Node::Float(_) | Node::Text(_)) =
-        reader.raw(DRIVE.supervision.name).map(|node| &node.value)
-    {
-        reader.problem(
-            DRIVE.supervision.name,
-            "`supervision` needs a timeout and an action",
-            "write supervision = { timeout = \"5s\", action = \"stop\" }",
-        );
-        return None;
-    }
-    let table = DRIVE.supervision.table(reader)?;
-    let timeout = SUPERVISION.timeout.read(&table);
-    let action = read_action(&table, profile, limits);
-    let adopt = SUPERVISION.adopt.get(&table);
-    table.finish();
-    if let Some(profile) = profile.filter(|profile| !shows_whether_it_runs(profile)) {
-        reader.problem(
-            DRIVE.supervision.name,
-            format!(
-                "profile `{}` has neither `running` nor a run command that is read, so the gateway could not detect \
-                 whether a drive runs when its lease expires",
-                profile.name
-            ),
-            "add one of them to the profile, or leave supervision out",
-        );
-    }
-    Some(Supervision {
-        timeout: timeout?,
-        action: action?,
-        adopt,
-    })
-}
-
-/// Whether a drive of this profile reports that it runs, or at least that it has a run command.
-fn shows_whether_it_runs(profile: &Profile) -> bool {
-    let plan = Plan::of(profile);
-    let is_read = |point| {
-        let index = profile.model_index(point);
-        index.is_some_and(|index| plan.shows(profile, index))
-    };
-    is_read(ModelPoint::Running) || is_read(ModelPoint::Run)
-}
-
-fn read_action(table: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<LeaseAction> {
-    let key = SUPERVISION.action.name;
-    let action = match table.raw(key).map(|node| &node.value) {
-        None => LeaseAction::Stop,
-        Some(Node::Table(_)) => {
-            let inner = SUPERVISION.action.table(table)?;
-            let reference: Option<f64> = inner.required(REFERENCE.speed_reference.name);
-            inner.finish();
-            LeaseAction::SpeedReference(reference?)
-        }
-        Some(_) => table.parsed(key, |text| {
-            ACTIONS.find(text).map_err(|_| {
-                Finding::new(
-                    format!("unknown action `{text}`"),
-                    format!("write {}", SUPERVISION.action.form.range()),
-                )
-            })
-        })?,
-    };
-    let Some(profile) = profile else { return Some(action) };
-    table.accept(key, check_action(&action, profile, limits))?;
-    Some(action)
-}
-
-fn check_action(action: &LeaseAction, profile: &Profile, limits: &Limits) -> Result<(), Finding> {
-    let needed = match action {
-        LeaseAction::LeaveRunning => return Ok(()),
-        LeaseAction::Stop => ModelPoint::Run,
-        LeaseAction::SpeedReference(_) => ModelPoint::SpeedReference,
-    };
-    let Some(point) = profile.model_point(needed).filter(|p| p.write) else {
-        return Err(Finding::new(
-            format!("profile `{}` cannot write `{}`", profile.name, needed.name()),
-            "use \"hold\" or another action",
-        ));
-    };
-    let LeaseAction::SpeedReference(reference) = action else {
-        return Ok(());
-    };
-    let range = limits.get(&point.name).or(point.range.as_ref());
-    match range.filter(|range| !range.contains(reference)) {
-        Some(range) => Err(Finding::new(
-            format!("speed_reference = {reference} is outside the limits"),
-            format!("write {} to {} percent", range.start(), range.end()),
-        )),
-        None => Ok(()),
-    }
 }

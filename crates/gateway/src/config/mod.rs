@@ -31,6 +31,7 @@ mod shutdown;
 mod slot;
 mod stale;
 mod start_guard;
+mod supervision;
 mod together;
 mod unique;
 mod unused_profiles;
