@@ -188,8 +188,12 @@ def run(programs, mutant, options):
         command = [programs[by or "world"], *tests]
         try:
             ended = subprocess.run(command, cwd=COPY, env=env, capture_output=True, text=True, timeout=options.time)
-        except subprocess.TimeoutExpired:
-            return ("nothing", f"did not end within {options.time} s")
+        except subprocess.TimeoutExpired as late:
+            # A test that failed has found the fault, though another one goes on for ever because of it.
+            printed = (late.stdout or b"").decode(errors="replace")
+            failed = re.search(r"^test (\S+) \.\.\. FAILED", printed, re.MULTILINE)
+            found = f"{'scenario' if by is None else 'unit test'} `{failed.group(1)}`" if failed else "nothing"
+            return (found, f"not all tests ended within {options.time} s")
         if ended.returncode == 0:
             continue
         output = ended.stdout + ended.stderr
