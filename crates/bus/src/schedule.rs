@@ -128,6 +128,8 @@ pub struct Schedule {
     cadence: Cadence,
     drives: PerDrive<DriveSchedule>,
     round: VecDeque<(DriveIndex, PlannedRead)>,
+    /// Memory in which the reads of a new round are sorted, empty otherwise.
+    sorted: Vec<(usize, DriveIndex, PlannedRead)>,
     /// Reads of this round that decide the state of a drive whose state is unknown: no slow poll goes before them.
     state_first: Vec<(DriveIndex, PlannedRead)>,
     round_due: Instant,
@@ -194,6 +196,7 @@ impl Schedule {
             cadence,
             drives,
             round: VecDeque::new(),
+            sorted: Vec::new(),
             state_first: Vec::new(),
             round_due: now,
             round_started: None,

@@ -158,12 +158,15 @@ impl Transaction {
     }
 
     /// The byte lists of an ended transaction.
-    pub(crate) fn into_buffers(self) -> Buffers {
-        let [frame, received, seen] = [self.frame, self.received, self.seen].map(|mut bytes| {
-            bytes.clear();
-            bytes
-        });
-        Buffers { frame, received, seen }
+    pub(crate) fn into_buffers(mut self) -> Buffers {
+        self.frame.clear();
+        self.received.clear();
+        self.seen.clear();
+        Buffers {
+            frame: self.frame,
+            received: self.received,
+            seen: self.seen,
+        }
     }
 
     /// Rejects a reply that is complete before `earliest`, because request and reply cannot both have been on the

@@ -157,7 +157,8 @@ impl Master {
         {
             return Decided::Send(turn);
         }
-        let rank = self.turns.rank(|rank| commands.waits(rank));
+        let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));
+        let rank = highest.and_then(|_| self.turns.rank(|rank| commands.waits(rank)));
         if self.polls_cease() {
             if !self.stops_the_line() {
                 self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
@@ -171,7 +172,6 @@ impl Master {
                 },
             };
         }
-        let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));
         match self.schedule.next_of(now, rank, highest) {
             // A stop waits for one poll at most, and for nothing else.
             Decision::Poll(poll) if highest == Some(Urgency::Stop) => self.poll(poll, now),

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::drives::{DriveSchedule, Item, Presence};
 use super::{FIRST_SHARE, Poll, PollReason, RoundStart, Schedule};
-use drivegate_model::drive::{DriveIndex, PlannedRead, PollClass};
+use drivegate_model::drive::{DriveIndex, PollClass};
 
 impl Schedule {
     /// Slow polls earn their share of all time, including idle time: on a nearly full line, idle moments too short
@@ -31,7 +31,7 @@ impl Schedule {
         self.join_again(now);
         // The first reads of all drives come before the second ones, so that a duplicate reply meets a request to
         // another drive.
-        let mut reads: Vec<(usize, DriveIndex, PlannedRead)> = Vec::new();
+        let mut reads = std::mem::take(&mut self.sorted);
         for (index, drive) in self
             .drives
             .enumerate()
@@ -50,8 +50,8 @@ impl Schedule {
             reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
         }
         reads.sort_by_key(|(place, index, _)| (*place, *index));
-        self.round
-            .extend(reads.into_iter().map(|(_, index, read)| (index, read)));
+        self.round.extend(reads.drain(..).map(|(_, index, read)| (index, read)));
+        self.sorted = reads;
         if self.round.is_empty() {
             self.round_due = now + self.cadence.fast;
             self.round_started = None;

@@ -97,7 +97,8 @@ pub(super) struct PackedRing<T> {
     start: Option<Instant>,
     bytes: VecDeque<u8>,
     most_bytes: usize,
-    window: Duration,
+    /// Age from which an entry is removed, in nanoseconds like the times of the entries, which are only compared.
+    window: i64,
     /// The entry that is packed; kept for its memory.
     entry: Vec<u8>,
     of: PhantomData<T>,
@@ -110,7 +111,7 @@ impl<T: Packed> PackedRing<T> {
             start: None,
             bytes: VecDeque::new(),
             most_bytes,
-            window,
+            window: count(window),
             entry: Vec::new(),
             of: PhantomData,
         }
@@ -135,7 +136,8 @@ impl<T: Packed> PackedRing<T> {
         };
         let (of_length, of_time) = head.split_at_mut(size_of_val(&length));
         of_length.copy_from_slice(&length.to_le_bytes());
-        of_time.copy_from_slice(&nanoseconds(start, now).to_le_bytes());
+        let now = nanoseconds(start, now);
+        of_time.copy_from_slice(&now.to_le_bytes());
         let size = self.entry.len();
         self.make_room(size, now, &mut gone);
         if self.bytes.capacity() - self.bytes.len() < size {
@@ -147,21 +149,20 @@ impl<T: Packed> PackedRing<T> {
     /// Limits the ring to this number of bytes; `gone` receives the packed entries that are removed for this.
     pub(super) fn limit(&mut self, most_bytes: usize, mut gone: impl FnMut(Instant, &[u8])) {
         self.most_bytes = most_bytes;
-        if let Some(start) = self.start {
-            self.make_room(0, start, &mut gone);
-        }
+        self.make_room(0, 0, &mut gone);
         self.bytes.shrink_to(most_bytes);
     }
 
-    /// Removes the oldest entries until no entry is older than the window at `now` and `size` more bytes fit.
-    fn make_room(&mut self, size: usize, now: Instant, gone: &mut impl FnMut(Instant, &[u8])) {
+    /// Removes the oldest entries until no entry is older than the window at `now`, nanoseconds since the very first entry,
+    /// and `size` more bytes fit.
+    fn make_room(&mut self, size: usize, now: i64, gone: &mut impl FnMut(Instant, &[u8])) {
         let Some(start) = self.start else { return };
-        while let Some((oldest, at)) = self.head(0, start) {
-            let is_old = now.saturating_duration_since(at) > self.window;
+        while let Some((oldest, at)) = self.head(0) {
+            let is_old = now.saturating_sub(at) > self.window;
             if !is_old && self.bytes.len() + size <= self.most_bytes {
                 break;
             }
-            gone(at, &self.slice(HEAD, oldest));
+            gone(instant(start, at), &self.slice(HEAD, oldest));
             self.bytes.drain(..(HEAD + oldest).min(self.bytes.len()));
         }
     }
@@ -170,19 +171,19 @@ impl<T: Packed> PackedRing<T> {
     pub(super) fn iter(&self) -> impl Iterator<Item = T> {
         let mut place = 0;
         std::iter::from_fn(move || {
-            let (length, at) = self.head(place, self.start?)?;
-            let entry = T::unpack(at, &self.slice(place + HEAD, length));
+            let (length, at) = self.head(place)?;
+            let entry = T::unpack(instant(self.start?, at), &self.slice(place + HEAD, length));
             place += HEAD + length;
             entry
         })
     }
 
-    /// Length and time of the entry at this position.
-    fn head(&self, place: usize, start: Instant) -> Option<(usize, Instant)> {
+    /// Length of the entry at this position, and its time in nanoseconds since the very first entry.
+    fn head(&self, place: usize) -> Option<(usize, i64)> {
         let head = self.slice(place, HEAD);
         let (length, time) = head.split_first_chunk()?;
         let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
-        let at = instant(start, i64::from_le_bytes(*time.first_chunk()?));
+        let at = i64::from_le_bytes(*time.first_chunk()?);
         (self.bytes.len() >= place + HEAD + length).then_some((length, at))
     }
 
@@ -204,9 +205,13 @@ impl<T: Packed> PackedRing<T> {
     }
 }
 
+/// Nanoseconds in a duration, at most as many as an entry can state.
+fn count(duration: Duration) -> i64 {
+    i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
+}
+
 /// Nanoseconds from `start` to `at`, which may be before `start`.
 fn nanoseconds(start: Instant, at: Instant) -> i64 {
-    let count = |duration: Duration| i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX);
     match at.checked_duration_since(start) {
         Some(after) => count(after),
         None => -count(start.saturating_duration_since(at)),
