@@ -34,7 +34,7 @@ pub struct Truth {
     pub counted: Option<Instant>,
     /// The drive tripped by its own timeout last.
     pub timed_out: Option<Instant>,
-    /// When another master wrote the word that the drive has, unless an order changed it since.
+    /// When another master wrote the word that the drive has, unless an order or a refresh overwrote the word.
     pub foreign: Option<Instant>,
     /// The last write of an order.
     pub commanded: Option<Instant>,

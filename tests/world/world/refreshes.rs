@@ -145,6 +145,10 @@ impl World {
                 .extend(items.iter().map(|(address, word)| ((table, *address), *word)));
         }
         let runs = run_command(&profile, &asked.pdu);
+        if asked.is_refresh && runs.is_some() {
+            // Another master's word that came between the last read and this write is overwritten.
+            truth.foreign = None;
+        }
         let by_reference = profile.repeats().is_ok_and(|repeats| !repeats.word);
         // The reference of a client's order feeds the timeout as its refresh does, and puts that off.
         if runs == Some(true) || (by_reference && is_counted(&profile, &asked.pdu)) {
