@@ -147,6 +147,8 @@ pub struct RefusedCommand<'r> {
     pub client: &'r Arc<str>,
     /// Code of the reason for the refusal.
     pub reason: &'static str,
+    /// Kind of the event.
+    pub kind: EventKind,
     /// Names of the bus and the drive; both empty if the event concerns no particular one.
     pub bus: &'r str,
     pub drive: &'r str,
@@ -247,16 +249,11 @@ impl Events {
     /// Publishes a refused command. The first one of a kind is published at once; after that, one event a second
     /// for each client covers all further ones.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
-        let kind = match refused.reason {
-            "guarded" => EventKind::Guarded,
-            "interlocked" => EventKind::Interlock,
-            _ => EventKind::RefusedCommand,
-        };
         let drive = Some(refused.drive).filter(|drive| !drive.is_empty());
         let event = Event {
             bus: refused.bus.to_string(),
             drive: drive.map(str::to_string),
-            ..Event::new(kind, SystemTime::now(), refused.text)
+            ..Event::new(refused.kind, SystemTime::now(), refused.text)
         };
         let mut store = self.store();
         let passed = store.limit.admit(refused.client, refused.reason, drive, event, now);

@@ -53,6 +53,7 @@ impl Report {
         let refused = RefusedCommand {
             client: origin.client(),
             reason: refusal.code(),
+            kind: refusal.event_kind(),
             bus: &drive.spec.bus,
             drive: &drive.spec.name,
             text: format!("refused {what} from {} {}: {refusal}", origin.kind.name(), origin.who),

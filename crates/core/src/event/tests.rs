@@ -58,6 +58,7 @@ fn refusals_push_out_no_event_of_a_drive_and_a_drive_none_of_another() {
         let refused = RefusedCommand {
             client: &client(n),
             reason: "not_allowed",
+            kind: EventKind::RefusedCommand,
             bus: "line1",
             drive: "pump-1",
             text: "refused".to_string(),

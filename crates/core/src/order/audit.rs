@@ -17,6 +17,7 @@ use tokio::sync::broadcast;
 
 use crate::event::{FairRing, RefusalLimit, in_order};
 use drivegate_model::drive::Value;
+use drivegate_model::drive::why::Fate;
 
 pub use file::{AuditFile, AuditFileOptions};
 
@@ -83,6 +84,9 @@ pub struct AuditRecord {
     /// The name under which the client shares limits with others; see [`super::Origin::client`].
     #[serde(skip)]
     pub(super) share: Arc<str>,
+    /// What became of the command.
+    #[serde(skip)]
+    pub(crate) fate: Fate,
 }
 
 fn bare<S: Serializer>(value: &Value, serializer: S) -> Result<S::Ok, S::Error> {
@@ -267,6 +271,7 @@ impl Audit {
             confirmed: None,
             count: 1,
             share: who.client().clone(),
+            fate: Fate::Taken,
         };
         self.record(record, Reach::Sent, now);
     }
@@ -386,6 +391,7 @@ mod tests {
             confirmed: None,
             count: 1,
             share: share.into(),
+            fate: Fate::Taken,
         }
     }
 

@@ -5,6 +5,8 @@ use std::time::Duration;
 
 use super::audit::Reach;
 use super::{CAPACITY, Guarded};
+use crate::event::EventKind;
+use drivegate_model::drive::why::Fate;
 use drivegate_proto::{Exception, Reply};
 
 /// Event that interrupted a started command.
@@ -114,6 +116,26 @@ impl Outcome {
             | Outcome::NotStopped
             | Outcome::ShuttingDown => Reach::Queued,
             Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
+        }
+    }
+
+    /// What became of the command, for the reason why a drive does not run.
+    pub(crate) fn fate(&self) -> Fate {
+        match self {
+            // Only an order with a stop has two parts, and the stop is what matters.
+            Outcome::Acknowledged(_) | Outcome::StopOnly(_) => Fate::Taken,
+            Outcome::StopFailed(stop) => stop.fate(),
+            Outcome::Exception(_) | Outcome::Refused(_) | Outcome::NotTaken(_) => Fate::Refused,
+            Outcome::Unknown(_) | Outcome::TimedOut | Outcome::Garbled | Outcome::Interrupted(_) => Fate::Unsure,
+            Outcome::Expired
+            | Outcome::Replaced
+            | Outcome::Purged
+            | Outcome::Withdrawn
+            | Outcome::NotStopped
+            | Outcome::BusDown
+            | Outcome::Offline
+            | Outcome::QueueFull
+            | Outcome::ShuttingDown => Fate::NotSent,
         }
     }
 
@@ -289,6 +311,23 @@ impl Refusal {
         }
     }
 
+    /// The kind of the event that reports the refusal.
+    pub fn event_kind(&self) -> EventKind {
+        match self {
+            Refusal::Guarded(_) => EventKind::Guarded,
+            Refusal::Interlocked(_) => EventKind::Interlock,
+            Refusal::NotAllowed(_)
+            | Refusal::NotWritable(_)
+            | Refusal::NotKnown(_)
+            | Refusal::BadValue(_)
+            | Refusal::HeldByOther(_)
+            | Refusal::NeedsTake(_)
+            | Refusal::UnknownDrive(_)
+            | Refusal::MotorRuns(_)
+            | Refusal::OtherValue(_) => EventKind::RefusedCommand,
+        }
+    }
+
     /// The client that blocks the drive, if any.
     pub fn holder(&self) -> Option<&Holder> {
         match self {
@@ -323,6 +362,30 @@ pub struct Answer {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_was_refused_did_not_expire() {
+        let refusals = [
+            Refusal::NotAllowed(String::new()),
+            Refusal::NotWritable(String::new()),
+            Refusal::BadValue(String::new()),
+            Refusal::Interlocked(String::new()),
+            Refusal::HeldByOther(Box::default()),
+            Refusal::NeedsTake(Box::default()),
+        ];
+        for refusal in refusals {
+            assert_eq!(Outcome::Refused(refusal.clone()).fate(), Fate::Refused, "{refusal:?}");
+        }
+        for (outcome, fate) in [
+            (Outcome::NotTaken("it shows state 3".to_string()), Fate::Refused),
+            (Outcome::Exception(Exception::VALUE), Fate::Refused),
+            (Outcome::Expired, Fate::NotSent),
+            (Outcome::StopFailed(Box::new(Outcome::TimedOut)), Fate::Unsure),
+            (Outcome::StopOnly(Box::new(Outcome::Expired)), Fate::Taken),
+        ] {
+            assert_eq!(outcome.fate(), fate, "{outcome:?}");
+        }
+    }
 
     #[test]
     fn the_page_has_every_result() {

@@ -207,6 +207,7 @@ impl Ticket {
             latency,
             confirmed: self.confirmed,
             count: 1,
+            fate: outcome.fate(),
         };
         self.command_log
             .audit

@@ -553,6 +553,7 @@ impl DriveHandle {
         let refused = RefusedCommand {
             client: origin.client(),
             reason: refusal.code(),
+            kind: refusal.event_kind(),
             bus: &spec.bus,
             drive: &spec.name,
             text: format!("refused {what} from {} {}: {refusal}", origin.kind.name(), origin.who),

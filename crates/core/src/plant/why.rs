@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use crate::order::{AuditRecord, CONFIRMED, CommandLog, Guarded, Origin, Reason, SourceKind};
+use crate::order::{AuditRecord, CommandLog, Guarded, Origin, Reason, SourceKind};
 use crate::process_image::{Access, BusImage, Link, Reading, RestoreLock};
-use drivegate_model::drive::why::{self, Cause, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
+use drivegate_model::drive::why::{self, Cause, Contact, Explanation, Giver, RunOrder, RunWish, Situation};
 
 /// Whether the drive of `reading`, on this bus, runs, and if not, why.
 pub fn explain(reading: &Reading<'_>, bus: &BusImage, command_log: &CommandLog) -> Explanation {
@@ -72,44 +72,11 @@ fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
             None if record.resets() => RunWish::Reset,
             None => return None,
         },
-        fate: fate(record.result),
+        fate: record.fate,
         by,
         who: format!("{} {}", record.source, record.client),
         text: record.text.clone(),
         result: record.result.to_string(),
         age,
     })
-}
-
-/// The fate of a command, by its result code.
-fn fate(result: &str) -> Fate {
-    match result {
-        "acknowledged" | CONFIRMED => Fate::Taken,
-        "timeout" | "garbled" | "unknown" | "interrupted" => Fate::Unsure,
-        "not_allowed" | "not_writable" | "bad_value" | "refused_by_drive" | "held_by_other" | "needs_take"
-        | "guarded" | "interlocked" => Fate::Refused,
-        _ => Fate::NotSent,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::order::{Holder, Refusal};
-
-    #[test]
-    fn what_was_refused_did_not_expire() {
-        for refusal in [
-            Refusal::NotAllowed(String::new()),
-            Refusal::NotWritable(String::new()),
-            Refusal::BadValue(String::new()),
-            Refusal::Interlocked(String::new()),
-            Refusal::HeldByOther(Box::default()),
-            Refusal::NeedsTake(Box::<Holder>::default()),
-        ] {
-            assert_eq!(fate(refusal.code()), Fate::Refused, "{}", refusal.code());
-        }
-        assert_eq!(fate("guarded"), Fate::Refused);
-        assert_eq!(fate("expired"), Fate::NotSent);
-    }
 }

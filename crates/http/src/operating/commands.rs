@@ -81,7 +81,13 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Refused(
             Refusal::HeldByOther(_) | Refusal::NeedsTake(_) | Refusal::Guarded(_) | Refusal::Interlocked(_),
         ) => StatusCode::CONFLICT,
-        Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
+        Outcome::Refused(
+            Refusal::NotWritable(_)
+            | Refusal::NotKnown(_)
+            | Refusal::BadValue(_)
+            | Refusal::MotorRuns(_)
+            | Refusal::OtherValue(_),
+        ) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
         // The status describes the part that was not carried out.
         Outcome::StopOnly(part) | Outcome::StopFailed(part) => status(part),

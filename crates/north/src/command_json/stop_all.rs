@@ -62,6 +62,7 @@ pub fn refuse_stop_all(plant: &Plant, refusal: Refusal, origin: &Origin, now: In
     let refused = RefusedCommand {
         client: origin.client(),
         reason: refusal.code(),
+        kind: refusal.event_kind(),
         bus: "",
         drive: "",
         text: format!("refused {STOP_ALL} from {} {}: {why}", origin.kind.name(), origin.who),

@@ -48,7 +48,7 @@ keys! {
         supervision: Present = Own { schema: Supervision::schema, range: "[bus.drive.supervision]" }, or "none";
         /// How often and how soon the motor may be [started](commands.md#guards).
         guard: Present = Own { schema: GuardTable::schema, range: "[bus.drive.guard]" }, or "none";
-        /// Conditions for [starting](commands.md#interlocks) the motor.(commands.md#interlocks).
+        /// Conditions for [starting](commands.md#interlocks) the motor.
         interlocks: Present = Own { schema: || each(InterlockTable::schema()), range: "[[bus.drive.interlocks]]" }, or "none";
         /// What is written at [shutdown](commands.md#shutdown): nothing, or a stop. Nothing is ever written to a
         /// monitored drive.
