@@ -7,22 +7,8 @@ use super::documents::{files, read};
 use super::words::{closing, is_test};
 use crate::support::tools::root;
 
-/// The refusals and outcomes of the rules (`docs/decisions/commands.md`).
-const OF_THE_GATE: [&str; 13] = [
-    "HeldByOther",
-    "NeedsTake",
-    "Guarded",
-    "Interlocked",
-    "NotAllowed",
-    "NotKnown",
-    "NotWritable",
-    "BadValue",
-    "UnknownDrive",
-    "MotorRuns",
-    "OtherValue",
-    "Expired",
-    "Purged",
-];
+/// The outcomes of the rules (`docs/decisions/commands.md`), to which every refusal belongs.
+const OUTCOMES_OF_THE_GATE: [&str; 2] = ["Expired", "Purged"];
 
 /// Files outside of the gate that may build these refusals, and why.
 const ELSEWHERE: [(&str, &[&str], &str); 24] = [
@@ -254,13 +240,16 @@ fn built(code: &str) -> Vec<(usize, String)> {
     let tokens = tokens(code);
     let mut found = Vec::new();
     for (at, window) in tokens.windows(3).enumerate() {
-        let [(line, "Refusal" | "Outcome"), (_, join), (_, name)] = window else {
+        let [(line, of @ ("Refusal" | "Outcome")), (_, join), (_, name)] = window else {
             continue;
         };
+        // Constants and functions of the type are not variants.
+        let is_variant = name.starts_with(char::is_uppercase) && name.contains(char::is_lowercase);
+        let has_rule = is_variant && (*of == "Refusal" || OUTCOMES_OF_THE_GATE.contains(name));
         let mut of_import = tokens[..at].iter().rev().take_while(|(_, token)| *token != ";");
         let is_renamed = *join == "as" && of_import.any(|(_, token)| *token == "order");
         let is_hidden = is_renamed || (*join == "::" && ["{", "*"].contains(name));
-        let is_of_gate = *join == "::" && OF_THE_GATE.contains(name) && !is_named_only(&tokens, at);
+        let is_of_gate = *join == "::" && has_rule && !is_named_only(&tokens, at);
         if is_hidden || is_of_gate {
             found.push((*line, (*name).to_string()));
         }
