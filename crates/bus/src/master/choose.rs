@@ -40,9 +40,9 @@ impl Turns {
     }
 
     /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy:
-    /// several such drives must not keep a stop from the others.
-    fn begins_before(&mut self, repetition: bool) -> bool {
-        let begins = repetition && self.queued_first < IN_A_ROW;
+    /// several such drives must not keep a stop from the others, and the drives that do not answer must not keep it from them.
+    fn begins_before(&mut self, repetition: bool, queued: Chosen) -> bool {
+        let begins = repetition && self.queued_first < if queued.is_last { 1 } else { IN_A_ROW };
         if begins {
             self.queued_first += 1;
         } else if repetition {
@@ -315,8 +315,10 @@ impl Master {
         let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
         let ready = commands.ready.of_mut(rank).take();
         let queued = *commands.queued.of(rank);
-        let mut goes = |ready: &NextStep| queued.is_none() || !self.turns.begins_before(ready.repeats_since.is_some());
-        if let Some(ready) = ready.filter(|ready| goes(ready)) {
+        let begins = |turns: &mut Turns, ready: &NextStep| {
+            queued.is_some_and(|queued| turns.begins_before(ready.repeats_since.is_some(), queued))
+        };
+        if let Some(ready) = ready.filter(|ready| !begins(&mut self.turns, ready)) {
             self.turns.served(rank, lower_waits);
             return Decided::Send(self.turn(ready, now));
         }

@@ -68,6 +68,8 @@ pub struct Pending {
 pub struct Chosen {
     /// Rank by which the command competes for the line: a redundant stop has the rank of an ordinary command.
     pub rank: Urgency,
+    /// The drive of the command does not answer.
+    pub is_last: bool,
     number: u64,
 }
 
@@ -241,10 +243,10 @@ impl Pending {
         self.expire(now);
         let mut choice = Choice::default();
         let mut passed_over: Vec<u64> = Vec::new();
-        while let Some(number) = self.best(rank, &passed_over, &mut ready, &redundant, &mut choice) {
+        while let Some((number, is_last)) = self.best(rank, &passed_over, &mut ready, &redundant, &mut choice) {
             match self.judge_turn(number, facts, now) {
                 Verdict::Go => {
-                    choice.chosen = Some(Chosen { rank, number });
+                    choice.chosen = Some(Chosen { rank, is_last, number });
                     break;
                 }
                 Verdict::Wait(until) => {
@@ -259,7 +261,8 @@ impl Pending {
         choice
     }
 
-    /// The command of this rank that is next by order and fairness, without those `passed_over`.
+    /// The command of this rank that is next by order and fairness, without those `passed_over`, and whether its drive does
+    /// not answer.
     fn best(
         &self,
         rank: Urgency,
@@ -267,7 +270,7 @@ impl Pending {
         ready: &mut impl FnMut(&Command) -> Ready,
         redundant: &impl Fn(DriveIndex) -> bool,
         choice: &mut Choice,
-    ) -> Option<u64> {
+    ) -> Option<(u64, bool)> {
         let mut readiness = |command: &Command| match ready(command) {
             Ready::At(until) => {
                 choice.wait(until);
@@ -320,7 +323,7 @@ impl Pending {
                 best = Some((key, number));
             }
         }
-        best.map(|(_, number)| number)
+        best.map(|((_, is_last, ..), number)| (number, is_last))
     }
 
     /// Judges a waiting command that is about to be sent. A refused command is answered and reported.

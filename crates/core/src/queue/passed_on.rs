@@ -10,7 +10,7 @@ use drivegate_model::drive::DriveIndex;
 
 impl Pending {
     /// The passed-on requests that may be sent, in order: nothing older waits for any drive that they reach. A stop
-    /// that cannot be sent because its drive is offline does not delay requests that also reach other drives.
+    /// that waits because its drive did not answer the last one does not delay requests that also reach other drives.
     pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
         if !self.has_passed_on() {
             return Vec::new();
@@ -73,7 +73,11 @@ impl Pending {
         for number in numbers {
             match self.judge_turn(number, facts, now) {
                 Verdict::Go => {
-                    choice.chosen = Some(Chosen { rank, number });
+                    choice.chosen = Some(Chosen {
+                        rank,
+                        is_last: false,
+                        number,
+                    });
                     break;
                 }
                 Verdict::Wait(until) => choice.wait(until),
@@ -89,7 +93,11 @@ impl Pending {
         let goes_first = |c: &&Command| c.as_passed_on().is_some_and(|p| p.first) && c.intent.window.expires > now;
         let rank = Urgency::Stop;
         let number = self.waiting.iter().find(goes_first).map(|c| c.intent.number);
-        number.map(|number| Chosen { rank, number })
+        number.map(|number| Chosen {
+            rank,
+            is_last: false,
+            number,
+        })
     }
 
     /// The waiting command that was chosen.

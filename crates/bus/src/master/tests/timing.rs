@@ -135,3 +135,32 @@ fn a_stop_goes_before_those_of_drives_that_do_not_answer() {
     );
     assert!(answering.iter().max() < others.iter().min(), "{answering:?} {others:?}");
 }
+
+/// Each stop of a drive that does not answer holds the line for its response timeout, and is given again.
+#[test]
+fn a_stop_is_repeated_for_a_busy_drive_between_those_of_drives_that_do_not_answer() {
+    let mut rig = Rig::new(12);
+    for (index, drive) in rig.drives.iter_mut().enumerate() {
+        drive.holding.insert(2000, 1);
+        drive.silent = index > 0;
+    }
+    rig.run(Duration::from_secs(5));
+    rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));
+    let from = rig.wire.len();
+    let _stops: Vec<_> = (0..12).map(|k| rig.switch(k, "client", false)).collect();
+    rig.run(Duration::from_secs(1));
+    let is_write = |(_, turn): &&(Instant, Turn)| turn.pdu().is_write();
+    let writes: Vec<bool> = rig.wire[from..]
+        .iter()
+        .filter(is_write)
+        .map(|(_, turn)| turn.target() == DriveIndex::new(0))
+        .collect();
+    let (others, own) = (
+        writes.iter().filter(|own| !**own).count(),
+        writes.iter().filter(|own| **own).count(),
+    );
+    assert!(
+        others >= 4 && own + 1 >= others,
+        "{own} repetitions, {others} stops to the others"
+    );
+}
