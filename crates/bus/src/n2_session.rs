@@ -35,6 +35,8 @@ struct Drive {
     options: N2Options,
     phase: Phase,
     polled: Option<Instant>,
+    /// Whether the last request was Identify, and had no reply.
+    silent: bool,
     /// Whether the drive has replied since it was identified.
     proved: bool,
     /// The device type that was reported last.
@@ -72,6 +74,7 @@ impl N2Sessions {
             phase: first(&options),
             options,
             polled: None,
+            silent: false,
             proved: false,
             device: None,
             device_proved: false,
@@ -86,11 +89,13 @@ impl N2Sessions {
         self.drives.is_empty()
     }
 
-    /// The step that the drive needs before a read (`None`) or a command.
+    /// The step that the drive needs before a read (`None`) or a command. A stop to a drive that does not reply to Identify is
+    /// sent all the same, by turns with Identify: perhaps only the drive's replies are lost, and its motor runs.
     pub fn before(&mut self, drive: DriveIndex, command: Option<Urgency>, now: Instant) -> Option<Session> {
         let drive = self.drives.get_mut(drive)?;
         if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
-            return Some(Session::Identify);
+            let is_stop = command == Some(Urgency::Stop);
+            return (!is_stop || !drive.silent).then_some(Session::Identify);
         }
         if command.is_some() {
             return None;
@@ -107,6 +112,11 @@ impl N2Sessions {
     /// A step returned by [`N2Sessions::before`] has ended.
     pub fn done(&mut self, drive: DriveIndex, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.transaction_ended(drive, ended);
+        if step == Session::Identify
+            && let Some(drive) = self.drives.get_mut(drive)
+        {
+            drive.silent = *ended == Ended::Silent;
+        }
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
             return if step == Session::Identify {
                 Progress::Failed
@@ -128,6 +138,9 @@ impl N2Sessions {
     /// Notes the end of any transaction with the drive; [`Progress::Failed`] if it was refused although the drive
     /// was just identified.
     pub fn transaction_ended(&mut self, drive: DriveIndex, ended: &Ended) -> Progress {
+        if let Some(drive) = self.drives.get_mut(drive) {
+            drive.silent = false;
+        }
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
             if *ended == Ended::Silent && self.seemed_identified(drive) {
                 self.gone(drive);

@@ -3,7 +3,7 @@
 //! Limits repeated stops to a silent drive. A person presses the button again, and the drive may listen again at
 //! any moment: the next stop is sent after the other requests had the line for as long as the last stop took.
 //! Endless stops must not take half of the line: beyond a few in a row they get a tenth, but wait no longer than
-//! for one reply.
+//! for one reply, on N2 also for a late one.
 
 use std::time::{Duration, Instant};
 
@@ -29,11 +29,11 @@ impl VainStops {
         self.took += took;
     }
 
-    /// A stop failed without any reply, for which the drive has `response_timeout`.
-    pub(super) fn in_vain(&mut self, response_timeout: Duration, now: Instant) {
+    /// A stop failed without any reply; `longest` is the longest pause before the next one.
+    pub(super) fn in_vain(&mut self, longest: Duration, now: Instant) {
         let took = std::mem::take(&mut self.took);
         let share = took * PAUSE;
-        let pause = share.min(response_timeout).max(took);
+        let pause = share.min(longest).max(took);
         if let Some(last) = self.last.replace(now) {
             let paid = now.saturating_duration_since(last).as_secs_f64() / share.as_secs_f64().max(1e-6);
             self.count = (self.count - paid).max(0.0);

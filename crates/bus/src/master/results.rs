@@ -402,6 +402,12 @@ impl Master {
     ) {
         let online = self.schedule.is_online(index);
         let (retries, response_timeout) = (self.retries_of(index), self.response_timeout_of(index));
+        // On N2 no poll for reports is sent as long as the acknowledgement of a stop may come late.
+        let longest = if self.waits.sessions.is_empty() {
+            response_timeout
+        } else {
+            response_timeout + self.n2_window()
+        };
         let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
             // The step was sent, perhaps without success: it is sent again when its reply can be trusted.
@@ -428,13 +434,15 @@ impl Master {
             _ if online => retries.max(u32::from(used.stood)),
             // Even a damaged reply shows that something answers: a stop is tried as often as at a drive that is online.
             Ended::Corrupt(_) if slot == Urgency::Stop => retries,
+            // By turns Identify and the stop itself.
+            Ended::Silent if slot == Urgency::Stop && !self.waits.sessions.is_empty() => 1,
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
             if silent {
-                drive.vain_stops.in_vain(response_timeout, now);
+                drive.vain_stops.in_vain(longest, now);
                 self.schedule.doubted(index);
             }
         }

@@ -214,3 +214,17 @@ fn a_drive_that_only_seemed_to_be_identified_is_identified_again() {
     rig.done(AGAIN, &Ended::Silent);
     assert_eq!(rig.before(None), Some(AGAIN));
 }
+
+#[test]
+fn a_stop_goes_by_turns_with_identify_to_a_drive_that_does_not_reply() {
+    let (mut rig, stop) = (rig(), Some(Urgency::Stop));
+    for _ in 0..2 {
+        assert_eq!(rig.before(stop), Some(IDENTIFY));
+        rig.done(IDENTIFY, &Ended::Silent);
+        assert_eq!(rig.before(stop), None, "perhaps its replies are lost");
+        assert_eq!(rig.before(Some(Urgency::Command)), Some(IDENTIFY), "no other command");
+        rig.sessions.transaction_ended(DriveIndex::new(0), &Ended::Silent);
+    }
+    rig.done(IDENTIFY, &identity());
+    assert_eq!(rig.before(stop), None);
+}

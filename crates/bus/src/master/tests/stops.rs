@@ -171,5 +171,10 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
         .filter(|(_, turn)| turn.rank().is_some())
         .count();
     assert!(tries <= 4, "{tries} times Identify for one stop");
+    let is_stop = |(_, turn): &(Instant, Turn)| turn.pdu().is_write() && turn.target() == DriveIndex::new(0);
+    assert!(
+        rig.wire[from..].iter().any(is_stop),
+        "perhaps only its replies are lost"
+    );
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
 }
