@@ -108,6 +108,8 @@ pub struct LineState {
     underway: Option<Underway>,
     /// Bytes received on an N2 line since the last transaction: late replies come then, too.
     unasked: Vec<u8>,
+    /// The last complete frame on an N2 line: an equal one may be its duplicate.
+    last_frame: Vec<u8>,
     /// The memory of the last transaction.
     buffers: Buffers,
 }
@@ -142,6 +144,7 @@ impl LineState {
             },
             underway: None,
             unasked: Vec::new(),
+            last_frame: Vec::new(),
             buffers: Buffers::default(),
         }
     }
@@ -306,7 +309,12 @@ impl LineState {
         self.unasked.extend_from_slice(bytes);
         while let Some(end) = self.unasked.iter().position(|byte| *byte == b'\r') {
             let frame: Vec<u8> = self.unasked.drain(..=end).collect();
-            late.has_arrived(&frame, now);
+            if !self.last_frame.is_empty() && frame.ends_with(&self.last_frame) {
+                late.came_again(&frame, now);
+            } else {
+                late.has_arrived(&frame, now);
+            }
+            self.last_frame = frame;
         }
         // More than a reply without an end is noise.
         if self.unasked.len() > MOST_UNASKED {
@@ -353,6 +361,10 @@ impl LineState {
         let is_value = matches!(&ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
         let beats = (early && is_value).then(|| self.least_baud(&transaction, now.saturating_duration_since(began)));
         self.weigh(&ended, early, (doubtful, late), &transaction);
+        if self.protocol == Protocol::N2 {
+            self.last_frame.clear();
+            self.last_frame.extend_from_slice(transaction.reply_frame());
+        }
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
         let at = now.min(transaction.deadline());

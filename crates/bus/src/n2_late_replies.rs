@@ -186,29 +186,44 @@ impl N2LateReplies {
             _ if is_own => Taken::Reply,
             Answer::Nak(_) => Taken::Doubtful,
             answer if form(pdu).is_some_and(|form| has_form(form, &answer)) => Taken::Doubtful,
-            _ => {
-                self.one_came(index, now);
+            answer => {
+                self.one_came(index, &answer, now);
                 Taken::Late(used)
             }
         }
     }
 
-    fn one_came(&mut self, index: usize, now: Instant) {
+    /// The late reply `answer` came, probably that of the request with this index: each drive that may have sent it may take
+    /// as long again.
+    fn one_came(&mut self, index: usize, answer: &Answer, now: Instant) {
+        self.may_take_as_long_again(answer, now);
         let Some(late) = self.0.get_mut(index) else { return };
-        let (address, until) = (late.address, now + late.window);
         late.count = late.count.saturating_sub(1);
         if late.count == 0 {
             self.0.remove(index);
         }
-        self.take_as_long_again(&[address], until);
+    }
+
+    fn may_take_as_long_again(&mut self, answer: &Answer, now: Instant) {
+        let senders = self.0.iter().filter(|late| late.could_be(answer));
+        let senders: Vec<u8> = senders.map(|late| late.address).collect();
+        for late in self.0.iter_mut().filter(|late| senders.contains(&late.address)) {
+            late.until = late.until.max(now + late.window);
+        }
+    }
+
+    /// Notes a frame that is equal to the one before it: a duplicate of that, or another late reply.
+    pub(super) fn came_again(&mut self, frame: &[u8], now: Instant) {
+        if let Some((_, answer)) = self::frame(frame) {
+            self.may_take_as_long_again(&answer, now);
+        }
     }
 
     /// Notes that the frame, which arrived by `now`, was a late reply; that one is then no longer expected.
     pub fn has_arrived(&mut self, frame: &[u8], now: Instant) {
-        let answer = self::frame(frame).map(|(_, answer)| answer);
-        let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
-        if let Some(index) = index {
-            self.one_came(index, now);
+        let Some((_, answer)) = self::frame(frame) else { return };
+        if let Some(index) = self.0.iter().position(|late| late.could_be(&answer)) {
+            self.one_came(index, &answer, now);
         }
     }
 
@@ -418,6 +433,20 @@ mod tests {
             Some(now + WINDOW),
             "another drive is not slower"
         );
+    }
+
+    #[test]
+    fn every_drive_that_may_have_sent_a_late_reply_takes_as_long_again() {
+        let now = Instant::now();
+        let came = now + WINDOW * 9 / 10;
+        let on = RequestPdu::WriteCoil { address: 0, on: true };
+        let state = read(Table::Coil, 1, 1);
+        let mut late = N2LateReplies::default();
+        late.given_up(asked(1, &on, now), WINDOW, now);
+        late.given_up(asked(2, &on, now), WINDOW, now);
+        late.given_up(asked(2, &state, now), WINDOW, now);
+        assert_eq!(late.take(3, &state, b"A\r", came), Taken::Late(2));
+        assert_eq!(late.blocks(&state, came), Some(came + WINDOW), "of drive 1 or 2");
     }
 
     #[test]

@@ -306,5 +306,28 @@ fn a_late_reply_of_n2_that_comes_between_two_requests_is_noted() {
         "the other one may take as long again"
     );
     assert!(rig.line.received(b"A4064\r", &mut late, came).is_none());
+    assert!(late.may_come(came), "it may be the first once more");
+    assert!(rig.line.received(b"A0060\r", &mut late, came).is_none());
     assert!(!late.may_come(came), "both came");
+}
+
+#[test]
+fn a_reply_of_n2_that_comes_once_more_between_two_requests_is_no_late_one() {
+    const WINDOW: Duration = Duration::from_millis(750);
+    let mut rig = DoublingLine::of(Protocol::N2);
+    assert!(rig.answers(&[(REGULAR, b"A1061\r")]));
+    let (now, state) = (rig.now, RequestPdu::read(Table::DiscreteInput, 2, 1));
+    let mut late = N2LateReplies::default();
+    let asked = LateRequest {
+        address: 2,
+        pdu: &state,
+        device: 0x10,
+        at: now,
+    };
+    late.given_up(asked, WINDOW, now);
+    let came = now + WINDOW * 9 / 10;
+    assert!(rig.line.received(b"A1061\r", &mut late, came).is_none());
+    assert_eq!(late.until(), Some(came + WINDOW), "the late one may still come");
+    assert!(rig.line.received(b"A0060\r", &mut late, came).is_none());
+    assert!(!late.may_come(came), "it came");
 }
