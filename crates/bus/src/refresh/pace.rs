@@ -5,14 +5,14 @@ use super::ordered::Reference;
 use drivegate_model::drive::{ModelPoint, Profile, Raw};
 
 /// Share of the reference within which a motor keeps its speed, by which it may stay below its reference, and by which a
-/// motor that slows down becomes slower from look to look, at least. A speed that is measured differs by less.
+/// motor that slows down there becomes slower from look to look, at least. A speed that is measured differs by less.
 const BAND: f64 = 0.005;
 
 /// Share of the reference by which a drive that compensates slip may turn faster than its reference.
 const SLIP: f64 = 0.05;
 
-/// Share of the reference by which a motor that kept its speed has at least become slower in the first look behind a stop.
-/// A wrong first look costs one refresh, and the next look decides.
+/// Share of the reference by which a motor that kept its speed has at least become slower in the first look behind a stop,
+/// and below its reference from look to look. A wrong first look costs one refresh, and the next look decides.
 const FIRST_FALL: f64 = 0.001;
 
 /// Speed of a refreshed motor in relation to the reference of the last order.
@@ -66,11 +66,13 @@ impl Pace {
         let is_there = (reference - band..=reference * (1.0 + SLIP)).contains(&speed);
         // Slip compensation turns the motor faster by its load, which may change for many periods.
         let is_below = speed < reference;
+        // At its reference a motor may drift by its load; a long ramp falls little from look to look.
+        let fall = if is_there { band } else { reference * FIRST_FALL };
         let together = |kept: Kept| is_there && kept.high - kept.low <= band;
         match self {
             Pace::Steady(kept) if kept.is_left_by(speed, reference * FIRST_FALL) => Pace::Falls(speed),
             // A motor that brakes at 0 Hz still shows that it runs.
-            Pace::Falls(last) if is_below && speed < last - band || speed <= band => Pace::Falls(speed),
+            Pace::Falls(last) if is_below && speed < last - fall || speed <= band => Pace::Falls(speed),
             Pace::Steady(kept) if together(kept.with(speed)) => Pace::Steady(kept.with(speed)),
             Pace::Arrived(last) | Pace::Falls(last) if together(Kept::of(last).with(speed)) => {
                 Pace::Steady(Kept::of(last).with(speed))
@@ -122,6 +124,8 @@ mod tests {
             (&[50.0, 50.0, 48.0, 49.0, 50.0, 50.0], "asvfas"),
             // The motor turns on at a lower speed.
             (&[50.0, 50.0, 48.0, 47.96, 47.96], "asvff"),
+            // A ramp of five minutes, or of 30 seconds with a period of 0.1 s.
+            (&[50.0, 50.0, 49.833, 49.667, 49.5, 49.333, 49.167], "asvvvvv"),
             // A ramp of two minutes: the first looks differ little.
             (&[50.0, 50.0, 49.9, 49.5, 49.1, 48.7], "asvvvv"),
             // The speed drifts, and is not constant.
