@@ -258,7 +258,9 @@ impl Master {
                 return;
             }
         }
-        if let Err(why) = drive.refresh.answered(&image.spec.profile, &reply, now) {
+        // The round reads again after a stall of the thread, behind which this reply came.
+        let is_before_stall = end.stood && !pdu.is_write();
+        if !is_before_stall && let Err(why) = drive.refresh.answered(&image.spec.profile, pdu, &reply, now) {
             drive.end_refresh(why);
         }
         if let (RequestPdu::Read { table, start, count }, Some(words)) = (pdu, reply.words()) {

@@ -12,6 +12,7 @@ use crate::supervision::Lease;
 use crate::transaction::{Ended, MAY_BE_LATE};
 use drivegate_core::order::{Answer, Authority, Order, Target, Ticket};
 use drivegate_core::process_image::{BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
+use drivegate_core::stalls::Stall;
 use drivegate_line::LineOptions;
 use drivegate_model::drive::{DriveIndex, ModelPoint, PollClass, Value};
 use drivegate_proto::n2::Session;
@@ -128,6 +129,8 @@ struct Rig {
     /// Whether the drives do not receive a broadcast.
     deaf: bool,
     news: Vec<News>,
+    /// The thread stalls behind the request for which this holds, before the reply is read.
+    stalls: Option<fn(&Turn) -> bool>,
     /// All turns that were sent on the line.
     wire: Vec<(Instant, Turn)>,
     now: Instant,
@@ -193,6 +196,7 @@ impl Rig {
             drives: (0..drives).map(|_| Registers::default()).collect(),
             deaf: false,
             news: Vec::new(),
+            stalls: None,
             wire: Vec::new(),
             now,
         }
@@ -236,12 +240,18 @@ impl Rig {
         };
         let took = if ended == Ended::Silent { TIMEOUT } else { COST };
         self.now += took;
+        let at = self.now;
+        let stood = self.stalls.take_if(|stalls| stalls(&turn)).is_some();
+        if stood {
+            self.now += Duration::from_millis(200);
+            self.master.after_stall(Stall::new(at, self.now), self.now);
+        }
         let mangled = false;
         let end = TurnEnd {
             ended,
             began,
-            at: self.now,
-            stood: false,
+            at,
+            stood,
             took,
             mangled,
             doubted: false,

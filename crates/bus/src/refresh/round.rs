@@ -161,16 +161,25 @@ impl Refresh {
         }
     }
 
-    /// Processes the drive's reply to the present step.
+    /// Processes the drive's reply to `pdu`, the request of the present step.
     ///
     /// # Errors
     /// If the refresh must end; contains the reason.
-    pub(crate) fn answered(&mut self, profile: &Profile, reply: &Reply, now: Instant) -> Result<(), End> {
+    pub(crate) fn answered(
+        &mut self,
+        profile: &Profile,
+        pdu: &RequestPdu,
+        reply: &Reply,
+        now: Instant,
+    ) -> Result<(), End> {
         let (Some((every, _)), Some(control)) = (self.settings, profile.control.as_ref()) else {
             return Ok(());
         };
-        let Some(stage) = self.round.as_ref().map(|round| round.stage) else {
-            return Ok(());
+        let stage = match self.round.as_ref().map(|round| round.stage) {
+            None => return Ok(()),
+            // A stall while the write was on the line began the reads of the round again.
+            Some(Stage::Own | Stage::Look) if pdu.is_write() => Stage::Write,
+            Some(stage) => stage,
         };
         if let Reply::Exception(code) = reply {
             if *code == Exception::FUNCTION && stage == Stage::Write && !self.apart {

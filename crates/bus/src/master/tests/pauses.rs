@@ -2,7 +2,6 @@
 
 use super::*;
 use drivegate_core::order::{Arrival, Connection, Interruption, Window};
-use drivegate_core::stalls::Stall;
 
 const MS: Duration = Duration::from_millis(1);
 const FIRST: DriveIndex = DriveIndex::new(0);

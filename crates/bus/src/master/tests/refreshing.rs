@@ -408,6 +408,32 @@ fn stands_still(rig: &mut Rig, ms: u64) {
         .after_stall(drivegate_core::stalls::Stall::new(began, rig.now), rig.now);
 }
 
+/// The reply to a read of a round that comes behind a short stall belongs to no step of the round, which begins again.
+#[test]
+fn a_stall_behind_the_request_of_a_round_ends_no_refresh() {
+    let is_read = |turn: &Turn| matches!(turn.purpose, Purpose::Refresh(_)) && !turn.pdu.is_write();
+    for (name, _) in FAMILIES {
+        let mut plant = Plant::new(name);
+        plant.starts();
+        plant.rig.run(EVERY * 3);
+        for place in 0..4 {
+            let until = plant.rig.now + Duration::from_secs(5);
+            let from = plant.rig.wire.len();
+            let seen = |plant: &Plant| plant.rig.wire[from..].iter().filter(|(_, turn)| is_read(turn)).count();
+            while seen(&plant) < place {
+                plant.rig.step();
+                assert!(plant.rig.now < until, "{name}");
+            }
+            plant.rig.stalls = Some(is_read);
+            plant.rig.run(Duration::from_secs(2));
+            plant.rig.stalls = Some(|turn| matches!(turn.purpose, Purpose::Refresh(_)) && turn.pdu.is_write());
+            let refreshes = plant.refreshes(5);
+            assert!(refreshes.len() >= 4, "{name} {place}: {}", refreshes.len());
+            assert!(plant.rig.bus.image.drives[0].is_refreshing(), "{name} {place}");
+        }
+    }
+}
+
 /// Values read in a round are no longer valid if the port was lost, or the thread was stalled, before the write of
 /// the round.
 #[test]
