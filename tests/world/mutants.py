@@ -17,6 +17,7 @@ import os
 import pathlib
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -179,6 +180,18 @@ def built(command, target):
 STALLS = "no_motor_starts_that_nobody_wants_to_run"
 
 
+def finished(command, env, seconds):
+    """The exit code, None where the time is over, and what was printed. Programs that a test starts end with it."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, cwd=COPY, env=env, text=True, start_new_session=True, **pipes) as program:
+        try:
+            output = program.communicate(timeout=seconds)[0]
+            return program.returncode, output
+        except subprocess.TimeoutExpired:
+            os.killpg(program.pid, signal.SIGKILL)
+            return None, program.communicate()[0]
+
+
 def run(programs, mutant, options):
     """What found the fault, a seed or else a scenario or a test, and what was seen; None where none did."""
     name, by = mutant["name"], mutant.get("by")
@@ -186,19 +199,16 @@ def run(programs, mutant, options):
     for tests in seeds if by is None else ([],):
         env = os.environ | {"MUTANT": name, "WORLD_SEEDS": str(options.seeds), "WORLD_FROM": "0"}
         command = [programs[by or "world"], *tests]
-        try:
-            ended = subprocess.run(command, cwd=COPY, env=env, capture_output=True, text=True, timeout=options.time)
-        except subprocess.TimeoutExpired as late:
+        returned, output = finished(command, env, options.time)
+        if returned is None:
             # A test that failed has found the fault, though another one goes on for ever because of it.
-            printed = (late.stdout or b"").decode(errors="replace")
-            failed = re.search(r"^test (\S+) \.\.\. FAILED", printed, re.MULTILINE)
+            failed = re.search(r"^test (\S+) \.\.\. FAILED", output, re.MULTILINE)
             found = f"{'scenario' if by is None else 'unit test'} `{failed.group(1)}`" if failed else "nothing"
             return (found, f"not all tests ended within {options.time} s")
-        if ended.returncode == 0:
+        if returned == 0:
             continue
-        output = ended.stdout + ended.stderr
-        if ended.returncode < 0:
-            return ("nothing", f"ended by signal {-ended.returncode}")
+        if returned < 0:
+            return ("nothing", f"ended by signal {-returned}")
         seed = re.search(r"FAILED: seed (\d+)", output)
         scenario = re.search(r"^test (\S+) \.\.\. FAILED", output, re.MULTILINE)
         seen = re.search(r"panicked at [^\n]*:\n([^\n]*)", output)
