@@ -24,7 +24,7 @@ const MOST_DECISIONS: usize = 1000;
 #[derive(Debug, Default)]
 pub(super) struct Turns {
     in_a_row: PerRank<u32>,
-    queued_first: u32,
+    queued_first: PerRank<u32>,
 }
 
 impl Turns {
@@ -42,11 +42,12 @@ impl Turns {
     /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy:
     /// several such drives must not keep a stop from the others, and the drives that do not answer must not keep it from them.
     fn begins_before(&mut self, repetition: bool, queued: Chosen) -> bool {
-        let begins = repetition && self.queued_first < if queued.is_last { 1 } else { IN_A_ROW };
+        let first = self.queued_first.of_mut(queued.rank);
+        let begins = repetition && *first < if queued.is_last { 1 } else { IN_A_ROW };
         if begins {
-            self.queued_first += 1;
+            *first += 1;
         } else if repetition {
-            self.queued_first = 0;
+            *first = 0;
         }
         begins
     }
