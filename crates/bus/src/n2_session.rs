@@ -109,6 +109,12 @@ impl N2Sessions {
         }
     }
 
+    /// Whether the drive must be identified before it can be read.
+    pub(crate) fn waits_for_identify(&self, drive: DriveIndex) -> bool {
+        let drive = self.drives.get(drive);
+        drive.is_some_and(|drive| matches!(drive.phase, Phase::Unknown | Phase::Waiting))
+    }
+
     /// A step returned by [`N2Sessions::before`] has ended.
     pub fn done(&mut self, drive: DriveIndex, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.transaction_ended(drive, ended);

@@ -435,7 +435,7 @@ impl Master {
             // Even a damaged reply shows that something answers: a stop is tried as often as at a drive that is online.
             Ended::Corrupt(_) if slot == Urgency::Stop => retries,
             // By turns Identify and the stop itself.
-            Ended::Silent if slot == Urgency::Stop && !self.waits.sessions.is_empty() => 1,
+            Ended::Silent if slot == Urgency::Stop && self.waits.sessions.waits_for_identify(index) => 1,
             _ => 0,
         };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
