@@ -336,7 +336,7 @@ impl World {
         }
         for (bus, healed) in self.buses.iter().zip(&healed) {
             let (sound, probed) = sound_ages(bus, window);
-            let round = bus.round.max(bus.line.cycle);
+            let (round, cycle) = (bus.round.max(bus.line.cycle), bus.line.slow_cycle);
             // The probe of a silent drive, and on N2 the requests that wait for its late reply, come at other moments than
             // in the world without faults, where the time of observation may have none.
             let probe = match bus.line.protocol {
@@ -353,7 +353,8 @@ impl World {
                     let Some(best) = best else { continue };
                     let most = match read.2 {
                         PollClass::Fast => *best + round + probe + self.exchange(bus) / 2 + STEP,
-                        _ => 2 * bus.slow_round.max(bus.line.slow_cycle) + 2 * round,
+                        // Monitoring registers are read in between, once in a slow round.
+                        _ => bus.slow_round.max(cycle) + bus.first_slow_round.max(cycle) + 2 * round,
                     };
                     // The world without faults has no orders and no refresh.
                     let most = if bus.line.refresh.is_some() { 3 * most / 2 } else { most };

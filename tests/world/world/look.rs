@@ -167,8 +167,12 @@ impl World {
             let round = bus.handle.image.health().fast.last.unwrap_or_default();
             // On N2, the bus waits for a missing report as long as the longest report takes. This happens twice: for
             // the report of this drive before the pause, and for the report of another drive after it.
+            let reports = 2 * (bus.line.response_timeout + Duration::from_secs(1));
+            let duels = self.clients.iter().any(|client| client.habit == Habit::Duels);
             let reports = match bus.line.protocol {
-                Protocol::N2 => 2 * (bus.line.response_timeout + Duration::from_secs(1)),
+                // Polls for reports also wait for the acknowledgements of stops without end, which may come late.
+                Protocol::N2 if duels => PROBED + reports,
+                Protocol::N2 => reports,
                 Protocol::ModbusRtu | Protocol::ModbusAscii => Duration::ZERO,
             };
             for (drive, truth) in truths.iter().enumerate() {
