@@ -296,8 +296,12 @@ impl Master {
                 run.others_go_first();
             }
         }
-        if let Purpose::Background(_) = turn.purpose {
-            self.background_sent(now);
+        match &turn.purpose {
+            Purpose::Background(_) => self.background_sent(now),
+            Purpose::Poll(poll) | Purpose::Session(_, _, Before::Poll(poll)) if poll.probe => {
+                self.schedule.probe_sent(poll.drive);
+            }
+            _ => {}
         }
         self.others_before_refresh(turn);
         let mut late = self

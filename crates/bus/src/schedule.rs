@@ -128,6 +128,8 @@ pub struct Schedule {
     cadence: Cadence,
     drives: PerDrive<DriveSchedule>,
     round: VecDeque<(DriveIndex, PlannedRead)>,
+    /// The drive that was probed last.
+    last_probed: Option<DriveIndex>,
     /// Memory in which the reads of a new round are sorted, empty otherwise.
     sorted: Vec<(usize, DriveIndex, PlannedRead)>,
     /// Reads of this round that decide the state of a drive whose state is unknown: no slow poll goes before them.
@@ -196,6 +198,7 @@ impl Schedule {
             cadence,
             drives,
             round: VecDeque::new(),
+            last_probed: None,
             sorted: Vec::new(),
             state_first: Vec::new(),
             round_due: now,
@@ -382,6 +385,11 @@ impl Schedule {
     /// Notes that no reply has proved this read: its items are read singly, and the whole read is tried again later.
     pub(crate) fn not_proved(&mut self, drive: DriveIndex, read: &PlannedRead, pause: Duration, now: Instant) {
         self.drives.of_mut(drive).take_apart(read, now, pause);
+    }
+
+    /// Notes that a probe, or what goes before it, is sent to this drive.
+    pub(crate) fn probe_sent(&mut self, drive: DriveIndex) {
+        self.last_probed = Some(drive);
     }
 
     /// Postpones a poll until this time.

@@ -106,19 +106,19 @@ impl Schedule {
             .map(|(_, poll, _)| poll)
     }
 
-    /// The probe of the absent drive that waits longest.
+    /// The probe of the absent drive that waits longest. Drives whose probes were postponed together take turns.
     fn due_probe(&self, now: Instant) -> Option<Poll> {
         let due = |drive: &DriveSchedule| match drive.presence {
             Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
             _ => None,
         };
-        let mut waiting: Vec<(Instant, DriveIndex)> = self
+        let mut waiting: Vec<(Instant, bool, DriveIndex)> = self
             .drives
             .enumerate()
-            .filter_map(|(i, d)| Some((due(d)?, i)))
+            .filter_map(|(index, drive)| Some((due(drive)?, Some(index) <= self.last_probed, index)))
             .collect();
         waiting.sort();
-        waiting.into_iter().find_map(|(_, index)| {
+        waiting.into_iter().find_map(|(_, _, index)| {
             let read = self.drives.of(index).probe()?;
             Some(Poll {
                 drive: index,

@@ -397,3 +397,25 @@ fn the_bits_of_the_status_word_come_before_other_slow_reads() {
     }
     assert!(families > 2, "{families}");
 }
+
+#[test]
+fn absent_drives_whose_probes_were_postponed_together_take_turns() {
+    let mut rig = PolledLine::new(3, Duration::from_millis(10));
+    let mut probed = Vec::new();
+    for _ in 0..6 {
+        let mut seen = None;
+        // The line is free for one probe, then none may be sent for a while.
+        while let Decision::Poll(poll) = rig.schedule.next(rig.now, None) {
+            assert!(poll.probe);
+            if seen.is_none() {
+                rig.schedule.probe_sent(poll.drive);
+                seen = Some(poll.drive.place());
+            }
+            rig.schedule.postpone(&poll, rig.now + COST);
+        }
+        probed.extend(seen);
+        rig.now += COST;
+    }
+    let count = |drive| probed.iter().filter(|probed| **probed == drive).count();
+    assert_eq!([0, 1, 2].map(count), [2, 2, 2], "{probed:?}");
+}
