@@ -69,6 +69,8 @@ pub struct Truth {
     pub stop_sent: Option<Instant>,
     /// The action of supervision that was last on the wire, if nothing else was written since.
     pub action: Option<Tried>,
+    /// The last write that the drive did as told, refreshes apart, was an action of supervision.
+    pub acted: bool,
     /// Time until which a stop that the broker delivered again may be in progress.
     pub repeated_until: Option<Instant>,
     /// When a request to the drive was last on the wire.
@@ -138,6 +140,7 @@ impl Truth {
             last_stop: None,
             stop_sent: None,
             action: None,
+            acted: false,
             repeated_until: None,
             asked: None,
             offline_since: None,
@@ -193,6 +196,7 @@ impl Truth {
         self.ordered.clear();
         (self.heard, self.online_since, self.carried) = ((None, None), None, None);
         (self.ran_by_order, self.supervised, self.action) = (None, None, None);
+        self.acted = false;
         self.trouble(now + AFTERMATH);
     }
 

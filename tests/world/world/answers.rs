@@ -355,11 +355,12 @@ impl World {
         let truth = &self.truths[record.bus][record.drive];
         let calm = self.scenario.incidents.is_none() && !self.buses[record.bus].line.is_noisy();
         if self.clients[record.client].habit == Habit::Steady && calm && !self.stopping {
-            // The older orders to its drive go first, each after all drives of the crowd were served once.
+            // The older orders to its drive go first, each after all drives of the crowd were served once; polls have half of
+            // the line, and a reset has two writes.
             let bus = &self.buses[record.bus];
             let turn = 2 * bus.line.turnaround + bus.handle.image.spec.format.chars(100);
             let turns = u32::from(bus.line.drives) * u32::try_from(record.before + 1).unwrap_or(u32::MAX);
-            let is_slow = 2 * turn * turns > record.expires - record.accepted;
+            let is_slow = 3 * turn * turns > record.expires - record.accepted;
             assert!(
                 record.before > 4
                     || is_slow

@@ -81,7 +81,7 @@ impl World {
             // The refresh begins again with the reference that supervision wrote, which may come long after the lease
             // expired, if the reference could not be calculated before. It needs no lease until another write.
             let speed = matches!(supervision.action, LeaseAction::SpeedReference(_));
-            let acted = speed && truth.action.is_some();
+            let acted = speed && truth.acted;
             assert!(
                 acted || now - last <= supervision.timeout + ACTION,
                 "drive {} is fed {:?} after its client fell silent",
@@ -140,6 +140,7 @@ impl World {
         };
         if !asked.is_refresh {
             truth.commanded = Some(now);
+            truth.acted = truth.action.as_ref().is_some_and(|action| action.pdu == asked.pdu);
             truth
                 .ordered
                 .extend(items.iter().map(|(address, word)| ((table, *address), *word)));
