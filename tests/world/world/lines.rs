@@ -332,10 +332,11 @@ impl World {
             self.now - at
         );
         let truth = &self.truths[bus][asked.drive];
-        // The drive may have sent this answer to an earlier attempt; the image then has that time. The checksum of
-        // N2 does not detect two flipped bits that compensate each other.
-        let flipped = self.buses[bus].line.protocol == Protocol::N2 && self.buses[bus].line.flips_bits();
-        let alike = |words: &Vec<u16>| *words == stored || (flipped && bits_on_n2(words, &stored) <= 2);
+        // The drive may have sent this answer to an earlier attempt; the image then has that time. The checksums of N2 and
+        // Modbus ASCII do not detect two flipped bits that compensate each other.
+        let in_digits = self.buses[bus].line.protocol != Protocol::ModbusRtu;
+        let flipped = in_digits && self.buses[bus].line.flips_bits();
+        let alike = |words: &Vec<u16>| *words == stored || (flipped && bits_in_digits(words, &stored) <= 2);
         let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words.is_some_and(alike);
         assert!(
             truth.did(from, said),
@@ -346,9 +347,9 @@ impl World {
     }
 }
 
-/// Bits in which the values differ as they are on the wire of N2, where each digit is a character: one of its bits may
-/// change several of the digit.
-fn bits_on_n2(said: &[u16], stored: &[u16]) -> u32 {
+/// Bits in which the values differ on a wire on which each digit is a character: one of its bits may change several of the
+/// digit.
+fn bits_in_digits(said: &[u16], stored: &[u16]) -> u32 {
     let digits = |words: &[u16]| -> String { words.iter().map(|word| format!("{word:04X}")).collect() };
     let (said, stored) = (digits(said), digits(stored));
     if said.len() == stored.len() {

@@ -117,6 +117,17 @@ impl World {
     /// the way since.
     pub(super) fn is_owed_a_feeding(&self, bus: usize, drive: usize, time: Duration) -> bool {
         let (line, truth, now) = (&self.buses[bus].line, &self.truths[bus][drive], self.now);
+        let profile = &self.buses[bus].profile;
+        // Where the reference feeds the timeout, an order must have set one.
+        let has_reference = || {
+            truth
+                .ordered
+                .keys()
+                .any(|(_, address)| profile.is_repeated_reference(*address))
+        };
+        if profile.repeats().is_ok_and(|repeats| !repeats.word) && !has_reference() {
+            return false;
+        }
         let sound = self.scenario.incidents.is_none() && !line.is_noisy() && self.buses[bus].open;
         let (Some(supervision), Some(ordered), Some(heard)) = (&line.supervision, truth.ran_by_order, truth.heard.0)
         else {
