@@ -119,13 +119,9 @@ impl World {
         let (line, truth, now) = (&self.buses[bus].line, &self.truths[bus][drive], self.now);
         let profile = &self.buses[bus].profile;
         // Where the reference feeds the timeout, an order must have set one.
-        let has_reference = || {
-            truth
-                .ordered
-                .keys()
-                .any(|(_, address)| profile.is_repeated_reference(*address))
-        };
-        if profile.repeats().is_ok_and(|repeats| !repeats.word) && !has_reference() {
+        let is_reference = |at: &(Table, u16)| at.0 == Table::Holding && profile.is_repeated_reference(at.1);
+        let has_reference = truth.ordered.keys().any(is_reference);
+        if profile.repeats().is_ok_and(|repeats| !repeats.word) && !has_reference {
             return false;
         }
         let sound = self.scenario.incidents.is_none() && !line.is_noisy() && self.buses[bus].open;
