@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::orders::is_counted;
+use drivegate_proto::Table;
 
 /// What a drive showed this long ago is no longer known: the reads right before a refresh are behind it.
 const SHOWN: Duration = Duration::from_millis(500);
