@@ -182,13 +182,17 @@ impl Restoration {
         }
     }
 
-    /// The journal is removed, or could not be.
+    /// The journal is removed, or could not be. Without a write the drive is whole, whatever is left of the journal: on
+    /// a read-only disk it was never written.
     pub fn removed(&mut self, result: Result<(), String>) {
         if let State::Removing(end) = &self.state {
-            self.state = State::Over(match result {
-                Ok(()) => end.clone(),
-                Err(why) => End::Unfinished(format!(
-                    "everything is written, but the journal cannot be removed: {why}"
+            self.state = State::Over(match (result, end) {
+                (Ok(()), end) => end.clone(),
+                (Err(left), End::NothingWritten(why)) => {
+                    End::NothingWritten(format!("{why}; a journal that exists cannot be removed: {left}"))
+                }
+                (Err(left), _) => End::Unfinished(format!(
+                    "everything is written, but the journal cannot be removed: {left}"
                 )),
             });
         }
@@ -457,6 +461,22 @@ mod tests {
         assert_eq!(restoration.wanted(), RestoreNeed::Remove);
         restoration.removed(Ok(()));
         assert!(matches!(restoration.end(), Some(End::NothingWritten(why)) if why.contains("no space left")));
+    }
+
+    #[test]
+    fn a_disk_that_takes_no_journal_and_removes_none_holds_no_untouched_drive() {
+        let now = Instant::now();
+        let read_only = || Err("read-only file system".to_string());
+        let mut restoration = begun(2, false, now);
+        restoration.recorded(read_only(), now);
+        restoration.removed(read_only());
+        assert!(matches!(restoration.end(), Some(End::NothingWritten(why)) if why.contains("cannot be written")));
+        // Once everything is written, the journal that stays would hold the drive after a restart, too.
+        let mut restoration = begun(1, false, now);
+        restoration.recorded(Ok(()), now);
+        restoration.answered(&TAKEN, now);
+        restoration.removed(read_only());
+        assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.starts_with("everything is written")));
     }
 
     #[test]
