@@ -18,6 +18,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
+use futures_util::future::join5;
 use tokio::task::JoinHandle;
 
 use self::leases::RemovedDrives;
@@ -410,8 +411,8 @@ impl Daemon {
         .map_err(failed)
     }
 
-    /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,
-    /// the last MQTT messages.
+    /// Shuts down in order: no new commands of local clients, tools, BACnet and Modbus TCP clients, the configured stop commands, the
+    /// buses, the last MQTT messages.
     pub async fn stop(mut self) {
         // Orders received over the local socket are answered when the buses have ended.
         let local = self.local.server().map(local::Local::connections);
@@ -422,19 +423,24 @@ impl Daemon {
             mut bacnet,
             mut http,
         } = std::mem::take(&mut self.listening);
-        slots.stop().await;
-        bacnet.stop().await;
-        modbus_tcp.stop().await;
-        drills::end(
+        // The motors wait for no client that is being served, no disk and no drive of a drill: all of these end meanwhile.
+        // The servers come first, so that none of them accepts another order, and the drill orders its last stop.
+        let drill = drills::end(
             &self.plant,
             &self.north.drills,
             &self.drills,
             "the end of the gateway",
             |_| true,
+        );
+        join5(
+            slots.stop(),
+            bacnet.stop(),
+            modbus_tcp.stop(),
+            drill,
+            self.stop_drives(),
         )
         .await;
         self.driller.abort();
-        self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();
         within(STOP_BUSES, "buses", async {

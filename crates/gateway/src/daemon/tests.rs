@@ -1,7 +1,13 @@
+use futures_util::FutureExt as _;
+
 use drivegate_testkit::mqtt as packets;
+use drivegate_testkit::online;
 
 use super::*;
 use drivegate_core::event::EventKind;
+use drivegate_core::order::{Authority, Order, Origin, SourceKind};
+use drivegate_core::plant::OrderRequest;
+use drivegate_model::drive::{ModelPoint, Value};
 
 /// A gateway with this number of buses, none of which has an adapter.
 fn without_adapters(buses: usize) -> Settings {
@@ -99,4 +105,40 @@ async fn the_first_birth_of_the_node_names_its_buses() {
         }
         daemon.stop().await;
     }
+}
+
+/// On the single thread of this test no server can end during the first poll of the shutdown: whatever waits for one is not
+/// done by then.
+#[tokio::test]
+async fn the_stops_at_the_end_wait_for_no_server() {
+    let line = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let text = format!(
+        "[gateway]\nname = \"hall\"\n[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\n[[bus]]\nname = \"line\"\nport = \"tcp://{}\"\n\
+         response_timeout = \"10s\"\n[[bus.drive]]\nname = \"pump\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n",
+        line.local_addr().unwrap()
+    );
+    let loaded = Settings::parse("drivegate.toml", &text, std::iter::empty());
+    let mut settings = without_adapters(0);
+    let configured = loaded.settings.unwrap_or_else(|| panic!("{:?}", loaded.errors));
+    (settings.buses, settings.modbus_tcp) = (configured.buses, configured.modbus_tcp);
+    let daemon = Daemon::start(settings).await.unwrap();
+    // The first poll is on the line and stays unanswered, so the order waits.
+    let mut adapter = line.accept().unwrap().0;
+    std::io::Read::read_exact(&mut adapter, &mut [0; 8]).unwrap();
+    let drive = daemon.plant().load().drive("pump").unwrap();
+    online(&drive.image);
+    let run = drive.image.spec.profile.model_index(ModelPoint::Run).unwrap();
+    let order = Order::Points(vec![(run, Value::Bool(true))]);
+    let request = OrderRequest::new(order, Origin::new(SourceKind::ModbusTcp, "plc"), Authority::Write);
+    let mut placed = drive.place(request.within(Duration::from_secs(60)), Instant::now());
+    let early = placed.answered().now_or_never();
+    assert!(early.is_none(), "{early:?}");
+    let mut end = Box::pin(daemon.stop());
+    assert!(end.as_mut().now_or_never().is_none(), "the server is still ending");
+    let answer = placed.answered().now_or_never();
+    assert!(
+        matches!(&answer, Some(answer) if answer.outcome == Outcome::ShuttingDown),
+        "{answer:?}"
+    );
+    end.await;
 }
