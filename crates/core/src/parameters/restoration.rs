@@ -80,8 +80,11 @@ pub struct Restoration {
     state: State,
     /// Whether a value on the drive may have been changed.
     touched: bool,
-    /// Whether a value was written that is not saved yet.
+    /// Whether a value was written that is not saved yet, or was not read again since.
     wrote: bool,
+    /// Whether the drive did not answer since the present pass over all parameters began: it may have been without power.
+    was_away: bool,
+    /// Number of passes that ended with a save, or because the drive was away.
     saves: u32,
     /// Since when the restore has been unable to continue.
     waits_since: Option<Instant>,
@@ -117,6 +120,7 @@ impl Restoration {
             state: State::Recording(0),
             touched,
             wrote: true,
+            was_away: false,
             saves: 0,
             waits_since: None,
             noted: now,
@@ -208,6 +212,15 @@ impl Restoration {
         if !clean && !not_sent {
             self.touched = true;
         }
+        self.was_away |= matches!(
+            outcome,
+            Outcome::TimedOut
+                | Outcome::Garbled
+                | Outcome::Unknown(_)
+                | Outcome::Interrupted(_)
+                | Outcome::Offline
+                | Outcome::BusDown
+        );
         match outcome {
             Outcome::Acknowledged(reply) => {
                 self.waits_since = None;
@@ -260,7 +273,8 @@ impl Restoration {
         let Some(write) = self.writes.get(place) else {
             return self.saved();
         };
-        self.wrote |= written && !write.volatile;
+        // What no save would keep is written again where nothing is saved.
+        self.wrote |= written && !(write.volatile && self.saves());
         let next = place + 1;
         self.journal.done = self.journal.done.max(next);
         if next < self.writes.len() {
@@ -272,12 +286,16 @@ impl Restoration {
             };
             return Then::Go;
         }
-        if !self.saves() || !self.wrote {
+        let again = self.saves() || self.was_away;
+        if !again || !self.wrote {
             self.finish();
             return Then::Go;
         }
         if self.saves == MOST_SAVES {
             return self.stop("the drive keeps losing what is written: is it being switched off and on?".to_string());
+        }
+        if !self.saves() {
+            return self.saved();
         }
         self.journal.saved = true;
         self.journal.phase = match self.journal.phase {
@@ -288,10 +306,11 @@ impl Restoration {
         Then::Go
     }
 
-    /// The drive has saved the values. If it lost power before, some may be lost, so all are checked again.
+    /// The drive has saved the values, or was away and needs no save. If it lost power before, some may be lost, so all are
+    /// checked again.
     fn saved(&mut self) -> Then {
         self.saves += 1;
-        self.wrote = false;
+        (self.wrote, self.was_away) = (false, false);
         self.state = State::Setting(0);
         if self.writes.is_empty() {
             self.finish();
@@ -451,6 +470,36 @@ mod tests {
                 "remove"
             ]
         );
+    }
+
+    #[test]
+    fn what_a_drive_lost_while_it_was_away_is_written_again() {
+        let (now, seen) = (Instant::now(), Outcome::Acknowledged(Reply::Registers(vec![0])));
+        let next = |restoration: &Restoration| match restoration.wanted() {
+            RestoreNeed::Set(order) => order.id,
+            need => format!("{need:?}"),
+        };
+        for away in [Outcome::Offline, Outcome::TimedOut, Outcome::BusDown] {
+            let mut restoration = begun(2, false, now);
+            restoration.recorded(Ok(()), now);
+            restoration.answered(&TAKEN, now);
+            assert!(matches!(restoration.answered(&away, now), Then::Pause(..)));
+            restoration.answered(&TAKEN, now);
+            assert_eq!(next(&restoration), "101", "{away:?}");
+            // The drive has lost the first value, so that is written once more; the second one is there.
+            restoration.answered(&TAKEN, now);
+            restoration.answered(&seen, now);
+            assert_eq!(restoration.wanted(), RestoreNeed::Remove, "{away:?}");
+        }
+        // A drive that is away in every pass and never keeps anything.
+        let mut restoration = begun(2, false, now);
+        restoration.recorded(Ok(()), now);
+        for _ in 0..=MOST_SAVES {
+            restoration.answered(&TAKEN, now);
+            restoration.answered(&Outcome::Offline, now);
+            restoration.answered(&TAKEN, now);
+        }
+        assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.contains("keeps losing")));
     }
 
     #[test]
