@@ -21,8 +21,8 @@ pub(super) struct BdSeq {
     used: bool,
     /// Whether the number is in the file.
     kept: bool,
-    /// The write in progress, which may take longer than [`WRITE`].
-    writing: Option<JoinHandle<io::Result<()>>>,
+    /// The number that is being written, which may take longer than [`WRITE`].
+    writing: Option<(u8, JoinHandle<io::Result<()>>)>,
 }
 
 impl BdSeq {
@@ -63,15 +63,30 @@ impl BdSeq {
 
     async fn write(&mut self, until: Instant) -> io::Result<()> {
         let slow = || io::Error::new(io::ErrorKind::TimedOut, "the disk does not respond");
-        if let Some(older) = &mut self.writing {
-            // An older number must not replace a newer one; whether the disk took it does not matter.
-            let _ = timeout_at(until, older).await.map_err(|_| slow())?;
+        if let Some((of, older)) = &mut self.writing {
+            // An older number must not replace a newer one.
+            let ended = timeout_at(until, older).await.map_err(|_| slow())?;
+            let is_written = *of == self.number && matches!(ended, Ok(Ok(())));
+            self.writing = None;
+            if is_written {
+                return Ok(());
+            }
         }
         let (path, number) = (self.path.clone(), self.number);
         let work = spawn_blocking(move || files::replace(&path, format!("{number}\n").as_bytes()));
-        let ended = timeout_at(until, self.writing.insert(work)).await.map_err(|_| slow())?;
+        let (_, work) = self.writing.insert((number, work));
+        let ended = timeout_at(until, work).await.map_err(|_| slow())?;
         self.writing = None;
         ended?
+    }
+
+    /// Writes the present number again if it is not in the file, without waiting for the disk. Returns whether it is in the
+    /// file by now.
+    pub(super) async fn keep(&mut self) -> bool {
+        if !self.kept {
+            self.kept = self.write(Instant::now()).await.is_ok();
+        }
+        self.kept
     }
 
     /// A broker accepted the connection with the last number, which is returned.
@@ -144,6 +159,23 @@ mod tests {
         assert_eq!(fs::read_to_string(&partial).unwrap(), "0\n", "the second did not begin");
         assert_eq!(next(&mut bd_seq).await, 2);
         assert_eq!(fs::read_to_string(&path).unwrap(), "2\n");
+    }
+
+    #[tokio::test]
+    async fn what_the_disk_did_not_take_is_written_once_there_is_a_disk() {
+        let dir = tempfile::tempdir().unwrap();
+        let state = dir.path().join("state");
+        fs::write(&state, "no directory").unwrap();
+        let mut bd_seq = BdSeq::open(&state, &Patience::default()).await;
+        assert!(bd_seq.next().await.1.is_err());
+        bd_seq.accepted();
+        assert!(!bd_seq.keep().await);
+        fs::remove_file(&state).unwrap();
+        while !bd_seq.keep().await {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        assert_eq!(fs::read_to_string(state.join(SPARKPLUG)).unwrap(), "0\n");
+        assert_eq!(reopened(&state).await, 1);
     }
 
     #[tokio::test]

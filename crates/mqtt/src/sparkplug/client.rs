@@ -8,6 +8,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use rumqttc::mqttbytes::v5::Filter;
+use tokio::time::{self, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use super::super::Options as BrokerOptions;
@@ -44,6 +45,9 @@ const HOST: Duration = Duration::from_secs(5);
 /// Longest random wait for the births when the host comes online, and for the next connection when it went offline,
 /// so that the nodes do not all act at once.
 const SPREAD: Duration = Duration::from_secs(2);
+
+/// Pause before the number of the session is written again.
+const WRITE_AGAIN: Duration = Duration::from_secs(1);
 
 /// When the births follow if the host is online now.
 fn births_at() -> Instant {
@@ -96,7 +100,8 @@ struct NodeClient {
     cursor: usize,
     orders: Orders,
     bd_seq: BdSeq,
-    bd_seq_fails: bool,
+    /// When the number of the session, which the disk did not take, is written again.
+    write_again: Option<time::Instant>,
     /// A message for which there was no room yet.
     held: Option<Message>,
     buses_at: Instant,
@@ -141,7 +146,7 @@ impl NodeClient {
             drives: Vec::new(),
             cursor: 0,
             bd_seq,
-            bd_seq_fails: false,
+            write_again: None,
             held: None,
             buses_at: now,
             leaving: None,
@@ -204,8 +209,8 @@ impl NodeClient {
     async fn next_number(&mut self) -> u8 {
         let (number, written) = self.bd_seq.next().await;
         match written {
-            Ok(()) => self.bd_seq_fails = false,
-            Err(why) if !std::mem::replace(&mut self.bd_seq_fails, true) => {
+            Ok(()) => self.write_again = None,
+            Err(why) if self.write_again.replace(time::Instant::now() + WRITE_AGAIN).is_none() => {
                 tracing::warn!(
                     target: "drivegate::north::mqtt", "{}: {why}; the session number of Sparkplug (bdSeq) starts at 0 \
                                                        after a restart; make the directory writable, or set \
@@ -216,6 +221,15 @@ impl NodeClient {
             Err(_) => {}
         }
         number
+    }
+
+    /// Writes the number of this connection again, which the disk did not take.
+    async fn keep_number(&mut self) {
+        self.write_again = Some(time::Instant::now() + WRITE_AGAIN);
+        if self.bd_seq.keep().await {
+            self.write_again = None;
+            tracing::info!(target: "drivegate::north::mqtt", "{} is written", self.bd_seq.path().display());
+        }
     }
 
     /// Ends this connection; the nodes of a group do so one after the other.
@@ -328,6 +342,9 @@ impl session::Client for NodeClient {
         tokio::select! {
             step = self.common.link.next() => return step,
             finished = self.orders.finished() => self.on_finished(finished),
+            () = sleep_until(self.write_again.unwrap_or_else(time::Instant::now)), if self.write_again.is_some() => {
+                self.keep_number().await;
+            }
         }
         Step::Nothing
     }

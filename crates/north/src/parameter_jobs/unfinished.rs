@@ -212,12 +212,18 @@ pub async fn hold_unfinished<'a>(
             drive.spec.name
         )));
     }
+    let locks_some = drives.iter().any(|drive| drive.is_new);
     let (vault, events) = (vault.clone(), events.clone());
     let looked = patience.read(move || check_unfinished(&vault, &events, store.dir(), &drives));
     if let Err(why) = looked.await {
+        let meanwhile = if locks_some {
+            "; the drives that are new accept only stops until they are read"
+        } else {
+            ""
+        };
         tracing::warn!(
-            target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {why}; the drives accept \
-                                                         only stops until they are read; check the disk of state_dir"
+            target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {why}{meanwhile}; check \
+                                                         the disk of state_dir"
         );
     }
 }
