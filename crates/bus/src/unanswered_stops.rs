@@ -3,8 +3,9 @@
 //! Limits repeated stops to a silent drive. A person presses the button again, and the drive may listen again at
 //! any moment: the next stop is sent after the other requests had the line for as long as the last stop took.
 //! Endless stops must not take half of the line: beyond a few in a row they get a tenth, but wait no longer than
-//! for one reply, on N2 also for a late one.
+//! for one reply. On N2 they also wait until no late reply can come.
 
+use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 /// Number of unanswered stops in a row that alternate with the other requests.
@@ -29,17 +30,19 @@ impl VainStops {
         self.took += took;
     }
 
-    /// A stop failed without any reply; `longest` is the longest pause before the next one.
-    pub(super) fn in_vain(&mut self, longest: Duration, now: Instant) {
+    /// A stop failed without any reply; `pauses` are the shortest and the longest pause before the next one.
+    pub(super) fn in_vain(&mut self, pauses: RangeInclusive<Duration>, now: Instant) {
         let took = std::mem::take(&mut self.took);
         let share = took * PAUSE;
-        let pause = share.min(longest).max(took);
+        let (shortest, longest) = pauses.into_inner();
+        let in_turn = took.max(shortest);
+        let pause = share.min(longest).max(in_turn);
         if let Some(last) = self.last.replace(now) {
             let paid = now.saturating_duration_since(last).as_secs_f64() / share.as_secs_f64().max(1e-6);
             self.count = (self.count - paid).max(0.0);
         }
         self.count += 1.0;
-        self.until = Some(now + if self.keeps_its_turn() { took } else { pause });
+        self.until = Some(now + if self.keeps_its_turn() { in_turn } else { pause });
     }
 
     fn keeps_its_turn(&self) -> bool {
@@ -70,7 +73,7 @@ mod tests {
             for _ in 0..40 {
                 now += took;
                 stops.not_answered(took);
-                stops.in_vain(ms(1000), now);
+                stops.in_vain(Duration::ZERO..=ms(1000), now);
                 let until = stops.waits_until(now).unwrap();
                 pauses.push(until - now);
                 now = until;
@@ -85,7 +88,7 @@ mod tests {
             );
             stops.answered();
             stops.not_answered(took);
-            stops.in_vain(ms(1000), now);
+            stops.in_vain(Duration::ZERO..=ms(1000), now);
             assert_eq!(stops.waits_until(now), Some(now + took));
         }
     }
@@ -95,7 +98,7 @@ mod tests {
         let (mut stops, mut now) = (VainStops::default(), Instant::now());
         for _ in 0..1000 {
             stops.not_answered(Duration::from_millis(100));
-            stops.in_vain(Duration::from_secs(1), now);
+            stops.in_vain(Duration::ZERO..=Duration::from_secs(1), now);
             now += Duration::from_secs(1);
             assert_eq!(stops.waits_until(now), None);
         }

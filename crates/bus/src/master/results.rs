@@ -1,6 +1,6 @@
 //! Applies the result of a transaction: to the drive, its samples, the schedule and the command.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::{Before, LineUse, Master, Purpose, Turn, TurnEnd};
 use crate::command_run::{Step, StepPurpose};
@@ -402,11 +402,13 @@ impl Master {
     ) {
         let online = self.schedule.is_online(index);
         let (retries, response_timeout) = (self.retries_of(index), self.response_timeout_of(index));
-        // On N2 no poll for reports is sent as long as the acknowledgement of a stop may come late.
-        let longest = if self.waits.sessions.is_empty() {
-            response_timeout
+        // On N2 no poll for reports is sent as long as the acknowledgement of a stop may come late, and no drive is read
+        // that is due for such a poll.
+        let pauses = if self.waits.sessions.is_empty() {
+            Duration::ZERO..=response_timeout
         } else {
-            response_timeout + self.n2_window()
+            let late = response_timeout + self.n2_window();
+            late..=late
         };
         let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
         if *ended == Ended::Corrupt(MAY_BE_LATE) {
@@ -442,7 +444,7 @@ impl Master {
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
             if silent {
-                drive.vain_stops.in_vain(longest, now);
+                drive.vain_stops.in_vain(pauses, now);
                 self.schedule.doubted(index);
             }
         }
