@@ -203,10 +203,13 @@ impl World {
             "a stop went out where the action is {:?}",
             supervision.action
         );
-        // On N2 an attempt whose reply may be a late one to an earlier request is not counted.
-        let retries = match self.buses[bus].line.protocol {
-            Protocol::N2 => u32::MAX,
-            _ => self.buses[bus].line.retries,
+        // On N2 an attempt whose reply may be a late one to an earlier request is not counted, nor is one that a busy drive
+        // did not take.
+        let line = &self.buses[bus].line;
+        let retries = if line.protocol == Protocol::N2 || line.faults.contains("busy") {
+            u32::MAX
+        } else {
+            line.retries
         };
         let truth = &mut self.truths[bus][drive];
         // An action that is on the wire when a client returns is not withdrawn, lost or not: its attempts continue.
