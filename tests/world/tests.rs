@@ -63,7 +63,7 @@ use self::world::{Figures, World};
 /// Seeds of every test run.
 const FIXED: u64 = 400;
 /// Seeds of every test run that found a fault which the fixed ones do not meet.
-const FOUND: [u64; 17] = [
+const FOUND: [u64; 19] = [
     508,
     816,
     4816,
@@ -81,6 +81,8 @@ const FOUND: [u64; 17] = [
     830_003_416,
     830_005_081,
     830_006_283,
+    840_005_824,
+    850_004_245,
 ];
 /// Seeds of every test run in which clients flood without a pause.
 const FLOODED: Range<u64> = 0..16;
