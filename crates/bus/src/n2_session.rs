@@ -89,13 +89,15 @@ impl N2Sessions {
         self.drives.is_empty()
     }
 
-    /// The step that the drive needs before a read (`None`) or a command. A stop to a drive that does not reply to Identify is
-    /// sent all the same, by turns with Identify: perhaps only the drive's replies are lost, and its motor runs.
+    /// The step that the drive needs before a read (`None`) or a command. A stop to a drive that was
+    /// there and does not reply to Identify is sent all the same, by turns with Identify: perhaps only the drive's replies are
+    /// lost, and its motor runs.
     pub fn before(&mut self, drive: DriveIndex, command: Option<Urgency>, now: Instant) -> Option<Session> {
         let drive = self.drives.get_mut(drive)?;
         if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
             let is_stop = command == Some(Urgency::Stop);
-            return (!is_stop || !drive.silent).then_some(Session::Identify);
+            let goes_first = is_stop && drive.silent && drive.device_proved;
+            return (!goes_first).then_some(Session::Identify);
         }
         if command.is_some() {
             return None;
@@ -109,10 +111,10 @@ impl N2Sessions {
         }
     }
 
-    /// Whether the drive must be identified before it can be read.
+    /// Whether a drive that was there must be identified before it can be read.
     pub(crate) fn waits_for_identify(&self, drive: DriveIndex) -> bool {
         let drive = self.drives.get(drive);
-        drive.is_some_and(|drive| matches!(drive.phase, Phase::Unknown | Phase::Waiting))
+        drive.is_some_and(|drive| drive.device_proved && matches!(drive.phase, Phase::Unknown | Phase::Waiting))
     }
 
     /// A step returned by [`N2Sessions::before`] has ended.

@@ -218,6 +218,10 @@ fn a_drive_that_only_seemed_to_be_identified_is_identified_again() {
 #[test]
 fn a_stop_goes_by_turns_with_identify_to_a_drive_that_does_not_reply() {
     let (mut rig, stop) = (rig(), Some(Urgency::Stop));
+    rig.done(IDENTIFY, &Ended::Silent);
+    assert_eq!(rig.before(stop), Some(IDENTIFY), "it was never there");
+    let mut rig = N2Drive::ready();
+    rig.sessions.gone(DriveIndex::new(0));
     for _ in 0..2 {
         assert_eq!(rig.before(stop), Some(IDENTIFY));
         rig.done(IDENTIFY, &Ended::Silent);
