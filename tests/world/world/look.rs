@@ -114,7 +114,9 @@ impl World {
                     continue;
                 };
                 let last = truth.heard.1.unwrap_or(heard);
-                let round = 3 * bus.handle.image.health().fast.last.unwrap_or_default();
+                // A new bus halves a read with a refused register four times before it has read the state of the drive.
+                let rounds = if bus.line.refuses.is_some() { 3 + 4 } else { 3 };
+                let round = rounds * bus.handle.image.health().fast.last.unwrap_or(bus.round);
                 let due = last.max(running).max(online) + supervision.timeout + ACTION + round;
                 let repeated = truth.repeated_until.is_some_and(|until| self.now < until);
                 let waits = repeated || self.open.contains_key(&(index, drive));
