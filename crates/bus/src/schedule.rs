@@ -128,8 +128,6 @@ pub struct Schedule {
     cadence: Cadence,
     drives: PerDrive<DriveSchedule>,
     round: VecDeque<(DriveIndex, PlannedRead)>,
-    /// The drive that was probed last.
-    last_probed: Option<DriveIndex>,
     /// Memory in which the reads of a new round are sorted, empty otherwise.
     sorted: Vec<(usize, DriveIndex, PlannedRead)>,
     /// Reads of this round that decide the state of a drive whose state is unknown: no slow poll goes before them.
@@ -198,7 +196,6 @@ impl Schedule {
             cadence,
             drives,
             round: VecDeque::new(),
-            last_probed: None,
             sorted: Vec::new(),
             state_first: Vec::new(),
             round_due: now,
@@ -389,7 +386,7 @@ impl Schedule {
 
     /// Notes that a probe, or what goes before it, is sent to this drive.
     pub(crate) fn probe_sent(&mut self, drive: DriveIndex) {
-        self.last_probed = Some(drive);
+        self.drives.of_mut(drive).put_off = 0;
     }
 
     /// Postpones a poll until this time.
@@ -399,6 +396,7 @@ impl Schedule {
         drive.doubted = false;
         if let (Presence::Away(_, pause), true) = (drive.presence, poll.probe) {
             drive.presence = Presence::Away(until, pause);
+            drive.put_off = drive.put_off.saturating_add(1);
         }
         if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.postponed = true;

@@ -1,5 +1,6 @@
 //! Decides which poll is due: the grid of fast rounds, the credit of slow polls, probes.
 
+use std::cmp::Reverse;
 use std::time::{Duration, Instant};
 
 use super::drives::{DriveSchedule, Item, Presence};
@@ -106,16 +107,17 @@ impl Schedule {
             .map(|(_, poll, _)| poll)
     }
 
-    /// The probe of the absent drive that waits longest. Drives whose probes were postponed together take turns.
+    /// The probe of the absent drive that waits longest. Of drives whose probes were postponed together, the one
+    /// goes first whose probe was postponed more often.
     fn due_probe(&self, now: Instant) -> Option<Poll> {
         let due = |drive: &DriveSchedule| match drive.presence {
             Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
             _ => None,
         };
-        let mut waiting: Vec<(Instant, bool, DriveIndex)> = self
+        let mut waiting: Vec<(Instant, Reverse<u32>, DriveIndex)> = self
             .drives
             .enumerate()
-            .filter_map(|(index, drive)| Some((due(drive)?, Some(index) <= self.last_probed, index)))
+            .filter_map(|(index, drive)| Some((due(drive)?, Reverse(drive.put_off), index)))
             .collect();
         waiting.sort();
         waiting.into_iter().find_map(|(_, _, index)| {

@@ -84,6 +84,8 @@ pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
     /// Until when a drill lets nothing be sent to the drive.
     pub(super) quiet_until: Option<Instant>,
+    /// How often a probe was postponed since one was sent.
+    pub(super) put_off: u32,
     pub(super) early: EarlyProbes,
     pub(super) tried: bool,
     /// Whether the drive answered a session step (Identify, poll of N2) since its last probe.
@@ -226,6 +228,7 @@ impl DriveSchedule {
             retries,
             presence: Presence::Away(now, Duration::ZERO),
             quiet_until: None,
+            put_off: 0,
             early: EarlyProbes::default(),
             tried: false,
             heard: false,
