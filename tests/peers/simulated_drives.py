@@ -8,6 +8,8 @@ from pymodbus.client import ModbusSerialClient
 from pymodbus.pdu.diag_message import ForceListenOnlyModeRequest, RestartCommunicationsOptionRequest
 
 model, port = sys.argv[1:]
+# Pause after a request without a reply: on a machine that stalls the line must not take it and the next one for one frame.
+UNANSWERED = 0.5
 FRAMERS = {"cx": FramerType.RTU, "teco": FramerType.ASCII}
 # A pseudo-terminal knows characters of 8 bits without parity only.
 client = ModbusSerialClient(port, framer=FRAMERS[model], baudrate=19200, parity="N", stopbits=1, timeout=30, retries=0)
@@ -49,15 +51,15 @@ def cx():
     show("no function", client.write_registers(0, [1, 2]))
     show("no parameter", client.read_holding_registers(199, count=1))
     client.write_coil(0, False, device_id=0, no_response_expected=True)
-    time.sleep(0.05)
+    time.sleep(UNANSWERED)
     show("broadcast", client.read_coils(0, count=3))
     show("echo", client.diag_query_data(b"\xa5\x37"))
     client.execute(True, ForceListenOnlyModeRequest())
-    time.sleep(0.05)
+    time.sleep(UNANSWERED)
     client.write_coil(0, True, no_response_expected=True)
-    time.sleep(0.05)
+    time.sleep(UNANSWERED)
     client.execute(True, RestartCommunicationsOptionRequest())
-    time.sleep(0.05)
+    time.sleep(UNANSWERED)
     show("listened only", client.read_coils(0, count=3))
 
 
@@ -75,7 +77,7 @@ def teco():
     show("no function", client.read_input_registers(0x20, count=1))
     show("save while running", client.write_register(0x900, 0))
     client.write_register(1, 0, device_id=0, no_response_expected=True)
-    time.sleep(0.05)
+    time.sleep(UNANSWERED)
     until(lambda: client.read_holding_registers(0x24, count=1).registers, [0])
     show("save", client.write_register(0x900, 0))
 
