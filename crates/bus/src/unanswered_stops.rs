@@ -3,7 +3,7 @@
 //! Limits repeated stops to a silent drive. A person presses the button again, and the drive may listen again at
 //! any moment: the next stop is sent after the other requests had the line for as long as the last stop took.
 //! Endless stops must not take half of the line: beyond a few in a row they get a tenth, but wait no longer than
-//! for one reply. On N2 they also wait until no late reply can come.
+//! for one reply. On N2 each further stop also waits until no late reply can come.
 
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};

@@ -281,21 +281,25 @@ fn a_reply_is_dated_no_later_than_it_can_have_left_the_drive() {
     }
 }
 
+const WINDOW: Duration = Duration::from_millis(750);
+
+/// A request of N2 that had no reply.
+fn asked(address: u8, pdu: &RequestPdu, at: Instant) -> LateRequest<'_> {
+    LateRequest {
+        address,
+        pdu,
+        device: 0x10,
+        at,
+    }
+}
+
 #[test]
 fn a_late_reply_of_n2_that_comes_between_two_requests_is_noted() {
-    const WINDOW: Duration = Duration::from_millis(750);
     let mut rig = DoublingLine::of(Protocol::N2);
     let (now, state) = (rig.now, RequestPdu::read(Table::DiscreteInput, 2, 1));
     let mut late = N2LateReplies::default();
-    for _ in 0..2 {
-        let asked = LateRequest {
-            address: 1,
-            pdu: &state,
-            device: 0x10,
-            at: now,
-        };
-        late.given_up(asked, WINDOW, now);
-    }
+    late.given_up(asked(1, &state, now), WINDOW, now);
+    late.given_up(asked(1, &state, now), WINDOW, now);
     let came = now + WINDOW * 9 / 10;
     for piece in [b"A40".as_slice(), b"64\r"] {
         assert!(rig.line.received(piece, &mut late, came).is_none());
@@ -313,18 +317,11 @@ fn a_late_reply_of_n2_that_comes_between_two_requests_is_noted() {
 
 #[test]
 fn a_reply_of_n2_that_comes_once_more_between_two_requests_is_no_late_one() {
-    const WINDOW: Duration = Duration::from_millis(750);
     let mut rig = DoublingLine::of(Protocol::N2);
     assert!(rig.answers(&[(REGULAR, b"A1061\r")]));
     let (now, state) = (rig.now, RequestPdu::read(Table::DiscreteInput, 2, 1));
     let mut late = N2LateReplies::default();
-    let asked = LateRequest {
-        address: 2,
-        pdu: &state,
-        device: 0x10,
-        at: now,
-    };
-    late.given_up(asked, WINDOW, now);
+    late.given_up(asked(2, &state, now), WINDOW, now);
     let came = now + WINDOW * 9 / 10;
     assert!(rig.line.received(b"A1061\r", &mut late, came).is_none());
     assert_eq!(late.until(), Some(came + WINDOW), "the late one may still come");

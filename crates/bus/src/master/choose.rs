@@ -39,8 +39,9 @@ impl Turns {
         None
     }
 
-    /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy:
-    /// several such drives must not keep a stop from the others, and the drives that do not answer must not keep it from them.
+    /// Whether a queued command begins before a command of its rank that repeats a step for which its drive was too busy.
+    /// Busy drives must not keep a stop from other drives, and drives that do not answer must not hold up the repetition for
+    /// a busy drive.
     fn begins_before(&mut self, repetition: bool, queued: Chosen) -> bool {
         let first = self.queued_first.of_mut(queued.rank);
         let begins = repetition && *first < if queued.is_last { 1 } else { IN_A_ROW };

@@ -258,7 +258,7 @@ impl Master {
                 return;
             }
         }
-        // The round reads again after a stall of the thread, behind which this reply came.
+        // A stall of the thread began the reads of the round again, so a reply to an earlier read answers none of them.
         let is_before_stall = end.stood && !pdu.is_write();
         if !is_before_stall && let Err(why) = drive.refresh.answered(&image.spec.profile, pdu, &reply, now) {
             drive.end_refresh(why);

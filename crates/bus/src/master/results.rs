@@ -436,7 +436,7 @@ impl Master {
             _ if online => retries.max(u32::from(used.stood)),
             // Even a damaged reply shows that something answers: a stop is tried as often as at a drive that is online.
             Ended::Corrupt(_) if slot == Urgency::Stop => retries,
-            // By turns Identify and the stop itself.
+            // Identify and the stop itself are sent by turns: each needs a try.
             Ended::Silent if slot == Urgency::Stop && self.waits.sessions.waits_for_identify(index) => 1,
             _ => 0,
         };

@@ -107,8 +107,8 @@ impl Schedule {
             .map(|(_, poll, _)| poll)
     }
 
-    /// The probe of the absent drive that waits longest. Of drives whose probes were postponed together, the one
-    /// goes first whose probe was postponed more often.
+    /// The probe of the absent drive that waits longest. Among drives whose probes are due at one time, the drive whose probe
+    /// was postponed most often goes first.
     fn due_probe(&self, now: Instant) -> Option<Poll> {
         let due = |drive: &DriveSchedule| match drive.presence {
             Presence::Away(at, _) if at <= now && !drive.is_quiet(now) => Some(at),
