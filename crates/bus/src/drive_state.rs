@@ -15,7 +15,7 @@ use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Urgen
 use drivegate_core::permit::LastWritten;
 use drivegate_core::process_image::{Access, DriveImage, DriveSpec, Reading};
 use drivegate_model::drive::control::Control;
-use drivegate_model::drive::{ModelPoint, Point, Profile};
+use drivegate_model::drive::{ModelPoint, Point, Profile, Value};
 use drivegate_proto::{Reply, Table};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -150,6 +150,9 @@ impl DriveState {
     pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Need<NextNeed> {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
+        let reversed = reading.model(ModelPoint::Reversed).good().map(Value::as_bool);
+        let turns = reversed.filter(|_| reading.is_set(ModelPoint::Running));
+        self.words.see_turning(turns);
         let mut wake_at: Option<Instant> = None;
         let mut wait = |until: Instant| wake_at = Some(wake_at.map_or(until, |at: Instant| at.min(until)));
         let mut order = [Urgency::Stop, Urgency::Command, Urgency::Read];

@@ -531,7 +531,11 @@ impl<'p> Case<'p> {
             if !outcome.is_ok() || progress.drive.running.is_none() {
                 return Err(self.wrong("a run command does not start the motor", progress));
             }
-            if direction.is_some_and(|reverse| progress.drive.running != Some(reverse)) {
+            // Without a direction in the order, a word that is not known anywhere turns the motor forward.
+            let unasked =
+                !self.known && self.control.own_word == OwnWord::Shadow || self.control.direction_elsewhere().is_some();
+            let wanted = direction.or(unasked.then_some(false));
+            if wanted.is_some_and(|reverse| progress.drive.running != Some(reverse)) {
                 return Err(self.wrong("the motor runs in the wrong direction", progress));
             }
         }

@@ -18,6 +18,8 @@ fn confirms(case: &Case) {
     };
     rig.order(&case.reference);
     confirmed("{\"run\": true}");
+    // Nothing was ordered before, so a run command alone turns the motor forward.
+    rig.printed("motor forward", 0);
     confirmed("{\"run\": false}");
     confirmed("{\"run\": true}");
     rig.drive.signal("USR1");

@@ -57,10 +57,7 @@ impl Ordered {
             return Vec::new();
         };
         let mut actions = Vec::new();
-        let elsewhere = control
-            .reverse
-            .and_then(|setting| Some((setting, setting.place?)))
-            .filter(|_| !matches!(control.run, Run::Pair { .. }));
+        let elsewhere = control.direction_elsewhere();
         let turned = self.reverse.zip(elsewhere).map(|(reverse, (setting, place))| {
             let word = if reverse { setting.applied(0) } else { setting.undone(0) };
             Action::Send(write(place, word, profile))

@@ -6,7 +6,7 @@ use std::time::Instant;
 use super::functions::TakenFunctions;
 use drivegate_core::order::written;
 use drivegate_model::drive::Profile;
-use drivegate_model::drive::control::Control;
+use drivegate_model::drive::control::{Control, ControlItem};
 use drivegate_proto::{RequestPdu, Table};
 
 /// The registers and coils of a drive whose bits are commanded, as the drive has them.
@@ -15,6 +15,8 @@ use drivegate_proto::{RequestPdu, Table};
 #[derive(Debug, Default)]
 pub struct KnownWords {
     words: BTreeMap<(Table, u16), u16>,
+    /// The last words of those places that are not known any more.
+    before: BTreeMap<(Table, u16), u16>,
     /// For each word, the bits that the last write took away, and when.
     fell: BTreeMap<(Table, u16), (u16, Instant)>,
     /// Arrival time of the reply that is being applied.
@@ -23,6 +25,8 @@ pub struct KnownWords {
     stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
+    /// The direction in which the motor turns, as the drive's status shows; `None` if it stands or the status has no direction.
+    turns: Option<bool>,
     /// Whether the ordered direction differs from the drive's word, so that the next start must set it.
     waits_for_start: bool,
     /// Words that were read successfully at least once.
@@ -46,7 +50,8 @@ impl KnownWords {
         self.stop = None;
         if let RequestPdu::MaskWrite { address, .. } = sent {
             // Other bits of the word may have changed since it was known.
-            self.words.remove(&(Table::Holding, *address));
+            let place = (Table::Holding, *address);
+            self.before.extend(self.words.remove(&place).map(|word| (place, word)));
         }
         for (table, address, word) in written(sent).into_iter().flat_map(|(table, items)| {
             let place = move |(address, word)| (table, address, word);
@@ -81,6 +86,7 @@ impl KnownWords {
     pub(crate) fn in_doubt(&mut self, table: Table, items: &[(u16, u16)], control: Option<&Control>) {
         for (address, word) in items {
             let before = self.words.remove(&(table, *address));
+            self.before.insert((table, *address), *word);
             let here = |control: &&Control| (control.at.table, control.at.address) == (table, *address);
             if let Some(control) = control.filter(here) {
                 let by = |word: u16| control.stop_word(control.standing(word));
@@ -129,15 +135,31 @@ impl KnownWords {
         self.waits_for_start = false;
     }
 
+    /// Notes the direction in which the motor turns, or that this is not known.
+    pub(crate) fn see_turning(&mut self, reverse: Option<bool>) {
+        self.turns = reverse;
+    }
+
+    /// The direction of an order that names none, where no known word has a direction: a motor that turns is not reversed, and one
+    /// that stands turns as was ordered last, forward if nothing was ordered. `true` is reverse.
+    pub(super) fn unnamed_direction(&self, control: &Control) -> bool {
+        let last = |place: ControlItem| {
+            let before = || self.before.get(&(place.table, place.address)).copied();
+            self.get(place.table, place.address).or_else(before)
+        };
+        let ordered = || control.direction_in(last).or(self.direction);
+        self.turns.or_else(ordered).unwrap_or(false)
+    }
+
     /// The direction that was kept for the next start.
     pub(super) fn at_next_start(&self) -> Option<bool> {
         self.direction.filter(|_| self.waits_for_start)
     }
 
     /// Forgets the words of a drive that may have restarted or received an unanswered write: they are read again
-    /// before a bit is changed.
+    /// before a bit is changed. A direction in them is still the one that was ordered last.
     pub fn forget(&mut self) {
-        self.words.clear();
+        self.before.append(&mut self.words);
         self.stop = None;
     }
 }

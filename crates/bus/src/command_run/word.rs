@@ -117,7 +117,7 @@ pub(super) fn made(
         let own = control.without_reset(own);
         pulsed.map_or(own, |pulsed| pulsed.released(own))
     });
-    let base = released.unwrap_or(0);
+    let base = released.unwrap_or_else(|| control.with_direction(0, words.unnamed_direction(control)));
     let form = match basis(word, control, words, released, known, motor) {
         Basis::Certain(form) => form,
         Basis::Judged(repeats) => match known.permit {
@@ -156,14 +156,15 @@ pub(super) fn made(
         },
         Word::DirectionElsewhere(_) => Made::Nothing,
         Word::KeptDirection => {
-            let place = control.reverse.and_then(|setting| Some((setting, setting.place?)));
-            match place.zip(words.at_next_start()) {
-                Some(((setting, place), reverse)) => {
-                    let word = if reverse { setting.applied(0) } else { setting.undone(0) };
-                    sent(place, word)
-                }
-                None => Made::Nothing,
-            }
+            let due = control.direction_elsewhere().and_then(|(setting, place)| {
+                // A drive whose coil is 0 runs forward, unless the coil has the opposite meaning.
+                let is_unknown = setting.value == 0 && words.get(place.table, place.address).is_none();
+                let reverse = words
+                    .at_next_start()
+                    .or(is_unknown.then(|| words.unnamed_direction(control)))?;
+                Some((place, if reverse { setting.applied(0) } else { setting.undone(0) }))
+            });
+            due.map_or(Made::Nothing, |(place, word)| sent(place, word))
         }
         Word::Run(reverse) => {
             let (place, word) = run_word(control, stays, reverse, words);
@@ -285,7 +286,7 @@ fn run_word(control: &Control, kept: u16, reverse: Option<bool>, words: &KnownWo
     match &control.run {
         Run::Pair { forward, reverse: back } => {
             let stands = control.direction_of(kept);
-            let turned = ordered.or(stands).or(words.direction).unwrap_or(false);
+            let turned = ordered.or(stands).unwrap_or_else(|| words.unnamed_direction(control));
             let run = if turned { back } else { forward };
             (run.place, run.applied(if run.place.is_some() { 0 } else { kept }))
         }

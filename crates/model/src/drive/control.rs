@@ -334,6 +334,25 @@ impl Control {
         }
     }
 
+    /// The direction that these words show, wherever the family has it; `None` if the word of that place is not known, or has
+    /// no direction.
+    pub fn direction_in(&self, word: impl Fn(ControlItem) -> Option<u16>) -> Option<bool> {
+        if let Some((setting, place)) = self.direction_elsewhere() {
+            return word(place).map(|word| setting.holds(word));
+        }
+        let Run::Pair { forward, reverse } = &self.run else {
+            return word(self.at).and_then(|word| self.direction_of(word));
+        };
+        let holds = |run: &Setting| word(run.place.unwrap_or(self.at)).is_some_and(|word| run.holds(word));
+        holds(reverse).then_some(true).or(holds(forward).then_some(false))
+    }
+
+    /// The direction where it has its own register or coil.
+    pub fn direction_elsewhere(&self) -> Option<(Setting, ControlItem)> {
+        let elsewhere = self.reverse.and_then(|setting| Some((setting, setting.place?)));
+        elsewhere.filter(|_| !matches!(self.run, Run::Pair { .. }))
+    }
+
     /// The place to which `run` is written.
     pub fn run_place(&self) -> ControlItem {
         let first = self.each_run().next().and_then(|setting| setting.place);

@@ -92,3 +92,95 @@ fn a_reset_takes_the_coil_of_the_run_command_away_whatever_was_read() {
     let written = writes(&mut bench, &[("fault_reset", 1.0)], Urgency::Command);
     assert_eq!(written, [coil(0, false), coil(2, false), coil(2, true), coil(2, false)]);
 }
+
+/// Family, control word, and its run words forward and in reverse, from the manuals: families whose word is not read back, and
+/// which have the direction in it.
+const UNREADABLE: [(&str, u16, u16, u16); 10] = [
+    ("weg-cfw", 682, 0x17, 0x13),
+    ("danfoss-fc", 49999, 0x047C, 0x847C),
+    ("teco-f510", 0x2501, 1, 3),
+    ("toshiba-vf-s15", 0xFA00, 0xC400, 0xC600),
+    ("yaskawa-v1000", 1, 1, 2),
+    ("mitsubishi-d700", 8, 2, 4),
+    ("fuji-frenic", 0x0706, 1, 2),
+    ("ls-g100", 5, 2, 4),
+    ("invt-goodrive", 0x2000, 1, 2),
+    ("delta-ms300", 0x2000, 0x12, 0x22),
+];
+
+/// The word that a run command without a direction writes.
+fn run_alone(bench: &mut ObedientDrive) -> Vec<(u16, u16)> {
+    let last = writes(bench, &[("run", 1.0)], Urgency::Command).pop();
+    written(&last.unwrap()).unwrap().1
+}
+
+#[test]
+fn a_run_command_alone_turns_a_motor_forward_of_which_nothing_is_known() {
+    for (family, address, forward, _) in UNREADABLE {
+        let mut fresh = bench(family);
+        assert_eq!(run_alone(&mut fresh), [(address, forward)], "{family}");
+        // A stop before knows nothing either.
+        let mut stopped = bench(family);
+        writes(&mut stopped, &[("run", 0.0)], Urgency::Stop);
+        assert_eq!(run_alone(&mut stopped), [(address, forward)], "{family}: behind a stop");
+    }
+}
+
+#[test]
+fn a_run_command_alone_never_reverses_a_motor_that_turns() {
+    for (family, address, forward, back) in UNREADABLE {
+        for (reverse, word) in [(0.0, forward), (1.0, back)] {
+            // An outage, a lost reply and a write by another way in leave the word unknown.
+            let mut ordered = bench(family);
+            writes(&mut ordered, &[("run", 1.0), ("reverse", reverse)], Urgency::Command);
+            ordered.words.forget();
+            assert_eq!(run_alone(&mut ordered), [(address, word)], "{family}: ordered");
+            let control = ordered.profile.control.clone().unwrap();
+            let place = control.at;
+            let mut raw = bench(family);
+            raw.words
+                .written(&raw.profile.functions.write_register(place.address, word));
+            raw.words.forget();
+            assert_eq!(run_alone(&mut raw), [(address, word)], "{family}: raw");
+            let mut lost = bench(family);
+            lost.words
+                .in_doubt(place.table, &[(place.address, word)], Some(&control));
+            assert_eq!(run_alone(&mut lost), [(address, word)], "{family}: in doubt");
+            // The gateway has restarted: only the status of the drive shows how the motor turns.
+            let mut restarted = bench(family);
+            restarted.words.see_turning(Some(reverse == 1.0));
+            assert_eq!(run_alone(&mut restarted), [(address, word)], "{family}: shown");
+        }
+    }
+}
+
+#[test]
+fn a_coil_that_is_0_in_reverse_is_written_before_the_first_run_command() {
+    // The L200 and L2002 of Hitachi: coil 1 = 1 is forward.
+    let text = std::fs::read_to_string(concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../profiles/hitachi-wj200.toml"
+    ))
+    .unwrap();
+    let inverted = text.replace(
+        "reverse = { point = \"direction_command\", bit = 0 }",
+        "reverse = { point = \"direction_command\", bit = 0, is = 0 }",
+    );
+    assert_ne!(inverted, text);
+    let profile = Profile::parse("l200.toml", &inverted, false).unwrap();
+    let mut bench = ObedientDrive {
+        profile: Arc::new(profile),
+        ..ObedientDrive::new(0)
+    };
+    let run = [("run", 1.0)];
+    assert_eq!(
+        writes(&mut bench, &run, Urgency::Command),
+        [coil(1, true), coil(0, true)]
+    );
+    bench.words.forget();
+    bench.words.see_turning(Some(true));
+    assert_eq!(
+        writes(&mut bench, &run, Urgency::Command),
+        [coil(1, false), coil(0, true)]
+    );
+}
