@@ -14,7 +14,8 @@ pub(in crate::permit) const RULE: Rule = Rule {
 };
 
 fn judge(ask: &Ask<'_>, _: &DriveGate, gate: &Gate) -> Verdict {
-    if ask.asks() != Asks::Run || !ask.origin.kind.is_client() {
+    let may_start = ask.asks() == Asks::Run || ask.wakes();
+    if !may_start || !ask.origin.kind.is_client() {
         return Verdict::Go;
     }
     let reserves = gate.rules.as_ref().is_some_and(|rules| rules.mode == Mode::Exclusive);
@@ -39,8 +40,9 @@ mod tests {
 
     use super::*;
     use crate::order::{Origin, SourceKind};
-    use crate::permit::rules::tests::{SECOND, Trial};
+    use crate::permit::rules::tests::{RUNS, SECOND, STANDS, Trial};
     use crate::permit::{AwaitedFiles, Rules};
+    use crate::testkit::read;
 
     fn rules(mode: Mode) -> Arc<Rules> {
         Arc::new(Rules {
@@ -95,6 +97,26 @@ mod tests {
             trial.gate.set_rules(mode.map(rules));
             let verdicts = trial.verdicts(&RULE, order, &Origin::new(kind, "c"));
             assert_eq!(verdicts, expected, "{file}, {mode:?}: {order} of {kind:?}");
+        }
+    }
+    #[test]
+    fn a_reference_that_turns_a_motor_at_standstill_waits_as_a_start_does() {
+        let mut trial = Trial::new();
+        let files = AwaitedFiles::default();
+        files.slots.begin("state/file.json".into());
+        trial.gate.set_awaited(Arc::new(files));
+        let client = Origin::new(SourceKind::Http, "c");
+        for (process_data, expected) in [
+            (&[0x03, 0, 0, 0][..], "held_by_other - -"),
+            (RUNS, "go - -"),
+            (STANDS, "go - -"),
+        ] {
+            read(&trial.image, 2100, process_data, trial.now);
+            assert_eq!(
+                trial.verdicts(&RULE, "reference", &client),
+                expected,
+                "{process_data:?}"
+            );
         }
     }
 }
