@@ -71,7 +71,7 @@ static OPTIONS: LazyLock<Options> = LazyLock::new(|| {
 fn answer(command: Command, how: u8) {
     let outcome = match how & 7 {
         0 => Outcome::TimedOut,
-        1 => Outcome::Exception(Exception(how >> 3)),
+        1 => Outcome::Exception(Exception::Modbus(how >> 3)),
         2 => Outcome::Acknowledged(Reply::Registers(vec![7; usize::from(how >> 3)])),
         3 => Outcome::BusDown,
         _ => Outcome::Acknowledged(match &command.intent.order {

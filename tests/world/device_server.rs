@@ -36,7 +36,7 @@ fn a_drive_for_which_only_the_server_answers_is_offline_until_it_replies() {
             assert_eq!(rig.good(1, ModelPoint::Running), None, "{about}");
             // A stop is sent all the same; what the server answers does not acknowledge it.
             let stop = rig.set(1, &[("run", 0.0)]);
-            assert_eq!(stop, Outcome::Unknown(Exception(code)), "{about}");
+            assert_eq!(stop, Outcome::Unknown(Exception::Modbus(code)), "{about}");
             rig.run(Duration::from_secs(60));
             assert!(!rig.is_online(0) && rig.is_online(1), "{about}");
             assert!(

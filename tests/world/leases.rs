@@ -20,7 +20,7 @@ const WRITES: [u8; 4] = [5, 6, 15, 16];
 
 #[test]
 fn a_lease_acts_in_its_time_whichever_read_is_not_answered() {
-    for exception in [Exception(0x0A), Exception(0x0B)] {
+    for exception in [Exception::Modbus(0x0A), Exception::Modbus(0x0B)] {
         for point in [ModelPoint::MotorCurrent, ModelPoint::Running] {
             let about = format!("{exception:?} to the read of {}", point.name());
             let mut rig = Rig::of(&Line {

@@ -237,7 +237,7 @@ fn what_means_no_object_and_what_the_drive_refuses() {
     let mut rig = ready(1);
     assert_eq!(rig.read(1, 1, 2), Outcome::Exception(Exception::ADDRESS));
     assert_eq!(rig.read(1, 0, 4), Outcome::Exception(Exception::ADDRESS));
-    assert_eq!(rig.read(1, 98, 2), Outcome::Exception(Exception::n2(0x10)));
+    assert_eq!(rig.read(1, 98, 2), Outcome::Exception(Exception::N2(0x10)));
     assert!(rig.read(1, 0, 2).is_ok());
 }
 

@@ -27,6 +27,7 @@ use self::parameter::ParameterRun;
 use self::steps::{
     Action, Check, Permit, RequestContext, actions, names_run, sets_all_bits, unsendable, write_on_change,
 };
+use self::word::Word;
 use super::confirm::{self, Effect};
 use super::start_gate::Start;
 use drivegate_core::order::{Command, Intent, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency, Work};
@@ -90,6 +91,8 @@ enum OnWire {
 enum Phase {
     /// The steps are sent as ordered.
     Steps,
+    /// The motor runs by this command already: its last word is sent again, and no failure stops the motor.
+    Repeats,
     /// The last word of a start sequence was sent, which starts the motor: if the rest fails, a stop follows.
     MotorStarted,
     /// The end of a pulse, or that stop, which is sent whatever happens.
@@ -472,6 +475,12 @@ impl CommandRun {
         };
         self.on_wire = self.on_wire.max(sent);
         if step.pdu.is_write() {
+            if let Some(Action::Word(Word::Sequence(word, _))) = self.actions.front()
+                && self.phase == Phase::Steps
+                && word.is_last
+            {
+                self.phase = Phase::MotorStarted;
+            }
             self.overtaken = 0;
             // The motor must be read again before the next write.
             self.look.forget();

@@ -15,7 +15,7 @@ use drivegate_core::order::{Command, Interruption, Order, Origin, Outcome, Urgen
 use drivegate_core::permit::LastWritten;
 use drivegate_core::process_image::{Access, DriveImage, DriveSpec, Reading};
 use drivegate_model::drive::control::Control;
-use drivegate_model::drive::{ModelPoint, Point, Profile, Value};
+use drivegate_model::drive::{ModelPoint, Point, Profile};
 use drivegate_proto::{Reply, Table};
 
 /// A status older than this, or than three rounds of the line, does not show whether the motor runs.
@@ -150,9 +150,7 @@ impl DriveState {
     pub(super) fn next_need(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Need<NextNeed> {
         let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
-        let reversed = reading.model(ModelPoint::Reversed).good().map(Value::as_bool);
-        let turns = reversed.filter(|_| reading.is_set(ModelPoint::Running));
-        self.words.see_turning(turns);
+        self.words.see_turning(turning(&reading));
         let mut wake_at: Option<Instant> = None;
         let mut wait = |until: Instant| wake_at = Some(wake_at.map_or(until, |at: Instant| at.min(until)));
         let mut order = [Urgency::Stop, Urgency::Command, Urgency::Read];
@@ -426,5 +424,68 @@ impl DriveState {
         self.stopped = None;
         self.vain_stops.answered();
         self.supervision.settle(now);
+    }
+}
+
+/// The direction in which the motor turns by its command: `true` if reverse, apart from the sign of the reference; `None` if
+/// it stands, runs from its panel, or the drive does not show that.
+fn turning(reading: &Reading<'_>) -> Option<bool> {
+    let good = |point: ModelPoint| reading.model(point).good();
+    let has = |point: ModelPoint| reading.spec.profile.model_index(point);
+    let is_local = has(ModelPoint::Remote).is_some() && !reading.is_set(ModelPoint::Remote);
+    if is_local || !reading.is_set(ModelPoint::Running) {
+        return None;
+    }
+    let reversed = good(ModelPoint::Reversed)?.as_bool();
+    let is_signed = |index| {
+        reading
+            .spec
+            .profile
+            .points
+            .get(index)?
+            .range
+            .as_ref()
+            .map(|range| *range.start() < 0.0)
+    };
+    match has(ModelPoint::SpeedReference).and_then(is_signed) {
+        Some(true) => Some(reversed != (good(ModelPoint::SpeedReference)?.as_f64() < 0.0)),
+        Some(false) | None => Some(reversed),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    /// Danfoss: status 50199 (bit 11 running, 9 not at its panel), actual value 50209 and reference 50009 with a sign.
+    #[test]
+    fn the_direction_of_a_command_is_seen_apart_from_the_sign_of_the_reference() {
+        let (runs, at_panel, stands) = (0x0A07, 0x0807, 0x0207);
+        for (status, actual, reference, expected) in [
+            (runs, 0x2000, Some(0x2000), Some(false)),
+            (runs, -0x2000, Some(0x2000), Some(true)),
+            (runs, -0x2000, Some(-0x2000), Some(false)),
+            (runs, 0x2000, Some(-0x2000), Some(true)),
+            (runs, -0x2000, None, None),
+            (at_panel, -0x2000, Some(0x2000), None),
+            (stands, -0x2000, Some(0x2000), None),
+        ] {
+            let profile = drivegate_testkit::profile("danfoss-fc");
+            let image = drivegate_testkit::image(drivegate_testkit::controlled("d", "b", 1, &profile));
+            drivegate_testkit::online(&image);
+            let now = Instant::now();
+            let store = |address: u16, word: i16| {
+                image.update(|s| s.store(Table::Holding, address, &[word as u16], now));
+            };
+            store(50199, status);
+            store(50209, actual);
+            if let Some(reference) = reference {
+                store(50009, reference);
+            }
+            let seen = turning(&image.reading(now, Duration::from_secs(1)));
+            assert_eq!(seen, expected, "{status:04X} {actual} {reference:?}");
+        }
     }
 }

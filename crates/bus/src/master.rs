@@ -281,6 +281,9 @@ impl Master {
         {
             let (drive, image) = (self.drives.of_mut(index), self.bus.image.drives.of(index));
             drive.repeated_stops.sending(&image.spec.profile, &turn.pdu, now);
+            if turn.pdu.is_write() && starts_motor(turn, index, drive) {
+                drive.repeated_stops.superseded();
+            }
         }
         let is_command = matches!(
             turn.purpose,
@@ -340,6 +343,16 @@ impl Master {
     pub(crate) fn n2_late(&mut self) -> &mut N2LateReplies {
         &mut self.waits.n2_late
     }
+}
+
+/// Whether the turn belongs to a command that starts the motor of this drive, perhaps by a sequence of words.
+fn starts_motor(turn: &Turn, index: DriveIndex, drive: &mut DriveState) -> bool {
+    let Purpose::Command { slot, .. } = &turn.purpose else {
+        return false;
+    };
+    drive
+        .run(*slot)
+        .is_some_and(|run| run.intent().effects.on(index).starts())
 }
 
 #[cfg(test)]

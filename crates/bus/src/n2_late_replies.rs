@@ -176,7 +176,7 @@ impl N2LateReplies {
         let mut alike = self.0.iter().filter(|late| late.could_be(&answer));
         let is_own = match &answer {
             // Any request may be refused like this while the drive waits for Identify.
-            Answer::Nak(code) if Exception::n2(*code) == Exception::N2_RESTARTED => {
+            Answer::Nak(code) if Exception::N2(*code) == Exception::N2_RESTARTED => {
                 alike.all(|late| late.address == address)
             }
             // An acknowledgement could be that of a write before another one.

@@ -39,7 +39,7 @@ impl RepeatedStops {
     /// Notes that a request is sent: a start supersedes an earlier stop.
     pub(super) fn sending(&mut self, profile: &Profile, pdu: &RequestPdu, now: Instant) {
         match runs_by(profile, pdu) {
-            Some(true) => self.due = [None; AGAIN.len()],
+            Some(true) => self.superseded(),
             Some(false) => {
                 let unanswered = self.unanswered.take();
                 if unanswered.is_some_and(|at| now.saturating_duration_since(at) < MAY_ARRIVE) {
@@ -48,6 +48,11 @@ impl RepeatedStops {
             }
             None => {}
         }
+    }
+
+    /// A start has begun, whose first words may be those of a stop.
+    pub(super) fn superseded(&mut self) {
+        self.due = [None; AGAIN.len()];
     }
 
     /// Whether a stop is still to be written again, or may have to be.

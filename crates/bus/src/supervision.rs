@@ -371,9 +371,10 @@ impl Supervision {
         let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
         match reading.spec.supervision.as_ref().map(|s| &s.action) {
             Some(LeaseAction::Stop) if due => Demand::Write(ModelPoint::Run, Value::Bool(false)),
-            Some(LeaseAction::SpeedReference(percent)) if due => {
-                Demand::Write(ModelPoint::SpeedReference, Value::Number(*percent))
-            }
+            Some(LeaseAction::SpeedReference(percent)) if due => Demand::Write(
+                ModelPoint::SpeedReference,
+                Value::Number(keeping_sign(*percent, reading)),
+            ),
             _ => Demand::None,
         }
     }
@@ -415,6 +416,20 @@ impl Supervision {
     }
 }
 
+/// The reference with the sign of the one in force: a lease that ends reverses no motor. As it is where the drive takes no such
+/// reference.
+fn keeping_sign(percent: f64, reading: &Reading<'_>) -> f64 {
+    let in_force = reading.model(ModelPoint::SpeedReference).good().map(Value::as_f64);
+    let index = reading.spec.profile.model_index(ModelPoint::SpeedReference);
+    let limits = index.and_then(|index| reading.spec.limits_of(index));
+    let is_taken = limits.is_none_or(|limits| limits.contains(&-percent));
+    if percent > 0.0 && is_taken && in_force.is_some_and(|percent| percent < 0.0) {
+        -percent
+    } else {
+        percent
+    }
+}
+
 /// Whether the drive answers without reporting whether its motor runs, because it refuses the point or the point is
 /// not read.
 fn does_not_say(reading: &Reading<'_>) -> bool {
@@ -439,15 +454,18 @@ fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_va
     if let Some(run) = sample.good().filter(|_| sample.at.is_some_and(|at| at > since)) {
         return Some(run.as_bool());
     }
-    let run = reading.spec.profile.run_place();
+    let profile = &reading.spec.profile;
+    let run = profile.run_place();
+    let control = profile.control.as_ref();
+    let is_unreadable = |place: ControlItem| control.is_some_and(|control| control.is_unreadable(place));
     let is_read = |place: ControlItem| {
         let word = reading.words(place.table, place.address, 1);
-        matches!(word, Ok(_) | Err(Unavailable::Stale))
+        !is_unreadable(place) && matches!(word, Ok(_) | Err(Unavailable::Stale))
     };
     if !in_vain && run.is_some_and(is_read) {
         return None;
     }
-    Some(written_run(&reading.spec.profile, words).unwrap_or(false))
+    Some(written_run(profile, words).unwrap_or(false))
 }
 
 /// The run command in the drive's word, as far as the word is known.

@@ -119,7 +119,7 @@ pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
     };
     let what = match (function, data) {
         (code, [exception]) if code & 0x80 != 0 => {
-            format!("function {}, {}", code & 0x7F, Exception(*exception))
+            format!("function {}, {}", code & 0x7F, Exception::Modbus(*exception))
         }
         (3 | 4 | 23, [count, words @ ..]) if usize::from(*count) == words.len() && words.len() % 2 == 0 => {
             format!("function {function}, {}", counted(words.len() / 2, "register"))

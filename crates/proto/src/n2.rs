@@ -243,7 +243,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
     let data = match answer {
         // The drive saw a wrong checksum: the line, not the drive, refuses.
         Answer::Nak(command::CHECKSUM) => return Err("the drive saw a wrong checksum (N02)"),
-        Answer::Nak(code) => return Ok(Reply::Exception(Exception::n2(code))),
+        Answer::Nak(code) => return Ok(Reply::Exception(Exception::N2(code))),
         Answer::Ack | Answer::Data(_) if expected == Form::Any => return Ok(Reply::Other(line.to_vec())),
         Answer::Data(digits) if expected == Form::Changes => return Ok(Reply::Changes(digits)),
         Answer::Data(digits) => bytes_of(&digits).ok_or("an odd number of digits")?,

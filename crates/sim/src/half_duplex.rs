@@ -415,7 +415,7 @@ impl HalfDuplex {
             (Some(Fault::Deaf | Fault::NeedsPause(_)), _) => return,
             (Some(Fault::CutRequest | Fault::CutEcho), _) => return self.cut_request(frame, asked, fault, now),
             (Some(Fault::DeafEcho), _) => {}
-            (Some(Fault::Exception(code)), _) => refuse(asked, Exception(code), &mut reply),
+            (Some(Fault::Exception(code)), _) => refuse(asked, Exception::Modbus(code), &mut reply),
             _ => {
                 self.slaves.answer(asked, now, &mut reply);
                 if let Some(acts) = &mut self.acts {

@@ -185,7 +185,7 @@ fn the_counters_of_a_drive_are_read_behind_its_parameters() {
 
         // A drive may refuse function 08, or stop answering after its last parameter; the reading is complete in
         // both cases.
-        for end in [Outcome::Exception(Exception(1)), Outcome::TimedOut] {
+        for end in [Outcome::Exception(Exception::Modbus(1)), Outcome::TimedOut] {
             let mut reading = Reading::new(profile.clone(), known.clone());
             let mut last = 0;
             while let Some(pdu) = reading.request() {
@@ -279,7 +279,7 @@ fn a_locked_drive_refuses_what_the_plan_says_it_will() {
             .needs
             .clone()
             .and_then(|need| need.exception)
-            .map(Exception);
+            .map(Exception::Modbus);
         assert_eq!(lock.is_some(), profile.name.starts_with("teco"));
         for write in &plan.writes {
             let is_locked = lock

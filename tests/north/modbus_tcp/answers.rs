@@ -166,9 +166,9 @@ async fn scene(state: State) -> (Rig, Client) {
         bus.image.update_health(|h| h.up = state != State::BusDown);
     }
     let outcome = match state {
-        State::DriveRefuses => Some(Outcome::Exception(Exception(2))),
+        State::DriveRefuses => Some(Outcome::Exception(Exception::Modbus(2))),
         State::DriveSilent => Some(Outcome::TimedOut),
-        State::DriveOwnCode => Some(Outcome::Exception(Exception(0x21))),
+        State::DriveOwnCode => Some(Outcome::Exception(Exception::Modbus(0x21))),
         _ => None,
     };
     if let Some(outcome) = outcome {

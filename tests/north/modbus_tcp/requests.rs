@@ -123,8 +123,8 @@ async fn what_the_drive_refuses() {
     let rig = Rig::new().await;
     let mut client = rig.client().await;
     rig.drive("pump-1").update(|s| {
-        s.refuse(Table::Holding, 7, 1, Exception(2));
-        s.refuse(Table::Holding, 8, 1, Exception(0x21));
+        s.refuse(Table::Holding, 7, 1, Exception::Modbus(2));
+        s.refuse(Table::Holding, 8, 1, Exception::Modbus(0x21));
     });
     assert_eq!(client.ask(1, &words(3, &[7, 1])).await, [0x83, 2]);
     assert_eq!(
@@ -133,12 +133,12 @@ async fn what_the_drive_refuses() {
         "the drive's own code"
     );
     let table = [
-        (Outcome::Exception(Exception(1)), 1),
-        (Outcome::Exception(Exception(2)), 2),
-        (Outcome::Exception(Exception(3)), 3),
-        (Outcome::Exception(Exception(0x0B)), 0x0B),
-        (Outcome::Exception(Exception(0x21)), 4),
-        (Outcome::Exception(Exception(0xFF)), 4),
+        (Outcome::Exception(Exception::Modbus(1)), 1),
+        (Outcome::Exception(Exception::Modbus(2)), 2),
+        (Outcome::Exception(Exception::Modbus(3)), 3),
+        (Outcome::Exception(Exception::Modbus(0x0B)), 0x0B),
+        (Outcome::Exception(Exception::Modbus(0x21)), 4),
+        (Outcome::Exception(Exception::Modbus(0xFF)), 4),
         (Outcome::Garbled, 4),
         (Outcome::TimedOut, 0x0B),
         (Outcome::Expired, 0x0B),

@@ -272,11 +272,11 @@ impl World {
         };
         // An order that was not sent because the state of the drive was unknown counts as refused.
         assert!(
-            record.sent.is_none() || !matches!(code.0, 0x05 | 0x0A | 0x0B),
+            record.sent.is_none() || !matches!(code.code(), 0x05 | 0x0A | 0x0B),
             "order {id} is told to be refused, and the answer was {code}"
         );
         assert!(
-            code.0 != 0x06 || self.now >= record.expires,
+            code.code() != 0x06 || self.now >= record.expires,
             "order {id} was given up {:?} before its time, because the drive was busy",
             record.expires - self.now
         );

@@ -25,7 +25,7 @@ pub struct KnownWords {
     stop: Option<u16>,
     /// The direction that was ordered last, where no bit of the drive keeps it until the next start.
     pub(super) direction: Option<bool>,
-    /// The direction in which the motor turns, as the drive's status shows; `None` if it stands or the status has no direction.
+    /// The direction in which the motor turns by its command, as the drive shows; `None` if it stands or that is not shown.
     turns: Option<bool>,
     /// Whether the ordered direction differs from the drive's word, so that the next start must set it.
     waits_for_start: bool,
@@ -135,20 +135,29 @@ impl KnownWords {
         self.waits_for_start = false;
     }
 
-    /// Notes the direction in which the motor turns, or that this is not known.
+    /// Notes the direction in which the motor turns by its command, or that this is not known.
     pub(crate) fn see_turning(&mut self, reverse: Option<bool>) {
         self.turns = reverse;
     }
 
-    /// The direction of an order that names none, where no known word has a direction: a motor that turns is not reversed, and one
-    /// that stands turns as was ordered last, forward if nothing was ordered. `true` is reverse.
+    /// The direction that was ordered last, by a word that may not be known any more; forward if none was ordered. `true` is
+    /// reverse.
+    pub(super) fn ordered_direction(&self, control: &Control) -> bool {
+        self.last_direction(control).unwrap_or(false)
+    }
+
+    /// The direction of a run command that names none: as ordered last, and if this run of the gateway ordered none, as the
+    /// motor turns, which is not to be reversed.
     pub(super) fn unnamed_direction(&self, control: &Control) -> bool {
+        self.last_direction(control).or(self.turns).unwrap_or(false)
+    }
+
+    fn last_direction(&self, control: &Control) -> Option<bool> {
         let last = |place: ControlItem| {
             let before = || self.before.get(&(place.table, place.address)).copied();
             self.get(place.table, place.address).or_else(before)
         };
-        let ordered = || control.direction_in(last).or(self.direction);
-        self.turns.or_else(ordered).unwrap_or(false)
+        control.direction_in(last).or(self.direction)
     }
 
     /// The direction that was kept for the next start.

@@ -153,13 +153,6 @@ impl CommandRun {
         if let Some(other) = other_function(&step.pdu).filter(|_| self.by_other_function) {
             step.pdu = other;
         }
-        if let Some(Action::Word(Word::Sequence(word, _))) = self.actions.front()
-            && self.phase == Phase::Steps
-            && step.pdu.is_write()
-            && word.is_last
-        {
-            self.phase = Phase::MotorStarted;
-        }
         step
     }
 
@@ -195,6 +188,7 @@ impl CommandRun {
     /// The motor already runs by this command: only the last word of the sequence is sent, which changes nothing or
     /// only the direction.
     fn only_last_word(&mut self, reverse: Option<bool>) {
+        self.phase = Phase::Repeats;
         let last = |action: &Action| matches!(action, Action::Word(Word::Sequence(word, _)) if word.is_last);
         while self.actions.front().is_some_and(|action| !last(action)) {
             self.pop();

@@ -16,6 +16,7 @@ mod elsewhere;
 mod functions;
 mod looking;
 mod on_change;
+mod repetitions;
 
 struct ObedientDrive {
     profile: Arc<Profile>,

@@ -117,7 +117,13 @@ pub(super) fn made(
         let own = control.without_reset(own);
         pulsed.map_or(own, |pulsed| pulsed.released(own))
     });
-    let base = released.unwrap_or_else(|| control.with_direction(0, words.unnamed_direction(control)));
+    let base = released.unwrap_or_else(|| {
+        let reverse = match word {
+            Word::Run(_) | Word::Sequence(..) => words.unnamed_direction(control),
+            _ => words.ordered_direction(control),
+        };
+        control.unknown_word(reverse)
+    });
     let form = match basis(word, control, words, released, known, motor) {
         Basis::Certain(form) => form,
         Basis::Judged(repeats) => match known.permit {
@@ -172,12 +178,11 @@ pub(super) fn made(
         }
         Word::Sequence(step, reverse) => {
             let reverse = reverse.or(words.at_next_start());
-            let reverse = reverse.or_else(|| own.and_then(|own| control.direction_of(own)));
-            let word = step.write.applied(stays);
-            sent(
-                at,
-                reverse.map_or(word, |reverse| control.with_direction(word, reverse)),
-            )
+            let reverse = reverse.unwrap_or_else(|| {
+                let own = own.and_then(|own| control.direction_of(own));
+                own.unwrap_or_else(|| words.unnamed_direction(control))
+            });
+            sent(at, control.with_direction(step.write.applied(stays), reverse))
         }
         // The word of a motor that runs stays as it is, as does one that the drive has. The coil of a motor that stands is written
         // in any case: no other write of the reset takes away a run command that another master has set since the last reading.

@@ -169,6 +169,16 @@ impl Rig {
         cycle: Duration,
         other: impl Fn(DriveSpec) -> DriveSpec,
     ) -> Rig {
+        let line = BusSpec {
+            protocol,
+            cycle,
+            ..bus_spec("b")
+        };
+        Rig::on(line, drives, profile, other)
+    }
+
+    /// A rig on this line that has not sent any request.
+    fn on(line: BusSpec, drives: u8, profile: &str, other: impl Fn(DriveSpec) -> DriveSpec) -> Rig {
         let profile = drivegate_testkit::profile(profile);
         let spec = |address: u8| DriveSpec {
             turnaround: Duration::ZERO,
@@ -181,11 +191,6 @@ impl Rig {
             ..controlled(&format!("d{address}"), "b", address, &profile)
         };
         let images = (1..=drives).map(|address| image(other(spec(address))));
-        let line = BusSpec {
-            protocol,
-            cycle,
-            ..bus_spec("b")
-        };
         let bus = bus(line, images.collect());
         let now = Instant::now();
         let mut master = Master::new(bus.clone(), &options(), SILENCE, &Handover::default(), now);

@@ -250,7 +250,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
         );
     };
     let acknowledged = || Outcome::Acknowledged(Reply::Written);
-    let refused = || Outcome::Exception(Exception(4));
+    let refused = || Outcome::Exception(Exception::Modbus(4));
     // Order and status, and the client that is named.
     let (stands, runs, faults) = (1u16, 3u16, 8u16);
     read(stands, now);

@@ -332,6 +332,30 @@ fn every_family_is_written_its_action() {
 }
 
 #[test]
+fn a_reference_of_the_action_keeps_the_direction_of_a_signed_reference() {
+    for (in_force, limit, expected) in [(-40.0, -100.0, -20.0), (40.0, -100.0, 20.0), (-40.0, 0.0, 20.0)] {
+        let profile = drivegate_testkit::profile("danfoss-fc");
+        let mut rig = SupervisedDrive::of(&profile, LeaseAction::SpeedReference(20.0));
+        let mut spec = rig.spec();
+        spec.limits.insert("speed_reference".to_string(), limit..=100.0);
+        rig.reload(spec);
+        rig.heartbeat();
+        rig.now += Duration::from_millis(5_900);
+        rig.shows(ModelPoint::SpeedReference, Value::Number(in_force));
+        let command = rig.after(100, true).expect("the action");
+        let sets = writes(&profile, command, rig.now);
+        let written = sets
+            .iter()
+            .find(|(name, _)| name == "speed_reference")
+            .map(|(_, value)| value.as_f64());
+        assert!(
+            written.is_some_and(|value| (value - expected).abs() < 0.02),
+            "{in_force}: {sets:?}"
+        );
+    }
+}
+
+#[test]
 fn an_action_that_fails_is_told_once_for_each_reason_and_counted_each_time() {
     let mut rig = SupervisedDrive::new(LeaseAction::Stop);
     rig.heartbeat();

@@ -157,7 +157,7 @@ impl Outcome {
     pub fn exception(&self) -> Option<Exception> {
         match self {
             Outcome::Acknowledged(_) => None,
-            Outcome::Exception(code) | Outcome::Unknown(code) if code.0 <= 0x0B => Some(*code),
+            Outcome::Exception(code) | Outcome::Unknown(code) if code.code() <= 0x0B => Some(*code),
             Outcome::Exception(_) | Outcome::Unknown(_) | Outcome::Garbled | Outcome::NotTaken(_) => {
                 Some(Exception::DEVICE_FAILURE)
             }
@@ -419,7 +419,7 @@ mod tests {
         for outcome in outcomes {
             let exception = outcome
                 .exception()
-                .map_or("none".to_string(), |e| format!("{:02X}", e.0));
+                .map_or("none".to_string(), |e| format!("{:02X}", e.code()));
             let row = format!("| `{}` | {exception} |", outcome.code());
             assert!(page.contains(&row), "docs/commands.md lacks {row}");
         }
@@ -432,7 +432,7 @@ mod tests {
             Outcome::StopOnly(Box::new(Outcome::Purged)).code()
         )));
         assert_eq!(
-            Outcome::Exception(Exception(0x33)).exception(),
+            Outcome::Exception(Exception::Modbus(0x33)).exception(),
             Some(Exception::DEVICE_FAILURE)
         );
         assert_eq!(Outcome::Exception(Exception::BUSY).exception(), Some(Exception::BUSY));

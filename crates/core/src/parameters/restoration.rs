@@ -334,7 +334,7 @@ impl Restoration {
     /// Handles an order that the drive refused.
     fn refused(&mut self, code: Exception, now: Instant) -> Then {
         let need = self.journal.plan.handling.needs.clone();
-        match need.filter(|need| need.exception == Some(code.0)) {
+        match need.filter(|need| need.exception == Some(code.code())) {
             _ if code == Exception::BUSY => self.pause(BUSY_PAUSE, "the drive is busy", now),
             Some(need) => self.wait_for_people(
                 need.remedy.clone(),

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::snapshot::{Cell, Snapshot, Unavailable};
 use super::{DriveSpec, RestoreLock};
+use drivegate_model::drive::control::ControlItem;
 use drivegate_model::drive::model::Kind;
 use drivegate_model::drive::profile::MOST_REGISTERS;
 use drivegate_model::drive::{
@@ -191,6 +192,8 @@ impl Reading<'_> {
 
     fn sample_of(&self, point: &Point) -> Sample {
         match &point.source {
+            // A control word that cannot be read has no value, whatever the drive shows in its register.
+            Source::Raw(raw) if point.class == PollClass::Never && self.is_unreadable(raw) => Sample::NONE,
             Source::Raw(raw) => self.raw_sample(raw, point.kind()),
             Source::Derived(derived) => {
                 let sources = || derived.sources().map(|source| self.sample(source));
@@ -212,6 +215,12 @@ impl Reading<'_> {
                 }
             }
         }
+    }
+
+    fn is_unreadable(&self, raw: &Raw) -> bool {
+        let (table, address) = (raw.table, raw.address);
+        let control = self.spec.profile.control.as_ref();
+        control.is_some_and(|control| control.is_unreadable(ControlItem { table, address }))
     }
 
     /// A value of the drive's own registers, with the worst quality and the oldest age among them. Register content

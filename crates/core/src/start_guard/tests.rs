@@ -461,5 +461,5 @@ fn times_for_people_are_never_0() {
 #[test]
 fn outcomes_of_guards_are_busy_to_modbus() {
     let refused = Outcome::Refused(Refusal::Interlocked("x".to_string()));
-    assert_eq!(refused.exception().map(|exception| exception.0), Some(6));
+    assert_eq!(refused.exception().map(|exception| exception.code()), Some(6));
 }

@@ -334,6 +334,11 @@ impl Control {
         }
     }
 
+    /// Whether the register is the control word of a drive that reads as something else.
+    pub fn is_unreadable(&self, place: ControlItem) -> bool {
+        self.own_word == OwnWord::Shadow && place == self.at
+    }
+
     /// The direction that these words show, wherever the family has it; `None` if the word of that place is not known, or has
     /// no direction.
     pub fn direction_in(&self, word: impl Fn(ControlItem) -> Option<u16>) -> Option<bool> {
@@ -367,6 +372,17 @@ impl Control {
         let runs = self.runs().into_iter().filter(|run| run.place.is_none());
         let bits = runs.fold(0, |bits, run| bits | run.value);
         self.always.applied(own & !bits)
+    }
+
+    /// The word from which the next one is made where the drive's own word is not known: in this direction and without a run
+    /// command.
+    pub fn unknown_word(&self, reverse: bool) -> u16 {
+        let word = match &self.run {
+            // A word without the other bits of a sequence would take the voltage off, and the motor would coast.
+            Run::Steps(steps) => steps.last().map_or(0, |last| self.resting(last.write.value)),
+            Run::One(_) | Run::Pair { .. } => 0,
+        };
+        self.with_direction(word, reverse)
     }
 
     /// The stop word, made from the present word.

@@ -199,7 +199,7 @@ impl ClientSession {
 
     fn put_exception(&self, header: Header, function: u8, code: Exception, out: &mut Vec<u8>) {
         frame::encode(header, out, |out| encode_exception(function, code, out));
-        self.stats().answered(function, code.0);
+        self.stats().answered(function, code.code());
     }
 
     /// Logs an exception code that only this drive uses; the client gets 04.

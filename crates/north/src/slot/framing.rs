@@ -247,7 +247,7 @@ mod tests {
             let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu)).unwrap();
             assert_eq!(request.meaning, Meaning::Faulty(Refused::Exception(code)), "{pdu:?}");
             let refusal = request.refusal(Protocol::ModbusRtu, Refused::Exception(code));
-            assert_eq!(refusal, framed(7, &[pdu[0] | 0x80, code.0]));
+            assert_eq!(refusal, framed(7, &[pdu[0] | 0x80, code.code()]));
         }
         for (pdu, reads) in [
             (&[8, 0, 0, 1, 2][..], true),

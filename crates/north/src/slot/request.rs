@@ -68,7 +68,7 @@ impl ToolRequest {
             Refused::Nak(code) => n2::Answer::Nak(code).encode(&mut frame),
             Refused::Exception(code) if protocol == Protocol::N2 => nak(code).encode(&mut frame),
             Refused::Exception(code) => {
-                let pdu = [self.function | 0x80, code.0];
+                let pdu = [self.function | 0x80, code.code()];
                 protocol.encode_frame(self.address, &pdu, &mut frame);
             }
         }

@@ -89,7 +89,7 @@ fn requests_of_the_reference() {
 
 /// Worked replies of reference/drives.md 7.3 and 7.4.
 fn replies() -> Vec<(Request, &'static str, Reply)> {
-    let refused = |code| Reply::Exception(Exception(code));
+    let refused = |code| Reply::Exception(Exception::Modbus(code));
     let input = to(1, RequestPdu::read(Table::Input, 0x20, 1));
     vec![
         (loop_test(), ":01080000AA55F8", Reply::Diagnostics(0xAA55)),
@@ -367,7 +367,7 @@ proptest! {
         cut in any::<prop::sample::Index>(),
     ) {
         let request = to(address, pdu);
-        let reply = if exception { Reply::Exception(Exception(code)) } else { regular(&request.pdu, seed) };
+        let reply = if exception { Reply::Exception(Exception::Modbus(code)) } else { regular(&request.pdu, seed) };
         let frame = replied(&request, &reply);
         let decoded = decode_reply(&request, &frame);
         if !matches!(request.pdu, RequestPdu::Diagnostics { .. }) || exception {

@@ -1,7 +1,7 @@
 //! Commands and answers of N2 in terms of its objects.
 
 use crate::n2::{self, Command, Region};
-use crate::{Reply, RequestPdu};
+use crate::{Exception, Reply, RequestPdu};
 
 /// A command of N2: `read AI 2 value`, `override AO 1 = 50`, `identify`.
 pub(super) fn command(pdu: &RequestPdu) -> Option<String> {
@@ -33,7 +33,7 @@ pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
             _ => super::answer(reply),
         },
         Reply::Written => "acknowledged".to_string(),
-        Reply::Exception(code) if code.0 & 0x80 != 0 => format!("N{:02X}: {}", code.0 & 0x7F, code.meaning()),
+        Reply::Exception(exception @ Exception::N2(code)) => format!("N{code:02X}: {}", exception.meaning()),
         // The reply is valid but its status byte marks the value as unreliable, so no exception of the drive is reported.
         Reply::Exception(_) if matches!(asked, RequestPdu::Read { .. }) => "unreliable".to_string(),
         _ => super::answer(reply),

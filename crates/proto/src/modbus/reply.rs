@@ -87,7 +87,7 @@ impl Reply {
                 // No exception of Modbus. TECO's table has 00 for a wrong check code (reference/drives.md 5.6 and 9.8): the line
                 // refuses, not the drive, and the request is repeated.
                 [0] => Err(Misfit),
-                [code] => Ok(Reply::Exception(Exception(*code))),
+                [code] => Ok(Reply::Exception(Exception::Modbus(*code))),
                 _ => Err(Misfit),
             };
         }
@@ -130,7 +130,7 @@ pub struct Misfit;
 
 /// Appends an exception PDU.
 pub fn encode_exception(function: u8, code: Exception, out: &mut Vec<u8>) {
-    out.extend_from_slice(&[function | 0x80, code.0]);
+    out.extend_from_slice(&[function | 0x80, code.code()]);
 }
 
 /// Writes of one item are echoed whole, of several by their first five bytes.

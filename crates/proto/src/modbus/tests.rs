@@ -43,7 +43,10 @@ fn refused_requests() {
 fn a_refusal_with_00_is_the_lines_and_no_answer() {
     let read = RequestPdu::read(Table::Holding, 0x20, 1);
     assert_eq!(Reply::decode(&read, &[0x83, 0]), Err(Misfit));
-    assert_eq!(Reply::decode(&read, &[0x83, 1]), Ok(Reply::Exception(Exception(1))));
+    assert_eq!(
+        Reply::decode(&read, &[0x83, 1]),
+        Ok(Reply::Exception(Exception::Modbus(1)))
+    );
 }
 
 fn any_request() -> impl Strategy<Value = RequestPdu> {

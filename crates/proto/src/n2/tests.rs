@@ -112,7 +112,7 @@ fn replies_of_the_reference() {
     let identify = asked(RequestPdu::N2(Session::Identify));
     let poll = asked(RequestPdu::N2(Session::Poll { again: false }));
     let start = asked(RequestPdu::WriteCoil { address: 0, on: true });
-    let refused = |code| Reply::Exception(Exception::n2(code));
+    let refused = |code| Reply::Exception(Exception::N2(code));
     for (request, text, reply) in [
         (&ai2, "A4248000092", words(0x4248, 0)),
         (&ai2, "A0042480000F2", words(0x4248, 0)),

@@ -74,7 +74,7 @@ fn exchange(drive: &mut CxDrive, frame: &str, now: SimTime) -> String {
         }
         (_, Err((function, exception))) => {
             let exception = drive.malformed(&[function], exception, now).unwrap();
-            rtu::encode_frame(address, &[function | 0x80, exception.0], &mut out);
+            rtu::encode_frame(address, &[function | 0x80, exception.code()], &mut out);
         }
     }
     out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")

@@ -403,11 +403,11 @@ fn store(address: u16, value: u16, model: Model<'_>) -> Result<(), u8> {
 
 /// The error code of the board for an exception that the drive answers on Modbus.
 pub(crate) fn code_of(exception: Exception) -> u8 {
-    match exception.0 {
-        0x01 => UNKNOWN,
+    match exception {
+        Exception::Modbus(0x01) => UNKNOWN,
         // A parameter of TECO that is written in DRIVE mode.
-        0x22 => TYPE,
-        own if own & 0x80 != 0 => own & 0x7F,
-        _ => DATA,
+        Exception::Modbus(0x22) => TYPE,
+        Exception::N2(own) => own,
+        Exception::Modbus(_) => DATA,
     }
 }

@@ -10,11 +10,11 @@ const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
 /// Maximum number of registers per message.
 const MOST_REGISTERS: u16 = 16;
 /// 00H: wrong check code.
-pub(super) const CHECK_ERROR: Exception = Exception(0x00);
+pub(super) const CHECK_ERROR: Exception = Exception::Modbus(0x00);
 /// Error 21H: value out of range, or a parameter that cannot be written over the bus.
-const DATA_ERROR: Exception = Exception(0x21);
+const DATA_ERROR: Exception = Exception::Modbus(0x21);
 /// 22H: Sn, Cn or On written in DRIVE mode, or saving while the drive runs.
-const WRITE_ERROR: Exception = Exception(0x22);
+const WRITE_ERROR: Exception = Exception::Modbus(0x22);
 /// Register that saves the parameters when it is written.
 const SAVE: u16 = 0x0900;
 /// Greatest frequency reference, 0.01 Hz.

@@ -8,8 +8,8 @@ use crate::in_time::InTime;
 use drivegate_proto::{Exception, Table, lrc};
 use std::time::Duration;
 
-const VALUE: Exception = Exception(0x21);
-const MODE: Exception = Exception(0x22);
+const VALUE: Exception = Exception::Modbus(0x21);
+const MODE: Exception = Exception::Modbus(0x22);
 
 type TecoInTime = InTime<TecoDrive>;
 
@@ -68,7 +68,7 @@ fn exchange(drive: &mut TecoDrive, frame: &str, now: SimTime) -> String {
         }
         Ok(request) => drive.answer(&request, now).unwrap().encode(&request, &mut answer),
         Err(exception) => match drive.malformed(pdu, exception, now) {
-            Some(exception) => answer.extend([pdu[0] | 0x80, exception.0]),
+            Some(exception) => answer.extend([pdu[0] | 0x80, exception.code()]),
             None => return String::new(),
         },
     }
@@ -197,7 +197,9 @@ fn messages_that_are_none() {
     let mut rig = TecoInTime::plain();
     let mut refused = |pdu: &[u8]| {
         let exception = RequestPdu::decode(pdu).unwrap_err();
-        rig.drive.malformed(pdu, exception, SimTime::ZERO).map(|code| code.0)
+        rig.drive
+            .malformed(pdu, exception, SimTime::ZERO)
+            .map(|code| code.code())
     };
     assert_eq!(refused(&[0x07]), Some(1));
     assert_eq!(refused(&[0x01, 0]), Some(1));

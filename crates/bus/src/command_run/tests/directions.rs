@@ -146,10 +146,24 @@ fn a_run_command_alone_never_reverses_a_motor_that_turns() {
             lost.words
                 .in_doubt(place.table, &[(place.address, word)], Some(&control));
             assert_eq!(run_alone(&mut lost), [(address, word)], "{family}: in doubt");
+            // The motor still turns as before: it slows down first, to turn as was ordered last.
+            let mut slows = bench(family);
+            slows
+                .words
+                .written(&slows.profile.functions.write_register(place.address, word));
+            slows.words.forget();
+            slows.words.see_turning(Some(reverse == 0.0));
+            assert_eq!(run_alone(&mut slows), [(address, word)], "{family}: slows down");
             // The gateway has restarted: only the status of the drive shows how the motor turns.
             let mut restarted = bench(family);
             restarted.words.see_turning(Some(reverse == 1.0));
             assert_eq!(run_alone(&mut restarted), [(address, word)], "{family}: shown");
+            // A stop orders no direction: the next start behind it turns forward, whoever turned the motor before.
+            let mut stopped = bench(family);
+            stopped.words.see_turning(Some(true));
+            writes(&mut stopped, &[("run", 0.0)], Urgency::Stop);
+            stopped.words.see_turning(None);
+            assert_eq!(run_alone(&mut stopped), [(address, forward)], "{family}: behind a stop");
         }
     }
 }
@@ -178,9 +192,54 @@ fn a_coil_that_is_0_in_reverse_is_written_before_the_first_run_command() {
         [coil(1, true), coil(0, true)]
     );
     bench.words.forget();
+    assert_eq!(
+        writes(&mut bench, &run, Urgency::Command),
+        [coil(1, true), coil(0, true)],
+        "as ordered last"
+    );
+    bench.words = KnownWords::default();
     bench.words.see_turning(Some(true));
     assert_eq!(
         writes(&mut bench, &run, Urgency::Command),
         [coil(1, false), coil(0, true)]
     );
+}
+
+/// Family and its stop word by ramp, from the manuals: what is written where nothing is known of the drive's own word.
+const STOPS: [(&str, u16); 10] = [
+    ("abb-acs550", 0x047E),
+    ("abb-acs580", 0x047E),
+    ("schneider-altivar", 0x0007),
+    ("siemens-g120", 0x047E),
+    ("siemens-v20", 0x047E),
+    ("danfoss-fc", 0x043C),
+    ("weg-cfw", 0x0016),
+    ("toshiba-vf-s15", 0xC000),
+    ("teco-f510", 0),
+    ("vacon-10", 0),
+];
+
+#[test]
+fn a_stop_without_a_known_word_stops_by_ramp() {
+    for (family, word) in STOPS {
+        let mut bench = bench(family);
+        let stop = writes(&mut bench, &[("run", 0.0)], Urgency::Stop).remove(0);
+        let (_, items) = written(&stop).unwrap();
+        assert_eq!(items[0].1, word, "{family}");
+    }
+    // A word of `also_stop` coasts or stops quickly; the gateway writes none.
+    for profile in Profiles::built_in().iter() {
+        let Some(control) = profile.control.as_ref().filter(|control| control.stop.place.is_none()) else {
+            continue;
+        };
+        for reverse in [false, true] {
+            let word = control.stop_word(control.unknown_word(reverse));
+            let coasts = control.also_stop.iter().any(|stop| stop.holds(word));
+            assert!(
+                !coasts && control.is_own_stop(control.at, word),
+                "{}: {word:04X}",
+                profile.name
+            );
+        }
+    }
 }

@@ -81,14 +81,14 @@ fn a_drive_that_does_not_tell_is_written() {
     let mut bench = bench();
     let mut command = reference(&bench);
     let check = sends(&bench, &mut command);
-    let refused = Reply::Exception(Exception::n2(0x10));
+    let refused = Reply::Exception(Exception::N2(0x10));
     assert_eq!(command.answered(&check, refused, &mut bench.words), None);
     assert_eq!(sends(&bench, &mut command), override_ao());
 }
 
 #[test]
 fn a_release_is_behind_the_override_and_may_fail() {
-    let refused = Reply::Exception(Exception::n2(0x11));
+    let refused = Reply::Exception(Exception::N2(0x11));
     for answer in [Some(Reply::Written), Some(refused), None] {
         let mut bench = bench();
         changed(&mut bench);
@@ -119,7 +119,7 @@ fn an_override_that_is_refused_is_not_released() {
     changed(&mut bench);
     let mut command = reference(&bench);
     assert_eq!(sends(&bench, &mut command), override_ao());
-    let refused = Exception::n2(0x10);
+    let refused = Exception::N2(0x10);
     let ended = command.answered(&override_ao(), Reply::Exception(refused), &mut bench.words);
     assert_eq!(ended, Some(Outcome::Exception(refused)));
 }

@@ -41,7 +41,8 @@ fn exceptions_that_refuse_nothing_end_no_command_as_refused() {
             assert!(outcome.to_string().contains("unknown"), "{outcome}");
             assert_eq!(outcome.exception(), Some(open));
         }
-        let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22].map(Exception);
+        // A maker's own codes, which have the numbers that errors of N2 have for clients.
+        let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22, 0x80, 0x81, 0x90, 0xFF].map(Exception::Modbus);
         for refused in refused {
             // For a drive that does not know function 06, the write is repeated with function 16.
             let writes = if refused == Exception::FUNCTION { 2 } else { 1 };
@@ -81,14 +82,14 @@ fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
         );
     }
     // Any other exception shows that the drive is present, and only one about the request itself splits the read.
-    for code in (1..=9).map(Exception) {
+    for code in (1..=9).chain([0x80, 0x81, 0x90]).map(Exception::Modbus) {
         let mut rig = Rig::new(1);
         rig.drives[0].to_reads = Some(code);
         rig.news.clear();
         rig.run(Duration::from_secs(3));
         assert!(rig.master.schedule.is_online(DriveIndex::new(0)), "{code}");
         let unavailable = rig.news.iter().any(|news| matches!(news, News::Unavailable(..)));
-        assert_eq!(unavailable, matches!(code.0, 1..=3), "{code}");
+        assert_eq!(unavailable, matches!(code.code(), 1..=3), "{code}");
     }
 }
 

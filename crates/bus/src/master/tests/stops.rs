@@ -1,5 +1,6 @@
 //! Stops on the line: to a drive that does not answer, cyclic ones, and ones that meet a command or a reset in progress.
 
+use super::family_drive::FamilyDrive;
 use super::*;
 
 #[test]
@@ -177,4 +178,43 @@ fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_li
         "perhaps only its replies are lost"
     );
     assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
+}
+
+/// A network may deliver an unanswered write late, so the stop behind it is sent again; not into a start that has begun since.
+#[test]
+fn a_stop_is_not_sent_again_into_a_start_by_a_sequence() {
+    for family in ["abb-acs580", "siemens-g120", "schneider-altivar"] {
+        let line = BusSpec {
+            port: "modbus-tcp://10.0.0.1:502".to_string(),
+            cycle: Duration::from_millis(10),
+            ..bus_spec("b")
+        };
+        let mut rig = Rig::on(line, 1, family, |spec| DriveSpec {
+            supervision: None,
+            ..spec
+        });
+        rig.drives[0].family = Some(FamilyDrive::new(&drivegate_testkit::profile(family)));
+        rig.run(Duration::from_secs(5));
+        rig.drives[0].next_write = Some(Ended::Silent);
+        rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(30.0));
+        rig.run(Duration::from_millis(300));
+        let stop = rig.now;
+        rig.switch(0, "a", false);
+        rig.run(Duration::from_millis(400));
+        let pending = rig.master.drives[0].repeated_stops.is_any();
+        assert!(pending, "{family}: the stop is to be sent again");
+        // The first word of the sequence has been sent when the stop is due, and the drive has not shown its state yet.
+        rig.now = rig.now.max(stop + Duration::from_millis(940));
+        let mut start = rig.switch(0, "a", true);
+        let outcome = loop {
+            rig.step();
+            if let Some(outcome) = outcome(&mut start) {
+                break outcome;
+            }
+            assert!(rig.now < stop + Duration::from_secs(9), "{family}: no answer");
+        };
+        assert!(outcome.is_ok(), "{family}: {outcome}");
+        rig.run(Duration::from_secs(4));
+        assert!(rig.drives[0].family.as_ref().unwrap().runs, "{family}");
+    }
 }

@@ -152,3 +152,18 @@ fn what_the_points_tell_together() {
     assert_eq!(reported(&both, &[(542, 0)]), OwnResponse::Off(COMMUNICATION_TIMEOUT));
     assert_eq!(reported(&both, &[(542, 50)]), OwnResponse::On);
 }
+
+/// Register 8 of Mitsubishi takes the control word and reads as the status: a motor that stands shows no run bit there, while
+/// the run command written last is still in force.
+#[test]
+fn the_status_behind_an_unreadable_control_word_shows_no_run_command() {
+    for (word, acts) in [(0x0002, true), (0x0000, false)] {
+        let mut rig = SupervisedDrive::of(&drivegate_testkit::profile("mitsubishi-d700"), LeaseAction::Stop);
+        rig.heartbeat();
+        rig.drive.words.learn(Table::Holding, 8, word);
+        rig.now += Duration::from_millis(4_900);
+        let now = rig.now;
+        rig.image().update(|s| s.store(Table::Holding, 8, &[0x0080], now));
+        assert_eq!(rig.later(100).is_some(), acts, "{word:#06x}");
+    }
+}

@@ -420,7 +420,11 @@ pub(super) fn made_points(control: &Control, points: &PerPoint<Point>, before: u
             })
         };
         let first = points.len() + before;
-        let known = points.position(is_plain).map(PointIndex::place);
+        // A register whose word cannot be read back shows something else: its point is no helper.
+        let known = points
+            .position(is_plain)
+            .filter(|_| !control.is_unreadable(place))
+            .map(PointIndex::place);
         let known = known.or_else(|| helpers.iter().position(is_plain).map(|index| first + index));
         PointIndex::new(known.unwrap_or_else(|| {
             helpers.push(helper(control, place));
