@@ -285,3 +285,53 @@ fn a_reload_carries_stale_after_to_the_buses_that_run() {
     until("good values", || is_good().then_some(()));
     assert!(!gateway.output().contains("the bus ends"));
 }
+
+/// The run bits of the control words that were written to `pump-1`.
+fn words(line: &SimulatedBus) -> Vec<u8> {
+    let mut frames = line.transcript();
+    frames.retain(|frame| frame.direction == Direction::ToDrives && frame.bytes.starts_with(&[1, 6, 0x07, 0xD0]));
+    frames.iter().map(|frame| frame.bytes[5] & 1).collect()
+}
+
+/// Whether an order to the only drive that is commanded waits or was written.
+fn is_accepted(site: &Site, line: &SimulatedBus) -> bool {
+    let (_, buses) = get(site.http, "/api/v1/buses").unwrap();
+    !buses.contains("\"queue_depth\":0") || !words(line).is_empty()
+}
+
+/// A gateway whose `pump-1` runs by an order over MQTT; nothing is configured to stop it with the gateway. `faults` begin
+/// then, and `waits` says when the stop, which follows over MQTT, is accepted and waits: the gateway is ended at that moment.
+fn ends_before_a_stop(keys: &str, faults: FaultPlan, waits: impl Fn(&Site, &SimulatedBus) -> bool) {
+    let line = LINE1.replace("profile_dirs", "state_dir = \"state\"\nprofile_dirs");
+    let site = Site::of(&[&line, &controlled("pump-1", 1, keys), MQTT, HTTP]);
+    let line = site.line(&[1]);
+    let _broker = site.broker();
+    let mut gateway = site.run_ready();
+    site.until_connected(true);
+    site.order("pump-1/set", "{\"run\": true}");
+    site.until_state("pump-1", "running");
+    line.record(100_000);
+    line.set_faults(faults);
+    let answer = std::thread::scope(|scope| {
+        let stop = scope.spawn(|| site.ask("pump-1/set", "{\"run\": false}"));
+        until("the stop waits", || waits(&site, &line).then_some(()));
+        gateway.signal("TERM");
+        let status = gateway.ended();
+        assert!(status.success(), "{status}");
+        stop.join().unwrap()
+    });
+    assert_eq!(words(&line).last(), Some(&0), "the motor runs on: {answer}");
+    assert_eq!(answer["ok"], true, "{answer}");
+}
+
+#[test]
+fn an_accepted_stop_that_min_run_delays_is_sent_before_the_gateway_ends() {
+    let waits = |site: &Site, _: &SimulatedBus| api(site.http, "pump-1")["stop_waits_ms"].is_u64();
+    ends_before_a_stop("guard = { min_run = \"1h\" }", FaultPlan::default(), waits);
+}
+
+#[test]
+fn an_accepted_stop_behind_a_slow_transaction_is_sent_before_the_gateway_ends() {
+    let slow = FaultPlan::new("late:900ms=1".parse().unwrap(), 1);
+    ends_before_a_stop("", slow, is_accepted);
+}

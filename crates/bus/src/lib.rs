@@ -14,6 +14,7 @@
 //! - `start_gate`: which commands to guarded drives may start them, and the stops of interlocks.
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
+//! - `longest_transaction`: how long the line may be in use before a stop.
 //! - `line_diagnosis`: feeds [`drivegate_core::diagnosis`] and shows the result.
 //! - [`proof`]: whether the commands of a profile are safe, tried with the commands of the bus itself.
 //! - [`news`]: the results of the master; `report` applies them to the process image, to events and to the log.
@@ -32,6 +33,7 @@ mod line_diagnosis;
 mod line_loop;
 pub mod line_state;
 pub mod listener;
+mod longest_transaction;
 pub mod master;
 pub mod n2_late_replies;
 pub mod n2_session;
@@ -54,6 +56,7 @@ mod unanswered_stops;
 pub use drivegate_core::stop_all::stop_of_line;
 
 pub use line_loop::BusTask;
+pub use longest_transaction::longest_transaction;
 
 use std::time::Duration;
 

@@ -9,10 +9,11 @@ use std::time::{Duration, Instant};
 
 use super::core::{Action, BusCore, Closed};
 use super::listener::ListenCore;
+use super::longest_transaction::longest_transaction;
 use super::master::Handover;
 use super::{BusOptions, Mode};
 use drivegate_core::event::Events;
-use drivegate_core::order::Outcome;
+use drivegate_core::order::{DEFAULT_EXPIRY, Outcome};
 use drivegate_core::plant::BusHandle;
 use drivegate_core::stalls::Stalls;
 use drivegate_line::{Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
@@ -33,6 +34,8 @@ pub struct BusTask {
     handle: BusHandle,
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
+    /// Longest wait for stops when the bus ends.
+    last_stops: Duration,
     /// Channel for the handover to the prepared bus; present until the bus begins.
     begin: Option<SyncSender<Handover>>,
     thread: Option<std::thread::JoinHandle<Handover>>,
@@ -57,6 +60,8 @@ impl BusTask {
     pub fn prepare(handle: BusHandle, options: BusOptions, events: Events) -> std::io::Result<BusTask> {
         let stop = Arc::new(AtomicBool::new(false));
         let beats = Arc::new(AtomicU64::new(0));
+        let drives = handle.image.drives.iter().map(|image| &image.spec);
+        let longest = longest_transaction(&handle.image.spec, &options, drives);
         let worker = Worker {
             handle: handle.clone(),
             options,
@@ -79,6 +84,8 @@ impl BusTask {
             handle,
             stop,
             beats,
+            // The transaction on the line, and the last one of a stop, which may begin at the end of the time of the stop.
+            last_stops: LAST_STOPS + 2 * longest,
             begin: Some(begin),
             thread: Some(thread),
         })
@@ -101,23 +108,37 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus after the transaction on the line, but within a second; all pending requests end.
+    /// Longest time for which [`BusTask::stop`] and [`BusTask::make_room`] wait for stops.
+    pub fn last_stops(&self) -> Duration {
+        self.last_stops
+    }
+
+    /// Ends the bus when the stops that clients ordered are sent, and after the transaction on the line; all other pending
+    /// requests end. The wait for stops is bounded by [`BusTask::last_stops`], that for the transaction by a second.
     pub fn stop(mut self) {
-        self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
+        let queue = self.handle.queue.clone();
+        queue.accept_only_stops(Instant::now());
+        self.wait_for_stops(|| !queue.close_after_stops(Instant::now()));
+        queue.close(Outcome::ShuttingDown, Instant::now());
         self.halt();
     }
 
     /// Ends a bus that another one replaces: stops wait for that one, handed over by [`BusHandle::take_over`]. The stops of the
-    /// drives of `last`, which no bus serves any more, are sent before; the wait for a silent drive is at most two seconds.
-    /// Returns the handover.
+    /// drives of `last`, which no bus serves any more, are sent before; the wait for a silent drive is bounded by
+    /// [`BusTask::last_stops`]. Returns the handover.
     pub fn make_room(mut self, last: Vec<DriveIndex>) -> Handover {
-        let began = Instant::now();
         let queue = self.handle.queue.clone();
-        queue.begin_handover(last, began);
-        while queue.has_last_stops() && began.elapsed() < LAST_STOPS {
+        queue.begin_handover(last, Instant::now());
+        self.wait_for_stops(|| queue.has_last_stops());
+        self.halt()
+    }
+
+    /// Waits within the time for the last stops while there are some.
+    fn wait_for_stops(&self, remain: impl Fn() -> bool) {
+        let began = Instant::now();
+        while remain() && began.elapsed() < self.last_stops {
             std::thread::sleep(LOOK_AGAIN);
         }
-        self.halt()
     }
 
     fn halt(&mut self) -> Handover {
@@ -139,8 +160,8 @@ impl Drop for BusTask {
     }
 }
 
-/// The time for the stops of drives that no bus serves any more.
-const LAST_STOPS: Duration = Duration::from_secs(2);
+/// The time for the last stops of a bus, besides the transactions at both ends of it.
+const LAST_STOPS: Duration = DEFAULT_EXPIRY;
 /// Pause between two checks of the last stops.
 const LOOK_AGAIN: Duration = Duration::from_millis(5);
 

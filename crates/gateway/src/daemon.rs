@@ -47,7 +47,7 @@ use drivegate_north::{NorthState, ServerError, modbus_tcp};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
-/// Time limit for the bus threads to end.
+/// Time limit for the bus threads to end, besides the time for the last stops of clients.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
 /// Time limit for clients of the local socket to receive their last answers.
@@ -443,7 +443,8 @@ impl Daemon {
         self.driller.abort();
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();
-        within(STOP_BUSES, "buses", async {
+        let last_stops = buses.iter().map(|(_, task)| task.last_stops()).max();
+        within(STOP_BUSES + last_stops.unwrap_or_default(), "buses", async {
             at_once(buses, BusTask::stop).await;
             if let Some(recorder) = recorder {
                 // If the recorder's thread panicked, the panic was already logged.

@@ -37,7 +37,7 @@ impl Pending {
 
     /// Whether a stop waits or is in progress for a drive that no bus serves after this one.
     fn has_last_stops(&self) -> bool {
-        let begun = |drive: &DriveIndex| self.begun_stops.contains(drive);
+        let begun = |drive: &DriveIndex| self.begun_stops.iter().any(|stop| stop.drive == *drive);
         self.last.iter().any(begun) || self.waiting.iter().any(|c| c.is_stop() && self.is_last(c))
     }
 

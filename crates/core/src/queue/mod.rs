@@ -12,6 +12,7 @@ mod stops;
 pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background};
 use handover::PresentQueue;
 pub use shared::CommandQueue;
+use stops::BegunStop;
 pub use stops::{NotStopped, Stopping};
 
 use std::collections::{BTreeMap, VecDeque};
@@ -49,8 +50,8 @@ pub struct Pending {
     ending: bool,
     /// Drives that no bus serves after this one: their stops are sent before this bus ends.
     last: Vec<DriveIndex>,
-    /// Drives whose stop was taken for sending, until the bus reports its end.
-    begun_stops: Vec<DriveIndex>,
+    /// Stops that were taken for sending, until the bus reports their end.
+    begun_stops: Vec<BegunStop>,
     /// The drives whose stops another queue took over.
     heirs: BTreeMap<DriveIndex, PresentQueue>,
     /// For each drive that was taken over from an earlier queue: how that queue finds the drive.
@@ -373,9 +374,7 @@ impl Pending {
     pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
         let index = self.waiting.iter().position(|c| c.intent.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
-        if command.is_stop() {
-            self.begun_stops.extend(command.drive());
-        }
+        self.begun_stops.extend(BegunStop::of(&command));
         for older in self.waiting.iter_mut().take(index) {
             if older.urgency() >= command.urgency() {
                 older.overtaken += 1;

@@ -109,26 +109,37 @@ impl CommandQueue {
     /// Ends everything that waits, and everything submitted from now on, with `outcome`.
     pub fn close(&self, outcome: Outcome, now: Instant) {
         self.background().close(&outcome, now);
+        self.lock().close(outcome, now);
+    }
+
+    /// Closes the queue for the end of the gateway, unless a client's stop waits or is in progress: an accepted stop is
+    /// sent. Returns whether the queue is closed.
+    pub fn close_after_stops(&self, now: Instant) -> bool {
         let mut pending = self.lock();
-        // A lost port does not matter to stops that another bus will send.
-        let keeps_stops = pending.ending && outcome == Outcome::BusDown;
-        pending.remove(now, &outcome, |c| !keeps_stops || !c.is_stop());
-        pending.ending = keeps_stops;
-        pending.begun_stops.clear();
-        pending.closed = Some(outcome);
+        let is_free = !pending.has_client_stops();
+        if is_free {
+            pending.close(Outcome::ShuttingDown, now);
+        }
+        is_free
+    }
+
+    /// Accepts only stops from now on, and ends all other waiting commands. Stops are not delayed any more.
+    pub fn accept_only_stops(&self, now: Instant) {
+        self.background().close(&Outcome::ShuttingDown, now);
+        let mut pending = self.lock();
+        pending.remove(now, &Outcome::ShuttingDown, |c| !c.ends_the_gateway());
+        pending.waiting.iter_mut().for_each(Command::end_delay);
+        pending.stops_only = true;
+        drop(pending);
+        self.wake();
     }
 
     /// Prepares for the end of the gateway: from now on only stops are accepted, and all other waiting commands
     /// end. The bus stops its drives until `deadline`, and reports those that were not stopped.
     pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
         let (report, missing) = oneshot::channel();
-        self.background().close(&Outcome::ShuttingDown, now);
-        let mut pending = self.lock();
-        pending.remove(now, &Outcome::ShuttingDown, |c| !c.is_stop());
-        pending.waiting.iter_mut().for_each(Command::end_delay);
-        pending.stops_only = true;
-        pending.stopping = Some(Stopping { deadline, report });
-        drop(pending);
+        self.accept_only_stops(now);
+        self.lock().stopping = Some(Stopping { deadline, report });
         self.wake();
         missing
     }
@@ -195,5 +206,16 @@ impl CommandQueue {
         // The flag is set under the lock, so that a drill that starts at this moment is not missed.
         self.has_quiet.store(quiet.is_some(), Ordering::Release);
         quiet
+    }
+}
+
+impl Pending {
+    fn close(&mut self, outcome: Outcome, now: Instant) {
+        // A lost port does not matter to stops that another bus will send.
+        let keeps_stops = self.ending && outcome == Outcome::BusDown;
+        self.remove(now, &outcome, |c| !keeps_stops || !c.is_stop());
+        self.ending = keeps_stops;
+        self.begun_stops.clear();
+        self.closed = Some(outcome);
     }
 }

@@ -44,11 +44,30 @@ impl Stopping {
     }
 }
 
+/// A stop that was taken for sending.
+#[derive(Debug)]
+pub(super) struct BegunStop {
+    pub(super) drive: DriveIndex,
+    /// Whether a client waits for the stop.
+    is_of_client: bool,
+}
+
+impl BegunStop {
+    /// The entry for a command that is taken for sending, if it is the stop of a drive.
+    pub(super) fn of(command: &Command) -> Option<BegunStop> {
+        let drive = command.drive().filter(|_| command.is_stop())?;
+        let is_of_client = command.client_waits_until().is_some();
+        Some(BegunStop { drive, is_of_client })
+    }
+}
+
 impl Pending {
     /// Delays a stop within `min_run`, and a stop that a cyclic client only repeats: a repetition is not a second stop.
     pub(super) fn delay(&self, command: &mut Command) {
         let is_usual = matches!(&command.work, Work::Stop(stop) if stop.haste == Haste::Usual);
-        let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command)) && !self.is_last(command);
+        let delays = is_usual && (self.gate.may_be_delayed(command) || self.repeats(command));
+        // What ends before the delay does would lose the stop.
+        let delays = delays && !self.is_last(command) && !self.stops_only;
         if let Work::Stop(stop) = &mut command.work
             && delays
         {
@@ -76,7 +95,13 @@ impl Pending {
 
     /// Notes that the stops taken for sending have ended, except those of the drives that are still `stopping`.
     pub fn settle_stops(&mut self, stopping: impl Fn(DriveIndex) -> bool) {
-        self.begun_stops.retain(|drive| stopping(*drive));
+        self.begun_stops.retain(|stop| stopping(stop.drive));
+    }
+
+    /// Whether a client's stop waits, or was taken for sending and has not ended.
+    pub(super) fn has_client_stops(&self) -> bool {
+        let waits = |c: &Command| c.is_stop() && c.client_waits_until().is_some();
+        self.begun_stops.iter().any(|stop| stop.is_of_client) || self.waiting.iter().any(waits)
     }
 
     /// At most one bare stop and one stop that also does more wait for each drive. Later ones join an equal one and

@@ -382,6 +382,35 @@ fn before_the_end_only_stops_get_in() {
     assert_eq!(missing.try_recv(), Ok(vec![one]));
 }
 
+/// The end of the gateway waits for stops of clients that wait or are begun, not for those of the gateway itself.
+#[test]
+fn the_queue_does_not_close_at_the_end_before_the_stops_of_clients_are_done() {
+    let queue = CommandQueue::new().unwrap();
+    let mut rig = Clients::new();
+    let closes = |rig: &mut Clients| {
+        std::mem::swap(&mut *queue.lock(), &mut rig.pending);
+        let closed = queue.close_after_stops(rig.now);
+        std::mem::swap(&mut *queue.lock(), &mut rig.pending);
+        closed
+    };
+    let stop = |rig: &mut Clients, kind, drive| rig.give((kind, "t"), drive, Urgency::Stop, points(&[1]), false);
+    let mut own = stop(&mut rig, SourceKind::Shutdown, 1);
+    let mut of_client = stop(&mut rig, SourceKind::Mqtt, 2);
+    assert!(!closes(&mut rig), "the stop waits");
+    let own_begun = rig.take().unwrap();
+    let begun = rig.take().unwrap();
+    assert_eq!(
+        (own_begun.drive(), begun.drive()),
+        (Some(DriveIndex::new(1)), Some(DriveIndex::new(2)))
+    );
+    assert!(!closes(&mut rig), "the stop is begun");
+    rig.pending.settle_stops(|drive| drive == DriveIndex::new(1));
+    assert_eq!((outcome(&mut own), outcome(&mut of_client)), (None, None));
+    assert!(closes(&mut rig), "only the gateway's own stop is left");
+    let mut late = stop(&mut rig, SourceKind::Mqtt, 3);
+    assert_eq!(outcome(&mut late), Some(Outcome::ShuttingDown));
+}
+
 #[test]
 fn expired_commands_are_never_sent_and_a_stop_does_not_expire() {
     let mut rig = Clients::new();
