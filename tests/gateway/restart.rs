@@ -7,8 +7,8 @@ use drivegate_sim::faults::FaultPlan;
 use drivegate_sim::statistics::Direction;
 use drivegate_sim::wire::SimulatedBus;
 
-use crate::support::process::{Running, api, get, mbpoll_read, until, until_ready, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, functions};
+use crate::support::process::{Running, api, get, mbpoll_read, mbpoll_write, until, until_ready, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, drive, functions};
 use crate::support::tools::{run_well, tool};
 
 /// A site with a gateway for `pump-1`; `keys` are further lines of the drive's section.
@@ -297,6 +297,62 @@ fn words(line: &SimulatedBus) -> Vec<u8> {
 fn is_accepted(site: &Site, line: &SimulatedBus) -> bool {
     let (_, buses) = get(site.http, "/api/v1/buses").unwrap();
     !buses.contains("\"queue_depth\":0") || !words(line).is_empty()
+}
+
+/// Waits until the last frame on the line is one of the second drive: a request, unless its last reply came this moment.
+fn until_the_other_is_asked(line: &SimulatedBus) {
+    until("a request to the other drive", || {
+        (line.transcript().last()?.bytes.first() == Some(&2)).then_some(())
+    });
+}
+
+/// The drive whose slow poll is on the line when the gateway ends has a time limit of its own.
+#[test]
+fn a_slow_drive_on_the_line_costs_no_other_drive_its_stop_at_the_end() {
+    let slow = drive("meter-2", 2, "response_timeout = \"5s\"");
+    let line = LINE1.replace("response_timeout = \"2s\"", "response_timeout = \"200ms\"");
+    let site = Site::of(&[
+        &line,
+        &controlled("pump-1", 1, "on_shutdown = \"stop\""),
+        &slow,
+        MODBUS_TCP,
+        HTTP,
+    ]);
+    let line = site.line(&[1, 2]);
+    let mut gateway = site.run_ready();
+    command(&site, 1);
+    site.until_state("pump-1", "running");
+    line.record(100_000);
+    line.set_faults(FaultPlan::new("late:3s=1".parse().unwrap(), 1).only(&[2]));
+    until_the_other_is_asked(&line);
+    gateway.signal("TERM");
+    let status = gateway.ended();
+    assert!(status.success(), "{status}");
+    assert_eq!(words(&line).first(), Some(&0), "the motor runs on");
+    assert!(!gateway.output().contains("its bus is down"), "{}", gateway.output());
+}
+
+/// A reload that removes the drive waits as long.
+#[test]
+fn a_slow_drive_on_the_line_costs_no_removed_drive_its_last_stop() {
+    let slow = drive("meter-2", 2, "response_timeout = \"5s\"");
+    let removed = controlled("pump-1", 1, "");
+    let site = Site::of(&[LINE1, &removed, &slow, MODBUS_TCP, HTTP]);
+    let line = site.line(&[1, 2]);
+    let gateway = site.run_ready();
+    command(&site, 1);
+    site.until_state("pump-1", "running");
+    line.record(100_000);
+    line.set_faults(FaultPlan::new("late:3s=1".parse().unwrap(), 1).only(&[2]));
+    site.change(&removed, "");
+    let stopped = std::thread::scope(|scope| {
+        until_the_other_is_asked(&line);
+        let stop = scope.spawn(|| mbpoll_write(site.modbus, 1, 33_024, &[0]));
+        until("the stop waits", || is_accepted(&site, &line).then_some(()));
+        gateway.reload();
+        stop.join().unwrap()
+    });
+    assert_eq!(words(&line).last(), Some(&0), "the motor runs on: {stopped:?}");
 }
 
 /// A gateway whose `pump-1` runs by an order over MQTT; nothing is configured to stop it with the gateway. `faults` begin

@@ -475,23 +475,22 @@ impl Daemon {
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
-            let stops = settings.shutdown_time();
-            let time = match stops.drives {
-                0 => Duration::ZERO,
-                // The transaction on the line ends before the stops begin.
-                _ => settings.options.response_timeout + stops.unanswered,
-            };
+            let time = settings.shutdown_time().unanswered;
             let missing = task.handle().queue.begin_shutdown(now + time, now);
             async move {
-                // A bus whose port is closed does not report.
+                // A bus whose port is closed does not report, nor one whose line is in use until the end.
                 let missing = tokio::time::timeout(time + STOP_SLACK, missing).await;
                 let missing: Vec<NotStopped> = missing.ok().and_then(Result::ok).unwrap_or_else(|| {
                     let stop = |d: &&DriveSpec| d.on_shutdown == OnShutdown::Stop && d.access == Access::Control;
                     let wanted = settings.drives.iter().filter(stop);
+                    let why = match task.handle().image.is_up() {
+                        true => "did not acknowledge its stop in time",
+                        false => "was not sent its stop command: its bus is down",
+                    };
                     wanted
                         .map(|d| NotStopped {
                             drive: d.name.clone(),
-                            why: "was not sent its stop command: its bus is down".to_string(),
+                            why: why.to_string(),
                         })
                         .collect()
                 });

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::settings::BusSettings;
+use drivegate_bus::longest_transaction;
 use drivegate_bus::stop_of_line::{BROADCAST_PAUSE, stop_of_line};
 use drivegate_core::process_image::{Access, DriveSpec, OnShutdown, Timing};
 use drivegate_model::document::Finding;
@@ -15,14 +16,15 @@ pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
 /// The part of the stop time that servers, broker and ports may need.
 pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
-/// How long the stops of one bus take, one after another, from the end of the current transaction.
+/// How long the stops of one bus take, one after another.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ShutdownTime {
     /// Number of drives to stop.
     pub drives: usize,
-    /// Time if every drive answers, after its turnaround.
+    /// Time if every drive answers, after its turnaround, from the end of the current transaction.
     pub answered: Duration,
-    /// Time if no drive answers: each try takes `response_timeout` and the time on the wire.
+    /// Time if no drive answers: each try takes `response_timeout` and the time on the wire. The transaction on the line,
+    /// which may be one of a slower drive, ends before.
     pub unanswered: Duration,
 }
 
@@ -78,6 +80,9 @@ impl BusSettings {
             time.drives += 1;
             time.answered += reading(drive.turnaround) + exchange(&write, drive.turnaround);
             time.unanswered += reading(timeout) + exchange(&write, timeout).saturating_mul(tries);
+        }
+        if time.drives > 0 {
+            time.unanswered += longest_transaction(&self.spec, &self.options, self.drives.iter());
         }
         time
     }

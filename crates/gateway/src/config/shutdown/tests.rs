@@ -24,7 +24,10 @@ fn near(time: Duration, milliseconds: f64) {
     );
 }
 
-/// 9600 8N1, 1.0417 ms a character: reading the word takes 8 + 3.5 + 7 + 3.5 characters, writing it 8 + 3.5 + 8 + 3.5.
+/// The longest transaction at 9600 8N1, 1.0417 ms a character: 8 + 3.5 + 255 + 3.5 characters for 125 registers.
+const LONGEST: f64 = 270.0 * 1.0417 + 100.0;
+
+/// Reading the word takes 8 + 3.5 + 7 + 3.5 characters, writing it 8 + 3.5 + 8 + 3.5.
 #[test]
 fn a_stop_by_hand() {
     let time = bus("retries = 2", "vacon-nx", 3).shutdown_time();
@@ -32,7 +35,23 @@ fn a_stop_by_hand() {
     near(time.answered, 2.0 * (22.0 * 1.0417 + 2.0 + 23.0 * 1.0417 + 2.0));
     near(
         time.unanswered,
-        2.0 * (22.0 * 1.0417 + 100.0 + 3.0 * (23.0 * 1.0417 + 100.0)),
+        LONGEST + 2.0 * (22.0 * 1.0417 + 100.0 + 3.0 * (23.0 * 1.0417 + 100.0)),
+    );
+}
+
+/// The poll of a slow drive, which is not stopped, may be on the line when the gateway ends.
+#[test]
+fn the_transaction_on_the_line_is_that_of_the_slowest_drive() {
+    let mut bus = bus("", "vacon-cx", 2);
+    let stop = 2.0 * (23.0 * 1.0417 + 100.0);
+    near(bus.shutdown_time().unanswered, LONGEST + stop);
+    bus.drives[1].timing.response_timeout = Some(Duration::from_secs(2));
+    near(bus.shutdown_time().unanswered, LONGEST + 1900.0 + stop);
+    // 50 ms before the request, and beyond the silence of the line after the reply.
+    bus.drives[1].timing.silence = Some(Duration::from_millis(50));
+    near(
+        bus.shutdown_time().unanswered,
+        LONGEST + 1900.0 + 2.0 * (50.0 - 3.5 * 1.0417) + stop,
     );
 }
 
@@ -41,7 +60,7 @@ fn a_stop_by_hand() {
 fn a_coil_is_written_at_once() {
     let time = bus("", "vacon-cx", 1).shutdown_time();
     near(time.answered, 23.0 * 1.0417 + 2.0);
-    near(time.unanswered, 2.0 * (23.0 * 1.0417 + 100.0));
+    near(time.unanswered, LONGEST + 2.0 * (23.0 * 1.0417 + 100.0));
 }
 
 #[test]
