@@ -113,6 +113,7 @@ pub struct Daemon {
     driller: JoinHandle<()>,
     drills: drills::DrillsFile,
     reservations: ReservationsFile,
+    saver: reservations::Saver,
     pulse: BusHeartbeats,
     /// Receiver of reload requests, and the file that the gateway runs with.
     control: Option<Control>,
@@ -148,8 +149,8 @@ impl Daemon {
             tokio::spawn(Watch::of_this_thread().run(events.clone())),
             report_refusals(shared.clone()),
             stop_all(shared.clone(), north.stop_all.clone()),
-            reservations::keep(shared.clone(), reservations.clone(), north.awaited.clone()),
         ];
+        let saver = reservations::Saver::start(shared.clone(), reservations.clone(), north.awaited.clone());
         let mut daemon = Daemon {
             plant: shared.clone(),
             settings: settings.clone(),
@@ -171,6 +172,7 @@ impl Daemon {
             driller: drills::watch(shared, north.drills.clone(), drills_file.clone()),
             drills: drills_file,
             reservations,
+            saver,
             pulse: BusHeartbeats::default(),
             control,
         };
@@ -452,6 +454,8 @@ impl Daemon {
             }
         })
         .await;
+        // No stop is accepted any more, so these are the last reservations.
+        within(STOP_AUDIT, "the file of reservations", self.saver.end()).await;
         self.tasks.iter().chain(&self.reader).for_each(JoinHandle::abort);
         // Refusals that are held back are reported now, even those that are due later.
         self.plant
