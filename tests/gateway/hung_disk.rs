@@ -120,6 +120,28 @@ fn a_disk_that_hangs_holds_up_neither_start_nor_reload_nor_stop() {
     lives_with(&FILES);
 }
 
+/// A path that is a link to itself cannot be read, by nobody.
+#[test]
+fn a_drive_is_commanded_as_soon_as_the_disk_returns_its_journal() {
+    for unreadable in ["params", "params/fan-2/restore.journal"] {
+        let site = site();
+        let path = site.file("state").join(unreadable);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::os::unix::fs::symlink(&path, &path).unwrap();
+        let _line = site.line(&[1, 2]);
+        let gateway = site.run_ready();
+        let refused = start(&site, "fan-2");
+        assert_eq!(refused["result"], "not_allowed", "{unreadable}: {refused}");
+        let why = refused["error"]["message"].as_str().unwrap_or_default();
+        assert!(why.contains("until its journal is read"), "{unreadable}: {why}");
+        std::fs::remove_file(&path).unwrap();
+        until("the drive is free", || {
+            (start(&site, "fan-2")["ok"] == true).then_some(())
+        });
+        gateway.until_printed("the journals of restores are read");
+    }
+}
+
 /// The gateway was ended while a stop of Alice reserved `pump-1`; the disk returns that only later.
 #[test]
 fn a_reservation_holds_from_the_start_on_however_late_the_disk_returns_it() {

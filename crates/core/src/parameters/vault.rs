@@ -84,8 +84,10 @@ struct State {
     numbered: u64,
     restores: BTreeMap<Machine, RestoreStatus>,
     restore_locks: BTreeMap<Machine, Arc<RestoreLock>>,
-    /// Machines whose journal was searched for.
+    /// Machines for which it is known whether they have a journal.
     looked_for: BTreeSet<Machine>,
+    /// Number of the last search for journals.
+    searches: u64,
     /// Journals without a drive that an event has reported.
     orphans: BTreeSet<PathBuf>,
     readings: BTreeMap<Machine, Status>,
@@ -220,9 +222,26 @@ impl Vault {
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
     }
 
-    /// Whether no journal of this machine was searched for yet; marks the machine as searched.
+    /// Whether it is not known yet if this machine has a journal.
     pub fn is_new(&self, drive: &Machine) -> bool {
-        self.lock().looked_for.insert(drive.clone())
+        !self.lock().looked_for.contains(drive)
+    }
+
+    /// Notes that the search for a journal of this machine is over.
+    pub fn looked_for(&self, drive: &Machine) {
+        self.lock().looked_for.insert(drive.clone());
+    }
+
+    /// Begins a search for journals, which replaces an earlier one that goes on; returns its number.
+    pub fn begin_search(&self) -> u64 {
+        let mut state = self.lock();
+        state.searches += 1;
+        state.searches
+    }
+
+    /// Whether no later search for journals has begun.
+    pub fn is_last_search(&self, number: u64) -> bool {
+        self.lock().searches == number
     }
 
     /// Sets the journals without a drive. Returns the new ones.

@@ -5,9 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
 
+use tokio::sync::oneshot;
+use tokio::task::spawn_blocking;
+
 use super::restore::blocking;
-use crate::patience::Patience;
+use crate::patience::{Patience, late};
 use drivegate_core::event::{Event, EventKind, Events};
+use drivegate_core::files::state::AGAIN;
 use drivegate_core::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
 use drivegate_core::plant::{DriveHandle, SharedPlant};
 use drivegate_core::process_image::{Access, BusSpec, DriveSpec, Machine};
@@ -181,88 +185,162 @@ pub(super) fn unfinished_event(bus: &str, drive: Option<&str>, text: String) -> 
 struct Configured {
     machine: Machine,
     spec: DriveSpec,
-    /// Whether the journal of the drive was not searched for yet.
-    is_new: bool,
 }
 
 /// Locks the drives with a journal of an interrupted restore before any client can command them, and reports
 /// journals that belong to no drive. Each machine is checked once, and stays locked until the check is done,
-/// however slow the disk is.
+/// however slow the disk is: while it refuses, it is asked again.
 pub async fn hold_unfinished<'a>(
     vault: &Arc<Vault>,
     events: &Events,
     patience: &Patience,
     drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,
 ) {
-    let configured = |(bus, spec): (&BusSpec, &DriveSpec)| {
-        let machine = bus.machine(spec);
-        Configured {
-            is_new: vault.is_new(&machine),
-            spec: spec.clone(),
-            machine,
-        }
+    let configured = |(bus, spec): (&BusSpec, &DriveSpec)| Configured {
+        machine: bus.machine(spec),
+        spec: spec.clone(),
     };
     let drives = drives.filter(|(_, spec)| spec.access != Access::Listen);
-    let drives: Vec<Configured> = drives.map(configured).collect();
+    let search = Search {
+        number: vault.begin_search(),
+        vault: vault.clone(),
+        events: events.clone(),
+        drives: drives.map(configured).collect(),
+    };
     let Some(store) = vault.store() else { return };
-    for drive in drives.iter().filter(|drive| drive.is_new) {
-        vault.restore_lock(&drive.machine).set(Some(format!(
-            "a restore of the parameters of `{}` may have been interrupted; until its journal is read, the drive \
-             accepts only stops",
-            drive.spec.name
-        )));
+    let mut locks_some = false;
+    for drive in search.new_drives() {
+        vault.restore_lock(&drive.machine).set(Some(not_read(&drive.spec.name)));
+        locks_some = true;
     }
-    let locks_some = drives.iter().any(|drive| drive.is_new);
-    let (vault, events) = (vault.clone(), events.clone());
-    let looked = patience.read(move || check_unfinished(&vault, &events, store.dir(), &drives));
-    if let Err(why) = looked.await {
+    let (done, looked) = oneshot::channel();
+    spawn_blocking(move || {
+        search.insist(store.dir(), || !done.is_closed());
+        // The receiver may have ended meanwhile.
+        done.send(())
+    });
+    if patience.wait(looked).await.is_none() {
         let meanwhile = if locks_some {
             "; the drives that are new accept only stops until they are read"
         } else {
             ""
         };
         tracing::warn!(
-            target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {why}{meanwhile}; check \
-                                                         the disk of state_dir"
+            target: "drivegate::north::parameter_jobs", "cannot look for journals of restores: {}{meanwhile}; check \
+                                                         the disk of state_dir", late()
         );
     }
 }
 
-fn check_unfinished(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
-    let journals = match found(params) {
-        Ok(journals) => journals,
-        Err(error) => {
-            for drive in drives.iter().filter(|drive| drive.is_new) {
-                let name = &drive.spec.name;
-                let why = format!("cannot look for journals of restores in {}: {error}", params.display());
-                hold(vault, events, drive, held_unfinished(name, &why));
+/// A search for the journals of these drives.
+struct Search {
+    number: u64,
+    vault: Arc<Vault>,
+    events: Events,
+    drives: Vec<Configured>,
+}
+
+impl Search {
+    /// The drives that are locked because their journal was not read yet.
+    fn new_drives(&self) -> impl Iterator<Item = &Configured> {
+        self.drives.iter().filter(|drive| self.vault.is_new(&drive.machine))
+    }
+
+    /// Looks for journals, and again while the disk refuses, as long as `goes_on` and no later search has begun.
+    fn insist(&self, params: &Path, goes_on: impl Fn() -> bool) {
+        let mut failing = false;
+        while let Err(why) = self.look(params) {
+            if !std::mem::replace(&mut failing, true) {
+                tracing::error!(
+                    target: "drivegate::north::parameter_jobs",
+                    "cannot read the journals of restores: {why}; retrying; check the disk of state_dir"
+                );
+                for drive in self.new_drives() {
+                    let text = format!("{} ({why})", not_read(&drive.spec.name));
+                    hold(&self.vault, &self.events, drive, text);
+                }
             }
-            return;
+            std::thread::sleep(AGAIN);
+            if !goes_on() || !self.vault.is_last_search(self.number) {
+                return;
+            }
         }
-    };
-    let others = vault.others();
-    let others = others.iter().map(|(machine, name)| (machine.clone(), name.as_str()));
-    let named: Vec<(Machine, &str)> = drives
-        .iter()
-        .map(|drive| (drive.machine.clone(), drive.spec.name.as_str()))
-        .chain(others)
-        .collect();
-    let claims = claims(&journals, &named);
-    for (drive, claim) in drives.iter().zip(claims.drives).filter(|(drive, _)| drive.is_new) {
-        let claimed = claim.and_then(|(journal, claim)| Some((journals.get(journal)?, claim)));
-        match claimed {
-            Some((journal, claim)) => hold(vault, events, drive, why_held(&drive.spec, journal, claim)),
-            None => vault.restore_lock(&drive.machine).set(None),
+        if failing {
+            tracing::warn!(target: "drivegate::north::parameter_jobs", "the journals of restores are read");
         }
     }
-    let orphans = claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan));
-    let orphans: Vec<_> = orphans.map(orphaned).collect();
-    let news = vault.new_orphans(orphans.iter().map(|(path, ..)| path.clone()).collect());
-    for (path, what, remedy) in orphans.into_iter().filter(|(path, ..)| news.contains(path)) {
-        let text = format!("{what}; {}; {remedy}", path.display());
-        tracing::error!(target: "drivegate::north::parameter_jobs", "{text}");
-        events.publish(unfinished_event("", None, text));
+
+    /// Locks each new drive that a journal concerns, and frees the others.
+    ///
+    /// # Errors
+    /// If the disk does not return all journals; contains the reason. The drives that an unread one concerns stay new.
+    fn look(&self, params: &Path) -> Result<(), String> {
+        let Search { vault, events, .. } = self;
+        let journals = found(params).map_err(|error| format!("{}: {error}", params.display()))?;
+        let unread: Vec<Option<String>> = journals.iter().map(|(file, _)| error_of(file)).collect();
+        if !vault.is_last_search(self.number) {
+            return Ok(());
+        }
+        let others = vault.others();
+        let others = others.iter().map(|(machine, name)| (machine.clone(), name.as_str()));
+        let named: Vec<(Machine, &str)> = self
+            .drives
+            .iter()
+            .map(|drive| (drive.machine.clone(), drive.spec.name.as_str()))
+            .chain(others)
+            .collect();
+        let claims = claims(&journals, &named);
+        let claimed = self.drives.iter().zip(claims.drives);
+        for (drive, claim) in claimed.filter(|(drive, _)| vault.is_new(&drive.machine)) {
+            if claim.is_some_and(|(journal, _)| unread.get(journal).is_some_and(Option::is_some)) {
+                continue;
+            }
+            vault.looked_for(&drive.machine);
+            if vault
+                .restore(&drive.machine)
+                .is_some_and(|restore| restore.is_in_progress())
+            {
+                // A restore that was resumed meanwhile has locked the drive, and frees it.
+                continue;
+            }
+            let claimed = claim.and_then(|(journal, claim)| Some((journals.get(journal)?, claim)));
+            match claimed {
+                Some((journal, claim)) => hold(vault, events, drive, why_held(&drive.spec, journal, claim)),
+                None => vault.restore_lock(&drive.machine).set(None),
+            }
+        }
+        self.report_orphans(claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan)));
+        match unread.into_iter().flatten().next() {
+            Some(why) => Err(why),
+            None => Ok(()),
+        }
     }
+
+    /// Reports the journals that belong to no drive, each once.
+    fn report_orphans<'f>(&self, orphans: impl Iterator<Item = &'f Found>) {
+        let orphans: Vec<_> = orphans.map(orphaned).collect();
+        let news = self
+            .vault
+            .new_orphans(orphans.iter().map(|(path, ..)| path.clone()).collect());
+        for (path, what, remedy) in orphans.into_iter().filter(|(path, ..)| news.contains(path)) {
+            let text = format!("{what}; {}; {remedy}", path.display());
+            tracing::error!(target: "drivegate::north::parameter_jobs", "{text}");
+            self.events.publish(unfinished_event("", None, text));
+        }
+    }
+}
+
+/// Why the disk does not return a journal; `None` if it does.
+fn error_of(file: &JournalFile) -> Option<String> {
+    let error = file.read().err()?;
+    Some(format!("{}: {error}", file.path().display()))
+}
+
+/// Text of the reason why a drive is locked whose journal was not read yet.
+fn not_read(name: &str) -> String {
+    format!(
+        "a restore of the parameters of `{name}` may have been interrupted; until its journal is read, the drive accepts only stops"
+    )
 }
 
 fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
