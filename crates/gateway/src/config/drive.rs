@@ -114,6 +114,9 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         }),
         _ => None,
     };
+    if let Some(spec) = &spec {
+        supervision::check_limits(reader, spec);
+    }
     Found {
         name,
         address: address.map(|a| (a, DRIVE.address.place(reader))),

@@ -1,10 +1,14 @@
 //! `supervision` of a drive: how long its lease lasts and what happens at its end, checked against the drive's profile.
 
+use std::time::{Duration, Instant};
+
 use super::drive::Limits;
 use super::keys::{ACTIONS, DRIVE, REFERENCE, SUPERVISION};
-use drivegate_core::process_image::{LeaseAction, Supervision};
+use drivegate_core::order::{Authority, Order, Refusal};
+use drivegate_core::permit::admit;
+use drivegate_core::process_image::{DriveImage, DriveSpec, LeaseAction, Supervision};
 use drivegate_model::document::{Finding, Raw as Node, Reader};
-use drivegate_model::drive::{ModelPoint, Plan, Profile};
+use drivegate_model::drive::{ModelPoint, Plan, PointIndex, Profile, Source, Value};
 
 pub(super) fn read(reader: &Reader<'_>, profile: Option<&Profile>, limits: &Limits) -> Option<Supervision> {
     if let Some(Node::Integer(_) | Node::Float(_) | Node::Text(_)) =
@@ -97,4 +101,63 @@ fn check_action(action: &LeaseAction, profile: &Profile, limits: &Limits) -> Res
         )),
         None => Ok(()),
     }
+}
+
+/// Reports an action that the limits of a reference in another unit refuse: the motor would keep its speed when the lease
+/// expires. The action is judged as when it is due, for a drive of which nothing was read.
+pub(super) fn check_limits(reader: &Reader<'_>, spec: &DriveSpec) {
+    let Some(Supervision {
+        action: LeaseAction::SpeedReference(reference),
+        ..
+    }) = spec.supervision
+    else {
+        return;
+    };
+    let profile = &spec.profile;
+    let Some(speed) = profile.model_index(ModelPoint::SpeedReference) else {
+        return;
+    };
+    let mut others = profile.points.enumerate().filter(|(index, _)| *index != speed);
+    let is_limited = others.any(|(index, point)| {
+        spec.limits.contains_key(&point.name) && written_for(profile, index) == written_for(profile, speed)
+    });
+    if !is_limited {
+        return;
+    }
+    let image = DriveImage::new(spec.clone(), Duration::ZERO);
+    let drive = image.reading(Instant::now(), Duration::ZERO);
+    let order = Order::Points(vec![(speed, Value::Number(reference))]);
+    match admit(order, &drive, Authority::Write) {
+        Err(Refusal::BadValue(why)) => reader.problem(
+            DRIVE.supervision.name,
+            format!(
+                "the limits refuse the action speed_reference = {reference}: {}",
+                why.trim_end_matches("; nothing was written")
+            ),
+            "change the action or the limits",
+        ),
+        Err(Refusal::NotKnown(_)) => reader.warning(
+            DRIVE.supervision.name,
+            format!(
+                "the limits may refuse the action speed_reference = {reference}, and the motor would keep its speed: that depends \
+                 on the frequency range of the drive"
+            ),
+            "set frequency_range for the drive, or limit speed_reference instead",
+        ),
+        _ => {}
+    }
+}
+
+/// The point whose register is written for a command to this one.
+fn written_for(profile: &Profile, point: PointIndex) -> PointIndex {
+    let next = |index: &PointIndex| {
+        let point = profile.points.get(*index)?;
+        match &point.source {
+            _ if point.write_to.is_some() => point.write_to,
+            Source::Derived(derived) => derived.band().map(|(of, ..)| of),
+            Source::Raw(_) => None,
+        }
+    };
+    let chain = std::iter::successors(Some(point), next);
+    chain.take(profile.points.len()).last().unwrap_or(point)
 }

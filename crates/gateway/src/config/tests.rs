@@ -398,6 +398,45 @@ fn every_family_can_be_supervised() {
     }
 }
 
+/// An action in percent keeps the limits in Hz: 10 % of 0 to 50 Hz are 5 Hz.
+#[test]
+fn an_action_that_the_limits_of_another_unit_refuse_is_reported() {
+    let (nx, teco) = (("vacon-nx", "modbus-rtu"), ("teco-7300pa", "modbus-ascii"));
+    let (error, warning) = ((1, 0), (0, 1));
+    let band = "frequency_range = [0, 50]";
+    for ((family, protocol), limits, band, action, found) in [
+        (nx, "frequency_reference = [20, 50]", band, 10.0, error),
+        (nx, "frequency_reference = [20, 50]", band, 60.0, (0, 0)),
+        (nx, "frequency_reference = [20, 50]", "", 10.0, warning),
+        (nx, "speed_reference = [0, 50]", "", 10.0, (0, 0)),
+        (teco, "frequency_reference = [0, 40]", band, 90.0, error),
+        (teco, "frequency_command = [0, 40]", band, 90.0, error),
+        (teco, "frequency_reference = [0, 40]", band, 60.0, (0, 0)),
+        (teco, "frequency_reference = [0, 40]", "", 90.0, warning),
+        (teco, "speed_reference = [0, 50]", "", 10.0, (0, 0)),
+    ] {
+        let source = format!(
+            "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/null\"\nprotocol = \"{protocol}\"\n\
+             [[bus.drive]]\nname = \"d\"\naddress = 1\nprofile = \"{family}\"\naccess = \"control\"\n{band}\n\
+             limits = {{ {limits} }}\nsupervision = {{ timeout = \"5s\", action = {{ speed_reference = {action:.1} }} }}\n"
+        );
+        let (loaded, _) = load(&source);
+        let of = |problems: &[Problem]| {
+            let mut texts = problems.iter().map(ToString::to_string).collect::<Vec<_>>();
+            texts.retain(|text| text.contains("refuse the action"));
+            texts
+        };
+        let (errors, warnings) = (of(&loaded.errors), of(&loaded.warnings));
+        assert_eq!((errors.len(), warnings.len()), found, "{source}{errors:?}{warnings:?}");
+        assert!(
+            errors
+                .iter()
+                .chain(&warnings)
+                .all(|text| text.contains("bus[0].drive[0].supervision"))
+        );
+    }
+}
+
 #[test]
 fn the_recorder_keeps_its_files_in_the_state_directory() {
     let all = settings(&FULL.replace("name = \"g\"", "name = \"g\"\nstate_dir = \"state\""));
