@@ -49,5 +49,6 @@ mod gateway {
     mod trace;
     mod trying;
     mod user_profiles;
+    mod without_gateway;
     mod wrong_protocol;
 }

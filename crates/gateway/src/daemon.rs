@@ -5,6 +5,7 @@ pub mod drills;
 mod file_limit;
 mod keepers;
 mod leases;
+mod obeyed_files;
 mod pulse;
 mod reservations;
 mod rights;

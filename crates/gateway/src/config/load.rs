@@ -6,7 +6,7 @@ use std::path::Path;
 use super::gateway::{self, Gateway};
 use super::keys::ROOT;
 use super::params::ParamsSettings;
-use super::settings::{BusSettings, ENVIRONMENT, Settings, Unusable};
+use super::settings::{BusSettings, ENVIRONMENT, Settings, StateFiles, Unusable};
 use super::together::{Clients, judge};
 use super::{
     authority, bacnet, bus, drill, http, interlocks, log, modbus_tcp, mqtt, params, recordings, stale, unused_profiles,
@@ -226,7 +226,7 @@ fn read(reader: &Reader<'_>, base: &Path, of_profiles: &mut OfProfiles) -> Optio
         socket,
         params: params.unwrap_or_else(|| ParamsSettings::below(&state_dir)),
         state_dir,
-        keeps_history: true,
+        state_files: StateFiles::Owned,
         recordings: recordings?,
         profile_dirs,
         profiles,

@@ -44,7 +44,7 @@ pub use log::LogSettings;
 pub use named_files::{FileKind, NamedFile, named_files};
 pub use params::ParamsSettings;
 pub use port::check as check_port;
-pub use settings::{BusSettings, Settings};
+pub use settings::{BusSettings, Settings, StateFiles, WithoutGateway};
 pub use stale::StaleAfter;
 
 #[cfg(test)]

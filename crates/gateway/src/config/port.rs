@@ -45,7 +45,16 @@ pub fn check(text: &str, base: &Path) -> Result<String, Finding> {
                  \"modbus-tcp://{text}\"?"
             ),
         )),
-        None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
+        None => {
+            let path = values::resolved(base, PathBuf::from(text));
+            // What is kept about the machine at this port is found again wherever the next process is started.
+            let whole = if path.is_absolute() {
+                Ok(path.clone())
+            } else {
+                std::path::absolute(&path)
+            };
+            Ok(whole.unwrap_or(path).display().to_string())
+        }
     }
 }
 
@@ -174,5 +183,8 @@ mod tests {
         ] {
             assert!(check(bad, base).is_err(), "{bad}");
         }
+        assert_eq!(check("line1", base).unwrap(), "/etc/drivegate/line1");
+        let here = std::env::current_dir().unwrap().join("line1");
+        assert_eq!(check("line1", Path::new("")).unwrap(), here.display().to_string());
     }
 }

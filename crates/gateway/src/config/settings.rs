@@ -30,9 +30,8 @@ pub struct Settings {
     pub socket: SocketPath,
     /// Directory for stored data.
     pub state_dir: PathBuf,
-    /// Whether events and counters are saved in the state directory: always true as configured, false for commands
-    /// that run only a part of a gateway.
-    pub keeps_history: bool,
+    /// How this process uses the files of that directory: as configured, [`StateFiles::Owned`].
+    pub state_files: StateFiles,
     /// The settings of the recorder.
     pub recordings: RecorderOptions,
     /// How parameters are read and kept.
@@ -71,6 +70,25 @@ impl Settings {
         let buses = self.buses.iter();
         buses.flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)))
     }
+}
+
+/// How a process uses the files of the state directory.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StateFiles {
+    /// The gateway reads and writes them.
+    Owned,
+    /// A command without a gateway obeys what they forbid, and changes only those of its own actions: the audit file and
+    /// readings of parameters.
+    Obeyed(Box<WithoutGateway>),
+    /// A trial neither reads nor writes them.
+    Unused,
+}
+
+/// The rest of the configuration, for a command that runs one drive of it without a gateway.
+#[derive(Debug, Clone, PartialEq)]
+pub struct WithoutGateway {
+    /// Options of BACnet, whose kept priorities bind the command although it serves no BACnet.
+    pub bacnet: Option<bacnet_server::Options>,
 }
 
 /// A bus with the drives on it.

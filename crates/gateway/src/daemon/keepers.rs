@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::server::within;
 use super::{Daemon, STOP_AUDIT, StartError, drills, reservations};
-use crate::config::Settings;
+use crate::config::{Settings, StateFiles};
 use drivegate_core::files::names::STARTS;
 use drivegate_core::files::{Keeper, State as _};
 use drivegate_core::history::{self, RecorderTask};
@@ -75,7 +75,7 @@ impl Daemon {
     /// without this.
     pub(super) async fn apply_keeper(&mut self, settings: &Settings) {
         let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
-        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
+        if settings.state_files != StateFiles::Owned || self.keeper.as_ref().is_some_and(same) {
             return;
         }
         let first = self.keeper.is_none();
@@ -106,7 +106,7 @@ impl Daemon {
         let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
         let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
         let none = !drives.any(|drive| drive.guard.is_some());
-        if none || !settings.keeps_history || self.starts.as_ref().is_some_and(same) {
+        if none || settings.state_files != StateFiles::Owned || self.starts.as_ref().is_some_and(same) {
             return;
         }
         self.stop_starts().await;
@@ -138,7 +138,7 @@ impl Daemon {
 
     /// Saves reservations on disk if a state directory is configured.
     pub(super) fn apply_reservations(&self, settings: &Settings) {
-        let kept = settings.keeps_history && settings.authority.is_some();
+        let kept = settings.state_files == StateFiles::Owned && settings.authority.is_some();
         let dir = kept.then_some(settings.state_dir.as_path());
         reservations::keep_in(&self.reservations, dir);
     }
@@ -164,7 +164,7 @@ impl Daemon {
     /// Applies the configured drills, which are saved on disk if a state directory is configured.
     pub(super) async fn apply_drills(&self, settings: &Settings) {
         let drills = &self.north.drills;
-        let kept = settings.keeps_history && settings.drill.is_some();
+        let kept = settings.state_files == StateFiles::Owned && settings.drill.is_some();
         let dir = kept.then_some(settings.state_dir.as_path());
         drills::keep_in(&self.drills, dir, &self.north.patience, drills).await;
         drills.set_options(settings.drill);

@@ -3,7 +3,7 @@
 use std::time::SystemTime;
 
 use super::Daemon;
-use crate::config::Settings;
+use crate::config::{Settings, StateFiles};
 use drivegate_http::local;
 use drivegate_north::bacnet;
 
@@ -28,9 +28,15 @@ impl Daemon {
     /// Expects the slots of an earlier run, or discards them if the gateway does not save slots. Must be called before
     /// any interface accepts orders.
     pub(super) async fn expect_kept_slots(&self, settings: &Settings) {
-        match &settings.bacnet {
-            Some(options) if options.keep_priorities => bacnet::expect_kept_slots(&self.north, &options.state_dir),
-            _ => bacnet::discard_kept_slots(&self.north, &settings.state_dir, &self.events).await,
+        match (&settings.state_files, &settings.bacnet) {
+            (StateFiles::Unused, _) => {}
+            (StateFiles::Obeyed(rest), _) => self.obey_files(settings, rest).await,
+            (StateFiles::Owned, Some(options)) if options.keep_priorities => {
+                bacnet::expect_kept_slots(&self.north, &options.state_dir);
+            }
+            (StateFiles::Owned, _) => {
+                bacnet::discard_kept_slots(&self.north, &settings.state_dir, &self.events).await;
+            }
         }
     }
 

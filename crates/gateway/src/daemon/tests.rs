@@ -24,7 +24,7 @@ fn without_adapters(buses: usize) -> Settings {
     let mut settings = loaded.settings.unwrap_or_else(|| panic!("{:?}", loaded.errors));
     settings.socket = local::SocketPath::Off;
     settings.recordings.max_count = 0;
-    settings.keeps_history = false;
+    settings.state_files = crate::config::StateFiles::Unused;
     settings
 }
 

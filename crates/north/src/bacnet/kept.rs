@@ -8,6 +8,7 @@ use std::time::{Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
+use super::Options;
 use super::rights::HostRights;
 use crate::NorthState;
 use crate::patience::DISK;
@@ -17,7 +18,7 @@ use drivegate_core::files::names::BACNET_PRIORITIES;
 use drivegate_core::files::{State, Words};
 use drivegate_core::order::{Commanded, Entry, Origin, SourceKind};
 use drivegate_core::permit::PROTECTING;
-use drivegate_core::plant::{BusHandle, Plant};
+use drivegate_core::plant::{BusHandle, Plant, SharedPlant};
 use drivegate_core::process_image::{Access, Machine};
 use drivegate_model::drive::Value;
 
@@ -141,6 +142,21 @@ pub async fn discard(stats: &NorthState, state_dir: &Path, events: &Events) {
     };
     // On a slow disk the file is discarded after this function returns.
     let _ = stats.patience.read(discard).await;
+}
+
+/// Restores the slots of an earlier run for a command without a gateway, which serves no BACnet: the slots of its drives
+/// refuse starts as in the gateway, and the file stays as it is. While the file cannot be read, no motor is started.
+pub async fn obey(stats: &NorthState, options: &Options, plant: &SharedPlant) {
+    expect(stats, &options.state_dir);
+    let path = options.state_dir.join(BACNET_PRIORITIES);
+    if let Ok(Ok(found)) = stats.patience.read(move || KeptSlots::load(&path)).await {
+        let plant = plant.load();
+        let KeptSlots(mut slots) = found.unwrap_or_default();
+        slots.retain(|slot| plant.drive_at(&slot.machine).is_some());
+        let rights = HostRights::new(options);
+        restore(&plant, &rights, &KeptSlots(slots), Instant::now(), SystemTime::now());
+        stats.awaited.slots.end();
+    }
 }
 
 /// The file of saved slots; the mark is its path with the slots in it, `None` if there is no file.

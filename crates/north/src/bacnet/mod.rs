@@ -30,7 +30,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-pub use self::kept::{discard as discard_kept_slots, expect as expect_kept_slots};
+pub use self::kept::{discard as discard_kept_slots, expect as expect_kept_slots, obey as obey_kept_slots};
 pub use self::loopback::Loopback;
 
 use self::rights::HostRights;

@@ -5,9 +5,10 @@ use std::time::{Duration, Instant};
 
 use super::Configured;
 use crate::client::{Client, Door};
+use drivegate_core::history::RecorderOptions;
 use drivegate_core::plant::DriveHandle;
 use drivegate_core::process_image::{OnShutdown, Reading};
-use drivegate_gateway::config::{BusSettings, ParamsSettings, Settings};
+use drivegate_gateway::config::{BusSettings, ParamsSettings, Settings, StateFiles, WithoutGateway};
 use drivegate_gateway::daemon::Daemon;
 use drivegate_http::InProcess;
 use drivegate_http::local::SocketPath;
@@ -69,6 +70,7 @@ impl Direct {
                 .map(|drive| (bus.spec.machine(drive), drive.name.clone()))
         });
         let params = ParamsSettings {
+            every: None,
             others: all.filter(|(_, other)| *other != name).collect(),
             ..target.settings.params.clone()
         };
@@ -78,12 +80,7 @@ impl Direct {
                 drives: vec![spec],
                 ..bus
             }],
-            socket: SocketPath::Off,
-            keeps_history: false,
-            modbus_tcp: None,
-            mqtt: None,
-            http: None,
-            ..target.settings.clone()
+            ..serving_nobody(&target.settings)
         };
         let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
         let drive = daemon.plant().load().drive(&name);
@@ -174,6 +171,29 @@ impl Direct {
     /// Closes the port and ends the bus.
     pub(super) async fn stop(self) {
         self.daemon.stop().await;
+    }
+}
+
+/// The configuration without servers, drills and recordings: the command is the only client, and what the gateway left
+/// on disk stays for the gateway.
+fn serving_nobody(settings: &Settings) -> Settings {
+    let rest = WithoutGateway {
+        bacnet: settings.bacnet.clone(),
+    };
+    Settings {
+        socket: SocketPath::Off,
+        state_files: StateFiles::Obeyed(Box::new(rest)),
+        recordings: RecorderOptions {
+            max_count: 0,
+            ..settings.recordings.clone()
+        },
+        slots: None,
+        modbus_tcp: None,
+        mqtt: None,
+        http: None,
+        bacnet: None,
+        drill: None,
+        ..settings.clone()
     }
 }
 

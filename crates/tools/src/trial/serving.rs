@@ -11,7 +11,7 @@ use crate::failure::{Failure, Outcome};
 use crate::scan::figure;
 use crate::{EXIT_FAILED, demo, report};
 use drivegate_core::plant::SharedPlant;
-use drivegate_gateway::config::{LogFormat, LogSettings, Settings};
+use drivegate_gateway::config::{LogFormat, LogSettings, Settings, StateFiles};
 use drivegate_gateway::daemon::Daemon;
 use drivegate_http::local::SocketPath;
 use drivegate_model::drive::{ModelPoint, State};
@@ -30,7 +30,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, keyboard: &Keyboard, text: &str, b
     // A trial writes nothing to disk and has no local socket.
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
-    settings.keeps_history = false;
+    settings.state_files = StateFiles::Unused;
     let _log = crate::log::start(&LogSettings {
         level: "error".to_string(),
         format: LogFormat::Auto,
