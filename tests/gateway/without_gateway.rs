@@ -1,4 +1,4 @@
-//! Commands while no gateway runs: they serve nobody, and honour what the gateway left on disk.
+//! Commands while no gateway runs: they serve nobody, honour what the gateway left on disk, and count their starts.
 
 use std::net::{TcpListener, UdpSocket};
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use serde_json::{Value as Json, json};
 
 use super::bacnet::free_udp_port;
 use super::drive_access::{Ran, drivegate};
-use crate::support::process::{free_port, until};
+use crate::support::process::{Running, free_port, until};
 use crate::support::site::{LINE1, Site, controlled};
 
 /// A site whose state directory is `state`.
@@ -144,4 +144,86 @@ fn a_reservation_binds_a_command() {
     refused(&site, &["pump-1", "run=true"], &["alice", "(held_by_other)"]);
     carried_out(&site, &["pump-1", "run=false"]);
     assert_eq!(std::fs::read(&file).unwrap(), bytes);
+}
+
+/// The starts of a machine that are in the file.
+fn counted(site: &Site, address: u8) -> Vec<u64> {
+    let text = std::fs::read_to_string(site.file("state/starts.json")).unwrap_or_default();
+    let saved: Json = serde_json::from_str(&text).unwrap_or_default();
+    let motors = saved["motors"].as_array().cloned().unwrap_or_default();
+    let of_machine = motors.iter().filter(|motor| motor["address"] == address);
+    of_machine
+        .flat_map(|motor| motor["starts"].as_array().unwrap().clone())
+        .map(|at| at.as_u64().unwrap())
+        .collect()
+}
+
+#[test]
+fn starts_without_a_gateway_are_counted_for_it() {
+    let drives = controlled("pump-1", 1, "guard = { starts_per_hour = 2 }") + &controlled("fan-2", 2, "");
+    let site = site(&drives, "");
+    let _line = site.line(&[1, 2]);
+    let now = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap().as_millis();
+    let earlier = u64::try_from(now).unwrap() - 600_000;
+    let other = machine(&site, 9, json!({"starts": [earlier]}));
+    left(&site, "starts.json", &json!({"drivegate_starts": 1, "motors": [other]}));
+    let (start, often) = (&["pump-1", "run=true"], ["2 starts within the last hour", "(guarded)"]);
+    // A start that a busy machine held up may count, too.
+    let mut done = 0;
+    let third = loop {
+        let ran = write(&site, start);
+        if ran.code != 0 {
+            break ran;
+        }
+        done += 1;
+        assert!(done <= 2 && counted(&site, 1).len() >= done, "{done} starts");
+        runs(&site, "pump-1", true);
+        carried_out(&site, &["pump-1", "run=false"]);
+        runs(&site, "pump-1", false);
+    };
+    assert!(often.iter().all(|wanted| third.err.contains(wanted)), "{}", third.err);
+    assert_eq!(counted(&site, 1).len(), 2);
+    carried_out(&site, &["pump-1", "run=false"]);
+    // The starts of other motors stay in the file; a conversion of clocks may move them by a moment.
+    let [kept] = counted(&site, 9)[..] else {
+        panic!("{:?}", counted(&site, 9))
+    };
+    assert!(kept.abs_diff(earlier) < 10_000, "{kept} {earlier}");
+    // The gateway knows of them.
+    let gateway = Running::drivegate(&["run", "--config", &site.config()]);
+    gateway.until_printed("drivegate is running");
+    let through = until("the gateway", || {
+        let ran = write(&site, start);
+        (!ran.err.contains("(offline)") && !ran.err.contains("(bus_down)")).then_some(ran)
+    });
+    assert!(through.err.contains(often[0]), "{}{}", through.out, through.err);
+}
+
+/// A gateway for another line counts starts in this directory.
+#[test]
+fn starts_that_another_process_counts_are_refused_and_stops_are_not() {
+    let guard = "guard = { starts_per_hour = 9 }";
+    let site = site(&controlled("pump-1", 1, guard), "");
+    let _line = site.line(&[1]);
+    let text = std::fs::read_to_string(site.config()).unwrap();
+    site.write(
+        "other.conf",
+        &text.replace("\"line1\"", "\"line9\"").replace("own.sock", "other.sock"),
+    );
+    let mut other = Running::drivegate(&["run", "--config", &site.path("other.conf")]);
+    other.until_printed("drivegate is running");
+    until("its file", || site.file("state/starts.json").exists().then_some(()));
+    refused(
+        &site,
+        &["pump-1", "run=true"],
+        &["another drivegate counts", "(guarded)"],
+    );
+    carried_out(&site, &["pump-1", "run=false"]);
+    assert!(counted(&site, 1).is_empty());
+    // The file is free again as soon as that process is gone, however it ended.
+    other.signal("KILL");
+    other.ended();
+    carried_out(&site, &["pump-1", "run=true"]);
+    assert!(!counted(&site, 1).is_empty());
+    carried_out(&site, &["pump-1", "run=false"]);
 }

@@ -6,6 +6,8 @@ pub const EVENTS: &str = "events.jsonl";
 pub const COUNTERS: &str = "counters.json";
 /// Starts of the last hour of drives with a guard.
 pub const STARTS: &str = "starts.json";
+/// File that is locked by the process that counts these starts.
+pub const STARTS_LOCK: &str = "starts.lock";
 /// First part of the names of buffered MQTT events.
 pub const MQTT_EVENTS: &str = "mqtt-events";
 /// First part of the names of buffered MQTT history.
@@ -75,6 +77,7 @@ mod tests {
             "events.jsonl.1",
             "counters.partial",
             "counters.damaged-1",
+            STARTS_LOCK,
             "mqtt-events-1.log",
             "mqtt-history-2-30.damaged",
             "mqtt-events.lock",

@@ -67,7 +67,7 @@ impl Rotated {
     pub fn open(&mut self) -> io::Result<(&mut File, u64)> {
         self.open = None;
         if let Some(dir) = self.path.parent() {
-            fs::create_dir_all(dir)?;
+            super::create_dir(dir)?;
         }
         let file = OpenOptions::new()
             .read(true)
@@ -75,6 +75,7 @@ impl Rotated {
             .create(true)
             .mode(0o640)
             .open(&self.path)?;
+        super::give_to_owner(&file, &self.path);
         flock(&file, FlockOperation::NonBlockingLockExclusive)
             .map_err(|_| io::Error::other("another process is writing to it; give each gateway its own"))?;
         let bytes = file.metadata()?.len();

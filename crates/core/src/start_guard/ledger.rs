@@ -101,6 +101,14 @@ impl Guards {
         self.around.store(Arc::new(next));
     }
 
+    /// Counts starts of these machines, which belong to no bus here, as part of their groups.
+    pub fn know(&self, groups: &[(Machine, Arc<str>)]) {
+        let mut ledger = self.lock();
+        groups
+            .iter()
+            .for_each(|(machine, group)| ledger.register(machine, group));
+    }
+
     /// Notes a change that must be written to disk.
     pub(super) fn notify_change(&self) {
         self.changed.notify_one();

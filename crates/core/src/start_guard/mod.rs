@@ -25,7 +25,7 @@ use std::time::Duration;
 
 pub use self::file::Saved;
 pub use self::interlock::Unmet;
-pub use self::keeper::keep;
+pub use self::keeper::{WhileTaken, keep, observe};
 pub use self::ledger::Guards;
 pub use self::motor::MotorReading;
 pub use self::start_attempt::ByRun;

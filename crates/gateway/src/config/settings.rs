@@ -13,7 +13,7 @@ use drivegate_core::drill::DrillOptions;
 use drivegate_core::history::RecorderOptions;
 use drivegate_core::order::AuditFileOptions;
 use drivegate_core::permit::Rules;
-use drivegate_core::process_image::{BusSpec, DriveSpec};
+use drivegate_core::process_image::{BusSpec, DriveSpec, Machine};
 use drivegate_http::local::SocketPath;
 use drivegate_model::drive::profile::Profiles;
 use drivegate_north::{bacnet as bacnet_server, modbus_tcp as modbus_tcp_server, slot as slot_server};
@@ -77,8 +77,8 @@ impl Settings {
 pub enum StateFiles {
     /// The gateway reads and writes them.
     Owned,
-    /// A command without a gateway obeys what they forbid, and changes only those of its own actions: the audit file and
-    /// readings of parameters.
+    /// A command without a gateway obeys what they forbid, and changes only those of its own actions: counted starts,
+    /// the audit file and readings of parameters.
     Obeyed(Box<WithoutGateway>),
     /// A trial neither reads nor writes them.
     Unused,
@@ -89,6 +89,17 @@ pub enum StateFiles {
 pub struct WithoutGateway {
     /// Options of BACnet, whose kept priorities bind the command although it serves no BACnet.
     pub bacnet: Option<bacnet_server::Options>,
+    /// The group of each drive whose starts the gateway counts on disk.
+    pub groups: Vec<(Machine, Arc<str>)>,
+    /// Whether the command can start its drive.
+    pub starts: bool,
+}
+
+impl WithoutGateway {
+    /// Whether the gateway counts the starts of this machine on disk.
+    pub fn counts(&self, machine: &Machine) -> bool {
+        self.groups.iter().any(|(counted, _)| counted == machine)
+    }
 }
 
 /// A bus with the drives on it.

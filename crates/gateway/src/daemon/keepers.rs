@@ -10,7 +10,7 @@ use drivegate_core::files::{Keeper, State as _};
 use drivegate_core::history::{self, RecorderTask};
 use drivegate_core::order::AuditFile;
 use drivegate_core::parameters::Store;
-use drivegate_core::start_guard::{self, Saved};
+use drivegate_core::start_guard::{self, Saved, WhileTaken};
 use drivegate_north::parameter_jobs::{hold_unfinished, keep_reading};
 use drivegate_north::patience::late;
 use drivegate_north::state_file::LATE;
@@ -104,13 +104,23 @@ impl Daemon {
     /// Keeps starts in the configured directory, where they are counted. Guarded drives are not started without that.
     pub(super) async fn apply_guards(&mut self, settings: &Settings) {
         let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
-        let mut drives = settings.buses.iter().flat_map(|bus| &bus.drives);
-        let none = !drives.any(|drive| drive.guard.is_some());
-        if none || settings.state_files != StateFiles::Owned || self.starts.as_ref().is_some_and(same) {
+        let mut drives = settings.drives();
+        let taken = match &settings.state_files {
+            StateFiles::Owned if drives.any(|(_, drive)| drive.guard.is_some()) => WhileTaken::Wait,
+            StateFiles::Obeyed(rest) if drives.any(|(bus, drive)| rest.counts(&bus.machine(drive))) => {
+                self.guards.know(&rest.groups);
+                if !rest.starts {
+                    return self.observe_starts(settings).await;
+                }
+                WhileTaken::GiveUp
+            }
+            _ => return,
+        };
+        if self.starts.as_ref().is_some_and(same) {
             return;
         }
         self.stop_starts().await;
-        match start_guard::keep(&settings.state_dir, self.guards.clone()) {
+        match start_guard::keep(&settings.state_dir, self.guards.clone(), taken) {
             Ok((keeper, read)) => {
                 self.starts = Some(keeper);
                 if self.north.patience.wait(read).await.is_none() {
@@ -122,6 +132,17 @@ impl Daemon {
                 "cannot start the thread that counts starts: {error}; drives with a guard are not started; free memory or threads"
             ),
         }
+    }
+
+    /// Reads the starts of earlier runs, which are not continued here.
+    async fn observe_starts(&self, settings: &Settings) {
+        let (dir, guards) = (settings.state_dir.clone(), self.guards.clone());
+        // A disk that hangs leaves them unread, and nothing is started.
+        let _ = self
+            .north
+            .patience
+            .read(move || start_guard::observe(&dir, &guards))
+            .await;
     }
 
     pub(super) async fn stop_starts(&mut self) {

@@ -80,7 +80,7 @@ impl Direct {
                 drives: vec![spec],
                 ..bus
             }],
-            ..serving_nobody(&target.settings)
+            ..serving_nobody(&target.settings, matches!(needs, Needs::Commands(_)))
         };
         let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
         let drive = daemon.plant().load().drive(&name);
@@ -176,9 +176,17 @@ impl Direct {
 
 /// The configuration without servers, drills and recordings: the command is the only client, and what the gateway left
 /// on disk stays for the gateway.
-fn serving_nobody(settings: &Settings) -> Settings {
+fn serving_nobody(settings: &Settings, starts: bool) -> Settings {
+    let is_any_guarded = settings.drives().any(|(_, drive)| drive.guard.is_some());
+    let counted = settings
+        .drives()
+        .filter(|(_, drive)| is_any_guarded && drive.counts_starts());
     let rest = WithoutGateway {
         bacnet: settings.bacnet.clone(),
+        groups: counted
+            .map(|(bus, drive)| (bus.machine(drive), drive.starts_with()))
+            .collect(),
+        starts,
     };
     Settings {
         socket: SocketPath::Off,

@@ -124,7 +124,7 @@ fn a_file_that_cannot_be_read_is_read_later_and_stays_as_it_is() {
     let path = folder.path().join("starts.json");
     // A folder of this name cannot be read as a file.
     std::fs::create_dir(&path).unwrap();
-    let (keeper, read) = keep(folder.path(), rig.shared.clone()).unwrap();
+    let (keeper, read) = keep(folder.path(), rig.shared.clone(), WhileTaken::Wait).unwrap();
     let begun = Instant::now();
     let refusal = loop {
         match rig.clear(&[0], 1, 1.0) {
@@ -158,9 +158,62 @@ fn files_of_others_are_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("starts.json");
     std::fs::write(&path, "{").unwrap();
-    let (keeper, read) = keep(folder.path(), Arc::new(Guards::default())).unwrap();
+    let (keeper, read) = keep(folder.path(), Arc::default(), WhileTaken::Wait).unwrap();
     // The channel closes when the file has been read.
     let _ = read.blocking_recv();
     assert!(folder.path().join("starts.damaged").exists(), "it is kept aside");
     drop(keeper);
+}
+
+#[test]
+fn one_process_at_a_time_counts_starts() {
+    let folder = tempfile::tempdir().unwrap();
+    let (gateway, read) = keep(folder.path(), Arc::default(), WhileTaken::Wait).unwrap();
+    // The channel closes when the file has been read, or cannot be.
+    let _ = read.blocking_recv();
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    rig.read(0, false, 0.0);
+    let (_command, read) = keep(folder.path(), rig.shared.clone(), WhileTaken::GiveUp).unwrap();
+    let _ = read.blocking_recv();
+    let refused = rig.clear(&[0], 1, 1.0);
+    let Verdict::Refuse(refusal) = &refused else {
+        unreachable!("{refused:?}")
+    };
+    assert!(
+        refusal.to_string().contains("another drivegate counts starts"),
+        "{refusal}"
+    );
+    let (_next, mut read) = keep(folder.path(), Arc::default(), WhileTaken::Wait).unwrap();
+    assert_eq!(read.try_recv(), Err(tokio::sync::oneshot::error::TryRecvError::Empty));
+    drop(gateway);
+    let _ = read.blocking_recv();
+}
+
+#[test]
+fn starts_of_drives_that_are_not_here_keep_their_distance() {
+    let stagger = Guard {
+        stagger: 60 * SECOND,
+        ..Guard::default()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (rig, time) = (GuardedDrives::of(stagger, Vec::new()), SystemTime::now());
+    let machine = crate::process_image::Machine {
+        port: "elsewhere".to_string(),
+        address: 9,
+        profile: "vacon-nx".to_string(),
+    };
+    let group = rig.images[0].spec.starts_with();
+    Saved::new([(machine.clone(), vec![time])].into_iter())
+        .save(&folder.path().join("starts.json"))
+        .unwrap();
+    observe(folder.path(), &rig.shared);
+    rig.read(0, false, 0.0);
+    assert_eq!(rig.refused(0, 1.0), None, "another group");
+    rig.shared.know(&[(machine, group)]);
+    assert_eq!(rig.refused(0, 1.0), Some("stagger"));
+    let _ = std::fs::write(folder.path().join("starts.json"), "{");
+    observe(folder.path(), &rig.shared);
+    let refused = rig.clear(&[0], 1, 70.0);
+    assert!(matches!(refused, Verdict::Refuse(_)), "{refused:?}");
+    assert!(!folder.path().join("starts.damaged").exists(), "a look changes nothing");
 }
