@@ -48,8 +48,14 @@ enum Disk {
     /// Starts are kept in memory only.
     #[default]
     None,
-    /// Starts will be kept in a file that is not read yet; with the reason if reading it failed.
-    Unread(PathBuf, Option<String>),
+    /// Starts will be kept in a file that is not read yet.
+    Unread {
+        path: PathBuf,
+        /// Why reading it failed, if it did.
+        why: Option<String>,
+        /// Generation at which the file began to be awaited.
+        since: u64,
+    },
     /// Starts are kept in a file.
     File {
         /// Newest generation that is in the file.
@@ -116,12 +122,17 @@ impl Guards {
 
     /// Announces that starts will be saved in this file; until [`Guards::keep`] has its content, no start is allowed.
     pub fn await_file(&self, path: &Path) {
-        self.lock().disk = Disk::Unread(path.to_path_buf(), None);
+        let mut ledger = self.lock();
+        ledger.disk = Disk::Unread {
+            path: path.to_path_buf(),
+            why: None,
+            since: ledger.generation,
+        };
     }
 
     /// Notes that the file could not be read, for this reason.
     pub fn not_read(&self, why: String) {
-        if let Disk::Unread(_, reason) = &mut self.lock().disk {
+        if let Disk::Unread { why: reason, .. } = &mut self.lock().disk {
             *reason = Some(why);
         }
     }
@@ -131,6 +142,7 @@ impl Guards {
     /// possible.
     pub fn keep(&self, saved: &Saved, now: Instant, time: SystemTime) {
         let mut ledger = self.lock();
+        ledger.withdraw_undecided();
         for (machine, starts) in saved.motors() {
             let at = |start: SystemTime| {
                 let age = time.duration_since(start).unwrap_or_default();
@@ -286,14 +298,22 @@ impl Ledger {
         }
     }
 
+    /// Withdraws the starts that were cleared without the file, none of which was written: they are judged again.
+    fn withdraw_undecided(&mut self) {
+        let Disk::Unread { since, .. } = self.disk else { return };
+        for entry in self.motors.values_mut() {
+            entry.motor.reserved.take_if(|reserved| reserved.generation > since);
+        }
+    }
+
     /// Whether a start that is decided is on disk.
     pub(super) fn kept(&self, reserved: &Reserved, now: Instant) -> SaveProgress {
         match &self.disk {
             Disk::None => SaveProgress::Yes,
-            Disk::Unread(path, Some(why)) => {
-                SaveProgress::Failed(format!("{}: it cannot be read: {why}", path.display()))
-            }
-            Disk::Unread(path, None) if now >= reserved.at + DISK => SaveProgress::Failed(format!(
+            Disk::Unread {
+                path, why: Some(why), ..
+            } => SaveProgress::Failed(format!("{}: it cannot be read: {why}", path.display())),
+            Disk::Unread { path, .. } if now >= reserved.at + DISK => SaveProgress::Failed(format!(
                 "{}: it is not read yet: the disk does not answer",
                 path.display()
             )),
@@ -304,7 +324,7 @@ impl Ledger {
             Disk::File { .. } if now >= reserved.at + DISK => {
                 SaveProgress::Failed(format!("the disk did not take them within {}", shown(DISK)))
             }
-            Disk::Unread(..) | Disk::File { .. } => SaveProgress::NotYet,
+            Disk::Unread { .. } | Disk::File { .. } => SaveProgress::NotYet,
         }
     }
 
@@ -340,7 +360,7 @@ impl Ledger {
     /// changed since.
     fn is_behind(&self, now: Instant) -> bool {
         match &self.disk {
-            Disk::None | Disk::Unread(..) => false,
+            Disk::None | Disk::Unread { .. } => false,
             Disk::File {
                 failed: Some(failed), ..
             } => self.generation > failed.generation || now >= failed.at + AGAIN,

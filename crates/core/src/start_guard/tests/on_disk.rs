@@ -217,3 +217,18 @@ fn starts_of_drives_that_are_not_here_keep_their_distance() {
     assert!(matches!(refused, Verdict::Refuse(_)), "{refused:?}");
     assert!(!folder.path().join("starts.damaged").exists(), "a look changes nothing");
 }
+
+#[test]
+fn a_start_that_waits_for_the_file_is_judged_by_it() {
+    let rig = GuardedDrives::of(per_hour(1), Vec::new());
+    rig.shared.await_file(std::path::Path::new("state/starts.json"));
+    rig.read(0, false, 0.0);
+    assert_eq!(reason(rig.clear(&[0], 1, 1.0)), "wait");
+    let machine = rig.bus.machine(&rig.images[0].spec);
+    let time = SystemTime::now();
+    let saved = Saved::new([(machine, vec![time - 60 * SECOND])].into_iter());
+    rig.shared.keep(&saved, rig.at(1.5), time);
+    let (generation, _) = rig.shared.to_write(rig.at(1.5), time).unwrap();
+    rig.shared.wrote(generation, Ok(()), rig.at(1.5));
+    assert_eq!(reason(rig.clear(&[0], 1, 1.6)), "starts_per_hour");
+}
