@@ -25,7 +25,8 @@ pub const LONGEST_ID: usize = 64;
 const WAIT: Duration = Duration::from_secs(2);
 /// Interval at which waiting threads check again.
 const STEP: Duration = Duration::from_millis(100);
-/// Time for which an address that no bus uses stays open: a reload leaves the connections as they are.
+/// Time for which the connection of a bus that ended is kept, and an address that no bus uses stays open: a reload
+/// leaves the connections as they are.
 const KEPT: Duration = Duration::from_secs(5);
 
 /// The addresses at which devices dial in.
@@ -45,16 +46,16 @@ struct Shared {
 
 struct State {
     lines: Vec<Entry>,
-    /// When a bus last released the address; `None` while a bus uses it.
-    free_since: Option<Instant>,
 }
 
 /// The entry of one bus's line.
 struct Entry {
     id: Vec<u8>,
     allow: Vec<IpNet>,
-    /// Whether the bus of this line exists.
-    wanted: bool,
+    /// Number of buses that have this line: for a moment of a reload it may be the old and the new one.
+    buses: usize,
+    /// When the last of them ended.
+    free_since: Instant,
     /// A connection that the line's bus has not taken yet.
     waiting: Option<TcpStream>,
     /// The connection that the line's bus serves.
@@ -69,8 +70,52 @@ impl Entry {
         self.waiting = Some(stream);
     }
 
+    fn is_wanted(&self) -> bool {
+        self.buses > 0
+    }
+
     fn allows(&self, from: IpAddr) -> bool {
         self.allow.iter().any(|net| net.contains(&from))
+    }
+
+    /// Whether the other end of the connection may dial in. A connection without another end may not.
+    fn allows_peer(&self, stream: &TcpStream) -> bool {
+        stream
+            .peer_addr()
+            .is_ok_and(|from| self.allows(from.ip().to_canonical()))
+    }
+
+    /// Another bus has the line now, with this `allow`. A device that it does not allow is hung up on.
+    fn begin(&mut self, allow: &[IpNet]) {
+        self.allow = allow.to_vec();
+        self.buses += 1;
+        let (waiting, served) = (self.waiting.take(), self.served.take());
+        self.waiting = waiting.and_then(|stream| self.kept_if_allowed(stream));
+        self.served = served.and_then(|stream| self.kept_if_allowed(stream));
+    }
+
+    /// The connection if its device may dial in; otherwise the device is hung up on.
+    fn kept_if_allowed(&self, stream: TcpStream) -> Option<TcpStream> {
+        if self.allows_peer(&stream) {
+            return Some(stream);
+        }
+        let from = stream
+            .peer_addr()
+            .map_or_else(|error| error.to_string(), |from| from.to_string());
+        tracing::warn!(target: "drivegate::line::dial_in", %from, "hung up on a device that its bus does not allow to dial in any more");
+        hang_up(stream);
+        None
+    }
+
+    /// Whether the bus of this line ended so long ago that no reload brings it back. Its device is hung up on then, so
+    /// that it dials in again.
+    fn is_over(&mut self, now: Instant) -> bool {
+        let is_over = !self.is_wanted() && now.saturating_duration_since(self.free_since) > KEPT;
+        if is_over {
+            let left = self.served.take().into_iter().chain(self.waiting.take());
+            left.for_each(hang_up);
+        }
+        is_over
     }
 }
 
@@ -107,13 +152,13 @@ impl Place {
         };
         let id = id.as_bytes().to_vec();
         let mut state = shared.state();
-        state.free_since = None;
         match state.lines.iter_mut().find(|line| line.id == id) {
-            Some(line) => (line.allow, line.wanted) = (allow.to_vec(), true),
+            Some(line) => line.begin(allow),
             None => state.lines.push(Entry {
                 id: id.clone(),
                 allow: allow.to_vec(),
-                wanted: true,
+                buses: 1,
+                free_since: Instant::now(),
                 waiting: None,
                 served: None,
             }),
@@ -146,10 +191,8 @@ impl Drop for Place {
     fn drop(&mut self) {
         let mut state = self.shared.state();
         if let Some(line) = state.lines.iter_mut().find(|line| line.id == self.id) {
-            line.wanted = false;
-        }
-        if state.lines.iter().all(|line| !line.wanted) {
-            state.free_since = Some(Instant::now());
+            line.buses = line.buses.saturating_sub(1);
+            line.free_since = Instant::now();
         }
     }
 }
@@ -232,7 +275,11 @@ impl Drop for Dialled {
         line.served = None;
         let lives = matches!(self.stream.peek(&mut [0]), Err(error) if error.kind() == io::ErrorKind::WouldBlock);
         if lives {
-            line.waiting = self.stream.try_clone().ok();
+            line.waiting = self
+                .stream
+                .try_clone()
+                .ok()
+                .and_then(|stream| line.kept_if_allowed(stream));
         }
     }
 }
@@ -250,10 +297,7 @@ fn listen(address: SocketAddr) -> io::Result<Arc<Shared>> {
     listener.set_nonblocking(true)?;
     let shared = Arc::new(Shared {
         address,
-        state: Mutex::new(State {
-            lines: Vec::new(),
-            free_since: None,
-        }),
+        state: Mutex::new(State { lines: Vec::new() }),
         came: Condvar::new(),
     });
     let serving = shared.clone();
@@ -275,6 +319,7 @@ struct Pending {
 /// Accepts connections until no bus uses the address any more.
 fn accept_all(listener: &TcpListener, shared: &Shared) {
     let mut pending: Vec<Pending> = Vec::new();
+    let mut failing = false;
     loop {
         let listening = [PollFd::new(listener, PollFlags::IN)];
         let said = pending.iter().map(|one| PollFd::new(&one.stream, PollFlags::IN));
@@ -283,15 +328,26 @@ fn accept_all(listener: &TcpListener, shared: &Shared) {
         let _ = poll_until(&mut fds, Instant::now() + STEP);
         drop(fds);
         let now = Instant::now();
-        if let Ok((stream, from)) = listener.accept() {
-            match set_up(&stream) {
-                Ok(()) if pending.len() < MOST_PENDING => pending.push(Pending {
-                    stream,
-                    from,
-                    said: Vec::new(),
-                    since: now,
-                }),
-                _ => hang_up(stream),
+        match listener.accept() {
+            Ok((stream, from)) => {
+                failing = false;
+                match set_up(&stream) {
+                    Ok(()) if pending.len() < MOST_PENDING => pending.push(Pending {
+                        stream,
+                        from,
+                        said: Vec::new(),
+                        since: now,
+                    }),
+                    _ => hang_up(stream),
+                }
+            }
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+            Err(error) => {
+                // The connection stays in the queue of the system, so that the next wait would end at once.
+                if !std::mem::replace(&mut failing, true) {
+                    tracing::warn!(target: "drivegate::line::dial_in", address = %shared.address, %error, "cannot accept a device");
+                }
+                std::thread::sleep(STEP);
             }
         }
         if is_unwanted(shared, now) {
@@ -312,10 +368,11 @@ fn accept_all(listener: &TcpListener, shared: &Shared) {
     }
 }
 
-/// Whether no bus has asked for the address for some time.
+/// Whether no bus has asked for the address for some time. Forgets the lines whose bus ended.
 fn is_unwanted(shared: &Shared, now: Instant) -> bool {
-    let since = shared.state().free_since;
-    since.is_some_and(|since| now.saturating_duration_since(since) > KEPT)
+    let mut state = shared.state();
+    state.lines.retain_mut(|line| !line.is_over(now));
+    state.lines.is_empty()
 }
 
 fn set_up(stream: &TcpStream) -> io::Result<()> {
@@ -332,7 +389,7 @@ fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending
     let mut allowed = state
         .lines
         .iter()
-        .filter(|line| line.wanted && line.allows(from))
+        .filter(|line| line.is_wanted() && line.allows(from))
         .peekable();
     if allowed.peek().is_none() {
         tracing::warn!(target: "drivegate::line::dial_in", from = %one.from, "hung up on a device that no bus allows to dial in");
@@ -349,7 +406,7 @@ fn identify(mut one: Pending, state: &mut State, now: Instant) -> Option<Pending
                 let ids = state
                     .lines
                     .iter()
-                    .filter(|line| line.wanted && line.allows(from))
+                    .filter(|line| line.is_wanted() && line.allows(from))
                     .map(|line| &line.id);
                 match belongs_to(&one.said, ids) {
                     Belongs::To(id) => Some(id),
@@ -429,6 +486,10 @@ fn hang_up(stream: TcpStream) {
 #[cfg(test)]
 mod tests {
     use std::io::Write;
+    use std::os::fd::AsRawFd;
+
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    use rustix::time::{ClockId, clock_gettime};
 
     use super::*;
     use crate::{Line, LineOptions};
@@ -504,6 +565,118 @@ mod tests {
         assert_eq!(heard(&first), b"kept");
         of_second.write_all(b"too").unwrap();
         assert_eq!(heard(&second), b"too");
+    }
+
+    fn is_hung_up(device: &mut TcpStream) -> bool {
+        match device.read(&mut [0]) {
+            Ok(read) => read == 0,
+            Err(error) => error.kind() == io::ErrorKind::ConnectionReset,
+        }
+    }
+
+    /// The line of a bus whose device dials in, however busy the machine is.
+    fn served(names: &mut Names, port: u16, id: &str) -> Line {
+        let until = Instant::now() + Duration::from_secs(60);
+        loop {
+            match open(names, port, id) {
+                Ok(line) => return line,
+                Err(error) => assert!(Instant::now() < until, "{error}"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_narrower_allow_hangs_up_what_waits_and_what_is_served() {
+        let port = free_port();
+        let address = format!("127.0.0.1:{port}");
+        let stranger: Vec<IpNet> = vec!["10.0.0.0/8".parse().unwrap()];
+        // The connection that a bus left to the one that replaces it.
+        let mut names = Names::allowing(&loopback());
+        names.dial_in = Some(Place::of(&address, "", &loopback()).unwrap());
+        let mut device = dials(port, "");
+        drop(served(&mut names, port, ""));
+        drop(names);
+        let narrowed = Place::of(&address, "", &stranger).unwrap();
+        assert!(is_hung_up(&mut device), "it waits");
+        assert!(narrowed.wait(&|| false).is_none());
+        drop(narrowed);
+        // A connection that is served while the new configuration arrives, and returned after that.
+        let mut names = Names::allowing(&loopback());
+        names.dial_in = Some(Place::of(&address, "", &loopback()).unwrap());
+        let mut device = dials(port, "");
+        let line = served(&mut names, port, "");
+        let narrowed = Place::of(&address, "", &stranger).unwrap();
+        assert!(is_hung_up(&mut device), "it is served");
+        drop(line);
+        assert!(narrowed.wait(&|| false).is_none());
+        drop((narrowed, names));
+        // A wider one keeps the connection.
+        let mut names = Names::allowing(&loopback());
+        names.dial_in = Some(Place::of(&address, "", &loopback()).unwrap());
+        let mut device = dials(port, "");
+        drop(served(&mut names, port, ""));
+        let wide: Vec<IpNet> = vec!["0.0.0.0/0".parse().unwrap()];
+        let widened = Place::of(&address, "", &wide).unwrap();
+        assert!(widened.wait(&|| false).is_some());
+        device.write_all(b"x").unwrap();
+    }
+
+    #[test]
+    fn a_device_whose_text_no_bus_has_any_more_is_hung_up() {
+        let port = free_port();
+        let address = format!("127.0.0.1:{port}");
+        let _stays = Place::of(&address, "A1", &loopback()).unwrap();
+        let mut names = Names::allowing(&loopback());
+        names.dial_in = Some(Place::of(&address, "A2", &loopback()).unwrap());
+        let mut device = dials(port, "A2");
+        drop(served(&mut names, port, "?id=A2"));
+        drop(names);
+        assert!(is_hung_up(&mut device), "it can dial in again");
+        // Again, its bus gets it.
+        let mut names = Names::allowing(&loopback());
+        names.dial_in = Some(Place::of(&address, "A2", &loopback()).unwrap());
+        let mut device = dials(port, "A2");
+        let line = served(&mut names, port, "?id=A2");
+        device.write_all(b"x").unwrap();
+        assert_eq!(heard(&line), b"x");
+    }
+
+    /// Runs in a process of its own, whose descriptors it may use up.
+    #[test]
+    fn a_process_without_descriptors_pauses_between_its_tries() {
+        const ALONE: &str = "DRIVEGATE_DIAL_IN_ALONE";
+        if std::env::var_os(ALONE).is_none() {
+            let name = "dial_in::tests::a_process_without_descriptors_pauses_between_its_tries";
+            let mut alone = std::process::Command::new(std::env::current_exe().unwrap());
+            let output = alone.args(["--exact", name]).env(ALONE, "1").output().unwrap();
+            let text = String::from_utf8_lossy(&output.stdout).into_owned();
+            assert!(output.status.success() && text.contains("1 passed"), "{text}");
+            return;
+        }
+        let port = free_port();
+        let place = Place::of(&format!("127.0.0.1:{port}"), "", &loopback()).unwrap();
+        let before = getrlimit(Resource::Nofile);
+        let limit = |current| {
+            let maximum = before.maximum;
+            setrlimit(Resource::Nofile, Rlimit { current, maximum }).unwrap();
+        };
+        // The next descriptor, which the device gets, is the last one.
+        let next = std::fs::File::open("/dev/null").unwrap().as_raw_fd();
+        limit(u64::try_from(next).ok().map(|next| next + 1));
+        let _device = dials(port, "");
+        let used = || Duration::try_from(clock_gettime(ClockId::ProcessCPUTime)).unwrap();
+        let begun = used();
+        std::thread::sleep(Duration::from_secs(2));
+        let used = used() - begun;
+        assert!(used < Duration::from_millis(200), "{used:?} of the processor");
+        limit(before.current);
+        let until = Instant::now() + Duration::from_secs(60);
+        while place.wait(&|| true).is_none() {
+            assert!(
+                Instant::now() < until,
+                "it gets its line as soon as there are descriptors"
+            );
+        }
     }
 
     #[test]
