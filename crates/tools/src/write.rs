@@ -109,13 +109,16 @@ fn parse(profile: Option<&Profile>, text: &str) -> Result<Setting, String> {
     })?;
     let (name, value) = (name.trim(), value.trim());
     match profile {
-        // Without a profile here, the gateway checks the point.
+        // Without a profile here, the gateway checks the point, but a stop is written in the same words as with one.
         None => Ok(Setting {
             point: name.to_string(),
-            value: serde_json::from_str(value)
-                .ok()
-                .filter(|value: &Json| value.is_boolean() || value.is_number())
-                .unwrap_or_else(|| value.into()),
+            value: match ModelPoint::ALL.iter().find(|point| point.name() == name) {
+                Some(point) if point.kind() == Kind::Bool => switched(name, value)?.into(),
+                _ => serde_json::from_str(value)
+                    .ok()
+                    .filter(|value: &Json| value.is_boolean() || value.is_number())
+                    .unwrap_or_else(|| value.into()),
+            },
             shown: format!("{name}={value}"),
         }),
         Some(profile) if name == RESTART_COMMUNICATION && profile.counts_messages => match value {
@@ -153,23 +156,31 @@ fn of_profile(profile: &Profile, name: &str, text: &str) -> Result<Setting, Stri
 }
 
 fn value_of(point: &Point, text: &str) -> Result<Value, String> {
-    let bad = |wanted: &str| {
-        let name = &point.name;
-        format!("`{text}` is not a value of `{name}`; command line; write {wanted}")
-    };
+    let bad = |wanted: &str| not_a_value(&point.name, text, wanted);
     let meaning = point.code_of(text);
-    match (point.kind(), text.to_ascii_lowercase().as_str()) {
-        (Kind::Bool, "true" | "on" | "yes" | "1") => Ok(Value::Bool(true)),
-        (Kind::Bool, "false" | "off" | "no" | "0") => Ok(Value::Bool(false)),
-        (Kind::Bool, _) => Err(bad("true or false, on or off, yes or no, 1 or 0")),
+    match point.kind() {
+        Kind::Bool => switched(&point.name, text).map(Value::Bool),
         _ if meaning.is_some() => Ok(Value::Integer(meaning.unwrap_or_default())),
-        (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
-        (Kind::Text, _) => Err(bad("another point: this one is a read-only text")),
-        (Kind::Number, _) => {
+        Kind::Integer => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
+        Kind::Text => Err(bad("another point: this one is a read-only text")),
+        Kind::Number => {
             let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
             number.map(Value::Number).ok_or_else(|| bad(&wanted_number(text)))
         }
     }
+}
+
+/// The value of a switch.
+fn switched(name: &str, text: &str) -> Result<bool, String> {
+    match text.to_ascii_lowercase().as_str() {
+        "true" | "on" | "yes" | "1" => Ok(true),
+        "false" | "off" | "no" | "0" => Ok(false),
+        _ => Err(not_a_value(name, text, "true or false, on or off, yes or no, 1 or 0")),
+    }
+}
+
+fn not_a_value(name: &str, text: &str, wanted: &str) -> String {
+    format!("`{text}` is not a value of `{name}`; command line; write {wanted}")
 }
 
 /// The number that was probably meant by a text with a decimal comma or a unit.
@@ -227,7 +238,36 @@ fn acknowledged(what: &str, write: &Written, way: RequestRoute) -> String {
 
 #[cfg(test)]
 mod tests {
+    use drivegate_model::drive::profile::Profiles;
+
     use super::*;
+
+    #[test]
+    fn a_stop_has_the_same_words_with_and_without_the_profile() {
+        let profiles = Profiles::built_in();
+        let profile = profiles.get("vacon-nx").unwrap();
+        for profile in [None, Some(&**profile)] {
+            for (text, value) in [
+                ("run=false", false),
+                ("run=OFF", false),
+                (" run = no", false),
+                ("run=0", false),
+                ("run=on", true),
+                ("reverse=1", true),
+                ("fault_reset=yes", true),
+            ] {
+                assert_eq!(parse(profile, text).unwrap().value, value, "{text}");
+            }
+            let wanted =
+                "`maybe` is not a value of `run`; command line; write true or false, on or off, yes or no, 1 or 0";
+            assert_eq!(parse(profile, "run=maybe").unwrap_err(), wanted);
+            let wanted = "expected POINT=VALUE, got `run`; ";
+            assert!(parse(profile, "run").unwrap_err().starts_with(wanted));
+        }
+        // The gateway knows the values of other points.
+        assert_eq!(parse(None, "speed_reference=50").unwrap().value, 50);
+        assert_eq!(parse(None, "mode=off").unwrap().value, "off");
+    }
 
     #[test]
     fn a_decimal_comma_or_a_unit_is_named() {
