@@ -14,7 +14,7 @@ use drivegate_http::messages::{NO_REPLY, PointValue, Word};
   drivegate read --config drivegate.toml pump-1 state fault_text
 
 Without points: all that are polled. state and fault_text are derived from points. A running gateway is asked through its local socket; without one the command
-opens the port itself.")]
+opens the port itself, and no server: nobody else reads or commands the drive through it.")]
 pub(super) struct Args {
     #[command(flatten)]
     drive: OneDrive,

@@ -19,7 +19,8 @@ use drivegate_model::drive::{ModelPoint, Point, Profile, RESTART_COMMUNICATION, 
   drivegate write --config drivegate.toml pump-1 fault_reset=true
 
 Several points are sent as one command, in a safe order. The drive must have access = \"control\"; limits hold.
-Without a gateway nothing supervises a motor that the command has started.")]
+Without a gateway the command opens the port itself, and nothing supervises a motor that it has started. Guards, and
+BACnet locks and reservations that the gateway left in state_dir, refuse starts as with it.")]
 pub(super) struct Args {
     #[command(flatten)]
     drive: OneDrive,
