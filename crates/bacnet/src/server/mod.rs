@@ -183,6 +183,26 @@ impl Server {
         self.increments.retain(|(instance, object), _| has(*instance, *object));
     }
 
+    /// Serves at another address or under other numbers: clients start from scratch, apart from their writes. A write in
+    /// progress is answered, and a late duplicate is still recognised, under the present number of its device.
+    pub fn restart(&mut self, options: Options, devices: Vec<Arc<Device>>, now: Instant) {
+        let bbmd = self.options.bbmd;
+        let before = std::mem::replace(self, Server::new(Options { bbmd, ..options }, devices, now));
+        let number = |device: &Arc<Device>| {
+            let place = match device.station {
+                Some(station) => *self.by_station.get(&station)?,
+                None => 0,
+            };
+            Some((device.instance, self.devices.get(place)?.instance))
+        };
+        let numbers: HashMap<u32, u32> = before.devices.iter().filter_map(number).collect();
+        (self.traffic, self.exchanges, self.jobs) = (before.traffic, before.exchanges, before.jobs);
+        let of_exchanges = self.exchanges.devices();
+        for device in of_exchanges.chain(self.jobs.iter_mut().map(|job| &mut job.device)) {
+            *device = numbers.get(device).copied().unwrap_or(*device);
+        }
+    }
+
     /// The device with this instance.
     fn device(&self, instance: u32) -> Option<Arc<Device>> {
         self.by_instance
@@ -232,7 +252,11 @@ impl Server {
 
     /// The next write to carry out; its result must be given to [`Server::written`].
     pub fn take_job(&mut self) -> Option<Job> {
-        self.jobs.pop_front()
+        let mut job = self.jobs.pop_front()?;
+        // The devices may have been replaced since the write was accepted.
+        let place = self.device(job.device).and_then(|device| device.find(job.object));
+        job.place = place.unwrap_or(usize::MAX);
+        Some(job)
     }
 
     /// Whether a write is in progress.

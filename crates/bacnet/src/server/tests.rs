@@ -139,6 +139,24 @@ fn device(instance: u32, station: Option<u8>, more: u32) -> Arc<Device> {
     ))
 }
 
+fn options() -> Options {
+    Options {
+        address: "10.0.0.1:47808".parse().unwrap(),
+        prefix: 24,
+        network: Some(NETWORK),
+        vendor: (0, "test".into()),
+        version: "1".into(),
+        bbmd: None,
+        foreign_devices: 0,
+    }
+}
+
+/// The server's own device and those of its drives, numbered from `first` on.
+fn devices(first: u32, drives: u8, more: u32) -> Vec<Arc<Device>> {
+    let drives = (1..=drives).map(|unit| device(first + u32::from(unit), Some(unit), more));
+    [device(first, None, 0)].into_iter().chain(drives).collect()
+}
+
 /// A test server at 10.0.0.1 with its own device 100, the devices 101 to 103 behind it, and its clients.
 struct ServerWithClients {
     server: Server,
@@ -156,22 +174,16 @@ impl ServerWithClients {
 
     fn of(drives: u8, more: u32) -> ServerWithClients {
         let now = Instant::now();
-        let options = Options {
-            address: "10.0.0.1:47808".parse().unwrap(),
-            prefix: 24,
-            network: Some(NETWORK),
-            vendor: (0, "test".into()),
-            version: "1".into(),
-            bbmd: None,
-            foreign_devices: 0,
-        };
-        let drives = (1..=drives).map(|unit| device(100 + u32::from(unit), Some(unit), more));
-        let devices = [device(100, None, 0)].into_iter().chain(drives).collect();
         ServerWithClients {
-            server: Server::new(options, devices, now),
+            server: Server::new(options(), devices(100, drives, more), now),
             plant: Plant::default(),
             now,
         }
+    }
+
+    /// Starts the server anew with these numbers: its own device has number `first`, its drives the next ones.
+    fn restart(&mut self, first: u32) {
+        self.server.restart(options(), devices(first, 3, 0), self.now);
     }
 
     fn client(last: u8) -> SocketAddrV4 {

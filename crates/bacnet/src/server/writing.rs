@@ -34,7 +34,7 @@ pub struct Job {
     pub from: Address,
     /// Instance of the device that is written.
     pub device: u32,
-    /// The object to write, by its index in the device.
+    /// The object to write, by its index in the device; an index without an object if the device no longer has it.
     pub place: usize,
     /// The object to write.
     pub object: ObjectId,
@@ -96,6 +96,11 @@ impl Exchanges {
 
     pub(super) fn is_busy(&self) -> bool {
         self.all.iter().any(|e| matches!(e.state, State::Running))
+    }
+
+    /// The instances of the devices that are or were written.
+    pub(super) fn devices(&mut self) -> impl Iterator<Item = &mut u32> {
+        self.all.iter_mut().map(|exchange| &mut exchange.device)
     }
 
     fn find(&self, from: Address, device: u32, invoke: u8) -> Option<&Exchange> {

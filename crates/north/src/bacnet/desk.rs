@@ -63,8 +63,8 @@ pub(super) struct Desk {
     connection: Connection,
 }
 
-fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
-    let options = ServerOptions {
+fn server_options((address, prefix): At, view: &View) -> ServerOptions {
+    ServerOptions {
         address,
         prefix,
         network: view.options.network,
@@ -72,15 +72,14 @@ fn server_of((address, prefix): At, view: &View, now: Instant) -> Server {
         vendor: (view.options.vendor, VENDOR.into()),
         version: drivegate_core::version::VERSION.into(),
         bbmd: None,
-    };
-    Server::new(options, view.devices(), now)
+    }
 }
 
 impl Desk {
     pub(super) fn new(options: Arc<Options>, rights: HostRights, plant: SharedPlant, at: At, now: Instant) -> Desk {
         let view = View::new(plant.load_full(), options, rights);
         Desk {
-            server: server_of(at, &view, now),
+            server: Server::new(server_options(at, &view), view.devices(), now),
             plant,
             view,
             present: HashSet::new(),
@@ -97,9 +96,10 @@ impl Desk {
         self.server.start(&self.view, now);
     }
 
-    /// Address or numbers have changed: clients start from scratch.
+    /// Address or numbers have changed: clients start from scratch, apart from their writes.
     pub(super) fn start_anew(&mut self, at: At, now: Instant) {
-        self.server = server_of(at, &self.view, now);
+        let options = server_options(at, &self.view);
+        self.server.restart(options, self.view.devices(), now);
         self.start(now);
     }
 

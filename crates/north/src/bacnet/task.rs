@@ -368,7 +368,7 @@ impl Task {
                 if !continues {
                     self.desk.start_anew(self.sockets.place(), now);
                 }
-                if !continues || !same_bbmd {
+                if !same_bbmd {
                     self.desk.server.set_bbmd(None, now);
                     (self.resolved, self.lookup) = (None, None);
                 }

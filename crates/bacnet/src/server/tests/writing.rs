@@ -86,6 +86,42 @@ fn what_comes_twice_is_done_once() {
 }
 
 #[test]
+fn what_comes_twice_is_done_once_across_new_numbers() {
+    let mut rig = ServerWithClients::new();
+    rig.write(5, 3, &run(1, 8));
+    let first = rig.job().unwrap();
+    rig.write(6, 1, &run(1, 8));
+    rig.restart(200);
+    let second = rig.job().expect("accepted before the restart");
+    let run_of_second = device(200, None, 0).find(RUN).unwrap();
+    assert_eq!((second.device, second.place), (201, run_of_second));
+    assert!(
+        rig.write(5, 3, &run(1, 8)).is_empty() && rig.job().is_none(),
+        "it joins the write in progress"
+    );
+    rig.write(7, 1, &run(1, 8));
+    let third = rig.job().unwrap();
+    assert!(
+        first.token != third.token && second.token != third.token,
+        "an earlier write must not answer a later one"
+    );
+    assert_eq!(rig.done(&first, Ok(())), [ack(3)]);
+    assert_eq!(rig.done(&second, Ok(())), [ack(1)]);
+    rig.restart(300);
+    let denied = apdu::error(3, 15, Error::SERVICE_REQUEST_DENIED);
+    assert_eq!(
+        rig.write(5, 3, &run(1, 8)),
+        [denied],
+        "a late duplicate behind another order"
+    );
+    assert_eq!(
+        rig.done(&third, Err(Error::TIMEOUT)),
+        [apdu::error(1, 15, Error::TIMEOUT)]
+    );
+    assert!(rig.job().is_none());
+}
+
+#[test]
 fn another_request_by_the_same_number_gets_the_one_answer() {
     let mut rig = ServerWithClients::new();
     rig.write(5, 3, &run(1, 8));
