@@ -1,5 +1,5 @@
 //! Connects the protocol with the drives: waiting writes, slots that wait for a reading, leases, drives that come
-//! online again. Has no sockets and no clock: `task` and `offline` provide both.
+//! online again. Has no sockets and no clock: `task` and `loopback` provide both.
 
 use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
 use std::net::SocketAddrV4;
@@ -51,6 +51,7 @@ pub(super) struct Desk {
     plant: SharedPlant,
     pub(super) view: View,
     pub(super) server: Server,
+    at: At,
     /// Drives that answered at the last look.
     present: HashSet<u32>,
     /// Leases that expired so far, by device.
@@ -82,6 +83,7 @@ impl Desk {
             server: Server::new(server_options(at, &view), view.devices(), now),
             plant,
             view,
+            at,
             present: HashSet::new(),
             leases: HashMap::new(),
             uncertain: BTreeSet::new(),
@@ -96,9 +98,15 @@ impl Desk {
         self.server.start(&self.view, now);
     }
 
+    /// Serves at another address.
+    pub(super) fn move_to(&mut self, at: At, now: Instant) {
+        self.at = at;
+        self.start_anew(now);
+    }
+
     /// Address or numbers have changed: clients start from scratch, apart from their writes.
-    pub(super) fn start_anew(&mut self, at: At, now: Instant) {
-        let options = server_options(at, &self.view);
+    fn start_anew(&mut self, now: Instant) {
+        let options = server_options(self.at, &self.view);
         self.server.restart(options, self.view.devices(), now);
         self.start(now);
     }
@@ -107,19 +115,27 @@ impl Desk {
         self.plant.load_full()
     }
 
-    /// Whether a reload has replaced the plant.
-    pub(super) fn is_outdated(&self) -> bool {
-        !Arc::ptr_eq(&self.plant.load(), &self.view.plant)
-    }
-
-    /// Shows the present plant with these options.
-    pub(super) fn see(&mut self, options: Arc<Options>) {
+    /// Shows the present plant, with the options that came with it, if a reload has replaced it: every request is
+    /// carried out by what its numbers mean now. Options alone change nothing before the plant does, since numbers follow
+    /// from both.
+    fn refresh(&mut self, now: Instant) {
+        if Arc::ptr_eq(&self.plant.load(), &self.view.plant) {
+            return;
+        }
+        let before = self.view.options.clone();
+        let options = self.view.rights.options().unwrap_or_else(|| before.clone());
+        let continues = before.continues(&options);
         self.view = View::new(self.plant.load_full(), options, self.view.rights.clone());
-        self.server.set_devices(self.view.devices());
+        if continues {
+            self.server.set_devices(self.view.devices());
+        } else {
+            self.start_anew(now);
+        }
     }
 
     /// Processes a received datagram.
     pub(super) fn receive(&mut self, from: SocketAddrV4, datagram: &[u8], now: Instant) {
+        self.refresh(now);
         self.view.set_time(now);
         self.server.receive(from, datagram, &self.view, now);
     }
@@ -142,12 +158,14 @@ impl Desk {
 
     /// Values of that device may have changed.
     pub(super) fn changed(&mut self, device: u32, now: Instant) {
+        self.refresh(now);
         self.view.set_time(now);
         self.server.changed(device, &self.view, now);
     }
 
     /// Processes the writes of clients until one of them must wait for its drive.
     pub(super) fn next_order(&mut self, now: Instant) -> Option<(u64, Waiting)> {
+        self.refresh(now);
         self.view.set_time(now);
         while let Some(job) = self.server.take_job() {
             let arrival = self.arrival(job.requested_at);
@@ -161,6 +179,7 @@ impl Desk {
 
     /// Notes the result of a write to a drive.
     pub(super) fn ended(&mut self, ended: &Ended, now: Instant) {
+        self.refresh(now);
         let plant = self.plant.load();
         if let (Some(slot), Some(drive)) = (ended.slot, plant.drive_at(&ended.machine)) {
             let settled = Settled::of(&ended.outcome);
@@ -177,6 +196,7 @@ impl Desk {
 
     /// Does all that is due at `now`.
     pub(super) fn poll(&mut self, now: Instant) {
+        self.refresh(now);
         self.view.set_time(now);
         self.note_leases();
         self.resolve_slots(now);

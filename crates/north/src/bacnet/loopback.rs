@@ -15,7 +15,6 @@ use drivegate_core::plant::SharedPlant;
 /// A server without sockets. Time is an argument.
 #[derive(Debug)]
 pub struct Loopback {
-    options: Arc<Options>,
     desk: Desk,
     waiting: Vec<(u64, Waiting)>,
 }
@@ -23,11 +22,10 @@ pub struct Loopback {
 impl Loopback {
     /// A server at the address of `options`, on a network with a mask of 8 bits.
     pub fn new(options: Options, plant: SharedPlant, now: Instant) -> Loopback {
-        let (options, at) = (Arc::new(options.clone()), (options.listen, 8));
-        let mut desk = Desk::new(options.clone(), HostRights::new(&options), plant, at, now);
+        let (rights, at) = (HostRights::new(&options), (options.listen, 8));
+        let mut desk = Desk::new(Arc::new(options), rights, plant, at, now);
         desk.start(now);
         Loopback {
-            options,
             desk,
             waiting: Vec::new(),
         }
@@ -56,9 +54,6 @@ impl Loopback {
 
     /// Does all that is due; the caller repeats this ten times a second.
     pub fn poll(&mut self, now: Instant) {
-        if self.desk.is_outdated() {
-            self.desk.see(self.options.clone());
-        }
         self.desk.poll(now);
         self.take_up(now);
     }

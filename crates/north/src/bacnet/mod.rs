@@ -133,19 +133,18 @@ impl Options {
         4
     }
 
-    /// Whether a server with these options can take over the `other` options without a restart: sockets and device
-    /// identity are unchanged.
+    /// Whether a server with these options can take over the `other` options without a restart: its device identity is
+    /// unchanged.
     fn continues(&self, other: &Options) -> bool {
         let identity = |options: &Options| {
             let Options {
-                listen,
                 device,
                 network,
                 vendor,
                 foreign_devices,
                 ..
             } = *options;
-            (listen, device, network, vendor, foreign_devices)
+            (device, network, vendor, foreign_devices)
         };
         identity(self) == identity(other)
     }

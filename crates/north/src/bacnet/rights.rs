@@ -25,9 +25,9 @@ impl HostRights {
         self.0.store(options.cloned().map(Arc::new));
     }
 
-    /// Whether the server still serves clients.
-    pub(super) fn are_there(&self) -> bool {
-        self.0.load().is_some()
+    /// The options in effect; `None` once the server serves no clients any more.
+    pub(super) fn options(&self) -> Option<Arc<Options>> {
+        self.0.load_full()
     }
 
     /// The right of a client.

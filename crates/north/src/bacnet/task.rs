@@ -32,8 +32,8 @@ use drivegate_core::event::{Event, EventKind};
 use drivegate_core::files::State as _;
 use drivegate_core::files::names::BACNET_PRIORITIES;
 use drivegate_core::order::Commanded;
-use drivegate_core::plant::SharedPlant;
-use drivegate_core::process_image::Snapshot;
+use drivegate_core::plant::{DriveHandle, Plant, SharedPlant};
+use drivegate_core::process_image::{Machine, Snapshot};
 use drivegate_model::drive::ModelPoint;
 
 /// Interval at which the task checks for due work.
@@ -50,7 +50,8 @@ const LAST_ANSWERS: Duration = Duration::from_millis(1500);
 /// A message from the server to its task.
 #[derive(Debug)]
 pub(super) enum ToTask {
-    /// Use other options, and other sockets if the address has changed.
+    /// Use other sockets if the address has changed, another BBMD and another file of slots; clients see other options
+    /// with the plant of the same reload.
     Apply(Box<Options>, Option<Sockets>),
     /// Accept no further requests.
     Retire,
@@ -70,15 +71,16 @@ pub(super) struct Task {
     busy: Arc<AtomicBool>,
     desk: Desk,
     writes: FuturesUnordered<Ending>,
-    /// Woken by every update of a drive.
+    /// Woken by every update of a drive of `watched`.
     news: Arc<Notify>,
+    watched: Arc<Plant>,
     /// The last snapshot of each drive with subscriptions.
     seen: HashMap<u32, Arc<Snapshot>>,
     kept: KeptFile,
     /// The slots from before the start while they are read, with the path of their file.
     reading: Option<(PathBuf, SlotsRead)>,
-    /// Devices with a slot from before the restart against which the motor may run.
-    watched: BTreeSet<u32>,
+    /// Drives with a slot from before the restart against which the motor may run.
+    protected: BTreeSet<Machine>,
     resolved: Option<Instant>,
     /// Task that looks up the BBMD.
     lookup: Option<JoinHandle<Option<SocketAddrV4>>>,
@@ -102,13 +104,14 @@ impl Task {
             readers: [waiting_reader(), waiting_reader(), waiting_reader()],
             stats,
             busy,
-            desk,
             writes: FuturesUnordered::new(),
             news: Arc::default(),
+            watched: desk.view.plant.clone(),
+            desk,
             seen: HashMap::new(),
             kept: KeptFile::new(KeptSlots::WORDS),
             reading: None,
-            watched: BTreeSet::new(),
+            protected: BTreeSet::new(),
             resolved: None,
             lookup: None,
             retired: false,
@@ -148,6 +151,7 @@ impl Task {
                 }
             }
             self.take_up_jobs();
+            self.watch_plant();
         }
         self.answer_what_was_begun().await;
         // A file that was not read is not overwritten.
@@ -217,11 +221,8 @@ impl Task {
 
     fn tick(&mut self) {
         let now = Instant::now();
-        if self.desk.is_outdated() {
-            self.see();
-        }
-        self.watch_kept();
         self.desk.poll(now);
+        self.watch_kept();
         self.stats.bacnet.set(Some(BacnetFigures {
             counters: self.desk.server.counters(),
             bbmd: self
@@ -239,11 +240,13 @@ impl Task {
         }
     }
 
-    /// Shows a new plant, or the present plant with new options.
-    fn see(&mut self) {
-        self.desk.see(self.options.clone());
-        self.seen.clear();
-        self.hear_drives();
+    /// Waits for updates of the drives that clients see now.
+    fn watch_plant(&mut self) {
+        if !Arc::ptr_eq(&self.watched, &self.desk.view.plant) {
+            self.watched = self.desk.view.plant.clone();
+            self.seen.clear();
+            self.hear_drives();
+        }
     }
 
     fn hear_drives(&self) {
@@ -274,7 +277,7 @@ impl Task {
     /// File in which slots are saved; `None` if they are not saved, or if a reload removes the server and makes the
     /// file useless.
     fn keep_file(&self) -> Option<std::path::PathBuf> {
-        let keeps = self.options.keep_priorities && self.desk.view.rights.are_there();
+        let keeps = self.options.keep_priorities && self.desk.view.rights.options().is_some();
         keeps.then(|| self.options.state_dir.join(BACNET_PRIORITIES))
     }
 
@@ -312,37 +315,35 @@ impl Task {
             kept::restore(&view.plant, &view.rights, &slots, Instant::now(), SystemTime::now());
         }
         self.kept.holds(Some((path, slots)));
-        let protected = |device: &u32| {
-            let drive = view.drives.get(device);
-            drive.is_some_and(|drive| drive.handle.priorities(|all| all.kept().next().is_some()))
-        };
-        self.watched = view.drives.keys().copied().filter(protected).collect();
+        let drives = view.drives.values().map(|drive| &drive.handle);
+        let protected = drives.filter(|drive| drive.priorities(|all| all.kept().next().is_some()));
+        self.protected = protected.map(DriveHandle::machine).collect();
         self.stats.awaited.slots.end();
     }
 
     /// Raises an event if a motor runs against a slot from before the restart.
     fn watch_kept(&mut self) {
-        let view = &self.desk.view;
-        self.watched.retain(|device| {
-            let Some(drive) = view.drives.get(device) else {
+        let plant = &self.desk.view.plant;
+        self.protected.retain(|machine| {
+            let Some(drive) = plant.drive_at(machine) else {
                 return false;
             };
             let now = Instant::now();
-            let Some(running) = drive.handle.reading(now).model(ModelPoint::Running).good() else {
+            let Some(running) = drive.reading(now).model(ModelPoint::Running).good() else {
                 return true;
             };
-            let slot = drive.handle.priorities(|all| {
+            let slot = drive.priorities(|all| {
                 let governs = all.governing(Commanded::Run)?;
                 Some((governs.1, governs.2.origin.who.clone()))
             });
             if let (true, Some((priority, who))) = (running.as_bool(), slot) {
-                let spec = &drive.handle.image.spec;
+                let spec = &drive.image.spec;
                 let text = format!(
                     "drive {} runs, and BACnet client {who} has held `run` inactive at priority {priority} since \
                      before the restart; nothing was written; stop the drive, or release the slot",
                     spec.name
                 );
-                drive.handle.publish(Event {
+                drive.publish(Event {
                     bus: spec.bus.clone(),
                     drive: Some(spec.name.clone()),
                     ..Event::new(EventKind::ForeignCommand, SystemTime::now(), text)
@@ -356,17 +357,13 @@ impl Task {
         match order {
             ToTask::Retire => self.retired = true,
             ToTask::Apply(options, sockets) => {
-                let continues = sockets.is_none() && self.options.continues(&options);
+                let now = Instant::now();
                 let same_bbmd = self.options.bbmd == options.bbmd;
                 self.options = Arc::from(options);
                 if let Some(sockets) = sockets {
                     self.sockets = sockets;
                     self.readers = [waiting_reader(), waiting_reader(), waiting_reader()];
-                }
-                self.see();
-                let now = Instant::now();
-                if !continues {
-                    self.desk.start_anew(self.sockets.place(), now);
+                    self.desk.move_to(self.sockets.place(), now);
                 }
                 if !same_bbmd {
                     self.desk.server.set_bbmd(None, now);

@@ -17,6 +17,7 @@ use drivegate_proto::{Reply, Table};
 mod objects;
 mod orders;
 mod refused;
+mod reload;
 
 const RUN: ObjectId = ObjectId::new(ObjectType::BINARY_VALUE, 1);
 const SPEED: ObjectId = ObjectId::new(ObjectType::ANALOG_VALUE, 1);

@@ -11,8 +11,8 @@ use super::view::View;
 use drivegate_core::order::{
     Arrival, Authority, Commanded, DEFAULT_EXPIRY, Entry, Order, Origin, Outcome, Proof, Refusal, SlotWrite, SourceKind,
 };
-use drivegate_core::permit::{self, Follows, Stage, client_access};
-use drivegate_core::plant::{DriveHandle, OrderRequest, Placed};
+use drivegate_core::permit::{self, Follows, Stage, client_access, meant_another};
+use drivegate_core::plant::{DriveHandle, FormerMachine, NamedBy, OrderRequest, Placed};
 use drivegate_core::process_image::Machine;
 use drivegate_model::drive::{PointIndex, Value};
 
@@ -61,6 +61,9 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
         handle.refuse(&described(job), refusal, origin, now);
         return JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED));
     }
+    if let Some(former) = handle.former(NamedBy::Unit, arrival.asked) {
+        return to_former(handle, &former, meaning, job, origin, arrival, now);
+    }
     let order = |point, origin, arrival| {
         let request = OrderRequest::new(Order::Points(vec![point]), origin, Authority::Write);
         waits(handle, handle.place(request.within(expiry).arrived(arrival), now), None)
@@ -80,6 +83,41 @@ pub(super) fn begin(view: &View, job: &Job, arrival: Arrival, now: Instant) -> J
         (Meaning::Slot(what, index), _) => slot(handle, what, index, job, origin, arrival, now),
         _ => JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)),
     }
+}
+
+/// A write whose device number meant another machine when its request arrived: it enters no slot. What was a stop by the
+/// slots of that machine is carried out there, anything else nowhere.
+fn to_former(
+    handle: &DriveHandle,
+    former: &FormerMachine,
+    meaning: Meaning,
+    job: &Job,
+    origin: Origin,
+    arrival: Arrival,
+    now: Instant,
+) -> JobProgress {
+    let value = match &job.value {
+        None => Some(None),
+        Some(Datum::Bool(on)) => Some(Some(*on)),
+        Some(_) => None,
+    };
+    let priority = job.priority.unwrap_or(LOWEST);
+    let stop = match (meaning, former, value) {
+        (Meaning::Slot(Commanded::Run, run), FormerMachine::There(there), Some(value)) => {
+            Some(run).filter(|_| there.priorities(|all| all.stops(priority, value)))
+        }
+        _ => None,
+    };
+    let Some(run) = stop else {
+        let refusal = meant_another();
+        let error = of_refusal(&refusal);
+        handle.refuse(&described(job), refusal, origin, now);
+        return JobProgress::Answered(Err(error));
+    };
+    // An order that names the present drive is given to the machine that the number meant.
+    let order = Order::Points(vec![(run, Value::Bool(false))]);
+    let request = OrderRequest::new(order, origin, Authority::Write).within(expiry(job));
+    waits(handle, handle.place(request.arrived(arrival), now), None)
 }
 
 /// Time after the request within which a write may be sent. A write that waited for another one of the same request

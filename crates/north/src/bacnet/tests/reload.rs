@@ -1,0 +1,227 @@
+//! Reloads that give device numbers to other machines: a write belongs to the machine that its number meant when the
+//! write arrived.
+
+use std::net::SocketAddrV4;
+
+use arc_swap::ArcSwap;
+use drivegate_bacnet::encoding::{Reader, Writer};
+use drivegate_bacnet::npdu::{self, Payload};
+use drivegate_bacnet::{Mac, To, bvlc};
+use drivegate_core::plant::{BusHandle, SharedPlant, UnusedNames};
+use drivegate_testkit::up;
+
+use super::super::desk::Desk;
+use super::*;
+
+const HOST: SocketAddrV4 = SocketAddrV4::new(std::net::Ipv4Addr::new(127, 0, 0, 5), 47808);
+
+/// A plant whose bus each reload replaces, and a server without sockets.
+struct Reloads {
+    plant: SharedPlant,
+    unused: UnusedNames,
+    server: Loopback,
+    now: Instant,
+}
+
+/// A bus with drives at these addresses, units 1, 2, …; the output frequency of each is its address in Hz.
+fn bus_of(addresses: &[u8], now: Instant) -> BusHandle {
+    let drive = |(unit, address): (u8, &u8)| {
+        let image = image(DriveSpec {
+            unit,
+            address: *address,
+            name: format!("p{address}"),
+            ..spec("vacon-nx")
+        });
+        read_all(&image, now, |_| u16::from(*address) * 100);
+        image
+    };
+    up(bus(bus_spec("line1"), (1..).zip(addresses).map(drive).collect()))
+}
+
+impl Reloads {
+    fn new() -> Reloads {
+        let now = Instant::now();
+        let plant = Plant::new("hall", STALE_AFTER, vec![bus_of(&[1, 2], now)]);
+        let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+        let mut reloads = Reloads {
+            server: Loopback::new(options(), plant.clone(), now),
+            unused: UnusedNames::default(),
+            plant,
+            now,
+        };
+        reloads.server.poll(now);
+        reloads.sent();
+        reloads
+    }
+
+    fn reload(&mut self, addresses: &[u8]) {
+        self.now += Duration::from_millis(10);
+        let (before, next) = (self.plant.load_full(), bus_of(addresses, self.now));
+        next.take_over(&before.buses, self.now);
+        let after = vec![next];
+        self.unused.follow(&before.buses, &after, self.now);
+        self.plant.store(Arc::new(Plant::new("hall", STALE_AFTER, after)));
+        self.now += Duration::from_millis(10);
+    }
+
+    fn sent(&mut self) -> Vec<Vec<u8>> {
+        let to_host = |(to, datagram): (To, Vec<u8>)| (to == To::Host(HOST)).then_some(datagram);
+        std::iter::from_fn(|| self.server.transmit())
+            .filter_map(to_host)
+            .collect()
+    }
+
+    /// The APDU that the device of that unit answers a request with; `None` if the answer does not come at once.
+    fn ask(&mut self, unit: u8, service: u8, object: ObjectId, content: impl FnOnce(&mut Writer)) -> Option<Vec<u8>> {
+        let mut writer = Writer::default();
+        writer.context_object(0, object).context_unsigned(1, 85);
+        content(&mut writer);
+        let apdu = [&[0x00, 0x05, 1, service][..], &writer.into_bytes()].concat();
+        let to = Some((1001, Mac::new(&[unit]).unwrap()));
+        let datagram = bvlc::unicast(&npdu::encode(to, None, true, Payload::Application(&apdu)));
+        self.server.receive(HOST, &datagram, self.now);
+        let datagram = self.sent().pop()?;
+        let Some(bvlc::Bvlc::Unicast(npdu)) = bvlc::decode(&datagram) else {
+            panic!("{datagram:?}")
+        };
+        let Payload::Application(apdu) = npdu::decode(npdu).unwrap().payload else {
+            panic!("{datagram:?}")
+        };
+        Some(apdu.to_vec())
+    }
+
+    fn run_at_8(&mut self, unit: u8, on: bool) -> Option<Vec<u8>> {
+        self.ask(unit, 15, RUN, |w| {
+            w.open(3).enumerated(on.into()).close(3).context_unsigned(4, 8);
+        })
+    }
+
+    /// Address and run command of the next order in the queue of the bus, which is carried out.
+    fn carried_out(&self) -> Option<(u8, bool)> {
+        let bus = self.plant.load().buses[0].clone();
+        let command = take_next(&bus.queue, self.now)?;
+        let drive = bus.image.drives.get(command.intent.target.drive().unwrap())?;
+        let order = (drive.spec.address, !command.is_stop());
+        command.answer(&done(), self.now);
+        Some(order)
+    }
+
+    /// Begins a write of `run` at priority 8 to unit 1 that arrived at `asked`, as the present plant understands it.
+    fn begun(&self, value: Option<bool>, asked: Instant) -> JobProgress {
+        let view = View::new(self.plant.load_full(), Arc::new(options()), HostRights::new(&options()));
+        let device = view.devices().into_iter().find(|device| device.instance == DEVICE);
+        let job = Job {
+            token: 1,
+            from: HOST.to_string().parse().unwrap(),
+            device: DEVICE,
+            place: device.unwrap().find(RUN).unwrap(),
+            object: RUN,
+            value: value.map(Datum::Bool),
+            priority: Some(8),
+            requested_at: asked,
+            since: asked,
+        };
+        writes::begin(&view, &job, Arrival::now(asked), self.now)
+    }
+
+    fn drive(&self, name: &str) -> DriveHandle {
+        self.plant.load().drive(name).unwrap()
+    }
+
+    /// A client at another address has `run` of a drive inactive at priority 3.
+    fn protect(&self, drive: &str) {
+        let origin = Origin::new(SourceKind::Bacnet, "127.0.0.7:47808");
+        let entry = drivegate_core::order::Entry::new(Value::Bool(false), origin, self.now);
+        self.drive(drive)
+            .priorities(|all| all.restore(Commanded::Run, 3, entry));
+    }
+}
+
+#[test]
+fn what_arrives_behind_a_reload_reaches_the_machine_that_the_number_means_now() {
+    let mut plant = Reloads::new();
+    let frequency = ObjectId::new(ObjectType::ANALOG_INPUT, 2);
+    let read = |plant: &mut Reloads| {
+        let answer = plant.ask(1, 12, frequency, |_| {}).unwrap();
+        let mut reader = Reader::new(&answer[3..]);
+        reader.context_object(0).unwrap();
+        reader.context_property(1).unwrap();
+        reader.open(3).unwrap();
+        reader.data().unwrap()
+    };
+    assert_eq!(read(&mut plant), Some(Data::Real(1.0)));
+    // The periodic work of the server, 100 ms apart, is not due between the reloads and the requests.
+    plant.reload(&[2, 1]);
+    assert_eq!(plant.run_at_8(1, false), None, "it waits for the drive");
+    assert_eq!(plant.carried_out(), Some((2, false)));
+    assert_eq!(plant.carried_out(), None);
+    plant.server.collect(plant.now);
+    assert_eq!(plant.sent().len(), 1, "the acknowledgement");
+    plant.reload(&[1, 2]);
+    assert_eq!(read(&mut plant), Some(Data::Real(1.0)));
+    plant.reload(&[2, 1]);
+    assert_eq!(read(&mut plant), Some(Data::Real(2.0)));
+}
+
+#[test]
+fn what_arrived_before_a_reload_reaches_the_machine_that_it_named_and_no_slot() {
+    let mut plant = Reloads::new();
+    let before = plant.now;
+    plant.reload(&[2, 1]);
+    plant.protect("p2");
+    let slots = |plant: &Reloads, drive| {
+        let entry = |all: &mut drivegate_core::permit::Priorities| all.entry(Commanded::Run, 8).is_some();
+        plant.drive(drive).priorities(entry)
+    };
+    // At the machine that has the number now, an inactive at 8 and a NULL would follow nothing.
+    for stop in [Some(false), None] {
+        let JobProgress::Waits(waiting) = plant.begun(stop, before) else {
+            panic!("a stop waits for its drive")
+        };
+        assert_eq!(plant.carried_out(), Some((1, false)), "{stop:?}");
+        assert_eq!(waiting.slot, None);
+        assert!(!slots(&plant, "p1") && !slots(&plant, "p2"));
+    }
+    let denied = |begun| matches!(begun, JobProgress::Answered(Err(Error::WRITE_ACCESS_DENIED)));
+    assert!(denied(plant.begun(Some(true), before)));
+    // Where the slots of the named machine make it no stop, nothing reaches either machine.
+    plant.protect("p1");
+    assert!(denied(plant.begun(Some(false), before)));
+    assert_eq!(plant.carried_out(), None);
+    assert!(!slots(&plant, "p1") && !slots(&plant, "p2"));
+}
+
+#[test]
+fn numbers_of_new_options_count_with_the_plant_of_the_same_reload() {
+    let mut plant = Reloads::new();
+    let (rights, at) = (HostRights::new(&options()), (options().listen, 8));
+    let mut desk = Desk::new(Arc::new(options()), rights.clone(), plant.plant.clone(), at, plant.now);
+    let numbers = |desk: &Desk| {
+        let name = |(number, drive): (&u32, &super::super::view::ShownDrive)| {
+            let name = drive.handle.image.spec.name.clone();
+            (*number, name)
+        };
+        let mut all: Vec<_> = desk.view.drives.iter().map(name).collect();
+        all.sort();
+        all
+    };
+    let of = |first: u32, names: [&str; 2]| [(first, names[0].to_string()), (first + 1, names[1].to_string())];
+    let renumbered = Options {
+        device: 200,
+        ..options()
+    };
+    rights.set(Some(&renumbered));
+    desk.poll(plant.now);
+    assert_eq!(numbers(&desk), of(101, ["p1", "p2"]));
+    plant.reload(&[2, 1]);
+    desk.poll(plant.now);
+    assert_eq!(numbers(&desk), of(201, ["p2", "p1"]));
+    rights.set(None);
+    plant.reload(&[1, 2]);
+    desk.poll(plant.now);
+    assert_eq!(
+        numbers(&desk),
+        of(201, ["p1", "p2"]),
+        "a server that ends keeps its options"
+    );
+}
