@@ -18,7 +18,7 @@ fn showing(view: View) -> Options {
 }
 
 /// The request of function 23.
-fn write_and_read((start, values): (u16, &[u16]), (read, count): (u16, u16)) -> Vec<u8> {
+pub(super) fn write_and_read((start, values): (u16, &[u16]), (read, count): (u16, u16)) -> Vec<u8> {
     let mut pdu = Vec::new();
     let values = values.to_vec();
     let request = RequestPdu::ReadWrite {

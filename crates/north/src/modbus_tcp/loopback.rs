@@ -37,10 +37,8 @@ impl Loopback {
         peer: SocketAddr,
         authority: Authority,
     ) -> Loopback {
-        let (state, view) = (
-            ServerState::new(options, stats, CancellationToken::new()),
-            PlantView::new(plant, Arc::default(), View::default()),
-        );
+        let view = PlantView::new(plant, stats.stop_all.clone(), View::default());
+        let state = ServerState::new(options, stats, CancellationToken::new());
         let client = Client::new(peer, None, authority);
         let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
         Loopback::of(session, Watch::in_virtual_time())
@@ -74,7 +72,7 @@ impl Loopback {
         self.take(bytes, false, now)
     }
 
-    /// Processes bytes like [`Offline::receive`], from a client that closed the connection after `bytes`.
+    /// Processes bytes like [`Loopback::receive`], from a client that closed the connection after `bytes`.
     pub fn receive_last(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let answers = self.take(bytes, true, now);
         if let Some(reader) = &self.reader {

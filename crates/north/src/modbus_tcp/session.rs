@@ -29,7 +29,7 @@ use drivegate_model::drive::{ModelPoint, Value};
 use drivegate_proto::modbus::encode_exception;
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
 
-use request::{answers, has_function, not_readable, read_limit, stop_in, stops_all_only, stops_by};
+use request::{answers, has_function, not_readable, read_limit, stops_all_only, stops_by, write_part};
 
 /// Function codes that write registers or coils.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
@@ -327,11 +327,8 @@ impl ClientSession {
         match self.routes.registers().locate(start, count) {
             At::Model(start) => self.command(header, drive, request, start, values, now),
             At::Drive if has_function(&drive.image.spec.profile, 6) => {
-                let order = match request {
-                    RequestPdu::ReadWrite { .. } => RequestPdu::write_registers(start, values),
-                    _ => request.clone(),
-                };
-                forwarded(header, drive, request, BusWork::Order(Order::Write(order)))
+                let order = Order::Write(write_part(&request).into_owned());
+                forwarded(header, drive, request, BusWork::Order(order))
             }
             At::Drive => Exception::FUNCTION.into(),
             At::Nowhere => match self.routes.registers().around_the_command_word(start, count) {
@@ -342,7 +339,8 @@ impl ClientSession {
     }
 
     /// Executes function 23: the write and, after its result, the read. Both are checked before anything is
-    /// written; a stop in the write is carried out even if the rest is refused.
+    /// written; a stop in the write is carried out even if the rest is refused. Nothing else of a refused write counts,
+    /// not even for the hold, the lease or the next command word.
     fn write_and_read(
         &self,
         header: Header,
@@ -352,35 +350,26 @@ impl ClientSession {
         (start, count): (u16, u16),
         now: Instant,
     ) -> Decision {
-        let at = self.routes.registers().locate(start, count);
+        let registers = self.routes.registers();
+        let at = registers.locate(start, count);
         let then = ReadBehind { at, start, count };
-        let refused = self.judge_read(header, drive, then, now).err();
+        if let Err(code) = self.judge_read(header, drive, then, now) {
+            return match registers.stop_in(drive, write) {
+                Some(stop) => forwarded(header, drive, request, BusWork::Stop(stop, not_readable(code, start))),
+                None => code.into(),
+            };
+        }
         match self.write(header, drive, request, write, now) {
-            Decision::Drive(both) => {
-                let (mut forwarded, work) = *both;
-                let work = match (refused, work) {
-                    (None, work) => {
-                        forwarded.then = Some(then);
-                        work
-                    }
-                    (Some(_), stop @ BusWork::Stop(..)) => stop,
-                    (Some(code), BusWork::Order(order)) => match stop_in(drive, &order) {
-                        Some(stop) => BusWork::Stop(stop, not_readable(code, start)),
-                        None => return code.into(),
-                    },
-                    (Some(code), _) => return code.into(),
-                };
-                Decision::Drive(Box::new((forwarded, work)))
+            Decision::Drive(mut both) => {
+                both.0.then = Some(then);
+                Decision::Drive(both)
             }
             // The write needs no command on the bus: it only renews the lease or concerns the hold of the drive.
-            Decision::Reply(request, _) => match refused {
-                Some(code) => code.into(),
-                None => {
-                    let mut forwarded = ForwardedRequest::new(header, drive, request);
-                    forwarded.then = Some(then);
-                    Decision::Drive(Box::new((forwarded, BusWork::Written)))
-                }
-            },
+            Decision::Reply(request, _) => {
+                let mut forwarded = ForwardedRequest::new(header, drive, request);
+                forwarded.then = Some(then);
+                Decision::Drive(Box::new((forwarded, BusWork::Written)))
+            }
             other => other,
         }
     }

@@ -2,15 +2,16 @@
 
 use std::time::Instant;
 
+use super::request::registers_written;
 use super::{ClientSession, Decision, WRITES};
 use crate::command_json::{nothing_to_stop, refuse_stop_all};
 use crate::modbus_tcp::frame::Frame;
 use crate::modbus_tcp::identify::Identity;
 use crate::register_map::{self, BusFigures, FIRST, NOT_STANDING, STOP_ALL};
-use drivegate_core::order::{self, Authority};
+use drivegate_core::order::Authority;
 use drivegate_core::plant::BusHandle;
 use drivegate_core::stop_all;
-use drivegate_proto::{Exception, Reply, RequestPdu, Table};
+use drivegate_proto::{Exception, Reply, RequestPdu};
 
 impl ClientSession {
     /// Unit 255: the input registers, which can also be read as holding registers, since many clients cannot read
@@ -47,17 +48,15 @@ impl ClientSession {
     }
 
     /// Handles a write to unit 255: 1 at the register that stops all drives that the listener serves. The drives are stopped
-    /// whatever else the write covers.
+    /// whatever else the write covers, and whatever function 23 reads: the rest is answered with 02 after them.
     fn stop_all(&self, frame: &Frame<'_>, now: Instant) -> Result<Decision, Exception> {
         if self.client.rights.authority() != Authority::Write {
             return Err(Exception::FUNCTION);
         }
         let request = RequestPdu::decode(frame.pdu)?;
-        let written = order::written(&request).filter(|(table, _)| *table == Table::Holding);
-        let mut items = written.map(|(_, items)| items).unwrap_or_default().into_iter();
-        let (_, value) = items
-            .find(|(address, _)| *address == STOP_ALL)
-            .ok_or(Exception::FUNCTION)?;
+        let written = registers_written(&request);
+        let stops = written.iter().find(|(address, _)| *address == STOP_ALL);
+        let (_, value) = *stops.ok_or(Exception::FUNCTION)?;
         if value != 1 {
             return Err(Exception::VALUE);
         }

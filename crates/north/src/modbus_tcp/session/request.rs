@@ -1,55 +1,81 @@
 //! What a request covers, and what a family has for it. Pure.
 
-use crate::modbus_tcp::routes::{At, EarlierUnit};
+use std::borrow::Cow;
+
+use crate::modbus_tcp::routes::{At, EarlierUnit, Registers};
 use crate::register_map::{self, STOP_ALL};
-use drivegate_core::order::{self, Order, Refusal};
+use drivegate_core::order::{self, Order, Parts, Refusal};
 use drivegate_core::plant::DriveHandle;
-use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
+use drivegate_model::drive::{ModelPoint, Profile, Value};
 use drivegate_proto::{Exception, Reply, RequestPdu, Table};
+
+/// What a request writes; of function 23 its write.
+pub(super) fn write_part(request: &RequestPdu) -> Cow<'_, RequestPdu> {
+    match request {
+        RequestPdu::ReadWrite {
+            write_start, values, ..
+        } => Cow::Owned(RequestPdu::write_registers(*write_start, values)),
+        request => Cow::Borrowed(request),
+    }
+}
+
+/// The holding registers that a request sets.
+pub(super) fn registers_written(request: &RequestPdu) -> Vec<(u16, u16)> {
+    let written = order::written(&write_part(request)).filter(|(table, _)| *table == Table::Holding);
+    written.map(|(_, items)| items).unwrap_or_default()
+}
 
 /// Whether a write to holding registers sets the register to 1.
 pub(super) fn stops_by(request: &RequestPdu, register: u16) -> bool {
-    let items = match request {
-        RequestPdu::ReadWrite {
-            write_start, values, ..
-        } => order::written(&RequestPdu::write_registers(*write_start, values)),
-        request => order::written(request),
-    };
-    items.is_some_and(|(table, items)| table == Table::Holding && items.contains(&(register, 1)))
+    registers_written(request).contains(&(register, 1))
 }
 
-impl EarlierUnit {
-    /// The stop that a write contains by the meaning that its registers had.
-    pub(super) fn stop(&self, drive: &DriveHandle, request: &RequestPdu) -> Option<Order> {
-        let profile = &drive.image.spec.profile;
-        let run = profile.model_index(ModelPoint::Run)?;
-        let stop = Order::Points(vec![(run, Value::Bool(false))]);
-        let write = match request {
-            RequestPdu::ReadWrite {
-                write_start, values, ..
-            } => RequestPdu::write_registers(*write_start, values),
-            request => request.clone(),
-        };
-        if self.is_default && stops_by(&write, STOP_ALL) {
-            return Some(stop);
-        }
-        let (start, values) = match &write {
-            RequestPdu::WriteRegister { address, value } => (*address, vec![*value]),
-            RequestPdu::WriteRegisters { start, values } => (*start, values.clone()),
-            _ => return drive.stop_meant(&Order::Write(write), drive),
-        };
+impl Registers {
+    /// The stop in a write of registers that is carried out without the rest.
+    pub(super) fn stop_in(self, drive: &DriveHandle, (start, values): (u16, &[u16])) -> Option<Order> {
         let count = u16::try_from(values.len()).ok()?;
-        let start = match self.registers.locate(start, count) {
-            At::Drive => return drive.stop_meant(&Order::Write(write), drive),
+        let start = match self.locate(start, count) {
+            At::Drive => {
+                let order = Order::Write(RequestPdu::write_registers(start, values));
+                return stop_of(drive, order);
+            }
             At::Model(start) => start,
-            At::Nowhere => self.registers.around_the_command_word(start, count)?,
+            At::Nowhere => self.around_the_command_word(start, count)?,
         };
         let before = register_map::CommandContext {
             word: None,
             fault: false,
         };
-        let command = register_map::command(profile, start, &values, before).ok()?;
-        command.points.contains(&(run, Value::Bool(false))).then_some(stop)
+        let command = register_map::command(&drive.image.spec.profile, start, values, before).ok()?;
+        stop_of(drive, Order::Points(command.points))
+    }
+}
+
+/// The stop part of an order.
+fn stop_of(drive: &DriveHandle, order: Order) -> Option<Order> {
+    match Parts::of(order, &drive.image.spec.profile) {
+        Parts::Two(stop, _) => Some(stop),
+        Parts::One(order) => drive.stop_meant(&order, drive).map(|_| order),
+    }
+}
+
+impl EarlierUnit {
+    /// The stop that a write contains by the meaning that its registers had.
+    pub(super) fn stop(&self, drive: &DriveHandle, request: &RequestPdu) -> Option<Order> {
+        let run = drive.image.spec.profile.model_index(ModelPoint::Run)?;
+        let stop = Order::Points(vec![(run, Value::Bool(false))]);
+        if self.is_default && stops_by(request, STOP_ALL) {
+            return Some(stop);
+        }
+        let write = write_part(request);
+        let is_stop = match write.as_ref() {
+            RequestPdu::WriteRegister { address, value } => {
+                self.registers.stop_in(drive, (*address, &[*value])).is_some()
+            }
+            RequestPdu::WriteRegisters { start, values } => self.registers.stop_in(drive, (*start, values)).is_some(),
+            _ => drive.stop_meant(&Order::Write(write.into_owned()), drive).is_some(),
+        };
+        is_stop.then_some(stop)
     }
 }
 
@@ -61,27 +87,6 @@ pub(super) fn not_readable(code: Exception, address: u16) -> Refusal {
         }
         code => Refusal::BadValue(format!("register 0x{address:04X} cannot be read now ({code})")),
     }
-}
-
-/// The stop that an order contains.
-pub(super) fn stop_in(drive: &DriveHandle, order: &Order) -> Option<Order> {
-    let profile = &drive.image.spec.profile;
-    let run = profile.model_index(ModelPoint::Run)?;
-    let stops = match order {
-        Order::Points(values) => values.contains(&(run, Value::Bool(false))),
-        Order::Write(pdu) => order::written(pdu).is_some_and(|(table, items)| {
-            let runs = |(address, word): &(u16, u16)| profile.runs_by(table, *address, *word);
-            items.iter().find_map(runs) == Some(false)
-        }),
-        Order::Parameter(_) | Order::Read(_) => false,
-    };
-    stops.then(|| match order {
-        Order::Points(values) => {
-            let keeps = |point: &PointIndex| *point == run || profile.model_index(ModelPoint::Reverse) == Some(*point);
-            Order::Points(values.iter().filter(|(point, _)| keeps(point)).copied().collect())
-        }
-        order => order.clone(),
-    })
 }
 
 /// Whether a write that stops all drives names no other register.
