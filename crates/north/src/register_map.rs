@@ -7,7 +7,7 @@
 mod command;
 mod gateway;
 
-pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
+pub(crate) use command::{CommandContext, CommandWrite, FAULT_RESET, command};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
 use drivegate_core::permit::{HoldState, HoldView};

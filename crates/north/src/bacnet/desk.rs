@@ -54,10 +54,10 @@ pub(super) struct Desk {
     at: At,
     /// Drives that answered at the last look.
     present: HashSet<u32>,
-    /// Leases that expired so far, by device.
-    leases: HashMap<u32, u64>,
-    /// Devices with a slot that awaits the next reading.
-    uncertain: BTreeSet<u32>,
+    /// Leases that expired so far.
+    leases: HashMap<Machine, u64>,
+    /// Drives with a slot that awaits the next reading.
+    uncertain: BTreeSet<Machine>,
     /// When datagrams were taken up that arrived earlier than that, and how they arrived.
     arrivals: VecDeque<(Instant, Arrival)>,
     /// Connection on which the datagrams of [`Desk::receive`] arrive.
@@ -185,8 +185,7 @@ impl Desk {
             let settled = Settled::of(&ended.outcome);
             drive.priorities(|all| all.settle(slot, settled, now));
             if settled == Settled::Unknown {
-                let device = self.view.options.device + u32::from(drive.image.spec.unit);
-                self.uncertain.insert(device);
+                self.uncertain.insert(ended.machine.clone());
             }
         }
         self.view.set_time(now);
@@ -221,7 +220,7 @@ impl Desk {
 
     /// A lease that ended without a stop gives the slots of its client back, too.
     fn note_leases(&mut self) {
-        for (device, drive) in &self.view.drives {
+        for drive in self.view.drives.values() {
             let image = &drive.handle.image;
             let stops = image
                 .spec
@@ -229,7 +228,7 @@ impl Desk {
                 .as_ref()
                 .is_none_or(|lease| lease.action == LeaseAction::Stop);
             let count = image.supervisions();
-            let before = self.leases.insert(*device, count);
+            let before = self.leases.insert(drive.handle.machine(), count);
             if !stops && before.is_some_and(|before| before < count) {
                 drive.handle.priorities(|all| all.silenced());
             }
@@ -238,11 +237,13 @@ impl Desk {
 
     /// Settles uncertain slots by readings.
     fn resolve_slots(&mut self, now: Instant) {
-        let drives = &self.view.drives;
-        self.uncertain.retain(|device| {
-            let Some(drive) = drives.get(device) else { return false };
-            let reading = drive.handle.reading(now);
-            drive.handle.priorities(|all| {
+        let plant = &self.view.plant;
+        self.uncertain.retain(|machine| {
+            let Some(drive) = plant.drive_at(machine) else {
+                return false;
+            };
+            let reading = drive.reading(now);
+            drive.priorities(|all| {
                 all.resolve(|what, since| {
                     let sample = reading.model(what.point());
                     sample.good().filter(|_| sample.at.is_some_and(|at| at > since))

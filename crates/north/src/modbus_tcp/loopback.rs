@@ -37,7 +37,7 @@ impl Loopback {
         peer: SocketAddr,
         authority: Authority,
     ) -> Loopback {
-        let view = PlantView::new(plant, stats.stop_all.clone(), View::default());
+        let view = PlantView::new(0, plant, stats.stop_all.clone(), View::default());
         let state = ServerState::new(options, stats, CancellationToken::new());
         let client = Client::new(peer, None, authority);
         let session = ClientSession::new(Arc::new(state), Arc::new(view), client);

@@ -263,7 +263,7 @@ impl TcpService<Options> for ModbusTcp {
                 }
                 None => {
                     *opened += 1;
-                    let view = PlantView::new(plant.clone(), state.stats.stop_all.clone(), view);
+                    let view = PlantView::new(*opened, plant.clone(), state.stats.stop_all.clone(), view);
                     Arc::new(Admission::new(*opened, policy, view, state.clone(), cancel.clone()))
                 }
             };

@@ -151,6 +151,8 @@ pub(super) struct EarlierUnit {
 /// The part of the plant that the clients of one listener can see.
 #[derive(Debug)]
 pub(super) struct PlantView {
+    /// Number of the listener.
+    pub(super) number: usize,
     plant: SharedPlant,
     stop_all: Arc<StopAll>,
     shown: ArcSwap<Shown>,
@@ -158,10 +160,11 @@ pub(super) struct PlantView {
 }
 
 impl PlantView {
-    pub(super) fn new(plant: SharedPlant, stop_all: Arc<StopAll>, view: View) -> PlantView {
+    pub(super) fn new(number: usize, plant: SharedPlant, stop_all: Arc<StopAll>, view: View) -> PlantView {
         let shown = Arc::new(Shown { view, before: None });
         let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), stop_all.clone(), shown.clone()));
         PlantView {
+            number,
             plant,
             stop_all,
             shown: ArcSwap::new(shown),

@@ -11,6 +11,7 @@ use futures_util::FutureExt;
 use tokio::sync::oneshot;
 
 use super::client::Client;
+use super::command_words::LastWord;
 use super::forwarded_request::{
     AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, ReadBehind, common, read_parts,
 };
@@ -20,7 +21,7 @@ use super::routes::{At, EarlierUnit, PlantView, Registers, Routes};
 use super::{ServerState, Uncached};
 use crate::ModbusTcpStats;
 use crate::log_throttle::LogThrottle;
-use crate::register_map::{self, GATEWAY_UNIT, STOP_ALL};
+use crate::register_map::{GATEWAY_UNIT, STOP_ALL};
 use drivegate_core::order::{Arrival, Authority, Order, Outcome};
 use drivegate_core::permit::meant_another;
 use drivegate_core::plant::DriveHandle;
@@ -177,7 +178,7 @@ impl ClientSession {
         let ForwardedRequest { header, request, .. } = forwarded;
         let drive = &forwarded.drive.image.spec.name;
         if forwarded.resets && !outcome.is_ok() {
-            self.last_word(&forwarded.drive, |word| *word = word.map(register_map::without_reset));
+            self.last_word(header.unit, &forwarded.drive, LastWord::forget_reset);
         }
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET

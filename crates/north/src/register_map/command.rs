@@ -4,7 +4,8 @@ use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, HOLD, NO_I16, NO_U16, 
 use drivegate_core::order::Refusal;
 use drivegate_model::drive::{ModelPoint, PointIndex, Profile, Value};
 
-const FAULT_RESET: u16 = 1 << 2;
+/// The bit of the command word that resets a fault.
+pub(crate) const FAULT_RESET: u16 = 1 << 2;
 
 /// The meaning of a write to the command block.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -181,10 +182,4 @@ fn command_word(
         }
     }
     Ok(None)
-}
-
-/// The word at 0x8100 without its fault reset, which did not reach the drive, so that the next write with bit 2
-/// resets again.
-pub(crate) fn without_reset(word: u16) -> u16 {
-    word & !FAULT_RESET
 }

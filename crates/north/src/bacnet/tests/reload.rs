@@ -96,13 +96,17 @@ impl Reloads {
         })
     }
 
-    /// Address and run command of the next order in the queue of the bus, which is carried out.
     fn carried_out(&self) -> Option<(u8, bool)> {
+        self.next(&done())
+    }
+
+    /// Address and run command of the next order in the queue of the bus, which ends so.
+    fn next(&self, outcome: &Outcome) -> Option<(u8, bool)> {
         let bus = self.plant.load().buses[0].clone();
         let command = take_next(&bus.queue, self.now)?;
         let drive = bus.image.drives.get(command.intent.target.drive().unwrap())?;
         let order = (drive.spec.address, !command.is_stop());
-        command.answer(&done(), self.now);
+        command.answer(outcome, self.now);
         Some(order)
     }
 
@@ -224,4 +228,64 @@ fn numbers_of_new_options_count_with_the_plant_of_the_same_reload() {
         of(201, ["p1", "p2"]),
         "a server that ends keeps its options"
     );
+}
+
+#[test]
+fn a_slot_that_waits_for_a_reading_waits_for_that_of_its_machine() {
+    let mut plant = Reloads::new();
+    plant.run_at_8(1, false);
+    assert_eq!(plant.next(&Outcome::TimedOut), Some((1, false)));
+    plant.server.collect(plant.now);
+    let stands = |plant: &Reloads| {
+        let entry = |all: &mut drivegate_core::permit::Priorities| all.entry(Commanded::Run, 8).is_some();
+        plant.drive("p1").priorities(entry)
+    };
+    plant.server.poll(plant.now);
+    assert!(!stands(&plant));
+    plant.reload(&[2, 1]);
+    plant.server.poll(plant.now);
+    assert!(stands(&plant), "the drive was read since, and shows the stop");
+}
+
+#[test]
+fn leases_are_counted_by_machine() {
+    let plant = Reloads::new();
+    let holds = Some(drivegate_core::process_image::Supervision {
+        timeout: Duration::from_secs(5),
+        action: drivegate_core::process_image::LeaseAction::LeaveRunning,
+        adopt: false,
+    });
+    let drive = |unit: u8| {
+        image(DriveSpec {
+            unit,
+            address: unit,
+            name: format!("p{unit}"),
+            supervision: holds.clone(),
+            ..spec("vacon-nx")
+        })
+    };
+    let bus = up(bus(bus_spec("line1"), vec![drive(1), drive(2)]));
+    let stored = || Arc::new(Plant::new("hall", STALE_AFTER, vec![bus.clone()]));
+    plant.plant.store(stored());
+    let (rights, at) = (HostRights::new(&options()), (options().listen, 8));
+    let mut desk = Desk::new(Arc::new(options()), rights.clone(), plant.plant.clone(), at, plant.now);
+    plant.drive("p2").image.count_supervision();
+    desk.poll(plant.now);
+    plant.protect("p2");
+    let stands = |plant: &Reloads| {
+        plant
+            .drive("p2")
+            .priorities(|all| all.entry(Commanded::Run, 3).is_some())
+    };
+    // The second drive gets the number that the first one had.
+    rights.set(Some(&Options {
+        device: 99,
+        ..options()
+    }));
+    plant.plant.store(stored());
+    desk.poll(plant.now);
+    assert!(stands(&plant), "no lease has ended");
+    plant.drive("p2").image.count_supervision();
+    desk.poll(plant.now);
+    assert!(!stands(&plant));
 }

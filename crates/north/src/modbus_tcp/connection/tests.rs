@@ -44,7 +44,12 @@ fn rig_with(pipe: usize, idle_timeout: Option<Duration>) -> PipedClient {
     let plant = Plant::new("test", Duration::from_secs(1), Vec::new());
     let stats = Arc::new(NorthState::default());
     let state = ServerState::new(options, stats.clone(), CancellationToken::new());
-    let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), Arc::default(), View::default());
+    let view = PlantView::new(
+        0,
+        Arc::new(ArcSwap::from_pointee(plant)),
+        Arc::default(),
+        View::default(),
+    );
     let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);
     let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
     let (client, end) = tokio::io::duplex(pipe);

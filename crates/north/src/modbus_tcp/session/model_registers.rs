@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use super::{ClientSession, Decision};
+use crate::modbus_tcp::command_words::{LastWord, ListenerUnit};
 use crate::modbus_tcp::forwarded_request::{BusWork, ForwardedRequest, common};
 use crate::modbus_tcp::frame::Header;
 use crate::register_map::{self, CommandWrite, HEARTBEAT, HOLD};
@@ -49,9 +50,10 @@ impl ClientSession {
         }
     }
 
-    /// Calls `update` with the word last written at 0x8100 of this drive.
-    pub(super) fn last_word<T>(&self, drive: &DriveHandle, update: impl FnOnce(&mut Option<u16>) -> T) -> T {
-        let unit = drive.image.spec.unit;
+    /// Calls `update` with the word last written at 0x8100 of this drive, by a request to this unit id.
+    pub(super) fn last_word<T>(&self, unit: u8, drive: &DriveHandle, update: impl FnOnce(&mut LastWord) -> T) -> T {
+        let listener = self.view.number;
+        let unit = ListenerUnit { listener, unit };
         self.state.command_words.update(unit, drive.machine(), update)
     }
 
@@ -75,11 +77,11 @@ impl ClientSession {
         }
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
-        let write = self.last_word(drive, |last| {
-            let before = register_map::CommandContext { word: *last, fault };
+        let write = self.last_word(header.unit, drive, |last| {
+            let before = last.context(fault);
             let write = register_map::command(&spec.profile, start, values, before)?;
             let resets = write.refused.is_none() && write.word.is_some_and(|word| before.resets(word));
-            *last = write.word.or(*last);
+            write.word.into_iter().for_each(|word| last.write(word));
             Ok((write, resets))
         });
         let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
