@@ -11,6 +11,8 @@ use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rt
 
 /// Time for which a USB adapter may hold bytes back, with a margin.
 pub const ADAPTER_DELAY: Duration = Duration::from_millis(30);
+/// Highest address of a drive by the Modbus specification.
+pub const HIGHEST_ADDRESS: u8 = 247;
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
 /// Up to this many characters before a reply count as a glitch of a line that changes direction, not as a damaged
@@ -69,6 +71,7 @@ pub struct Frames {
     times: Vec<Instant>,
     last: Option<Instant>,
     held_back: Duration,
+    highest: u8,
 }
 
 impl Frames {
@@ -79,10 +82,16 @@ impl Frames {
             protocol,
             format,
             held_back,
+            highest: HIGHEST_ADDRESS,
             bytes: Vec::new(),
             times: Vec::new(),
             last: None,
         }
+    }
+
+    /// Sets the highest address of Modbus requests, which is [`HIGHEST_ADDRESS`] at first.
+    pub fn set_highest_address(&mut self, highest: u8) {
+        self.highest = highest;
     }
 
     /// Adds bytes that arrived at `now`: the last of them just then, the others earlier by their wire time, but not
@@ -132,7 +141,7 @@ impl Frames {
             let rest = self.bytes.get(at..).unwrap_or_default();
             // After more than a short glitch no reply is accepted: the request that it belongs to may be in the garbage.
             let open = open.filter(|_| at <= GLITCH);
-            match rtu_at(rest, open) {
+            match rtu_at(rest, open, self.highest) {
                 FrameSearch::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {
                     return self.cut(at + length, cut);
                 }
@@ -166,7 +175,7 @@ impl Frames {
         let line = self.bytes.get(..length).unwrap_or_default();
         let begin = begin_of(self.protocol, line);
         let frame = line.get(begin..).unwrap_or_default();
-        let cut = line_cut(self.protocol, frame, open.filter(|_| begin <= GLITCH));
+        let cut = line_cut(self.protocol, frame, open.filter(|_| begin <= GLITCH), self.highest);
         // Bytes before a request become a separate piece.
         if begin > 0 && !matches!(cut, Cut::Reply { .. } | Cut::Garbage) {
             return self.cut(begin, Cut::Garbage);
@@ -189,9 +198,9 @@ impl Frames {
 }
 
 /// Searches for a frame at the start of `bytes` on a Modbus RTU line.
-fn rtu_at(bytes: &[u8], open: Option<&Request>) -> FrameSearch {
+fn rtu_at(bytes: &[u8], open: Option<&Request>, highest: u8) -> FrameSearch {
     let reply = open.map_or(FrameSearch::Nothing, |open| rtu_reply(bytes, open));
-    match (reply, rtu_request(bytes)) {
+    match (reply, rtu_request(bytes, highest)) {
         (FrameSearch::Is(length, cut), _) => FrameSearch::Is(length, cut),
         // The first three bytes fit the expected reply; a request would have another byte count there.
         (FrameSearch::MayBecome(true), _) => FrameSearch::MayBecome(true),
@@ -249,11 +258,11 @@ fn reply_or_request(open: &Request, reply: &Reply, pdu: &[u8]) -> Option<Cut> {
     })
 }
 
-fn rtu_request(bytes: &[u8]) -> FrameSearch {
+fn rtu_request(bytes: &[u8], highest: u8) -> FrameSearch {
     let (Some(&address), Some(&function)) = (bytes.first(), bytes.get(1)) else {
         return FrameSearch::MayBecome(false);
     };
-    if address > 247 || !rtu::is_known(function) {
+    if address > highest || !rtu::is_known(function) {
         return FrameSearch::Nothing;
     }
     // The number of bytes must agree with a count before them.
@@ -335,7 +344,7 @@ fn begin_of(protocol: Protocol, line: &[u8]) -> usize {
 }
 
 /// Decides what one whole line is: a request, the reply to the open request, or garbage.
-fn line_cut(protocol: Protocol, frame: &[u8], open: Option<&Request>) -> Cut {
+fn line_cut(protocol: Protocol, frame: &[u8], open: Option<&Request>, highest: u8) -> Cut {
     let reply = match open.map(|open| (open, protocol.decode(open, frame))) {
         Some((open, Decoded::Reply { reply, .. })) => Some((open, reply)),
         _ => None,
@@ -360,7 +369,7 @@ fn line_cut(protocol: Protocol, frame: &[u8], open: Option<&Request>) -> Cut {
         return cut;
     }
     match RequestPdu::decode(&pdu) {
-        Ok(pdu) if address <= 247 => Cut::Request {
+        Ok(pdu) if address <= highest => Cut::Request {
             address,
             pdu: Some(pdu),
         },

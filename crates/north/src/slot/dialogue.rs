@@ -86,6 +86,7 @@ impl Dialogue {
     pub(super) fn received(&mut self, bytes: &[u8], arrival: Arrival, now: Instant) -> bool {
         let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
         self.reads_at = now.checked_add(BYTE_TIME.saturating_mul(count));
+        self.framing.set_highest_address(self.tool.highest_address());
         self.framing.add(bytes, arrival, now);
         self.on_time(now)
     }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use super::request::ToolRequest;
 use crate::arrivals::Arrivals;
 use drivegate_core::order::Arrival;
-use drivegate_proto::frames::Frames;
+use drivegate_proto::frames::{Frames, HIGHEST_ADDRESS};
 use drivegate_proto::{LineFormat, Protocol};
 
 /// Silence after an incomplete frame after which its rest is no longer expected: longer than the pauses of serial
@@ -32,6 +32,7 @@ pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
     arrivals: Arrivals,
+    highest: u8,
     /// How the last message arrived, dated from its first byte.
     arrival: Option<Arrival>,
 }
@@ -42,8 +43,15 @@ impl Framing {
             protocol,
             frames: Frames::new(protocol, format, HALF_FRAME),
             arrivals: Arrivals::default(),
+            highest: HIGHEST_ADDRESS,
             arrival: None,
         }
+    }
+
+    /// Sets the highest address on the line.
+    pub(super) fn set_highest_address(&mut self, highest: u8) {
+        self.highest = highest;
+        self.frames.set_highest_address(highest);
     }
 
     /// Adds bytes with this arrival that are read at `now`.
@@ -58,7 +66,7 @@ impl Framing {
             let piece = self.frames.next(None, now)?;
             self.arrival = self.arrivals.take(piece.bytes.len());
             if !self.is_blank(&piece.bytes) {
-                return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
+                return Some(match ToolRequest::of(self.protocol, &piece.bytes, self.highest) {
                     Some(request) => ToolFrame::Request(request),
                     None => ToolFrame::Broken,
                 });
@@ -174,6 +182,28 @@ mod tests {
     }
 
     #[test]
+    fn the_reserved_address_is_one_only_on_a_line_that_has_it() {
+        let now = Instant::now();
+        let pdu = [3, 8, 52, 0, 11];
+        for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
+            for (highest, said) in [(HIGHEST_ADDRESS, ToolFrame::Broken), (248, asks(248, 2100, 11))] {
+                let mut framing = framing(protocol);
+                framing.set_highest_address(highest);
+                let mut frame = Vec::new();
+                protocol.encode_frame(248, &pdu, &mut frame);
+                // A request that follows without a pause is found.
+                protocol.encode_frame(1, &pdu, &mut frame);
+                add(&mut framing, &frame, now);
+                assert_eq!(
+                    all(&mut framing, now),
+                    [said, asks(1, 2100, 11)],
+                    "{protocol:?} {highest}"
+                );
+            }
+        }
+    }
+
+    #[test]
     fn a_function_that_is_not_decoded_is_whole_by_silence() {
         let now = Instant::now();
         let mut framing = framing(Protocol::ModbusRtu);
@@ -244,7 +274,7 @@ mod tests {
             (&[22, 0, 4, 0, 242, 0, 37], Exception::FUNCTION),
             (&[5, 0, 0, 1, 0], Exception::VALUE),
         ] {
-            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu)).unwrap();
+            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu), HIGHEST_ADDRESS).unwrap();
             assert_eq!(request.meaning, Meaning::Faulty(Refused::Exception(code)), "{pdu:?}");
             let refusal = request.refusal(Protocol::ModbusRtu, Refused::Exception(code));
             assert_eq!(refusal, framed(7, &[pdu[0] | 0x80, code.code()]));
@@ -258,11 +288,11 @@ mod tests {
             (&[43, 13, 1, 0], false),
             (&[17], false),
         ] {
-            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu)).unwrap();
+            let request = ToolRequest::of(Protocol::ModbusRtu, &framed(7, pdu), HIGHEST_ADDRESS).unwrap();
             assert_eq!(matches!(request.meaning, Meaning::Read(_)), reads, "{pdu:?}");
             assert_eq!(matches!(request.meaning, Meaning::Unchecked(_)), !reads, "{pdu:?}");
         }
-        let exception = ToolRequest::of(Protocol::ModbusRtu, &framed(7, &[0x83, 2]));
+        let exception = ToolRequest::of(Protocol::ModbusRtu, &framed(7, &[0x83, 2]), HIGHEST_ADDRESS);
         assert_eq!(exception, None, "a reply is no request");
     }
 

@@ -63,7 +63,7 @@ impl Loopback {
     }
 
     /// Processes bytes of the tool, if any, and returns its answer up to `now`. A request is in the queue of the
-    /// bus when this returns, or waits until [`Offline::wake_at`].
+    /// bus when this returns, or waits until [`Loopback::wake_at`].
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         let connection = self.connection.get_or_insert_with(|| Connection::opened(now));
         let arrival = Arrival::over(connection.clone(), now);

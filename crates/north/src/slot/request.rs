@@ -40,15 +40,16 @@ pub(super) enum Refused {
 }
 
 impl ToolRequest {
-    /// The request in a complete frame; `None` if the frame is invalid. An invalid frame is not answered.
-    pub(super) fn of(protocol: Protocol, frame: &[u8]) -> Option<ToolRequest> {
+    /// The request in a complete frame on a Modbus line whose addresses end at `highest`, or on an N2 line; `None` if the
+    /// frame is invalid. An invalid frame is not answered.
+    pub(super) fn of(protocol: Protocol, frame: &[u8], highest: u8) -> Option<ToolRequest> {
         let (address, pdu) = match protocol {
             Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec()))?,
             Protocol::ModbusAscii => ascii::open_frame(frame)?,
             Protocol::N2 => return of_n2(frame),
         };
         let function = *pdu.first()?;
-        let sound = address <= 247 && (1..0x80).contains(&function);
+        let sound = address <= highest && (1..0x80).contains(&function);
         sound.then(|| ToolRequest {
             address,
             function,

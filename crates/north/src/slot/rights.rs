@@ -75,11 +75,11 @@ impl Grants for ToolRight {
 mod tests {
     use std::time::{Duration, Instant};
 
-    use drivegate_testkit::{nx_plant, online, read_nx};
+    use drivegate_testkit::{STALE_AFTER, bus, bus_spec, controlled, image, nx, nx_plant, online, read_nx, up};
 
     use super::super::Loopback;
     use super::*;
-    use drivegate_core::plant::SharedPlant;
+    use drivegate_core::plant::{Plant, SharedPlant};
     use drivegate_proto::{LineFormat, Protocol, RequestPdu, rtu};
 
     fn slot(access: SlotAccess) -> Slot {
@@ -128,7 +128,11 @@ mod tests {
 
     impl Tool {
         fn new(access: SlotAccess) -> Tool {
-            let (plant, now) = (nx_plant(&["p1"]), Instant::now());
+            Tool::of(nx_plant(&["p1"]), access)
+        }
+
+        fn of(plant: Plant, access: SlotAccess) -> Tool {
+            let now = Instant::now();
             let image = plant.drive("p1").unwrap().image;
             online(&image);
             read_nx(&plant, "p1", 1, 0, now);
@@ -153,6 +157,22 @@ mod tests {
         pdu.encode(&mut bytes);
         rtu::encode_frame(address, &bytes, &mut frame);
         frame
+    }
+
+    #[test]
+    fn a_drive_at_the_reserved_address_is_reached() {
+        let (write, drive) = (
+            RequestPdu::write_register(2002, 1000),
+            controlled("p1", "line1", 248, &nx()),
+        );
+        let bus = up(bus(bus_spec("line1"), vec![image(drive)]));
+        let mut rig = Tool::of(Plant::new("hall", STALE_AFTER, vec![bus]), SlotAccess::Write);
+        assert!(rig.tool.receive(&frame(248, &write), rig.now).is_empty());
+        assert_eq!(rig.waiting(), 1);
+        // On a line without it, nobody answers.
+        let mut rig = Tool::new(SlotAccess::Raw);
+        assert!(rig.tool.receive(&frame(248, &write), rig.now).is_empty());
+        assert_eq!((rig.waiting(), rig.tool.is_waiting()), (0, false));
     }
 
     /// When the right is removed: after the first half of the frame, or while the write waits for its share of the line.

@@ -18,6 +18,7 @@ use drivegate_core::plant::{
 };
 use drivegate_core::process_image::Access;
 use drivegate_model::drive::plan::WireTime;
+use drivegate_proto::frames::HIGHEST_ADDRESS;
 use drivegate_proto::{LineFormat, Protocol, RequestPdu, describe};
 
 /// Share of the time of a line that writes of tools take at most, stops apart.
@@ -125,6 +126,18 @@ impl Tool {
 
     pub(super) fn count(&self, outcome: SlotOutcome) {
         self.terms.stats.slots.count(&self.terms.slot.bus, outcome);
+    }
+
+    /// Highest address on a Modbus line: that of the specification, unless the bus has a drive at a reserved one.
+    pub(super) fn highest_address(&self) -> u8 {
+        let plant = self.terms.plant.load();
+        let on_bus = |bus: &&BusHandle| bus.image.spec.name == self.terms.slot.bus;
+        let drives = plant
+            .buses
+            .iter()
+            .filter(on_bus)
+            .flat_map(|bus| bus.image.drives.iter());
+        drives.map(|drive| drive.spec.address).fold(HIGHEST_ADDRESS, u8::max)
     }
 
     fn writes(&self) -> bool {
