@@ -264,6 +264,11 @@ impl Server {
         self.exchanges.is_busy()
     }
 
+    /// Whether the request of a job still waits for its end, and may give out further jobs with the same token.
+    pub fn is_running(&self, token: u64) -> bool {
+        self.exchanges.is_running(token)
+    }
+
     /// Devices to which a client has subscribed.
     pub fn subscribed(&self) -> Vec<u32> {
         self.cov.devices()

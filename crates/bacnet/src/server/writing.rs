@@ -108,6 +108,12 @@ impl Exchanges {
         self.all.iter().rev().find(is)
     }
 
+    pub(super) fn is_running(&self, token: u64) -> bool {
+        self.all
+            .iter()
+            .any(|e| e.token == token && matches!(e.state, State::Running))
+    }
+
     fn running(&mut self, token: u64) -> Option<&mut Exchange> {
         let is = |e: &&mut Exchange| e.token == token && matches!(e.state, State::Running);
         self.all.iter_mut().find(is)

@@ -1,12 +1,12 @@
 //! Connects the protocol with the drives: waiting writes, slots that wait for a reading, leases, drives that come
 //! online again. Has no sockets and no clock: `task` and `loopback` provide both.
 
-use std::collections::{BTreeSet, HashMap, HashSet, VecDeque};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::net::SocketAddrV4;
 use std::sync::Arc;
 use std::time::Instant;
 
-use drivegate_bacnet::{Application as _, Options as ServerOptions, Server};
+use drivegate_bacnet::{Application as _, Error, Job, Options as ServerOptions, Server};
 
 use super::Options;
 use super::rights::HostRights;
@@ -17,8 +17,6 @@ use drivegate_core::permit::Settled;
 use drivegate_core::plant::{Plant, SharedPlant};
 use drivegate_core::process_image::{LeaseAction, Machine};
 
-/// Maximum number of batches of datagrams whose arrival times are kept until their writes are processed.
-const MOST_KEPT: usize = 64;
 /// The name of the vendor without an identifier of one's own.
 const VENDOR: &str = "drivegate";
 
@@ -58,8 +56,10 @@ pub(super) struct Desk {
     leases: HashMap<Machine, u64>,
     /// Drives with a slot that awaits the next reading.
     uncertain: BTreeSet<Machine>,
-    /// When datagrams were taken up that arrived earlier than that, and how they arrived.
-    arrivals: VecDeque<(Instant, Arrival)>,
+    /// When the last batch of datagrams was read, and how they arrived.
+    batch: Option<(Instant, Arrival)>,
+    /// How the requests arrived whose writes are in progress, by token.
+    in_progress: HashMap<u64, Arrival>,
     /// Connection on which the datagrams of [`Desk::receive`] arrive.
     connection: Connection,
 }
@@ -87,7 +87,8 @@ impl Desk {
             present: HashSet::new(),
             leases: HashMap::new(),
             uncertain: BTreeSet::new(),
-            arrivals: VecDeque::new(),
+            batch: None,
+            in_progress: HashMap::new(),
             connection: Connection::opened(now),
         }
     }
@@ -140,20 +141,26 @@ impl Desk {
         self.server.receive(from, datagram, &self.view, now);
     }
 
-    /// Notes when the datagrams arrived that are processed at `now`.
+    /// Notes how the datagrams arrived that are processed at `now`.
     pub(super) fn received(&mut self, arrival: Arrival, now: Instant) {
-        if self.arrivals.len() >= MOST_KEPT {
-            self.arrivals.pop_front();
-        }
-        self.arrivals.push_back((now, arrival));
+        self.batch = Some((now, arrival));
     }
 
-    fn arrival(&self, taken_up: Instant) -> Arrival {
-        let known = self.arrivals.iter().rev().find(|(at, _)| *at == taken_up);
-        known.map_or_else(
-            || Arrival::over(self.connection.clone(), taken_up),
-            |(_, arrival)| arrival.clone(),
-        )
+    /// How the request of a job arrived; all of its writes arrived with it.
+    fn arrival(&mut self, job: &Job) -> Arrival {
+        let of_request = || match &self.batch {
+            Some((at, arrival)) if *at == job.requested_at => arrival.clone(),
+            _ => Arrival::over(self.connection.clone(), job.requested_at),
+        };
+        self.in_progress.entry(job.token).or_insert_with(of_request).clone()
+    }
+
+    /// Gives the client the result of a write, or begins the next one of its request.
+    fn written(&mut self, token: u64, result: Result<(), Error>, now: Instant) {
+        self.server.written(token, result, &self.view, now);
+        if !self.server.is_running(token) {
+            self.in_progress.remove(&token);
+        }
     }
 
     /// Values of that device may have changed.
@@ -168,9 +175,9 @@ impl Desk {
         self.refresh(now);
         self.view.set_time(now);
         while let Some(job) = self.server.take_job() {
-            let arrival = self.arrival(job.requested_at);
+            let arrival = self.arrival(&job);
             match writes::begin(&self.view, &job, arrival, now) {
-                JobProgress::Answered(result) => self.server.written(job.token, result, &self.view, now),
+                JobProgress::Answered(result) => self.written(job.token, result, now),
                 JobProgress::Waits(waiting) => return Some((job.token, *waiting)),
             }
         }
@@ -190,7 +197,7 @@ impl Desk {
         }
         self.view.set_time(now);
         let result = writes::error(&ended.outcome);
-        self.server.written(ended.token, result, &self.view, now);
+        self.written(ended.token, result, now);
     }
 
     /// Does all that is due at `now`.

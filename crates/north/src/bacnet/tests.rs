@@ -16,6 +16,7 @@ use drivegate_proto::{Reply, Table};
 
 mod objects;
 mod orders;
+mod pauses;
 mod refused;
 mod reload;
 
